@@ -1,0 +1,109 @@
+"""The manipulation tasks: one table that the readers, experts, environments and benchmarks share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["TASKS", "TaskSpec", "get_task"]
+
+_ARM_KEYS = ("eef_pos", "eef_quat", "gripper_qpos")
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """What the library knows about one task.
+
+    Attributes:
+        name: the short name used by robomimic and by this library's options.
+        env_name: the robosuite environment.
+        arms: the number of Panda arms (1 or 2).
+        horizon_ph: time limit in control steps for one-operator (``ph``) data.
+        horizon_mh: time limit in control steps for six-operator (``mh``) data.
+        object_dim: width of the ``object`` observation.
+        cameras: the cameras of robomimic's image files, third person first.
+        scripted: whether a scripted expert exists.
+        official: the robomimic dataset styles published for the task.
+    """
+
+    name: str
+    env_name: str
+    arms: int
+    horizon_ph: int
+    horizon_mh: int
+    object_dim: int
+    cameras: tuple[str, ...] = ("agentview", "robot0_eye_in_hand")
+    scripted: bool = True
+    official: tuple[str, ...] = ("ph", "mh")
+
+    @property
+    def low_dim_keys(self) -> tuple[str, ...]:
+        """Observation keys whose concatenation is the state: ``object`` first, then each arm."""
+        return ("object",) + tuple(f"robot{i}_{key}" for i in range(self.arms) for key in _ARM_KEYS)
+
+    @property
+    def observation_dim(self) -> int:
+        """Width of the concatenated state."""
+        return self.object_dim + 9 * self.arms
+
+    @property
+    def action_dim(self) -> int:
+        """Width of the action: a 6-d pose delta and a gripper command per arm."""
+        return 7 * self.arms
+
+    def horizon(self, style: str) -> int:
+        """Time limit in control steps for data of ``style`` (``"ph"`` or ``"mh"``)."""
+        return self.horizon_mh if style == "mh" else self.horizon_ph
+
+
+TASKS: dict[str, TaskSpec] = {
+    spec.name: spec
+    for spec in (
+        TaskSpec("lift", "Lift", 1, 400, 500, 10),
+        TaskSpec("can", "PickPlaceCan", 1, 400, 500, 14),
+        TaskSpec("square", "NutAssemblySquare", 1, 400, 500, 14),
+        TaskSpec("stack", "Stack", 1, 400, 500, 23, official=()),
+        TaskSpec(
+            "transport",
+            "TwoArmTransport",
+            2,
+            700,
+            1100,
+            41,
+            cameras=(
+                "shouldercamera0",
+                "shouldercamera1",
+                "robot0_eye_in_hand",
+                "robot1_eye_in_hand",
+            ),
+        ),
+        TaskSpec(
+            "tool_hang",
+            "ToolHang",
+            1,
+            700,
+            700,
+            44,
+            cameras=("sideview", "robot0_eye_in_hand"),
+            scripted=False,
+            official=("ph",),
+        ),
+    )
+}
+
+
+def get_task(name: str) -> TaskSpec:
+    """Look a task up by its short name.
+
+    Args:
+        name: one of ``lift``, ``can``, ``square``, ``stack``, ``transport``, ``tool_hang``.
+
+    Raises:
+        ValueError: if there is no such task.
+
+    Examples:
+        >>> get_task("square").observation_dim
+        23
+    """
+    if name not in TASKS:
+        raise ValueError(f"unknown task {name!r}; choose one of {', '.join(TASKS)}")
+    return TASKS[name]

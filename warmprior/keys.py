@@ -1,0 +1,42 @@
+"""The key contract: every tensor that two parts of the library exchange, and its name.
+
+Shapes use ``B`` (any batch dimensions), ``To`` (observation steps), ``P`` (prediction length),
+``H`` (chunk length), ``d_o`` and ``d_a`` (observation and action width). Time runs from ``t=0``
+(source) to ``t=1`` (data). Index 0 of a chunk is the action at the *current* step. All actions under
+these keys live in the normalised action space; :data:`ACTION` alone is raw on the simulator's side
+of the denormalising transform.
+
+======================  =====================================  ==================================
+constant                key                                    shape and dtype
+======================  =====================================  ==================================
+:data:`OBSERVATION`     ``"observation"``                      ``[*B, To, d_o]`` float
+:data:`ACTION`          ``"action"``                           ``[*B, d_a]`` float
+:data:`LOC`             ``("prior", "loc")``                   ``[*B, P, d_a]`` float
+:data:`WARM`            ``("prior", "warm")``                  ``[*B, P, 1]`` bool
+:data:`NOISE`           ``("prior", "noise")``, the source a0  ``[*B, P, d_a]`` float
+:data:`DELTA`           ``("prior", "delta")``                 ``[*B, P, d_a]`` float
+:data:`ELAPSED`         ``("prior", "elapsed")``               ``[*B, 1]`` int64
+:data:`CHUNK`           ``("vla_action", "chunk")``            ``[*B, P, d_a]`` float
+:data:`IS_PAD`          ``"action_is_pad"``                    ``[*B, P]`` bool
+:data:`EXECUTED`        ``"executed_steps"``                   ``[*B, 1]`` int64
+:data:`EPISODE`         ``"episode"``                          ``[N]`` int64, data only
+:data:`FRAME`           ``"frame"``                            ``[N]`` int64, data only
+======================  =====================================  ==================================
+"""
+
+from __future__ import annotations
+
+from torchrl.data.vla import ACTION_CHUNK_KEY, ACTION_IS_PAD_KEY, ACTION_KEY, OBSERVATION_KEY
+
+OBSERVATION = OBSERVATION_KEY
+ACTION = ACTION_KEY
+LOC = ("prior", "loc")
+WARM = ("prior", "warm")
+NOISE = ("prior", "noise")
+DELTA = ("prior", "delta")
+ELAPSED = ("prior", "elapsed")
+CHUNK = ACTION_CHUNK_KEY
+IS_PAD = ACTION_IS_PAD_KEY
+EXECUTED = "executed_steps"
+EPISODE = "episode"
+FRAME = "frame"
