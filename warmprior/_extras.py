@@ -1,0 +1,42 @@
+"""Optional dependencies: the core needs only torch, tensordict and torchrl."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from types import ModuleType
+
+__all__ = ["require"]
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Import an optional module, or say which extra of this package provides it.
+
+    The module is looked up before it is imported, so an import error raised *inside* an installed
+    module is not mistaken for a missing one.
+
+    Args:
+        module: dotted name of the module, e.g. ``"h5py"``.
+        extra: the extra of this package that installs it, e.g. ``"sim"``.
+
+    Returns:
+        The imported module.
+
+    Raises:
+        ImportError: if the module is not installed.
+
+    Examples:
+        >>> require("json", "sim").dumps([1])
+        '[1]'
+        >>> require("no_such_module", "sim")
+        Traceback (most recent call last):
+            ...
+        ImportError: no_such_module is not installed; run: pip install 'warmprior[sim]'
+    """
+    try:
+        found = importlib.util.find_spec(module) is not None
+    except ModuleNotFoundError:  # a parent package is missing
+        found = False
+    if not found:
+        raise ImportError(f"{module} is not installed; run: pip install 'warmprior[{extra}]'")
+    return importlib.import_module(module)
