@@ -1,0 +1,262 @@
+"""What robomimic's files say about their environment and actions, in the terms of robosuite 1.5.
+
+:func:`modernize_env_args` rewrites the ``env_args`` of a robomimic file. :func:`absolute_actions`
+turns its pose deltas into poses in the world frame, and :func:`absolute_to_env_action` turns those
+into what an environment with absolute inputs takes.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from warmprior.data.rotation import (
+    matrix_to_rotation_6d,
+    quaternion_to_matrix,
+    rotation_6d_to_rotvec,
+    rotvec_to_matrix,
+)
+
+__all__ = [
+    "absolute_actions",
+    "absolute_to_env_action",
+    "delta_conventions",
+    "modernize_env_args",
+]
+
+_ARMS = ("right", "left")
+_RENAMED = {"damping": "damping_ratio", "damping_limits": "damping_ratio_limits"}
+_OUTPUT_MAX = (0.05, 0.05, 0.05, 0.5, 0.5, 0.5)
+# The gripper site, which the controller moves, is the hand body (robot0_eef_quat) turned by -90
+# degrees about its own z axis.
+_HAND_TO_SITE = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
+
+
+def _modernize_part(part: dict[str, Any], *, old: bool, absolute: bool) -> None:
+    for before, after in _RENAMED.items():
+        if before in part:
+            part[after] = part.pop(before)
+    delta = part.pop("control_delta", True)
+    part.setdefault("input_type", "delta" if delta else "absolute")
+    # Up to robosuite 1.4 a delta was in the world frame; from 1.5 on it is in the robot's base
+    # frame unless the file says otherwise. Bases that face each other make the two differ.
+    part.setdefault("input_ref_frame", "world" if old else "base")
+    part.setdefault("gripper", {"type": "GRIP"})
+    if absolute:
+        if part.get("type") != "OSC_POSE":
+            raise ValueError(
+                f"absolute actions need an OSC_POSE controller, env_args has {part.get('type')!r}"
+            )
+        part["input_type"], part["input_ref_frame"] = "absolute", "world"
+
+
+def _modernize_controller(config: dict[str, Any], absolute: bool) -> dict[str, Any]:
+    old = "body_parts" not in config
+    if old:
+        config = {"type": "BASIC", "body_parts": {"right": config}}
+    parts = config["body_parts"]
+    parts.update(parts.pop("arms", {}))
+    for name in _ARMS:
+        if name in parts:
+            _modernize_part(parts[name], old=old, absolute=absolute)
+    return config
+
+
+def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> dict[str, Any]:
+    """Rewrite the ``env_args`` of any robomimic file for robosuite 1.5.
+
+    Files of robosuite 1.4 and earlier name one arm controller; robosuite 1.5 wants a composite one,
+    has renamed the damping options, replaced ``control_delta`` with ``input_type``, changed the
+    default frame of a delta and the names of the two-arm layouts. Some files published for 1.5
+    still carry the old description, so what the file contains decides, not its version. The
+    dynamics of old data are kept (``lite_physics=False``). Applying the function twice changes
+    nothing more.
+
+    Args:
+        env_args: the parsed JSON of the attribute ``data.attrs["env_args"]``: a dict with
+            ``env_name`` and ``env_kwargs``. Not modified.
+        absolute: make the environment take absolute poses in the world frame
+            (see :func:`absolute_to_env_action`) instead of what the file says.
+
+    Returns:
+        A deep copy, from which ``robosuite.make(new["env_name"], **new["env_kwargs"])`` works.
+
+    Raises:
+        ValueError: if ``env_name`` or ``env_kwargs`` is missing, or ``absolute`` is asked of a
+            controller other than ``OSC_POSE``.
+
+    Examples:
+        >>> old = {"type": "OSC_POSE", "damping": 1, "control_delta": True}
+        >>> new = modernize_env_args(
+        ...     {"env_name": "Lift", "env_kwargs": {"robots": ["Panda"], "controller_configs": old}}
+        ... )
+        >>> arm = new["env_kwargs"]["controller_configs"]["body_parts"]["right"]
+        >>> arm["damping_ratio"], arm["input_type"], arm["input_ref_frame"]
+        (1, 'delta', 'world')
+    """
+    for key in ("env_name", "env_kwargs"):
+        if key not in env_args:
+            raise ValueError(f"env_args has no {key!r}; it has {sorted(env_args)}")
+    new = copy.deepcopy(dict(env_args))
+    kwargs = new["env_kwargs"]
+    configs = kwargs.get("controller_configs")
+    if configs:
+        listed = configs if isinstance(configs, list) else [configs]
+        old = any("body_parts" not in config for config in listed)
+        listed = [_modernize_controller(config, absolute) for config in listed]
+        kwargs["controller_configs"] = listed if isinstance(configs, list) else listed[0]
+        # MimicGen's variants (Coffee_D0, ...) set lite_physics themselves and refuse the argument.
+        if not re.search(r"_D\d$", new["env_name"]):
+            kwargs.setdefault("lite_physics", not old)
+    elif absolute:
+        raise ValueError("absolute actions need the controller_configs of the file's env_kwargs")
+    layout = kwargs.get("env_configuration")
+    if isinstance(layout, str):
+        kwargs["env_configuration"] = layout.removeprefix("single-arm-")
+    if "mount_types" in kwargs:
+        kwargs["base_types"] = kwargs.pop("mount_types")
+    # The index of a GPU on the machine that recorded the data.
+    kwargs.pop("render_gpu_device_id", None)
+    return new
+
+
+def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
+    """Say in which units and frame an environment reads its pose deltas.
+
+    Args:
+        env_args: as :func:`modernize_env_args` takes.
+
+    Returns:
+        ``output_max`` ``[6]`` float64, what an input of 1 means (3 in metres, 3 in radians), and
+        ``base_rotation`` ``[arms, 3, 3]`` float64, from the frame of the deltas to the world.
+
+    Raises:
+        ValueError: if the controller is not an ``OSC_POSE`` one fed with deltas in ``[-1, 1]``.
+
+    Examples:
+        >>> arm = {"type": "OSC_POSE", "output_max": [0.05] * 3 + [0.5] * 3}
+        >>> output_max, base_rotation = delta_conventions(
+        ...     {"env_name": "Lift", "env_kwargs": {"robots": "Panda", "controller_configs": arm}}
+        ... )
+        >>> output_max.tolist(), base_rotation.shape
+        ([0.05, 0.05, 0.05, 0.5, 0.5, 0.5], torch.Size([1, 3, 3]))
+    """
+    kwargs = modernize_env_args(env_args)["env_kwargs"]
+    config = kwargs.get("controller_configs") or {"body_parts": {"right": {"type": "OSC_POSE"}}}
+    part = (config[0] if isinstance(config, list) else config)["body_parts"]["right"]
+    if part.get("type") != "OSC_POSE" or part.get("input_type", "delta") != "delta":
+        raise ValueError(
+            f"expected OSC_POSE deltas, env_args has {part.get('type')} with input_type "
+            f"{part.get('input_type')!r}; read these actions as they are (absolute_actions=False)"
+        )
+    output_max = torch.as_tensor(part.get("output_max", _OUTPUT_MAX), dtype=torch.float64).expand(6)
+    output_min = torch.as_tensor(part.get("output_min", -output_max), dtype=torch.float64).expand(6)
+    limits = (part.get("input_min", -1), part.get("input_max", 1))
+    if not torch.equal(output_min, -output_max) or limits != (-1, 1):
+        raise ValueError(
+            "only symmetric deltas are supported: input -1..1 and output_min = -output_max"
+        )
+    robots = kwargs.get("robots", ["Panda"])
+    arms = 1 if isinstance(robots, str) else len(robots)
+    turned = arms == 2 and kwargs.get("env_configuration", "default") in ("default", "opposed")
+    yaws = torch.zeros(arms, dtype=torch.float64)
+    if turned and part.get("input_ref_frame", "base") == "base":
+        yaws = torch.tensor([math.pi / 2, -math.pi / 2], dtype=torch.float64)
+    axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return output_max.clone(), rotvec_to_matrix(yaws[:, None] * axis)
+
+
+def _per_arm(name: str, value: Tensor, width: int, arms: int | None = None) -> Tensor:
+    if value.ndim == 0 or value.shape[-1] not in (width, 2 * width):
+        raise ValueError(
+            f"{name} must have {width} or {2 * width} columns, got {list(value.shape)}"
+        )
+    if arms is not None and value.shape[-1] != arms * width:
+        raise ValueError(f"{name} has {value.shape[-1]} columns; {arms} arm(s) need {arms * width}")
+    return value.double().unflatten(-1, (-1, width))
+
+
+def absolute_actions(
+    actions: Tensor,
+    eef_pos: Tensor,
+    eef_quat: Tensor,
+    *,
+    quat_is_site: bool = False,
+    output_max: Tensor | Sequence[float] = _OUTPUT_MAX,
+    base_rotation: Tensor | None = None,
+) -> Tensor:
+    """Turn pose deltas into the poses they ask for, in the world frame.
+
+    The goal position is ``eef_pos + output_max[:3] * clip(delta)`` and the goal orientation
+    ``exp(output_max[3:] * clip(turn)) @ R_site``. ``R_site`` is the frame of the gripper site;
+    robomimic's ``robot0_eef_quat`` is that of the hand body, 90 degrees away, and is converted
+    here.
+
+    Args:
+        actions: ``[..., 7]`` or, for two arms, ``[..., 14]``: position delta, rotation delta and
+            gripper.
+        eef_pos: ``[..., 3]`` or ``[..., 6]`` gripper positions before the action, in metres.
+        eef_quat: ``[..., 4]`` or ``[..., 8]`` hand orientations before the action, ``(x, y, z,
+            w)``.
+        quat_is_site: ``eef_quat`` is ``robot0_eef_quat_site``, the gripper site's own frame.
+        output_max: ``[6]``, what an input of 1 means, in metres and radians.
+        base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; ``None`` if they
+            are in the world frame already (see :func:`delta_conventions`).
+
+    Returns:
+        ``[..., 10]`` or ``[..., 20]`` in the dtype of ``actions``: per arm the position in metres,
+        the first two rows of the rotation matrix, and the gripper.
+
+    Raises:
+        ValueError: if a width does not belong to one or two arms, or the widths disagree.
+
+    Examples:
+        >>> action = torch.tensor([1.0, 0, 0, 0, 0, 0, -1.0])
+        >>> position, site = torch.tensor([0.1, 0, 1.0]), torch.tensor([0, 0, 0, 1.0])
+        >>> absolute_actions(action, position, site, quat_is_site=True)
+        tensor([ 0.1500,  0.0000,  1.0000,  1.0000,  0.0000,  0.0000,  0.0000,  1.0000,
+                 0.0000, -1.0000])
+    """
+    delta = _per_arm("actions", actions, 7)
+    arms = delta.shape[-2]
+    position = _per_arm("eef_pos", eef_pos, 3, arms)
+    rotation = quaternion_to_matrix(_per_arm("eef_quat", eef_quat, 4, arms))
+    if not quat_is_site:
+        rotation = rotation @ quaternion_to_matrix(rotation.new_tensor(_HAND_TO_SITE))
+    scale = torch.as_tensor(output_max, dtype=torch.float64, device=delta.device)
+    step = (delta[..., :6].clamp(-1, 1) * scale).unflatten(-1, (2, 3))
+    if base_rotation is not None:
+        # Turning both vectors is enough: B exp(r) B^T = exp(B r).
+        step = step @ base_rotation.to(step).mT
+    goal = position + step[..., 0, :]
+    turned = matrix_to_rotation_6d(rotvec_to_matrix(step[..., 1, :]) @ rotation)
+    return torch.cat((goal, turned, delta[..., 6:]), -1).flatten(-2).to(actions.dtype)
+
+
+def absolute_to_env_action(actions: Tensor) -> Tensor:
+    """Turn absolute actions into what an environment with absolute inputs takes.
+
+    Args:
+        actions: ``[..., 10]`` or ``[..., 20]``, as :func:`absolute_actions` returns them or as a
+            policy predicts them: the six rotation numbers are orthonormalised.
+
+    Returns:
+        ``[..., 7]`` or ``[..., 14]`` in the dtype of ``actions``: per arm the position in metres,
+        the rotation vector in radians and the gripper.
+
+    Raises:
+        ValueError: if the width is neither 10 nor 20.
+
+    Examples:
+        >>> absolute_to_env_action(torch.tensor([0.1, 0, 1, 1, 0, 0, 0, 1, 0, -1]))
+        tensor([ 0.1000,  0.0000,  1.0000,  0.0000,  0.0000,  0.0000, -1.0000])
+    """
+    pose = _per_arm("actions", actions, 10)
+    rotvec = rotation_6d_to_rotvec(pose[..., 3:9])
+    return torch.cat((pose[..., :3], rotvec, pose[..., 9:]), -1).flatten(-2).to(actions.dtype)

@@ -1,0 +1,203 @@
+"""Rotations as quaternions, matrices, rotation vectors and six numbers, over any leading shape.
+
+Quaternions are ``(x, y, z, w)``, as in robomimic's observations. The 6-d form is the first two
+*rows* of the rotation matrix, one after the other.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+__all__ = [
+    "matrix_to_rotation_6d",
+    "matrix_to_rotvec",
+    "quaternion_to_matrix",
+    "rotation_6d_to_matrix",
+    "rotation_6d_to_rotvec",
+    "rotvec_to_matrix",
+]
+
+
+def _check_width(value: Tensor, width: int, what: str) -> None:
+    if value.ndim == 0 or value.shape[-1] != width:
+        raise ValueError(f"{what} needs {width} numbers in its last dimension, got {value.shape}")
+
+
+def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
+    """Turn ``(x, y, z, w)`` quaternions into rotation matrices.
+
+    Args:
+        quaternion: ``[..., 4]``; normalised here, so any non-zero length will do.
+
+    Returns:
+        ``[..., 3, 3]``.
+
+    Raises:
+        ValueError: if the last dimension is not 4.
+
+    Examples:
+        >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 1.0, 1.0])).round(decimals=3)
+        tensor([[ 0., -1.,  0.],
+                [ 1.,  0.,  0.],
+                [ 0.,  0.,  1.]])
+    """
+    _check_width(quaternion, 4, "a quaternion")
+    x, y, z, w = normalize(quaternion, dim=-1).unbind(-1)
+    rows = (
+        torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)), -1),
+        torch.stack((2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)), -1),
+        torch.stack((2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)), -1),
+    )
+    return torch.stack(rows, -2)
+
+
+def rotvec_to_matrix(rotvec: Tensor) -> Tensor:
+    """Turn rotation vectors (axis times angle in radians) into rotation matrices.
+
+    Args:
+        rotvec: ``[..., 3]`` in radians.
+
+    Returns:
+        ``[..., 3, 3]``.
+
+    Raises:
+        ValueError: if the last dimension is not 3.
+
+    Examples:
+        >>> rotvec_to_matrix(torch.zeros(3))
+        tensor([[1., 0., 0.],
+                [0., 1., 0.],
+                [0., 0., 1.]])
+    """
+    _check_width(rotvec, 3, "a rotation vector")
+    x, y, z = rotvec.unbind(-1)
+    zero = torch.zeros_like(x)
+    skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
+    angle = rotvec.norm(dim=-1)[..., None, None]
+    # sinc keeps Rodrigues' two coefficients exact as the angle goes to zero.
+    first = torch.sinc(angle / math.pi)
+    second = 0.5 * torch.sinc(angle / (2 * math.pi)) ** 2
+    identity = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
+    return identity + first * skew + second * (skew @ skew)
+
+
+def matrix_to_rotvec(matrix: Tensor) -> Tensor:
+    """Turn rotation matrices into rotation vectors of length at most pi.
+
+    Args:
+        matrix: ``[..., 3, 3]`` rotation matrices.
+
+    Returns:
+        ``[..., 3]`` in radians.
+
+    Raises:
+        ValueError: if the last dimensions are not ``(3, 3)``.
+
+    Examples:
+        >>> half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+        >>> matrix_to_rotvec(half_turn)
+        tensor([3.1416, 0.0000, 0.0000])
+    """
+    if matrix.shape[-2:] != (3, 3):
+        raise ValueError(f"a rotation matrix needs shape [..., 3, 3], got {matrix.shape}")
+    m = matrix
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    xy, xz, yz = (
+        m[..., 0, 1] + m[..., 1, 0],
+        m[..., 0, 2] + m[..., 2, 0],
+        m[..., 1, 2] + m[..., 2, 1],
+    )
+    wx, wy, wz = (
+        m[..., 2, 1] - m[..., 1, 2],
+        m[..., 0, 2] - m[..., 2, 0],
+        m[..., 1, 0] - m[..., 0, 1],
+    )
+    # 4 q q^T from the matrix: each row is the quaternion times one of its entries. The row of the
+    # largest entry is the one that loses no digits, near half turns included.
+    outer = torch.stack(
+        (
+            torch.stack((1 + xx - yy - zz, xy, xz, wx), -1),
+            torch.stack((xy, 1 - xx + yy - zz, yz, wy), -1),
+            torch.stack((xz, yz, 1 - xx - yy + zz, wz), -1),
+            torch.stack((wx, wy, wz, 1 + xx + yy + zz), -1),
+        ),
+        -2,
+    )
+    best = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    row = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
+    quaternion = normalize(row, dim=-1)
+    quaternion = torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+    axis, w = quaternion[..., :3], quaternion[..., 3:]
+    sine = axis.norm(dim=-1, keepdim=True)
+    tiny = torch.finfo(matrix.dtype).tiny
+    return axis * torch.where(sine > tiny, 2 * torch.atan2(sine, w) / sine.clamp_min(tiny), 2.0)
+
+
+def matrix_to_rotation_6d(matrix: Tensor) -> Tensor:
+    """Keep the first two rows of rotation matrices.
+
+    Args:
+        matrix: ``[..., 3, 3]`` rotation matrices.
+
+    Returns:
+        ``[..., 6]``.
+
+    Raises:
+        ValueError: if the last dimensions are not ``(3, 3)``.
+
+    Examples:
+        >>> matrix_to_rotation_6d(torch.eye(3))
+        tensor([1., 0., 0., 0., 1., 0.])
+    """
+    if matrix.shape[-2:] != (3, 3):
+        raise ValueError(f"a rotation matrix needs shape [..., 3, 3], got {matrix.shape}")
+    return matrix[..., :2, :].flatten(-2)
+
+
+def rotation_6d_to_matrix(rotation_6d: Tensor) -> Tensor:
+    """Turn any six numbers into the rotation matrix they mean, by Gram-Schmidt.
+
+    Args:
+        rotation_6d: ``[..., 6]``, two rows that need be neither of unit length nor orthogonal, but
+            not parallel.
+
+    Returns:
+        ``[..., 3, 3]``.
+
+    Raises:
+        ValueError: if the last dimension is not 6.
+
+    Examples:
+        >>> rotation_6d_to_matrix(torch.tensor([2.0, 0.0, 0.0, 1.0, 3.0, 0.0]))
+        tensor([[1., 0., 0.],
+                [0., 1., 0.],
+                [0., 0., 1.]])
+    """
+    _check_width(rotation_6d, 6, "a 6-d rotation")
+    first = normalize(rotation_6d[..., :3], dim=-1)
+    second = rotation_6d[..., 3:]
+    second = normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
+    return torch.stack((first, second, torch.linalg.cross(first, second)), -2)
+
+
+def rotation_6d_to_rotvec(rotation_6d: Tensor) -> Tensor:
+    """Turn 6-d rotations into rotation vectors of length at most pi.
+
+    Args:
+        rotation_6d: ``[..., 6]``, as :func:`rotation_6d_to_matrix` takes.
+
+    Returns:
+        ``[..., 3]`` in radians.
+
+    Raises:
+        ValueError: if the last dimension is not 6.
+
+    Examples:
+        >>> rotation_6d_to_rotvec(torch.tensor([0.0, -1.0, 0.0, 1.0, 0.0, 0.0]))
+        tensor([0.0000, 0.0000, 1.5708])
+    """
+    return matrix_to_rotvec(rotation_6d_to_matrix(rotation_6d))
