@@ -1,0 +1,62 @@
+"""WarmPrior: temporally grounded source distributions for flow-matching policies, in TorchRL.
+
+The public names of :mod:`warmprior.modules`, :mod:`warmprior.transforms` and
+:mod:`warmprior.objectives` are available here. :mod:`warmprior.data`, :mod:`warmprior.envs`,
+:mod:`warmprior.training` and :mod:`warmprior.diagnostics` are imported by name; parts of them need
+the extra ``warmprior[sim]``.
+"""
+
+from importlib.metadata import version
+
+from warmprior.modules import (
+    ChiTransformer,
+    GaussianPrior,
+    Interpolant,
+    LinearInterpolant,
+    ODEActor,
+    PastPrior,
+    PolynomialInterpolant,
+    PreviewPrior,
+    Prior,
+    PriorSampler,
+    TrigonometricInterpolant,
+    VelocityMLP,
+    VelocityNetwork,
+    WarmPriorActor,
+    integrate,
+)
+from warmprior.objectives import FlowMatchingLoss
+from warmprior.transforms import (
+    ActionHistory,
+    ActionWindow,
+    ChunkStep,
+    Normalizer,
+    window_replay_buffer,
+)
+
+__version__ = version("warmprior")
+
+__all__ = [
+    "ActionHistory",
+    "ActionWindow",
+    "ChiTransformer",
+    "ChunkStep",
+    "FlowMatchingLoss",
+    "GaussianPrior",
+    "Interpolant",
+    "LinearInterpolant",
+    "Normalizer",
+    "ODEActor",
+    "PastPrior",
+    "PolynomialInterpolant",
+    "PreviewPrior",
+    "Prior",
+    "PriorSampler",
+    "TrigonometricInterpolant",
+    "VelocityMLP",
+    "VelocityNetwork",
+    "WarmPriorActor",
+    "__version__",
+    "integrate",
+    "window_replay_buffer",
+]

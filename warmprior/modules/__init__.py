@@ -1,0 +1,34 @@
+"""Priors, velocity networks and the actor."""
+
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.chi_transformer import ChiTransformer
+from warmprior.modules.interpolant import (
+    Interpolant,
+    LinearInterpolant,
+    PolynomialInterpolant,
+    TrigonometricInterpolant,
+)
+from warmprior.modules.mlp import VelocityMLP
+from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
+from warmprior.modules.ode import ODEActor, integrate
+from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior.modules.sampler import PriorSampler
+
+__all__ = [
+    "ChiTransformer",
+    "GaussianPrior",
+    "Interpolant",
+    "LinearInterpolant",
+    "ODEActor",
+    "PastPrior",
+    "PolynomialInterpolant",
+    "PreviewPrior",
+    "Prior",
+    "PriorSampler",
+    "TimestepEmbedding",
+    "TrigonometricInterpolant",
+    "VelocityMLP",
+    "VelocityNetwork",
+    "WarmPriorActor",
+    "integrate",
+]

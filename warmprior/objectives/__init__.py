@@ -1,0 +1,5 @@
+"""Losses."""
+
+from warmprior.objectives.flow_matching import FlowMatchingLoss
+
+__all__ = ["FlowMatchingLoss"]

@@ -1,0 +1,8 @@
+"""Transforms of replay buffers and environments."""
+
+from warmprior.transforms.chunk import ChunkStep
+from warmprior.transforms.history import ActionHistory
+from warmprior.transforms.normalize import Normalizer
+from warmprior.transforms.window import ActionWindow, window_replay_buffer
+
+__all__ = ["ActionHistory", "ActionWindow", "ChunkStep", "Normalizer", "window_replay_buffer"]

@@ -1,0 +1,55 @@
+"""A deterministic environment whose true returns, lengths and observations are known in closed form."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+ACTION_DIM = 2
+
+
+class CountingEnv(EnvBase):
+    """Observation ``[step, episode, *last action]``; reward ``step`` at each step; ends after ``length``."""
+
+    def __init__(self, length: int = 7, truncate: bool = False) -> None:
+        super().__init__(device="cpu", batch_size=[])
+        self.length, self.truncate = length, truncate
+        self.observation_spec = Composite(observation=Unbounded((2 + ACTION_DIM,)))
+        self.action_spec = Bounded(-1, 1, (ACTION_DIM,))
+        self.reward_spec = Unbounded((1,))
+        self.done_spec = Composite(
+            {
+                key: Categorical(2, dtype=torch.bool, shape=(1,))
+                for key in ("done", "terminated", "truncated")
+            }
+        )
+        self.t, self.episode = 0, -1
+
+    def _observation(self, action: torch.Tensor) -> torch.Tensor:
+        return torch.cat([torch.tensor([float(self.t), float(self.episode)]), action])
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.t = 0
+        self.episode += 1
+        out = TensorDict({"observation": self._observation(torch.zeros(ACTION_DIM))}, [])
+        return out.update(self.full_done_spec.zero())
+
+    def _step(self, tensordict):
+        self.t += 1
+        done = torch.tensor([self.t >= self.length])
+        never = torch.zeros(1, dtype=torch.bool)
+        return TensorDict(
+            {
+                "observation": self._observation(tensordict["action"]),
+                "reward": torch.tensor([float(self.t)]),
+                "done": done,
+                "terminated": never if self.truncate else done,
+                "truncated": done if self.truncate else never,
+            },
+            [],
+        )
+
+    def _set_seed(self, seed):
+        return seed

@@ -1,0 +1,111 @@
+"""Interpolants: the path from the source to the data and its velocity."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+__all__ = [
+    "Interpolant",
+    "LinearInterpolant",
+    "PolynomialInterpolant",
+    "TrigonometricInterpolant",
+]
+
+
+class Interpolant:
+    r"""The path :math:`a_t = \alpha(t) a_0 + \beta(t) a_1` and its velocity.
+
+    Subclasses give :meth:`coefficients`; they must satisfy :math:`\alpha(0)=\beta(1)=1` and
+    :math:`\alpha(1)=\beta(0)=0`, so that the flow starts at the source and ends at the data.
+    """
+
+    name: ClassVar[str]
+
+    def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        r"""Return :math:`\alpha, \beta, \dot\alpha, \dot\beta` at times ``t`` in [0, 1], each like ``t``."""
+        raise NotImplementedError
+
+    def __call__(self, a0: Tensor, a1: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Point on the path and the regression target :math:`\dot\alpha a_0 + \dot\beta a_1`.
+
+        Args:
+            a0: source, ``[*B, P, d_a]``.
+            a1: data, ``[*B, P, d_a]``.
+            t: times, ``[*B]``.
+
+        Returns:
+            ``a_t`` and its velocity, each ``[*B, P, d_a]``.
+        """
+        alpha, beta, d_alpha, d_beta = self.coefficients(t[..., None, None])
+        return alpha * a0 + beta * a1, d_alpha * a0 + d_beta * a1
+
+    def config(self) -> dict[str, Any]:
+        """JSON-serialisable description."""
+        return {"name": self.name}
+
+
+class LinearInterpolant(Interpolant):
+    r"""Straight line: :math:`\alpha = 1 - t`, :math:`\beta = t` (Lipman et al., 2023; the paper's).
+
+    Examples:
+        >>> import torch
+        >>> a0, a1 = torch.zeros(1, 2, 1), torch.ones(1, 2, 1)
+        >>> a_t, velocity = LinearInterpolant()(a0, a1, torch.tensor([0.25]))
+        >>> a_t.flatten().tolist(), velocity.flatten().tolist()
+        ([0.25, 0.25], [1.0, 1.0])
+    """
+
+    name = "linear"
+
+    def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Coefficients of the straight line."""
+        one = torch.ones_like(t)
+        return 1 - t, t, -one, one
+
+
+class TrigonometricInterpolant(Interpolant):
+    r"""Quarter circle: :math:`\alpha = \cos(\pi t/2)`, :math:`\beta = \sin(\pi t/2)`.
+
+    Keeps the variance constant for uncorrelated unit-variance ends (Albergo and Vanden-Eijnden, 2023).
+    """
+
+    name = "trigonometric"
+
+    def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Coefficients of the quarter circle."""
+        w = math.pi / 2
+        sin, cos = torch.sin(w * t), torch.cos(w * t)
+        return cos, sin, -w * sin, w * cos
+
+
+class PolynomialInterpolant(Interpolant):
+    r"""Convex power: :math:`\alpha = 1 - t^n`, :math:`\beta = t^n` (Lipman et al., 2024, Sec. 4.8).
+
+    Args:
+        n: the power, > 0; ``n=1`` is the straight line. For ``n > 1`` the flow starts at rest, so one
+            Euler step from ``t=0`` does not move: use more steps.
+
+    Raises:
+        ValueError: if ``n <= 0``.
+    """
+
+    name = "polynomial"
+
+    def __init__(self, n: float = 2.0) -> None:
+        if n <= 0:
+            raise ValueError(f"the power n must be > 0, got {n}")
+        self.n = float(n)
+
+    def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Coefficients of the power path."""
+        beta = t**self.n
+        d_beta = self.n * t ** (self.n - 1)
+        return 1 - beta, beta, -d_beta, d_beta
+
+    def config(self) -> dict[str, Any]:
+        """JSON-serialisable description."""
+        return {"name": self.name, "n": self.n}

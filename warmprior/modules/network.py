@@ -1,0 +1,154 @@
+"""What every velocity network shares: its interface, its configuration and the time embedding."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+__all__ = ["TimestepEmbedding", "VelocityNetwork"]
+
+
+class VelocityNetwork(nn.Module):
+    """Base class of velocity networks ``v(t, a_t, o)`` that can be saved by name and configuration.
+
+    Subclasses pass their constructor arguments on to this class. :class:`~warmprior.ODEActor` and
+    :class:`~warmprior.FlowMatchingLoss` take any callable of the same signature; this base only adds
+    shape checks and :meth:`config`.
+
+    Args:
+        action_dim: ``d_a``.
+        observation_dim: ``d_o``.
+        prediction_length: ``P``.
+        observation_steps: ``To``.
+        kwargs: further constructor arguments of the subclass, recorded by :meth:`config`.
+
+    Raises:
+        ValueError: if a width or length is not positive.
+    """
+
+    _registry: ClassVar[dict[str, type[VelocityNetwork]]] = {}
+
+    def __init__(
+        self,
+        action_dim: int,
+        observation_dim: int,
+        prediction_length: int,
+        observation_steps: int,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__()
+        sizes = {
+            "action_dim": action_dim,
+            "observation_dim": observation_dim,
+            "prediction_length": prediction_length,
+            "observation_steps": observation_steps,
+        }
+        for name, size in sizes.items():
+            if size < 1:
+                raise ValueError(f"{name} must be at least 1, got {size}")
+        self.action_dim = action_dim
+        self.observation_dim = observation_dim
+        self.prediction_length = prediction_length
+        self.observation_steps = observation_steps
+        self._config = {**sizes, **kwargs}
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        VelocityNetwork._registry[cls.__name__] = cls
+
+    def check_shapes(self, a: Tensor, observation: Tensor) -> None:
+        """Compare the inputs with what the network was built for.
+
+        Args:
+            a: ``[B, P, d_a]``.
+            observation: ``[B, To, d_o]``.
+
+        Raises:
+            ValueError: naming the expected and the given shape.
+        """
+        expected = (self.prediction_length, self.action_dim)
+        if tuple(a.shape[1:]) != expected:
+            raise ValueError(
+                f"{type(self).__name__} was built for chunks [B, P, d_a] with (P, d_a) = {expected}, "
+                f"got {tuple(a.shape)}"
+            )
+        expected = (self.observation_steps, self.observation_dim)
+        if tuple(observation.shape[1:]) != expected:
+            raise ValueError(
+                f"{type(self).__name__} was built for observations [B, To, d_o] with "
+                f"(To, d_o) = {expected}, got {tuple(observation.shape)}"
+            )
+
+    def config(self) -> dict[str, Any]:
+        """JSON-serialisable class name and constructor arguments."""
+        return {"name": type(self).__name__, **self._config}
+
+    @staticmethod
+    def from_config(config: dict[str, Any]) -> VelocityNetwork:
+        """Build a network (with fresh weights) from :meth:`config`'s output.
+
+        Raises:
+            ValueError: if no imported class has that name.
+        """
+        kwargs = dict(config)
+        name = kwargs.pop("name", None)
+        if name not in VelocityNetwork._registry:
+            known = ", ".join(sorted(VelocityNetwork._registry))
+            raise ValueError(
+                f"unknown network {name!r}; known: {known}. Pass the network itself, or import the "
+                "module that defines it first."
+            )
+        return VelocityNetwork._registry[name](**kwargs)
+
+    def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
+        """Optimiser groups: decay on matrix weights, none on biases, norms and embeddings.
+
+        Args:
+            weight_decay: decay of the first group.
+        """
+        decay: list[nn.Parameter] = []
+        no_decay: list[nn.Parameter] = []
+        for name, parameter in self.named_parameters():
+            is_matrix = parameter.ndim >= 2 and not name.endswith("position")
+            (decay if is_matrix else no_decay).append(parameter)
+        return [
+            {"params": decay, "weight_decay": weight_decay},
+            {"params": no_decay, "weight_decay": 0.0},
+        ]
+
+
+class TimestepEmbedding(nn.Module):
+    """Sines and cosines of ``1000 t`` at log-spaced frequencies (Vaswani et al., 2017).
+
+    Flow times lie in [0, 1]; without the factor 1000 (the range of the diffusion step for which the
+    frequencies were chosen) all embeddings would nearly coincide.
+
+    Args:
+        dim: width of the embedding, even.
+
+    Raises:
+        ValueError: if ``dim`` is odd or < 4.
+
+    Examples:
+        >>> import torch
+        >>> TimestepEmbedding(8)(torch.tensor([0.0, 1.0])).shape
+        torch.Size([2, 8])
+    """
+
+    frequencies: Tensor
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        if dim < 4 or dim % 2:
+            raise ValueError(f"the timestep embedding must be even and >= 4, got {dim}")
+        half = dim // 2
+        exponent = torch.arange(half) * (-math.log(10_000.0) / (half - 1))
+        self.register_buffer("frequencies", 1000.0 * exponent.exp(), persistent=False)
+
+    def forward(self, t: Tensor) -> Tensor:
+        """Embed times ``t`` ``[B]`` as ``[B, dim]``."""
+        angle = t[:, None] * self.frequencies
+        return torch.cat([angle.sin(), angle.cos()], dim=-1)

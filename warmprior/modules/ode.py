@@ -1,0 +1,192 @@
+"""Fixed-step integration of a velocity network from the source to the action chunk."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from warmprior import keys
+
+__all__ = ["SOLVERS", "ODEActor", "integrate"]
+
+Velocity = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class _Tableau:
+    """An explicit Runge-Kutta method: nodes ``c``, rows ``a`` below the diagonal, weights ``b``."""
+
+    c: tuple[float, ...]
+    a: tuple[tuple[float, ...], ...]
+    b: tuple[float, ...]
+
+
+SOLVERS: dict[str, _Tableau] = {
+    "euler": _Tableau((0.0,), ((),), (1.0,)),
+    "midpoint": _Tableau((0.0, 0.5), ((), (0.5,)), (0.0, 1.0)),
+    "heun": _Tableau((0.0, 1.0), ((), (1.0,)), (0.5, 0.5)),
+    "rk4": _Tableau(
+        (0.0, 0.5, 0.5, 1.0),
+        ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
+        (1 / 6, 1 / 3, 1 / 3, 1 / 6),
+    ),
+}
+
+Solver = Literal["euler", "midpoint", "heun", "rk4"]
+
+
+def _steps(nfe: int, solver: str) -> int:
+    if solver not in SOLVERS:
+        raise ValueError(f"unknown solver {solver!r}; choose one of {', '.join(SOLVERS)}")
+    stages = len(SOLVERS[solver].b)
+    if nfe < 1 or nfe % stages:
+        raise ValueError(
+            f"nfe is the number of network evaluations: it must be a positive multiple of {stages} "
+            f"for the {solver} solver, got {nfe}"
+        )
+    return nfe // stages
+
+
+def _combine(a: Tensor, h: float, weights: tuple[float, ...], slopes: list[Tensor]) -> Tensor:
+    for weight, slope in zip(weights, slopes, strict=False):
+        if weight:
+            a = a + (h * weight) * slope
+    return a
+
+
+def integrate(
+    velocity: Velocity,
+    a0: Tensor,
+    *,
+    nfe: int,
+    solver: Solver = "euler",
+    return_path: bool = False,
+) -> Tensor:
+    r"""Solve :math:`\dot a_t = v(t, a_t)` from ``t=0`` to ``t=1`` on a uniform grid.
+
+    Args:
+        velocity: ``(t [B], a_t [B, ...]) -> velocity [B, ...]``.
+        a0: source, ``[B, ...]``.
+
+    Keyword Args:
+        nfe: number of calls of ``velocity``, a multiple of the solver's stages (Euler 1, midpoint and
+            Heun 2, RK4 4).
+        solver: ``"euler"`` (the paper's), ``"midpoint"``, ``"heun"`` or ``"rk4"``.
+        return_path: return every grid point instead of the last.
+
+    Returns:
+        ``a_1`` ``[B, ...]``, or the path ``[B, steps + 1, ...]`` from ``a_0`` to ``a_1``.
+
+    Raises:
+        ValueError: for an unknown solver or an ``nfe`` that it cannot spend.
+
+    Examples:
+        >>> import torch
+        >>> a0 = torch.ones(1, 1)
+        >>> float(integrate(lambda t, a: a, a0, nfe=4, solver="rk4"))  # e = 2.71828...
+        2.7083...
+    """
+    steps = _steps(nfe, solver)
+    tableau = SOLVERS[solver]
+    h = 1.0 / steps
+    a = a0
+    path = [a0]
+    for step in range(steps):
+        slopes: list[Tensor] = []
+        for node, row in zip(tableau.c, tableau.a, strict=True):
+            t = torch.full(a.shape[:1], (step + node) * h, dtype=a.dtype, device=a.device)
+            slopes.append(velocity(t, _combine(a, h, row, slopes)))
+        a = _combine(a, h, tableau.b, slopes)
+        if return_path:
+            path.append(a)
+    return torch.stack(path, dim=1) if return_path else a
+
+
+class ODEActor(TensorDictModuleBase):
+    """Transports the source to an action chunk: ``(noise, observation) -> chunk``.
+
+    Args:
+        network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``.
+
+    Keyword Args:
+        nfe: number of network evaluations per chunk; an attribute, and overridable per call:
+            ``actor(data, nfe=3)``.
+        solver: see :func:`integrate`.
+        clip: the chunk is clamped to ``[-clip, clip]``; ``None`` (default) leaves it as integrated.
+            Set it where the normalised data span ``[-1, 1]``, so that what the environment executes
+            is what the prior remembers.
+        noise_key: key of the source, ``[*B, P, d_a]``.
+        observation_key: key of the observation, ``[*B, To, d_o]``.
+        chunk_key: key written, ``[*B, P, d_a]``.
+        path_key: if given, the integration path ``[*B, steps + 1, P, d_a]`` is written there.
+
+    Raises:
+        ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend, or an unknown solver.
+        KeyError: if an input key is missing.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import ODEActor, VelocityMLP
+        >>> network = VelocityMLP(action_dim=2, observation_dim=3, prediction_length=4)
+        >>> actor = ODEActor(network, nfe=9)
+        >>> data = TensorDict({"observation": torch.zeros(5, 2, 3),
+        ...                    ("prior", "noise"): torch.randn(5, 4, 2)}, [5])
+        >>> actor(data, nfe=1)["vla_action", "chunk"].shape
+        torch.Size([5, 4, 2])
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        *,
+        nfe: int = 9,
+        solver: Solver = "euler",
+        clip: float | None = None,
+        noise_key: NestedKey = keys.NOISE,
+        observation_key: NestedKey = keys.OBSERVATION,
+        chunk_key: NestedKey = keys.CHUNK,
+        path_key: NestedKey | None = None,
+    ) -> None:
+        super().__init__()
+        _steps(nfe, solver)
+        if clip is not None and clip <= 0:
+            raise ValueError(f"clip must be > 0 or None, got {clip}")
+        self.network = network
+        self.nfe = nfe
+        self.solver = solver
+        self.clip = clip
+        self.path_key = path_key
+        self.in_keys = [noise_key, observation_key]
+        self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
+
+    def forward(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
+        """Write the chunk (and the path, where asked for)."""
+        a0, observation = (tensordict.get(key) for key in self.in_keys)
+        if a0 is None or observation is None:
+            missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
+            raise KeyError(f"ODEActor needs the keys {self.in_keys}; missing: {missing}")
+        batch = a0.shape[:-2]
+        observation = observation.reshape(-1, *observation.shape[len(batch) :])
+        path_or_chunk = integrate(
+            lambda t, a: self.network(t, a, observation),
+            a0.reshape(-1, *a0.shape[-2:]),
+            nfe=self.nfe if nfe is None else nfe,
+            solver=self.solver,
+            return_path=self.path_key is not None,
+        )
+        chunk = path_or_chunk
+        if self.path_key is not None:
+            tensordict.set(self.path_key, path_or_chunk.reshape(*batch, *path_or_chunk.shape[1:]))
+            chunk = path_or_chunk[:, -1]
+        chunk = chunk.reshape(a0.shape)
+        if self.clip is not None:
+            chunk = chunk.clamp(-self.clip, self.clip)
+        return tensordict.set(self.out_keys[0], chunk)

@@ -1,0 +1,57 @@
+"""From a prior's mean to a source sample."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+
+from warmprior import keys
+from warmprior.modules.prior import Prior
+
+__all__ = ["PriorSampler"]
+
+
+class PriorSampler(TensorDictModuleBase):
+    """Draws the source ``a_0`` of the flow: ``(loc, warm) -> noise``.
+
+    Args:
+        prior: the source distribution.
+
+    Keyword Args:
+        loc_key: key of the mean, ``[*B, P, d_a]``.
+        warm_key: key of the warm mask, bool ``[*B, P, 1]``.
+        noise_key: key written, ``[*B, P, d_a]``.
+        generator: source of randomness; PyTorch's global generator by default.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, PriorSampler
+        >>> sampler = PriorSampler(PastPrior(2, sigma=0.0))
+        >>> data = TensorDict({"prior": {"loc": torch.ones(3, 2, 1),
+        ...                              "warm": torch.ones(3, 2, 1, dtype=torch.bool)}}, [3])
+        >>> sampler(data)["prior", "noise"].unique()
+        tensor([1.])
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        *,
+        loc_key: NestedKey = keys.LOC,
+        warm_key: NestedKey = keys.WARM,
+        noise_key: NestedKey = keys.NOISE,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.prior = prior
+        self.generator = generator
+        self.in_keys = [loc_key, warm_key]
+        self.out_keys = [noise_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the source sample."""
+        loc, warm = (tensordict.get(key) for key in self.in_keys)
+        return tensordict.set(self.out_keys[0], self.prior.sample(loc, warm, self.generator))

@@ -1,0 +1,166 @@
+"""Behaviour cloning by flow matching from any source distribution."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase, TensorDictParams
+from tensordict.utils import NestedKey
+from torch import nn
+from torchrl.objectives.common import LossModule
+
+from warmprior import keys
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.interpolant import Interpolant, LinearInterpolant
+
+__all__ = ["FlowMatchingLoss"]
+
+
+class FlowMatchingLoss(LossModule):
+    r"""Conditional flow matching with the actor's own source (Algorithm 1, training).
+
+    For each window: draw :math:`a_0` from the prior and :math:`t \sim U(0, 1)`, set
+    :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regress
+    :math:`v_\theta(t, a_t, o)` on :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's
+    end do not count.
+
+    Args:
+        actor_network: the policy whose velocity network is trained; its prior gives the source.
+
+    Keyword Args:
+        interpolant: the path; linear by default.
+        reduction: ``"mean"`` over unpadded coordinates (Algorithm 1 divided by their number),
+            ``"sum"`` (Algorithm 1's squared norm, summed over the batch) or ``"none"``
+            (``[*B, P, d_a]``, zero where padded).
+        generator: source of randomness of ``t`` and :math:`a_0`; the actor sampler's by default.
+
+    .. note::
+        Keys read (all renameable by :meth:`set_keys`): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool
+        ``[*B, P]`` (True = padded; optional), ``loc`` ``[*B, P, d_a]``, ``warm`` bool ``[*B, P, 1]``
+        and ``observation`` ``[*B, To, d_o]``.
+
+    Raises:
+        ValueError: for an unknown ``reduction``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import FlowMatchingLoss, PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior import window_replay_buffer
+        >>> data = TensorDict({"observation": torch.randn(100, 3), "action": torch.randn(100, 2),
+        ...                    "episode": torch.arange(100) // 25}, [100])
+        >>> prior = PastPrior(8)
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, prior.prediction_length), prior)
+        >>> loss_module = FlowMatchingLoss(actor)
+        >>> batch = window_replay_buffer(data, prior, batch_size=16).sample()
+        >>> loss_module(batch)["loss_flow_matching"].backward()
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Configurable tensordict keys, see the class docstring."""
+
+        chunk: NestedKey = keys.CHUNK
+        pad_mask: NestedKey = keys.IS_PAD
+        loc: NestedKey = keys.LOC
+        warm: NestedKey = keys.WARM
+        observation: NestedKey = keys.OBSERVATION
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    velocity_network: nn.Module
+    velocity_network_params: TensorDictParams
+    target_velocity_network_params: TensorDictParams
+
+    def __init__(
+        self,
+        actor_network: WarmPriorActor,
+        *,
+        interpolant: Interpolant | None = None,
+        reduction: str = "mean",
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self._in_keys: list[NestedKey] | None = None
+        self._out_keys: list[NestedKey] | None = None
+        super().__init__()
+        if reduction not in ("none", "mean", "sum"):
+            raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
+        self.convert_to_functional(actor_network.network, "velocity_network")
+        self.prior = actor_network.prior
+        self.interpolant = LinearInterpolant() if interpolant is None else interpolant
+        self.reduction = reduction
+        self.generator = actor_network.sampler.generator if generator is None else generator
+        self.set_keys(observation=actor_network.in_keys[0])
+
+    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
+        self._in_keys = None
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys that :meth:`forward` reads."""
+        if self._in_keys is None:
+            k = self.tensor_keys
+            self._in_keys = [k.observation, k.chunk, k.pad_mask, k.loc, k.warm]
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, value: list[NestedKey]) -> None:
+        self._in_keys = value
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Keys of the result."""
+        return ["loss_flow_matching"] if self._out_keys is None else self._out_keys
+
+    @out_keys.setter
+    def out_keys(self, value: list[NestedKey]) -> None:
+        self._out_keys = value
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Compute the loss.
+
+        Args:
+            tensordict: a batch of windows, see the class docstring.
+
+        Returns:
+            TensorDict with ``"loss_flow_matching"``, reduced as configured.
+
+        Raises:
+            KeyError: if a needed key is missing.
+        """
+        k = self.tensor_keys
+        needed = (k.chunk, k.loc, k.warm, k.observation)
+        a1, loc, warm, observation = (tensordict.get(key, None) for key in needed)
+        missing = [
+            key
+            for key, value in zip(needed, (a1, loc, warm, observation), strict=True)
+            if value is None
+        ]
+        if missing:
+            raise KeyError(f"FlowMatchingLoss needs the keys {list(needed)}; missing: {missing}")
+        batch = a1.shape[:-2]
+        a0 = self.prior.sample(loc, warm, self.generator)
+        t = torch.rand(batch, generator=self.generator, device=a1.device, dtype=a1.dtype)
+        a_t, velocity = self.interpolant(a0, a1, t)
+        with self.velocity_network_params.to_module(
+            self.velocity_network, preserve_module_state=False
+        ):
+            predicted = self.velocity_network(
+                t.reshape(-1),
+                a_t.reshape(-1, *a1.shape[-2:]),
+                observation.reshape(-1, *observation.shape[len(batch) :]),
+            )
+        error = (predicted.reshape(a1.shape) - velocity).square()
+        pad = tensordict.get(k.pad_mask, None)
+        if pad is not None:
+            error = error.masked_fill(pad.unsqueeze(-1), 0.0)
+        if self.reduction == "none":
+            return TensorDict({self.out_keys[0]: error}, batch_size=[])
+        loss = error.sum()
+        if self.reduction == "mean":
+            count = error.numel() if pad is None else (~pad).sum() * error.shape[-1]
+            # A batch that is padding only has no error, and must not become NaN.
+            loss = loss / torch.as_tensor(count, device=loss.device).clamp_min(1)
+        return TensorDict({self.out_keys[0]: loss}, batch_size=[])

@@ -1,0 +1,140 @@
+"""The environment's side of a prior: its mean for the next decision."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.data import Categorical, TensorSpec, Unbounded
+from torchrl.envs.transforms import Transform
+
+from warmprior import keys
+from warmprior.modules.prior import Prior
+
+__all__ = ["ActionHistory"]
+
+
+class ActionHistory(Transform):
+    """Writes the prior's mean for the next decision after each step, and a cold one at resets.
+
+    A function of the step's own tensordict, without state: it gives the same in ``env.rollout``,
+    collectors and batched environments, inside or outside of workers, with any policy (random ones
+    included), and per sub-environment when some of them reset. Append it after :class:`ChunkStep`,
+    which tells how many actions were executed.
+
+    =========================  ===========================  ====================================
+    key                        shape                        meaning
+    =========================  ===========================  ====================================
+    ``("prior", "loc")``       ``[*B, P, d_a]`` float       the mean, normalised action space
+    ``("prior", "warm")``      ``[*B, P, 1]`` bool          where the mean counts
+    ``("prior", "elapsed")``   ``[*B, 1]`` int64            actions executed since the reset
+    =========================  ===========================  ====================================
+
+    Args:
+        prior: the source distribution of the policy that will act.
+
+    Keyword Args:
+        chunk_key: the predicted chunk, ``[*B, P, d_a]``.
+        executed_key: the number of executed actions, int64 ``[*B, 1]``.
+        loc_key: where the mean is written.
+        warm_key: where the mask is written.
+        elapsed_key: where the count of executed actions is written.
+
+    Raises:
+        ValueError: if the environment's chunks have another length than the prior's predictions.
+        KeyError: if :class:`ChunkStep` does not come before.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv, Compose
+        >>> from warmprior import ActionHistory, ChunkStep, PastPrior
+        >>> env = TransformedEnv(
+        ...     GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(PastPrior(4))))
+        >>> rollout = env.rollout(3)
+        >>> rollout["prior", "warm"].all(1).flatten().tolist()
+        [False, True, True]
+        >>> bool((rollout["prior", "loc"][1:] == rollout["vla_action", "chunk"][:-1]).all())
+        True
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        *,
+        chunk_key: NestedKey = keys.CHUNK,
+        executed_key: NestedKey = keys.EXECUTED,
+        loc_key: NestedKey = keys.LOC,
+        warm_key: NestedKey = keys.WARM,
+        elapsed_key: NestedKey = keys.ELAPSED,
+    ) -> None:
+        super().__init__(in_keys=[chunk_key], out_keys=[loc_key, warm_key, elapsed_key])
+        self.prior = prior
+        self.chunk_key = unravel_key(chunk_key)
+        self.executed_key = unravel_key(executed_key)
+        self.loc_key = unravel_key(loc_key)
+        self.warm_key = unravel_key(warm_key)
+        self.elapsed_key = unravel_key(elapsed_key)
+        self._action_dim: int | None = None
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        executed = next_tensordict.get(self.executed_key)
+        if executed is None:
+            raise KeyError(
+                f"ActionHistory found no {self.executed_key!r} after the step: append it after "
+                "ChunkStep"
+            )
+        elapsed = tensordict.get(self.elapsed_key) + executed
+        loc, warm = self.prior.next_mean(
+            tensordict.get(self.loc_key), tensordict.get(self.chunk_key), executed, elapsed
+        )
+        next_tensordict.set(self.loc_key, loc)
+        next_tensordict.set(self.warm_key, warm)
+        return next_tensordict.set(self.elapsed_key, elapsed)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # Cold everywhere: TorchRL merges these rows into the sub-environments that were reset only.
+        batch, device = tensordict_reset.batch_size, tensordict_reset.device
+        length = self.prior.prediction_length
+        action_dim = self._action_dim or self._check_chunk(self.parent.full_action_spec)
+        loc = torch.zeros(*batch, length, action_dim, device=device)
+        tensordict_reset.set(self.loc_key, loc)
+        tensordict_reset.set(self.warm_key, torch.zeros_like(loc[..., :1], dtype=torch.bool))
+        elapsed = torch.zeros(*batch, 1, dtype=torch.int64, device=device)
+        return tensordict_reset.set(self.elapsed_key, elapsed)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Outside environments the transform does nothing: the keys are already in the data."""
+        return tensordict
+
+    def _check_chunk(self, action_spec: TensorSpec) -> int:
+        if self.chunk_key not in action_spec.keys(True, True):
+            raise KeyError(
+                f"ActionHistory found no {self.chunk_key} among the actions "
+                f"{list(action_spec.keys(True, True))}: append it after ChunkStep"
+            )
+        length, action_dim = action_spec[self.chunk_key].shape[-2:]
+        if length != self.prior.prediction_length:
+            raise ValueError(
+                f"the environment takes chunks of {length} actions, but {self.prior} predicts "
+                f"{self.prior.prediction_length}: use "
+                f"ChunkStep({self.prior.chunk_length}, "
+                f"prediction_length={self.prior.prediction_length})"
+            )
+        # Kept because resets are frequent and TorchRL rebuilds specs on every access.
+        self._action_dim = action_dim
+        return action_dim
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the mean, the mask and the count."""
+        action_dim = self._check_chunk(self.parent.full_action_spec)
+        batch, device = observation_spec.shape, observation_spec.device
+        length = self.prior.prediction_length
+        observation_spec[self.loc_key] = Unbounded((*batch, length, action_dim), device=device)
+        observation_spec[self.warm_key] = Categorical(
+            2, shape=(*batch, length, 1), dtype=torch.bool, device=device
+        )
+        observation_spec[self.elapsed_key] = Unbounded(
+            (*batch, 1), dtype=torch.int64, device=device
+        )
+        return observation_spec

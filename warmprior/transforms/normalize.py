@@ -1,0 +1,136 @@
+"""Min-max normalisation, fitted once and applied on the data's and the environment's side."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
+
+from warmprior import keys
+
+__all__ = ["Normalizer"]
+
+
+class Normalizer(nn.Module):
+    """Maps every dimension of every key to ``[-1, 1]`` by the data's minimum and maximum (Table 4).
+
+    Dimensions that never vary map to 0 and back to their constant. The statistics are buffers: they
+    travel with :meth:`WarmPriorActor.save_pretrained` and to devices.
+
+    Args:
+        low: minimum per key, each ``[d]``, raw units.
+        high: maximum per key, each ``[d]``, raw units.
+
+    Raises:
+        ValueError: if the keys or shapes of ``low`` and ``high`` differ, or values are not finite.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> data = TensorDict({"observation": torch.tensor([[0.0, 5.0], [4.0, 5.0]]),
+        ...                    "action": torch.tensor([[-0.5], [1.0]])}, [2])
+        >>> normalizer = Normalizer.fit(data)
+        >>> normalizer.normalize(data)["observation"].tolist()
+        [[-1.0, 0.0], [1.0, 0.0]]
+        >>> bool((normalizer.denormalize(normalizer.normalize(data)) == data).all())
+        True
+    """
+
+    def __init__(self, low: dict[str, Tensor], high: dict[str, Tensor]) -> None:
+        super().__init__()
+        if low.keys() != high.keys():
+            raise ValueError(f"low has the keys {sorted(low)}, high has {sorted(high)}")
+        self.keys = list(low)
+        for key in self.keys:
+            if low[key].shape != high[key].shape:
+                raise ValueError(
+                    f"{key}: low has shape {tuple(low[key].shape)}, high {tuple(high[key].shape)}"
+                )
+            if not (torch.isfinite(low[key]).all() and torch.isfinite(high[key]).all()):
+                raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
+            half = (high[key] - low[key]) / 2
+            self.register_buffer(f"{key}_loc", (high[key] + low[key]) / 2)
+            self.register_buffer(f"{key}_scale", torch.where(half > 0, half, 1.0))
+
+    @classmethod
+    def fit(
+        cls, data: TensorDictBase, keys: tuple[str, ...] = (keys.OBSERVATION, keys.ACTION)
+    ) -> Normalizer:
+        """Take the minimum and maximum over all steps of a dataset.
+
+        Args:
+            data: flat steps ``[N]`` with raw ``[N, d]`` entries.
+            keys: the entries to normalise.
+
+        Raises:
+            KeyError: if a key is missing.
+            ValueError: if there is no step, or an entry is not finite.
+        """
+        if not len(data):
+            raise ValueError("cannot fit a normaliser to an empty dataset")
+        missing = [key for key in keys if data.get(key, None) is None]
+        if missing:
+            raise KeyError(f"cannot fit a normaliser: the data lack {missing}")
+        return cls(
+            {key: data[key].amin(0).clone() for key in keys},
+            {key: data[key].amax(0).clone() for key in keys},
+        )
+
+    def loc(self, key: str) -> Tensor:
+        """Middle of the range of ``key``, ``[d]``, raw units."""
+        return self.get_buffer(f"{key}_loc")
+
+    def scale(self, key: str) -> Tensor:
+        """Half the range of ``key`` (1 where it is constant), ``[d]``, raw units."""
+        return self.get_buffer(f"{key}_scale")
+
+    def normalize(self, data: TensorDictBase) -> TensorDictBase:
+        """Raw to normalised, for the keys that are present; a shallow copy."""
+        data = data.clone(False)
+        for key in self.keys:
+            if data.get(key, None) is not None:
+                data.set(key, (data.get(key) - self.loc(key)) / self.scale(key))
+        return data
+
+    def denormalize(self, data: TensorDictBase) -> TensorDictBase:
+        """Normalised to raw, for the keys that are present; a shallow copy."""
+        data = data.clone(False)
+        for key in self.keys:
+            if data.get(key, None) is not None:
+                data.set(key, data.get(key) * self.scale(key) + self.loc(key))
+        return data
+
+    def env_transforms(self) -> list[Transform]:
+        """TorchRL transforms that do the same next to the base environment.
+
+        Observations are normalised on the way out and actions denormalised on the way in. Append them
+        before :class:`~warmprior.ChunkStep`, so that they act on every control step.
+        """
+        transforms: list[Transform] = []
+        for key in self.keys:
+            loc, scale = self.loc(key).clone(), self.scale(key).clone()
+            if key == keys.ACTION:
+                transforms.append(
+                    ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale)
+                )
+            else:
+                transforms.append(
+                    ObservationNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True)
+                )
+        return transforms
+
+    def config(self) -> dict[str, Any]:
+        """JSON-serialisable widths; the values themselves are buffers."""
+        return {"widths": {key: list(self.loc(key).shape) for key in self.keys}}
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> Normalizer:
+        """An unfitted normaliser of :meth:`config`'s keys and widths, to load buffers into."""
+        widths = config["widths"]
+        return cls(
+            {key: torch.zeros(shape) for key, shape in widths.items()},
+            {key: torch.zeros(shape) for key, shape in widths.items()},
+        )

@@ -1,0 +1,210 @@
+"""Training windows, gathered on sample from contiguous demonstrations."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import RandomSampler, TensorDictReplayBuffer, TensorStorage
+from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
+from torchrl.envs.transforms import Transform
+
+from warmprior import keys
+from warmprior.modules.prior import Prior
+
+__all__ = ["ActionWindow", "window_replay_buffer"]
+
+
+class ActionWindow(Transform):
+    """Replaces sampled steps by training windows with the mean of a prior.
+
+    For the step ``i`` it gathers the last ``To`` observations (the episode's first one repeated at the
+    start), the target chunk ``[i, i+P)`` (the episode's last action repeated past its end, and marked
+    in ``"action_is_pad"``) and the ``H`` actions before, from which the prior makes its mean. Windows
+    never cross episode borders, and border windows are sampled like all others.
+
+    Args:
+        data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
+            ``"action"`` ``[N, d_a]`` and ``"episode"`` ``[N]``; in memory, memory-mapped or on a GPU.
+        prior: the source distribution.
+
+    Keyword Args:
+        observation_steps: ``To``.
+        generator: source of randomness of :meth:`Prior.withhold`, on the data's device.
+        frame_key: the sampled step's index into ``data``, int64 ``[B]``. (A replay buffer adds its
+            own ``"index"`` only after its transforms ran.)
+        observation_key: key of the observation, in ``data`` and in windows.
+        action_key: key of the action in ``data``.
+        episode_key: key of the episode number in ``data``.
+
+    Raises:
+        KeyError: if ``data`` lacks a key.
+        ValueError: if ``data`` is empty or not flat, an entry holds NaN or Inf, or an episode is not
+            contiguous.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior
+        >>> data = TensorDict({"observation": torch.zeros(5, 3),
+        ...                    "action": torch.arange(5.0)[:, None],
+        ...                    "episode": torch.zeros(5, dtype=torch.int64)}, [5])
+        >>> window = ActionWindow(data, PastPrior(2))
+        >>> batch = window(TensorDict({"frame": torch.tensor([0, 2, 4])}, [3]))
+        >>> batch["vla_action", "chunk"].squeeze(-1).tolist()
+        [[0.0, 1.0], [2.0, 3.0], [4.0, 4.0]]
+        >>> batch["action_is_pad"].tolist()
+        [[False, False], [False, False], [False, True]]
+        >>> batch["prior", "loc"].squeeze(-1).tolist()
+        [[0.0, 0.0], [0.0, 1.0], [2.0, 3.0]]
+    """
+
+    start: Tensor
+    end: Tensor
+    action_offsets: Tensor
+    observation_offsets: Tensor
+
+    def __init__(
+        self,
+        data: TensorDictBase,
+        prior: Prior,
+        *,
+        observation_steps: int = 2,
+        generator: torch.Generator | None = None,
+        frame_key: NestedKey = keys.FRAME,
+        observation_key: NestedKey = keys.OBSERVATION,
+        action_key: NestedKey = keys.ACTION,
+        episode_key: NestedKey = keys.EPISODE,
+    ) -> None:
+        super().__init__(in_keys=[frame_key], out_keys=[observation_key, keys.CHUNK])
+        if observation_steps < 1:
+            raise ValueError(f"observation_steps must be at least 1, got {observation_steps}")
+        self.prior = prior
+        self.generator = generator
+        self.frame_key = frame_key
+        self.observation_key = observation_key
+        observation, action, episode = _checked(data, observation_key, action_key, episode_key)
+        start, end = _episode_borders(episode)
+        horizon = prior.chunk_length
+        for name, value in {
+            "observation": observation,
+            "action": action,
+            "start": start,
+            "end": end,
+            "action_offsets": torch.arange(-horizon, prior.prediction_length, device=start.device),
+            "observation_offsets": torch.arange(1 - observation_steps, 1, device=start.device),
+        }.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the windows of the sampled steps."""
+        frame = tensordict.get(self.frame_key)
+        if frame is None:
+            raise KeyError(
+                f"ActionWindow needs the index of each sampled step under {self.frame_key!r}: store "
+                "torch.arange(N) there, or use window_replay_buffer"
+            )
+        frame = frame.reshape(-1, 1)
+        start, end = self.start[frame], self.end[frame]
+        index = frame + self.action_offsets
+        valid = (index >= start) & (index <= end)
+        action = self.action[index.clamp(start, end)]
+        horizon = self.prior.chunk_length
+        history_valid = valid[:, :horizon]
+        target = action[:, horizon:]
+        # Outside the episode the gather repeats its first action, which belongs to the target: zero it.
+        history = action[:, :horizon] * history_valid.unsqueeze(-1)
+        loc, warm = self.prior.training_mean(history, history_valid, target)
+        warm = self.prior.withhold(warm, self.generator)
+        recent = (frame + self.observation_offsets).clamp_min(start)
+        batch = tensordict.batch_size
+        for key, value in (
+            (self.observation_key, self.observation[recent]),
+            (keys.CHUNK, target),
+            (keys.IS_PAD, ~valid[:, horizon:]),
+            (keys.LOC, loc),
+            (keys.WARM, warm),
+        ):
+            tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
+        return tensordict
+
+
+def _checked(
+    data: TensorDictBase, observation_key: NestedKey, action_key: NestedKey, episode_key: NestedKey
+) -> tuple[Tensor, Tensor, Tensor]:
+    entries = []
+    for key in (observation_key, action_key, episode_key):
+        value = data.get(key, None)
+        if value is None:
+            raise KeyError(f"the data lack {key!r}; they hold {sorted(map(str, data.keys(True)))}")
+        entries.append(value)
+    observation, action, episode = entries
+    if data.ndim != 1 or not len(data):
+        raise ValueError(f"the data must be flat steps [N] with N > 0, got {tuple(data.shape)}")
+    for key, value in ((observation_key, observation), (action_key, action)):
+        finite = torch.isfinite(value).flatten(1).all(1)
+        if not finite.all():
+            raise ValueError(
+                f"{key!r} holds NaN or Inf, first at step {int((~finite).nonzero()[0])}"
+            )
+    return observation, action, episode.flatten()
+
+
+def _episode_borders(episode: Tensor) -> tuple[Tensor, Tensor]:
+    """First and last step of every step's episode, each ``[N]``."""
+    values, lengths = torch.unique_consecutive(episode, return_counts=True)
+    if len(values.unique()) != len(values):
+        repeated = values.sort().values
+        repeated = repeated[1:][repeated[1:] == repeated[:-1]]
+        raise ValueError(f"the steps of episode {int(repeated[0])} are not contiguous")
+    last = lengths.cumsum(0) - 1
+    first = last - lengths + 1
+    return first.repeat_interleave(lengths), last.repeat_interleave(lengths)
+
+
+def window_replay_buffer(
+    data: TensorDictBase,
+    prior: Prior,
+    *,
+    batch_size: int,
+    observation_steps: int = 2,
+    sampler: Sampler | None = None,
+    generator: torch.Generator | None = None,
+) -> TensorDictReplayBuffer:
+    """A replay buffer that samples training windows from demonstrations.
+
+    It stores only the step numbers; :class:`ActionWindow` gathers everything else from ``data``, which
+    is faster than letting the storage read whole steps first.
+
+    Args:
+        data: contiguous normalised steps, see :class:`ActionWindow`.
+        prior: the source distribution.
+
+    Keyword Args:
+        batch_size: windows per sample.
+        observation_steps: ``To``.
+        sampler: ``RandomSampler()`` by default; ``SamplerWithoutReplacement()`` for epochs.
+        generator: source of randomness of sampler and prior; PyTorch's global one by default.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PreviewPrior
+        >>> data = TensorDict({"observation": torch.zeros(50, 3), "action": torch.zeros(50, 2),
+        ...                    "episode": torch.arange(50) // 25}, [50])
+        >>> batch = window_replay_buffer(data, PreviewPrior(8), batch_size=32).sample()
+        >>> batch["vla_action", "chunk"].shape, batch["observation"].shape
+        (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
+    """
+    window = ActionWindow(data, prior, observation_steps=observation_steps, generator=generator)
+    frames = torch.arange(len(data), device=window.start.device)
+    return TensorDictReplayBuffer(
+        storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)])),
+        sampler=RandomSampler() if sampler is None else sampler,
+        writer=ImmutableDatasetWriter(),
+        batch_size=batch_size,
+        transform=window,
+        generator=generator,
+    )
