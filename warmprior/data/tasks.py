@@ -4,9 +4,29 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["TASKS", "TaskSpec", "get_task"]
+__all__ = ["EVALUATION_SEED", "TASKS", "TaskSpec", "get_task", "low_dim_keys"]
+
+#: Simulator seed of the first evaluation episode. Demonstrations are generated from smaller ones,
+#: so a policy is never evaluated on an initial state it was trained on.
+EVALUATION_SEED = 10_000_000
 
 _ARM_KEYS = ("eef_pos", "eef_quat", "gripper_qpos")
+
+
+def low_dim_keys(arms: int) -> tuple[str, ...]:
+    """Name the observations that make up the state, in robomimic's order.
+
+    Args:
+        arms: number of arms.
+
+    Returns:
+        ``"object"``, then the pose and gripper of each arm.
+
+    Examples:
+        >>> low_dim_keys(1)
+        ('object', 'robot0_eef_pos', 'robot0_eef_quat', 'robot0_gripper_qpos')
+    """
+    return ("object", *(f"robot{i}_{key}" for i in range(arms) for key in _ARM_KEYS))
 
 
 @dataclass(frozen=True)
@@ -38,7 +58,7 @@ class TaskSpec:
     @property
     def low_dim_keys(self) -> tuple[str, ...]:
         """Observation keys whose concatenation is the state: ``object`` first, then each arm."""
-        return ("object",) + tuple(f"robot{i}_{key}" for i in range(self.arms) for key in _ARM_KEYS)
+        return low_dim_keys(self.arms)
 
     @property
     def observation_dim(self) -> int:

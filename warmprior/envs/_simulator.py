@@ -1,0 +1,196 @@
+"""What every use of robosuite here shares: a quiet import, isolated seeding and one way to make it."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import random
+import warnings
+from collections.abc import Iterator, Mapping
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from warmprior._extras import require
+from warmprior.data.tasks import get_task
+
+__all__ = [
+    "import_robosuite",
+    "isolated_numpy_seed",
+    "make_simulator",
+    "task_env_args",
+]
+
+# Sizes drawn when a model is loaded (Lift's cube, Transport's hammer) must be the same in every
+# process, or the same seed would mean different episodes.
+_MODEL_SEED = 0
+_ARM_CONTROLLER = {
+    "type": "OSC_POSE",
+    "input_max": 1,
+    "input_min": -1,
+    "output_max": [0.05, 0.05, 0.05, 0.5, 0.5, 0.5],
+    "output_min": [-0.05, -0.05, -0.05, -0.5, -0.5, -0.5],
+    "kp": 150,
+    "damping_ratio": 1,
+    "impedance_mode": "fixed",
+    "kp_limits": [0, 300],
+    "damping_ratio_limits": [0, 10],
+    "position_limits": None,
+    "orientation_limits": None,
+    "uncouple_pos_ori": True,
+    "input_type": "delta",
+    "input_ref_frame": "world",
+    "interpolation": None,
+    "ramp_ratio": 0.2,
+    "gripper": {"type": "GRIP"},
+}
+
+
+@contextlib.contextmanager
+def _without_warnings() -> Iterator[None]:
+    """Hold back warnings (not errors): robosuite logs five about optional parts when imported."""
+    before = logging.root.manager.disable
+    logging.disable(max(before, logging.WARNING))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
+
+
+def import_robosuite() -> ModuleType:
+    """Import robosuite without its start-up warnings.
+
+    Returns:
+        The module ``robosuite``.
+
+    Raises:
+        ImportError: if robosuite is not installed.
+
+    Examples:
+        >>> import_robosuite().__version__  # doctest: +SKIP
+        '1.5.1'
+    """
+    with _without_warnings():
+        return require("robosuite", "sim")
+
+
+@contextlib.contextmanager
+def isolated_numpy_seed(seed: int) -> Iterator[None]:
+    """Seed the global generators that robosuite's samplers use, and restore them afterwards.
+
+    Args:
+        seed: any integer; taken modulo ``2**32``.
+
+    Examples:
+        >>> np.random.seed(1)
+        >>> with isolated_numpy_seed(5):
+        ...     inside = np.random.rand()
+        >>> outside = np.random.rand()
+        >>> np.random.seed(1)
+        >>> bool(outside == np.random.rand())
+        True
+    """
+    numpy_state, python_state = np.random.get_state(), random.getstate()
+    np.random.seed(seed % 2**32)
+    random.seed(seed)
+    try:
+        yield
+    finally:
+        np.random.set_state(numpy_state)
+        random.setstate(python_state)
+
+
+def task_env_args(task: str, image_size: int = 0) -> dict[str, Any]:
+    """Describe a task's environment as the ``env_args`` of a robomimic file.
+
+    Every option that changes what an action means is written out: pose deltas of at most 5 cm and
+    0.5 rad in the world frame, 20 Hz control.
+
+    Args:
+        task: a name of :data:`warmprior.data.tasks.TASKS`.
+        image_size: side of the camera images in pixels; 0 for none.
+
+    Returns:
+        A dict that JSON can hold: ``env_name``, ``env_version``, ``type`` and ``env_kwargs``.
+
+    Raises:
+        ValueError: if there is no such task.
+
+    Examples:
+        >>> task_env_args("square")["env_name"]
+        'NutAssemblySquare'
+    """
+    spec = get_task(task)
+    kwargs: dict[str, Any] = {
+        "has_renderer": False,
+        "has_offscreen_renderer": bool(image_size),
+        "ignore_done": True,
+        "use_object_obs": True,
+        "use_camera_obs": bool(image_size),
+        "control_freq": 20,
+        "robots": ["Panda"] * spec.arms,
+        "camera_depths": False,
+        "camera_heights": image_size or 84,
+        "camera_widths": image_size or 84,
+        "lite_physics": True,
+        "reward_shaping": False,
+        "controller_configs": {
+            "type": "BASIC",
+            "body_parts": {"right": {key: _copy(value) for key, value in _ARM_CONTROLLER.items()}},
+        },
+    }
+    if spec.arms == 2:
+        kwargs["env_configuration"] = "opposed"
+    if image_size:
+        kwargs["camera_names"] = list(spec.cameras)
+    return {"env_name": spec.env_name, "env_version": "1.5.1", "type": 1, "env_kwargs": kwargs}
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, dict):
+        return dict(value)
+    return list(value) if isinstance(value, list) else value
+
+
+def make_simulator(env_args: Mapping[str, Any]) -> Any:
+    """Make a robosuite environment for stepping: no renderer, no time limit, cheap resets.
+
+    Frames are rendered on demand elsewhere, and time limits belong to the wrapper, so the options
+    of ``env_args`` that concern either are overridden. The model is loaded once
+    (``hard_reset=False``), under a fixed seed.
+
+    Args:
+        env_args: a robomimic description in the terms of robosuite 1.5.
+
+    Returns:
+        A ``robosuite.environments.base.MujocoEnv``.
+
+    Raises:
+        ImportError: if robosuite is not installed.
+        ValueError: if robosuite has no environment of that name.
+
+    Examples:
+        >>> make_simulator(task_env_args("lift")).action_dim  # doctest: +SKIP
+        7
+    """
+    robosuite = import_robosuite()
+    name = env_args["env_name"]
+    if name not in robosuite.ALL_ENVIRONMENTS:
+        raise ValueError(
+            f"robosuite has no environment {name!r}; if another package registers it (as mimicgen "
+            f"does), import that package first. Registered: {', '.join(sorted(robosuite.ALL_ENVIRONMENTS))}"
+        )
+    kwargs = dict(env_args["env_kwargs"])
+    kwargs.update(
+        has_renderer=False,
+        has_offscreen_renderer=False,
+        use_camera_obs=False,
+        ignore_done=True,
+        hard_reset=False,
+        renderer="mujoco",  # the default starts an interactive viewer
+    )
+    with _without_warnings(), isolated_numpy_seed(_MODEL_SEED):
+        return robosuite.make(name, **kwargs)

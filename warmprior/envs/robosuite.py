@@ -1,0 +1,331 @@
+"""robosuite environments for TorchRL: the tasks of robomimic, from low-dimensional state or pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs.common import _EnvWrapper
+from torchrl.envs.utils import _classproperty
+
+from warmprior import keys
+from warmprior.data.tasks import TASKS, TaskSpec, get_task
+from warmprior.data.tasks import low_dim_keys as default_keys
+from warmprior.envs._simulator import import_robosuite, make_simulator, task_env_args
+from warmprior.envs.control_loop import ControlLoop, StepLoop
+from warmprior.envs.rendering import render_camera, rendering_backend
+
+__all__ = ["RobosuiteEnv", "RobosuiteWrapper"]
+
+_LOOPS = {"lean": ControlLoop, "robosuite": StepLoop}
+
+
+class RobosuiteWrapper(_EnvWrapper):
+    """Wraps a robosuite environment.
+
+    ==================  =============================================================
+    key                 shape, dtype
+    ==================  =============================================================
+    ``"observation"``   ``[d_o]`` float32: ``low_dim_keys``, concatenated
+    ``"pixels"``        ``[h, w, 3]`` uint8, the right way up; only ``from_pixels``
+    ``"success"``       ``[1]`` bool
+    ``"action"``        ``[d_a]`` float32 in ``[-1, 1]``, the simulator's own units
+    ``"reward"``        ``[1]`` float32: 1 where the task is solved, 0 elsewhere
+    ``"terminated"``    ``[1]`` bool: solved (see ``terminate_on_success``)
+    ``"truncated"``     ``[1]`` bool: out of time
+    ==================  =============================================================
+
+    The n-th reset after :meth:`set_seed` (or after construction) plays the episode of simulator
+    seed ``seed + seed_offset + n * seed_stride``. With ``seed_offset=i, seed_stride=workers`` and
+    the same seed for all (``set_seed(seed, static_seed=True)``), worker ``i`` of a
+    :class:`~torchrl.envs.ParallelEnv` plays every ``workers``-th episode and no two play the same.
+    The global generators of numpy and Python are left as they were.
+
+    Args:
+        env: the robosuite environment. Its own time limit, reward and renderer are not used.
+        low_dim_keys: robomimic names of the observations to concatenate; ``None`` for
+            ``"object"`` and each arm's pose and gripper.
+        horizon: time limit in control steps; ``None`` for the environment's own.
+        control_loop: ``"lean"`` for :class:`~warmprior.envs.control_loop.ControlLoop`,
+            ``"robosuite"`` for ``env.step``.
+        from_pixels: render ``camera`` at every step.
+        camera: the camera rendered.
+        camera_size: side of the image in pixels, or its height and width.
+        seed: of the first episodes.
+        seed_offset: added to every seed.
+        seed_stride: between the seeds of consecutive episodes.
+        terminate_on_success: end the episode once the task is solved.
+        device: of the tensordicts.
+
+    Raises:
+        ValueError: if an option is out of range, an observation or camera does not exist, or the
+            lean loop does not support the robots.
+        RuntimeError: if pixels are asked for and nothing here can render.
+
+    Examples:
+        >>> import robosuite  # doctest: +SKIP
+        >>> env = RobosuiteWrapper(robosuite.make("Door", robots="Panda"))  # doctest: +SKIP
+        >>> env.rollout(3)["observation"].shape  # doctest: +SKIP
+        torch.Size([3, 23])
+    """
+
+    git_url = "https://github.com/ARISE-Initiative/robosuite"
+    libname = "robosuite"
+
+    def __init__(
+        self,
+        env: Any = None,
+        *,
+        low_dim_keys: Sequence[str] | None = None,
+        horizon: int | None = None,
+        control_loop: Literal["lean", "robosuite"] = "lean",
+        from_pixels: bool = False,
+        camera: str = "agentview",
+        camera_size: int | tuple[int, int] = 84,
+        seed: int = 0,
+        seed_offset: int = 0,
+        seed_stride: int = 1,
+        terminate_on_success: bool = True,
+        device: torch.device | str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        if control_loop not in _LOOPS:
+            raise ValueError(f"control_loop is {' or '.join(_LOOPS)}, got {control_loop!r}")
+        if horizon is not None and horizon < 1:
+            raise ValueError(f"horizon must be at least 1, got {horizon}")
+        if seed_stride < 1:
+            raise ValueError(f"seed_stride must be at least 1, got {seed_stride}")
+        size = (camera_size, camera_size) if isinstance(camera_size, int) else tuple(camera_size)
+        if len(size) != 2 or min(size) < 1:
+            raise ValueError(f"camera_size is a side or (height, width), got {camera_size!r}")
+        if env is not None:
+            kwargs["env"] = env
+        self.low_dim_keys = None if low_dim_keys is None else tuple(low_dim_keys)
+        self.horizon = horizon
+        self.control_loop = control_loop
+        self.from_pixels, self.camera, self.camera_size = from_pixels, camera, size
+        self.terminate_on_success = terminate_on_success
+        self._seed, self._offset, self._stride = seed, seed_offset, seed_stride
+        self._episode, self._elapsed = 0, 0
+        super().__init__(device=device, **kwargs)
+
+    @_classproperty
+    def available_envs(cls) -> list[str]:
+        """Names of the tasks that :class:`RobosuiteEnv` builds."""
+        return list(TASKS)
+
+    @property
+    def lib(self) -> Any:
+        """The module ``robosuite``."""
+        return import_robosuite()
+
+    @property
+    def episode_seed(self) -> int:
+        """The simulator seed that the next reset uses."""
+        return self._seed + self._offset + self._episode * self._stride
+
+    @property
+    def loop(self) -> StepLoop:
+        """The control loop: simulator state, poses of bodies and sites."""
+        return self._loop
+
+    def render_frame(
+        self, camera: str | None = None, size: int | tuple[int, int] | None = None
+    ) -> np.ndarray:
+        """Render the current state; works whether or not ``from_pixels`` was asked for.
+
+        Args:
+            camera: defaults to the environment's.
+            size: side in pixels or ``(height, width)``; defaults to ``camera_size``.
+
+        Returns:
+            uint8 ``[h, w, 3]``, the right way up. The episode goes on as if nothing was rendered.
+
+        Raises:
+            ValueError: if there is no such camera.
+            RuntimeError: if no OpenGL backend works.
+
+        Examples:
+            >>> env.render_frame("frontview", 256).shape  # doctest: +SKIP
+            (256, 256, 3)
+        """
+        size = self.camera_size if size is None else size
+        height, width = (size, size) if isinstance(size, int) else size
+        return render_camera(self._env, camera or self.camera, height, width)
+
+    def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
+        if "env" not in kwargs:
+            raise TypeError("RobosuiteWrapper needs a robosuite environment: RobosuiteWrapper(env)")
+
+    def _build_env(self, env: Any) -> Any:  # type: ignore[override]
+        if self.horizon is None and not env.ignore_done:
+            self.horizon = env.horizon
+        return env
+
+    def _init_env(self) -> None:
+        """Nothing to prepare: the first reset does."""
+
+    def _make_specs(self, env: Any) -> None:
+        if self.low_dim_keys is None:
+            self.low_dim_keys = default_keys(len(env.robots))
+        self._loop = _LOOPS[self.control_loop](env, self.low_dim_keys)
+        if self.from_pixels and rendering_backend() is None:
+            self.render_frame()  # raises, saying what to install
+        width = sum(value.size for value in self._loop.observations().values())
+
+        def flag() -> Categorical:
+            return Categorical(2, dtype=torch.bool, shape=(1,), device=self.device)
+
+        self.observation_spec = Composite(
+            {keys.OBSERVATION: Unbounded((width,), device=self.device), "success": flag()}
+        )
+        if self.from_pixels:
+            self.observation_spec["pixels"] = Bounded(
+                0, 255, shape=(*self.camera_size, 3), dtype=torch.uint8, device=self.device
+            )
+        limit = torch.tensor(_action_limits(env))
+        self.action_spec = Bounded(-limit, limit, device=self.device)
+        self.reward_spec = Bounded(0.0, 1.0, shape=(1,), device=self.device)
+        self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag())
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self._seed, self._episode = seed, 0
+
+    def _read(self, observations: Mapping[str, np.ndarray], success: bool) -> dict[str, Any]:
+        flat = np.concatenate([observations[key] for key in self.low_dim_keys or ()])
+        out = {
+            keys.OBSERVATION: torch.from_numpy(flat.astype(np.float32)),
+            "success": torch.tensor([success]),
+        }
+        if self.from_pixels:
+            out["pixels"] = torch.from_numpy(self.render_frame())
+        return out
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        observations = self._loop.reset(self.episode_seed)
+        self._episode += 1
+        self._elapsed = 0
+        return TensorDict(self._read(observations, False), [], device=self.device)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict.get(keys.ACTION).detach().cpu().numpy()
+        observations, success = self._loop.step(action.astype(np.float64))
+        self._elapsed += 1
+        terminated = success and self.terminate_on_success
+        truncated = not terminated and self.horizon is not None and self._elapsed >= self.horizon
+        out = self._read(observations, success)
+        out["reward"] = torch.tensor([float(success)])
+        out["terminated"] = torch.tensor([terminated])
+        out["truncated"] = torch.tensor([truncated])
+        out["done"] = torch.tensor([terminated or truncated])
+        return TensorDict(out, [], device=self.device)
+
+
+def _action_limits(env: Any) -> list[float]:
+    limits: list[float] = []
+    for robot in env.robots:
+        controller = robot.composite_controller.part_controllers.get("right")
+        width = robot.action_dim
+        if getattr(controller, "input_type", "delta") == "absolute":
+            # Metres and radians, not fractions of the largest delta.
+            limits += [2.0] * 3 + [np.pi] * 3 + [1.0] * (width - 6)
+        else:
+            limits += [1.0] * width
+    return limits
+
+
+class RobosuiteEnv(RobosuiteWrapper):
+    """A robosuite task by its short name, or the environment of a robomimic file.
+
+    See :class:`RobosuiteWrapper` for keys and seeds.
+
+    Args:
+        task: ``lift``, ``can``, ``square``, ``stack``, ``transport`` or ``tool_hang``.
+        env_args: instead of ``task``: the parsed ``data.attrs["env_args"]`` of a robomimic or
+            MimicGen file of any version.
+        style: ``"ph"`` or ``"mh"``, the data whose time limit applies.
+        horizon: time limit in control steps; ``None`` for the task's (without a limit if
+            ``env_args`` names an environment that is not in the table).
+        control_loop: as for the wrapper.
+        from_pixels: as for the wrapper.
+        camera: ``None`` for the task's first.
+        camera_size: as for the wrapper.
+        seed: ``None`` for 0.
+        seed_offset: as for the wrapper.
+        seed_stride: as for the wrapper.
+        terminate_on_success: as for the wrapper.
+        device: as for the wrapper.
+
+    Raises:
+        ImportError: if robosuite is not installed.
+        ValueError: if the task is unknown, or not exactly one of ``task`` and ``env_args`` is given.
+
+    Examples:
+        >>> env = RobosuiteEnv("lift", seed=3)  # doctest: +SKIP
+        >>> env.rollout(5)["observation"].shape  # doctest: +SKIP
+        torch.Size([5, 19])
+        >>> RobosuiteEnv("life")
+        Traceback (most recent call last):
+            ...
+        ValueError: unknown task 'life'; choose one of lift, can, square, stack, transport, tool_hang
+    """
+
+    def __init__(
+        self,
+        task: str | None = None,
+        *,
+        env_args: Mapping[str, Any] | None = None,
+        style: str = "ph",
+        horizon: int | None = None,
+        control_loop: Literal["lean", "robosuite"] = "lean",
+        from_pixels: bool = False,
+        camera: str | None = None,
+        camera_size: int | tuple[int, int] = 84,
+        seed: int | None = None,
+        seed_offset: int = 0,
+        seed_stride: int = 1,
+        terminate_on_success: bool = True,
+        device: torch.device | str | None = None,
+    ) -> None:
+        if (task is None) == (env_args is None):
+            raise ValueError("give either task or env_args")
+        if style not in ("ph", "mh"):
+            raise ValueError(f"style is 'ph' or 'mh', got {style!r}")
+        spec: TaskSpec | None
+        if env_args is None:
+            spec = get_task(str(task))
+            env_args = task_env_args(spec.name)
+        else:
+            from warmprior.data.robomimic_env import modernize_env_args
+
+            env_args = modernize_env_args(env_args)
+            by_name = {entry.env_name: entry for entry in TASKS.values()}
+            spec = by_name.get(env_args["env_name"])
+        if spec is not None:
+            horizon = spec.horizon(style) if horizon is None else horizon
+            camera = spec.cameras[0] if camera is None else camera
+        self.task = spec
+        super().__init__(
+            env_args=env_args,
+            horizon=horizon,
+            control_loop=control_loop,
+            from_pixels=from_pixels,
+            camera=camera or "agentview",
+            camera_size=camera_size,
+            seed=seed or 0,
+            seed_offset=seed_offset,
+            seed_stride=seed_stride,
+            terminate_on_success=terminate_on_success,
+            device=device,
+        )
+
+    def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
+        """The constructor has checked them."""
+
+    def _build_env(self, env_args: Mapping[str, Any]) -> Any:  # type: ignore[override]
+        return make_simulator(env_args)
