@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DatasetError", "RobomimicIndex", "open_robomimic", "read_index", "read_rows"]
 
-_BLOCK = 4096  # rows read at once: a bound on temporary memory, whatever the length of a demo
+BLOCK = 4096  # rows read at once: a bound on temporary memory, whatever the length of a demo
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
 
@@ -139,8 +139,8 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
         parsed = json.loads(text)
     except ValueError as error:
         raise DatasetError(f"{path}: data.attrs['env_args'] is not JSON ({error})") from error
-    if not isinstance(parsed, dict) or "env_name" not in parsed:
-        raise DatasetError(f"{path}: data.attrs['env_args'] names no environment (env_name)")
+    if not (isinstance(parsed, dict) and {"env_name", "env_kwargs"} <= parsed.keys()):
+        raise DatasetError(f"{path}: data.attrs['env_args'] lacks env_name or env_kwargs")
     return parsed
 
 
@@ -206,7 +206,7 @@ def read_index(
     *,
     filter_key: str | None = None,
     observation_keys: Sequence[str] | None = None,
-    extra_keys: Sequence[str] = (),
+    poses: bool = False,
 ) -> RobomimicIndex:
     """Check a robomimic file and say what it holds. No values are read.
 
@@ -216,7 +216,7 @@ def read_index(
         observation_keys: the observations to read. By default those of the task, or, for an
             unknown environment, ``object`` and each robot's pose and gripper as far as the file
             has them.
-        extra_keys: observations that must be there as well, without being part of the state.
+        poses: also require the hand pose of every arm, from which absolute actions are built.
 
     Returns:
         The selection.
@@ -244,7 +244,10 @@ def read_index(
                 raise DatasetError(f"{path}: observation_keys is empty; name at least one")
         else:
             keys = task.low_dim_keys if task else _default_keys(path, available)
-        wanted = [f"obs/{key}" for key in (*keys, *extra_keys)]
+        wanted = [f"obs/{key}" for key in keys]
+        if poses and "actions" in first:
+            for arm in range(first["actions"].shape[-1] // 7):
+                wanted += [f"obs/robot{arm}_eef_pos", f"obs/robot{arm}_eef_quat"]
         required: dict[str, int] = {}
         if task is not None:
             required["actions"] = task.action_dim
@@ -272,24 +275,25 @@ def read_index(
     )
 
 
-def read_rows(file: h5py.File, demo: str, key: str, out: np.ndarray) -> None:
-    """Read one array of a demo into ``out``, block by block, and check that it is finite.
+def read_rows(file: h5py.File, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+    """Read rows of one array of a demo into ``out``, block by block, and check them.
 
     Args:
         file: the open file.
         demo: the name of the demo.
         key: path inside the demo, such as ``"actions"`` or ``"obs/object"``.
-        out: ``[steps, width]`` floating-point memory to fill; may be a strided view.
+        out: ``[rows, width]`` floating-point memory to fill; may be a strided view.
+        first: the row of the demo that goes to the first row of ``out``.
 
     Raises:
         DatasetError: if a value is not finite in the type of ``out``, or the file cannot be read.
     """
     name = f"data/{demo}/{key}"
     dataset = file[name]
-    for start in range(0, len(out), _BLOCK):
-        rows = out[start : start + _BLOCK]
+    for start in range(0, len(out), BLOCK):
+        rows = out[start : start + BLOCK]
         try:
-            block = dataset[start : start + _BLOCK]
+            block = dataset[first + start : first + start + len(rows)]
         except OSError as error:
             raise DatasetError(
                 f"{file.filename}: {name} cannot be read ({error}); copy or download the file again"
@@ -300,5 +304,5 @@ def read_rows(file: h5py.File, demo: str, key: str, out: np.ndarray) -> None:
         if not finite.all():
             raise DatasetError(
                 f"{file.filename}: {name} (shape {dataset.shape}) has NaN or infinity in row "
-                f"{start + int(np.argmin(finite))}. {_LEAVE_OUT}"
+                f"{first + start + int(np.argmin(finite))}. {_LEAVE_OUT}"
             )

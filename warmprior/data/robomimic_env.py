@@ -187,7 +187,6 @@ def absolute_actions(
     eef_pos: Tensor,
     eef_quat: Tensor,
     *,
-    quat_is_site: bool = False,
     output_max: Tensor | Sequence[float] = _OUTPUT_MAX,
     base_rotation: Tensor | None = None,
 ) -> Tensor:
@@ -204,7 +203,6 @@ def absolute_actions(
         eef_pos: ``[..., 3]`` or ``[..., 6]`` gripper positions before the action, in metres.
         eef_quat: ``[..., 4]`` or ``[..., 8]`` hand orientations before the action, ``(x, y, z,
             w)``.
-        quat_is_site: ``eef_quat`` is ``robot0_eef_quat_site``, the gripper site's own frame.
         output_max: ``[6]``, what an input of 1 means, in metres and radians.
         base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; ``None`` if they
             are in the world frame already (see :func:`delta_conventions`).
@@ -218,17 +216,15 @@ def absolute_actions(
 
     Examples:
         >>> action = torch.tensor([1.0, 0, 0, 0, 0, 0, -1.0])
-        >>> position, site = torch.tensor([0.1, 0, 1.0]), torch.tensor([0, 0, 0, 1.0])
-        >>> absolute_actions(action, position, site, quat_is_site=True)
-        tensor([ 0.1500,  0.0000,  1.0000,  1.0000,  0.0000,  0.0000,  0.0000,  1.0000,
-                 0.0000, -1.0000])
+        >>> position, hand = torch.tensor([0.1, 0, 1.0]), torch.tensor([0, 0, 1.0, 1.0])
+        >>> absolute_actions(action, position, hand).round(decimals=3)[:3]
+        tensor([0.1500, 0.0000, 1.0000])
     """
     delta = _per_arm("actions", actions, 7)
     arms = delta.shape[-2]
     position = _per_arm("eef_pos", eef_pos, 3, arms)
-    rotation = quaternion_to_matrix(_per_arm("eef_quat", eef_quat, 4, arms))
-    if not quat_is_site:
-        rotation = rotation @ quaternion_to_matrix(rotation.new_tensor(_HAND_TO_SITE))
+    hand = quaternion_to_matrix(_per_arm("eef_quat", eef_quat, 4, arms))
+    rotation = hand @ quaternion_to_matrix(hand.new_tensor(_HAND_TO_SITE))
     scale = torch.as_tensor(output_max, dtype=torch.float64, device=delta.device)
     step = (delta[..., :6].clamp(-1, 1) * scale).unflatten(-1, (2, 3))
     if base_rotation is not None:

@@ -1,0 +1,17 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("h5py")
+
+from tests.data.synthetic import write_robomimic_file
+
+
+@pytest.fixture
+def square_file(tmp_path: Path):
+    """A square file of three demos with masks, and the arrays in it."""
+    path = tmp_path / "square.hdf5"
+    demos = write_robomimic_file(path, masks={"train": [2, 0], "valid": [1], "empty": []})
+    return path, demos

@@ -1,0 +1,185 @@
+from __future__ import annotations
+
+import hashlib
+import threading
+from collections import Counter
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from tests.data.synthetic import write_robomimic_file
+from warmprior.data.download import REPOSITORIES, download_robomimic
+from warmprior.data.robomimic import RobomimicExperienceReplay
+from warmprior.data.tasks import TASKS
+
+pytest.importorskip("huggingface_hub")
+
+FIRST, MIRROR = REPOSITORIES
+FILE = "v1.5/square/ph/low_dim_v15.hdf5"
+
+
+class Hub:
+    """A server on the loopback interface that answers as the hub's file addresses do.
+
+    ``files`` maps (repository, path) to (announced length, body); ``missing`` is the error code for
+    everything else.
+    """
+
+    def __init__(self) -> None:
+        self.files: dict[tuple[str, str], tuple[int, bytes]] = {}
+        self.missing = "RepoNotFound"
+        self.requests: Counter[tuple[str, str]] = Counter()
+        hub = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def _answer(self, body: bool) -> None:
+                parts = self.path.split("/resolve/main/")
+                repository = parts[0].removeprefix("/datasets/")
+                hub.requests[self.command, repository] += 1
+                found = hub.files.get((repository, parts[-1]))
+                if found is None:
+                    self.send_response(404)
+                    self.send_header("X-Error-Code", hub.missing)
+                    self.send_header("X-Repo-Commit", "b" * 40)
+                    self.send_header("Content-Length", "0")
+                    self.end_headers()
+                    return
+                announced, content = found
+                self.send_response(200)
+                self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()}"')
+                self.send_header("X-Repo-Commit", "a" * 40)
+                self.send_header("X-Linked-Size", str(announced))
+                self.send_header("Content-Length", str(len(content)))
+                self.end_headers()
+                if body:
+                    self.wfile.write(content)
+
+            def do_HEAD(self) -> None:
+                self._answer(body=False)
+
+            def do_GET(self) -> None:
+                self._answer(body=True)
+
+            def log_message(self, *args) -> None:
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.address = f"http://127.0.0.1:{self.server.server_port}"
+        self.thread = threading.Thread(target=self.server.serve_forever, daemon=True)
+        self.thread.start()
+
+    def put(self, repository: str, content: bytes, announced: int | None = None) -> None:
+        self.files[repository, FILE] = (announced or len(content), content)
+
+    def close(self) -> None:
+        self.server.shutdown()
+        self.server.server_close()
+        self.thread.join()
+
+
+@pytest.fixture
+def hub(monkeypatch):
+    for name in ("http_proxy", "https_proxy", "all_proxy"):
+        monkeypatch.delenv(name, raising=False)
+        monkeypatch.delenv(name.upper(), raising=False)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    server = Hub()
+    yield server
+    server.close()
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory) -> bytes:
+    path = tmp_path_factory.mktemp("hub") / "file.hdf5"
+    write_robomimic_file(path)
+    return path.read_bytes()
+
+
+def test_first_repository(hub, content, tmp_path):
+    hub.put(FIRST, content)
+    path = download_robomimic("square", root=tmp_path, endpoint=hub.address)
+    assert path == tmp_path / FILE and path.read_bytes() == content
+    assert {repository for _, repository in hub.requests} == {FIRST}
+    assert RobomimicExperienceReplay(path).num_episodes == 3
+
+
+@pytest.mark.parametrize("missing", ["RepoNotFound", "EntryNotFound"])
+def test_mirror_when_the_first_has_nothing(hub, content, tmp_path, missing):
+    hub.missing = missing
+    hub.put(MIRROR, content)
+    path = download_robomimic("square", root=tmp_path, endpoint=hub.address)
+    assert path.read_bytes() == content
+    assert hub.requests["GET", MIRROR] == 1
+
+
+def test_is_fetched_once(hub, content, tmp_path):
+    hub.put(FIRST, content)
+    options = {"root": tmp_path, "endpoint": hub.address}
+    path = download_robomimic("square", **options)
+    assert download_robomimic("square", **options) == path
+    assert hub.requests["GET", FIRST] == 1
+    download_robomimic("square", force=True, **options)
+    assert hub.requests["GET", FIRST] == 2
+    hub.close()  # what is there serves without a connection
+    assert download_robomimic("square", **options) == path
+
+
+@pytest.mark.parametrize("missing", ["RepoNotFound", "EntryNotFound"])
+def test_names_every_attempt(hub, tmp_path, missing):
+    hub.missing = missing
+    with pytest.raises(OSError, match="could not download") as caught:
+        download_robomimic("square", root=tmp_path, endpoint=hub.address)
+    message = str(caught.value)
+    kind = "RepositoryNotFoundError" if missing == "RepoNotFound" else "EntryNotFoundError"
+    assert FILE in message and message.count(kind) == 2
+    assert all(f"- {repository}: " in message for repository in REPOSITORIES)
+    assert caught.value.__cause__ is not None
+
+
+def test_shorter_than_announced_is_refused(hub, content, tmp_path):
+    for repository in REPOSITORIES:
+        hub.put(repository, content[:-5000], announced=len(content))
+    with pytest.raises(OSError, match=f"should be of size {len(content)}"):
+        download_robomimic("square", root=tmp_path, endpoint=hub.address)
+    assert not (tmp_path / FILE).exists()
+
+
+def test_cut_short_at_the_source_is_refused(hub, content, tmp_path):
+    for repository in REPOSITORIES:
+        hub.put(repository, content[:-5000])
+    options = {"root": tmp_path, "endpoint": hub.address}
+    with pytest.raises(OSError, match=r"(?s)DatasetError: .*not a readable HDF5 file.*force=True"):
+        download_robomimic("square", **options)
+    hub.put(FIRST, content)
+    assert download_robomimic("square", force=True, **options).read_bytes() == content
+
+
+def test_mirror_when_the_first_is_broken(hub, content, tmp_path):
+    hub.put(FIRST, b"<html>maintenance</html>")
+    hub.put(MIRROR, content)
+    path = download_robomimic("square", root=tmp_path, endpoint=hub.address)
+    assert path.read_bytes() == content
+
+
+def test_default_cache(hub, content, tmp_path, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
+    hub.put(FIRST, content)
+    path = download_robomimic("square", endpoint=hub.address)
+    assert path.is_relative_to(tmp_path / "cache") and path.read_bytes() == content
+
+
+def test_unknown_task_or_style_asks_nobody(hub):
+    with pytest.raises(ValueError, match="choose one of lift, can, square, transport, tool_hang"):
+        download_robomimic("stack", endpoint=hub.address)
+    with pytest.raises(ValueError, match="'mg' data; it has: ph, mh"):
+        download_robomimic("lift", "mg", endpoint=hub.address)
+    assert not hub.requests
+
+
+def test_every_official_file_has_its_address(hub, content, tmp_path):
+    for task, spec in TASKS.items():
+        for style in spec.official:
+            name = f"v1.5/{task}/{style}/low_dim_v15.hdf5"
+            hub.files[FIRST, name] = (len(content), content)
+            path = download_robomimic(task, style, root=tmp_path, endpoint=hub.address)
+            assert path == tmp_path / name

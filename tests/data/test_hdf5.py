@@ -1,0 +1,297 @@
+from __future__ import annotations
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.data.synthetic import env_args_15, write_robomimic_file
+from warmprior.data.hdf5 import DatasetError, open_robomimic, read_index, read_rows
+from warmprior.data.tasks import TASKS
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_index_of_every_task(tmp_path, task):
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path, task=task)
+    index = read_index(path, poses=True)
+    assert index.task is TASKS[task]
+    assert index.observation_keys == TASKS[task].low_dim_keys
+    assert sum(index.observation_dims) == TASKS[task].observation_dim
+    assert index.action_dim == TASKS[task].action_dim
+    assert index.lengths == (12, 5, 30)
+    assert index.env_args == env_args_15(task)
+
+
+def test_values_round_trip(square_file):
+    path, demos = square_file
+    with open_robomimic(path) as file:
+        for number, demo in enumerate(demos):
+            for key, value in demo.items():
+                name = key if key in ("actions", "rewards") else f"obs/{key}"
+                out = np.full((len(value), value[0].size), np.nan)
+                read_rows(file, f"demo_{number}", name, out)
+                np.testing.assert_array_equal(out, value.reshape(out.shape))
+
+
+def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):
+    monkeypatch.setattr("warmprior.data.hdf5.BLOCK", 7)
+    path = tmp_path / "file.hdf5"
+    (demo,) = write_robomimic_file(path, lengths=(40,))
+    with h5py.File(path) as file:
+        out = np.empty((40, 7), np.float32)
+        read_rows(file, "demo_0", "actions", out)
+        part = np.empty((9, 7), np.float32)
+        read_rows(file, "demo_0", "actions", part, first=20)
+    np.testing.assert_array_equal(out, demo["actions"].astype(np.float32))
+    np.testing.assert_array_equal(part, demo["actions"][20:29].astype(np.float32))
+
+
+def test_demos_are_ordered_by_number(tmp_path):
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path, lengths=range(1, 13))
+    assert read_index(path).lengths == tuple(range(1, 13))
+
+
+def test_masks_select(square_file):
+    path, _ = square_file
+    assert read_index(path, filter_key="train").demos == ("demo_0", "demo_2")
+    assert read_index(path, filter_key="valid").lengths == (5,)
+
+
+def test_observation_keys_select_and_order(square_file):
+    path, _ = square_file
+    index = read_index(path, observation_keys=["robot0_gripper_qpos", "object"])
+    assert index.observation_dims == (2, 14)
+
+
+def test_unknown_environment_uses_what_it_finds(tmp_path):
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path, task="transport", env_args=env_args_15("lift") | {"env_name": "Own"})
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            del demo["obs/robot1_eef_quat"]
+    index = read_index(path)
+    assert index.task is None and index.action_dim == 14
+    assert index.observation_keys == (
+        *("object", "robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"),
+        *("robot1_eef_pos", "robot1_gripper_qpos"),
+    )
+
+
+# ---------------------------------------------------------------------------- bad files
+def test_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"absent\.hdf5: no such file"):
+        read_index(tmp_path / "absent.hdf5")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        read_index(tmp_path)  # a folder
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.001, 0.5, 0.99])
+def test_truncated_file(square_file, keep):
+    path, _ = square_file
+    content = path.read_bytes()
+    path.write_bytes(content[: int(keep * len(content))])
+    with pytest.raises(DatasetError, match=r"square\.hdf5: not a readable HDF5.*download it again"):
+        read_index(path)
+
+
+def test_not_hdf5(tmp_path):
+    path = tmp_path / "page.hdf5"
+    path.write_text("<html>please log in</html>" * 100)
+    with pytest.raises(DatasetError, match=r"page\.hdf5: not a readable HDF5"):
+        read_index(path)
+
+
+def _no_data(file):
+    file.move("data", "elsewhere")
+
+
+def _no_demos(file):
+    for name in list(file["data"]):
+        del file["data"][name]
+
+
+def _no_env_args(file):
+    del file["data"].attrs["env_args"]
+
+
+def _bad_json(file):
+    file["data"].attrs["env_args"] = "{"
+
+
+def _no_env_name(file):
+    file["data"].attrs["env_args"] = json.dumps({"type": 1})
+
+
+def _bad_name(file):
+    file.move("data/demo_1", "data/second")
+
+
+def _no_obs(file):
+    del file["data/demo_1/obs"]
+
+
+def _no_key(file):
+    del file["data/demo_1/obs/object"]
+
+
+def _no_actions(file):
+    del file["data/demo_1/actions"]
+
+
+def _no_rewards(file):
+    del file["data/demo_1/rewards"]
+
+
+def _no_steps(file):
+    _replace(file, "data/demo_1/actions", np.zeros((0, 7)))
+
+
+def _short_observation(file):
+    _replace(file, "data/demo_1/obs/object", np.zeros((4, 14)))
+
+
+def _scalar_actions(file):
+    _replace(file, "data/demo_1/actions", 3.0)
+
+
+def _wide_action(file):
+    _replace(file, "data/demo_1/actions", np.zeros((5, 8)))
+
+
+def _wide_object(file):
+    _replace(file, "data/demo_1/obs/object", np.zeros((5, 15)))
+
+
+def _uneven_key(file):
+    _replace(file, "data/demo_1/obs/robot0_eef_pos", np.zeros((5, 2)))
+
+
+def _text(file):
+    _replace(file, "data/demo_1/obs/object", np.array([b"a"] * 5))
+
+
+def _replace(file, name, value):
+    del file[name]
+    file[name] = value
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_no_data, ["no group 'data'", "elsewhere"]),
+        (_no_demos, ["no demos"]),
+        (_no_env_args, ["env_args", "copy it"]),
+        (_bad_json, ["env_args", "JSON"]),
+        (_no_env_name, ["env_name"]),
+        (_bad_name, ["data/second", "rename"]),
+        (_no_obs, ["data/demo_1", "'obs'", "low_dim"]),
+        (_no_key, ["data/demo_1", "obs/object", "robot0_eef_pos"]),
+        (_no_actions, ["data/demo_1", "'actions'", "rewards"]),
+        (_no_rewards, ["data/demo_1", "'rewards'", "actions"]),
+        (_no_steps, ["data/demo_1", "no steps", "(0, 7)", "mask"]),
+        (_short_observation, ["data/demo_1/obs/object", "(4, 14)", "5 rows", "mask"]),
+        (_scalar_actions, ["data/demo_1", "no steps", "()"]),
+        (_wide_action, ["data/demo_1/actions", "(5, 8)", "NutAssemblySquare", "7 columns"]),
+        (_wide_object, ["data/demo_1/obs/object", "(5, 15)", "14 columns"]),
+        (_uneven_key, ["data/demo_1/obs/robot0_eef_pos", "(5, 2)", "3 columns"]),
+        (_text, ["data/demo_1/obs/object", "vectors of numbers"]),
+    ],
+    ids=lambda value: value.__name__.strip("_") if callable(value) else "",
+)
+def test_bad_file_says_what_and_where(square_file, change, said):
+    path, _ = square_file
+    with h5py.File(path, "a") as file:
+        change(file)
+    with pytest.raises(DatasetError) as caught:
+        read_index(path)
+    for word in ["square.hdf5", *said]:
+        assert word in str(caught.value)
+
+
+def test_images_are_not_part_of_a_state(square_file):
+    path, _ = square_file
+    with pytest.raises(DatasetError, match=r"agentview_image has shape \(12, 4, 4, 3\)"):
+        read_index(path, observation_keys=["object", "agentview_image"])
+
+
+def test_observation_keys_must_exist(square_file):
+    path, _ = square_file
+    with pytest.raises(DatasetError, match=r"demo_0 has no 'obs/nothing'.*robot0_eef_pos"):
+        read_index(path, observation_keys=["nothing"])
+    with pytest.raises(DatasetError, match="empty"):
+        read_index(path, observation_keys=[])
+
+
+def test_poses_must_exist(square_file):
+    path, _ = square_file
+    with h5py.File(path, "a") as file:
+        del file["data/demo_2/obs/robot0_eef_quat"]
+    read_index(path, observation_keys=["object"])
+    with pytest.raises(DatasetError, match="demo_2 has no 'obs/robot0_eef_quat'"):
+        read_index(path, observation_keys=["object"], poses=True)
+
+
+def test_unknown_environment_without_known_keys(tmp_path):
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path, env_args=env_args_15("lift") | {"env_name": "Own"})
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            del demo["obs"]
+            demo["obs/position"] = np.zeros((len(demo["actions"]), 2))
+    with pytest.raises(DatasetError, match="observation_keys"):
+        read_index(path)
+    assert read_index(path, observation_keys=["position"]).observation_dims == (2,)
+
+
+def test_filter_keys(square_file, tmp_path):
+    path, _ = square_file
+    with pytest.raises(DatasetError, match=r"unknown filter key 'better'.*empty, train, valid"):
+        read_index(path, filter_key="better")
+    with pytest.raises(DatasetError, match="mask/empty names no demos"):
+        read_index(path, filter_key="empty")
+    with h5py.File(path, "a") as file:
+        del file["data/demo_2"]
+    with pytest.raises(DatasetError, match=r"mask/train names demos .* demo_2"):
+        read_index(path, filter_key="train")
+    bare = tmp_path / "bare.hdf5"
+    write_robomimic_file(bare)
+    with pytest.raises(DatasetError, match="'train'; this file has none"):
+        read_index(bare, filter_key="train")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e39])
+@pytest.mark.parametrize("key", ["actions", "rewards", "obs/object"])
+def test_non_finite_values(square_file, key, value):
+    path, _ = square_file
+    with h5py.File(path, "a") as file:
+        file[f"data/demo_2/{key}"][17, ...] = value
+        width = 1 if key == "rewards" else file[f"data/demo_2/{key}"].shape[1]
+    out = np.empty((30, width), np.float32)  # 1e39 is finite only in float64
+    with (
+        h5py.File(path) as file,
+        pytest.raises(DatasetError, match=rf"square.hdf5: data/demo_2/{key}.*row 17\."),
+    ):
+        read_rows(file, "demo_2", key, out)
+
+
+def test_corrupt_values(tmp_path):
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path)
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/actions"]
+        dataset = file.create_dataset(
+            "data/demo_0/actions", data=np.zeros((12, 7)), chunks=(12, 7), fletcher32=True
+        )
+        offset = dataset.id.get_chunk_info(0).byte_offset
+    with path.open("r+b") as raw:
+        raw.seek(offset)
+        raw.write(b"\x01\x02\x03")
+    read_index(path)
+    with (
+        h5py.File(path) as file,
+        pytest.raises(DatasetError, match=r"data/demo_0/actions cannot be read"),
+    ):
+        read_rows(file, "demo_0", "actions", np.empty((12, 7)))

@@ -1,0 +1,245 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torchrl.data import SliceSampler
+from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
+from torchrl.envs.transforms import RenameTransform
+
+from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
+from warmprior.data import (
+    DatasetError,
+    RobomimicExperienceReplay,
+    absolute_actions,
+    modernize_env_args,
+)
+from warmprior.data.tasks import TASKS
+
+
+def _state(demo, task):
+    return np.concatenate([demo[key] for key in TASKS[task].low_dim_keys], -1)
+
+
+@pytest.mark.parametrize("storage", ["memory", "memmap"])
+@pytest.mark.parametrize("task", TASKS)
+def test_values_equal_what_was_written(tmp_path, task, storage):
+    path = tmp_path / "file.hdf5"
+    demos = write_robomimic_file(path, lengths=(12, 1, 30), task=task, failures=(2,))
+    replay = RobomimicExperienceReplay(path, storage=storage, scratch_dir=tmp_path / "scratch")
+    data = replay.data
+    assert data.batch_size == (43,) and len(replay) == 43
+    expected = {
+        "observation": np.concatenate([_state(demo, task) for demo in demos]),
+        "action": np.concatenate([demo["actions"] for demo in demos]),
+    }
+    for key, value in expected.items():
+        assert data[key].dtype == torch.float32
+        np.testing.assert_array_equal(data[key].numpy(), value.astype(np.float32))
+    rewards = np.concatenate([demo["rewards"] for demo in demos])[:, None]
+    np.testing.assert_array_equal(data["next", "reward"].numpy(), rewards)
+    assert data["episode"].tolist() == [0] * 12 + [1] + [2] * 30
+    assert data["frame"].tolist() == list(range(43))
+    ends = {"done": [11, 12, 42], "terminated": [11, 12], "truncated": [42]}
+    for key, rows in ends.items():
+        assert data["next", key].shape == (43, 1) and data["next", key].dtype == torch.bool
+        assert data["next", key].squeeze(-1).nonzero().squeeze(-1).tolist() == rows
+    assert set(data.keys(True, True)) == {
+        *("observation", "action", "episode", "frame"),
+        *(("next", key) for key in ("reward", "done", "terminated", "truncated")),
+    }
+    assert replay.num_episodes == 3 and replay.episode_lengths.tolist() == [12, 1, 30]
+    assert replay.task is TASKS[task] and replay.path == path
+    assert replay.observation_keys == TASKS[task].low_dim_keys
+    assert replay.env_args == modernize_env_args(env_args_15(task))
+
+
+def test_mask_numbers_episodes_from_zero(square_file):
+    path, demos = square_file
+    data = RobomimicExperienceReplay(path, filter_key="train").data
+    assert data["episode"].unique().tolist() == [0, 1]
+    np.testing.assert_array_equal(data["action"][12:], demos[2]["actions"].astype(np.float32))
+
+
+def test_data_is_the_storage(square_file, tmp_path):
+    path, _ = square_file
+    for options in ({}, {"storage": "memmap", "scratch_dir": tmp_path / "maps"}):
+        replay = RobomimicExperienceReplay(path, batch_size=7, **options)
+        assert replay.data["action"].data_ptr() == replay.data["action"].data_ptr()
+        replay.data["action"].fill_(0.25)
+        assert (replay.sample()["action"] == 0.25).all()
+    assert list((tmp_path / "maps").rglob("*.memmap"))
+
+
+def test_memmap_without_a_folder(square_file):
+    path, demos = square_file
+    replay = RobomimicExperienceReplay(path, storage="memmap")
+    np.testing.assert_array_equal(
+        replay.data["action"][:12].numpy(), demos[0]["actions"].astype(np.float32)
+    )
+
+
+def test_is_immutable(square_file):
+    path, _ = square_file
+    replay = RobomimicExperienceReplay(path)
+    with pytest.raises(RuntimeError, match="doesn't allow writing"):
+        replay.extend(replay.data)
+
+
+def test_works_with_torchrl_samplers_and_transforms(square_file):
+    path, _ = square_file
+    replay = RobomimicExperienceReplay(
+        path, batch_size=47, sampler=SamplerWithoutReplacement(shuffle=True)
+    )
+    assert sorted(replay.sample()["frame"].tolist()) == list(range(47))
+    replay = RobomimicExperienceReplay(
+        path,
+        batch_size=20,
+        sampler=SliceSampler(slice_len=5, end_key=("next", "done")),
+        transform=RenameTransform(["observation"], ["state"]),
+    )
+    sample = replay.sample().reshape(4, 5)
+    assert (sample["frame"].diff(dim=-1) == 1).all()
+    assert (sample["episode"].diff(dim=-1) == 0).all()
+    assert "state" in sample.keys() and "observation" not in sample.keys()  # noqa: SIM118
+
+
+def test_observation_keys(square_file):
+    path, demos = square_file
+    replay = RobomimicExperienceReplay(path, observation_keys=["robot0_eef_pos", "object"])
+    expected = np.concatenate([demos[1]["robot0_eef_pos"], demos[1]["object"]], -1)
+    np.testing.assert_array_equal(
+        replay.data["observation"][12:17].numpy(), expected.astype(np.float32)
+    )
+
+
+@pytest.mark.parametrize("frame", ["old", "world", "base"])
+@pytest.mark.parametrize("task", ["square", "transport"])
+def test_absolute_actions(tmp_path, task, frame):
+    path = tmp_path / "file.hdf5"
+    meta = env_args_14(task) if frame == "old" else env_args_15(task, frame)
+    demos = write_robomimic_file(path, task=task, env_args=meta)
+    replay = RobomimicExperienceReplay(path, absolute_actions=True)
+    arms = TASKS[task].arms
+    poses = [
+        np.concatenate([demos[1][f"robot{a}_{key}"] for a in range(arms)], -1)
+        for key in ("eef_pos", "eef_quat")
+    ]
+    # The two bases of transport face each other along y.
+    base = torch.eye(3, dtype=torch.float64).expand(arms, 3, 3)
+    if frame == "base" and task == "transport":
+        quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+        base = torch.stack((quarter, quarter.mT))
+    expected = absolute_actions(
+        *map(torch.from_numpy, (demos[1]["actions"], *poses)), base_rotation=base
+    )
+    torch.testing.assert_close(replay.data["action"][12:17], expected.float())
+    parts = replay.env_args["env_kwargs"]["controller_configs"]["body_parts"]
+    assert parts["right"]["input_type"] == "absolute"
+    assert parts["right"]["input_ref_frame"] == "world"
+
+
+def test_absolute_actions_need_matching_robots(tmp_path):
+    path = tmp_path / "file.hdf5"
+    meta = env_args_15("transport")
+    meta["env_kwargs"]["robots"] = ["Panda"]
+    write_robomimic_file(path, task="transport", env_args=meta)
+    with pytest.raises(DatasetError, match="14 columns"):
+        RobomimicExperienceReplay(path, absolute_actions=True)
+
+
+def test_env_args_are_a_copy(square_file):
+    replay = RobomimicExperienceReplay(square_file[0])
+    replay.env_args["env_kwargs"].clear()
+    assert replay.env_args["env_kwargs"]
+
+
+def test_refuses_bad_options(square_file, tmp_path, monkeypatch):
+    path, _ = square_file
+    with pytest.raises(ValueError, match="'disk'"):
+        RobomimicExperienceReplay(path, storage="disk")
+    with pytest.raises(ValueError, match="memory maps live on the CPU"):
+        RobomimicExperienceReplay(path, storage="memmap", device="cuda")
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        RobomimicExperienceReplay(tmp_path / "absent.hdf5")
+    with pytest.raises(ValueError, match="choose one of lift, can"):
+        RobomimicExperienceReplay("sqare", download=True)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"official square mh file.*download=True"):
+        RobomimicExperienceReplay("square", style="mh")
+
+
+def test_bad_values_stop_the_load(square_file):
+    import h5py
+
+    path, _ = square_file
+    with h5py.File(path, "a") as file:
+        file["data/demo_1/obs/object"][3, 2] = np.nan
+    with pytest.raises(DatasetError, match=r"demo_1/obs/object .* row 3\."):
+        RobomimicExperienceReplay(path)
+
+
+def test_downloads_by_task_name(square_file, tmp_path, monkeypatch):
+    asked = []
+
+    def fake(task, style, *, root):
+        asked.append((task, style, root))
+        return square_file[0]
+
+    monkeypatch.setattr("warmprior.data.robomimic.download_robomimic", fake)
+    monkeypatch.chdir(tmp_path / "..")
+    replay = RobomimicExperienceReplay("square", style="mh", download=True, root="somewhere")
+    assert asked == [("square", "mh", "somewhere")] and replay.num_episodes == 3
+
+
+def test_import_needs_no_optional_package():
+    code = """
+        import sys
+        import warmprior.data
+        loaded = {"h5py", "huggingface_hub", "robosuite"} & set(sys.modules)
+        assert not loaded, loaded
+    """
+    subprocess.run([sys.executable, "-c", textwrap.dedent(code)], check=True)
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads Linux's /proc")
+@pytest.mark.parametrize(
+    "options",
+    [
+        "",
+        pytest.param("absolute_actions=True", marks=pytest.mark.slow),
+        pytest.param("storage='memmap'", marks=pytest.mark.slow),
+    ],
+)
+def test_peak_memory(tmp_path, options):
+    small, large = tmp_path / "small.hdf5", tmp_path / "large.hdf5"
+    write_robomimic_file(small)
+    write_robomimic_file(large, lengths=[50_000, 400_000])
+    code = f"""
+        import re, sys
+        from pathlib import Path
+        from warmprior.data import RobomimicExperienceReplay
+        # What is imported or cached on first use is not the data's.
+        RobomimicExperienceReplay(sys.argv[1], {options})
+        status = lambda key: 1024 * int(
+            re.search(key + r":\\s+(\\d+)", Path("/proc/self/status").read_text())[1]
+        )
+        before = status("VmRSS")
+        data = RobomimicExperienceReplay(sys.argv[2], {options}).data
+        size = sum(v.numel() * v.element_size() for v in data.values(True, True))
+        print((status("VmHWM") - before) / size, size)
+    """
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code), str(small), str(large)],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+    ratio, size = map(float, result.stdout.split())
+    assert size > 5e7
+    assert 0.7 < ratio < 1.3  # below, the measurement itself would be broken
