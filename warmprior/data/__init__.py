@@ -6,6 +6,7 @@ from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.data.robomimic_env import (
     absolute_actions,
     absolute_to_env_action,
+    delta_conventions,
     modernize_env_args,
 )
 from warmprior.data.rotation import rotation_6d_to_rotvec
@@ -18,6 +19,7 @@ __all__ = [
     "TaskSpec",
     "absolute_actions",
     "absolute_to_env_action",
+    "delta_conventions",
     "download_robomimic",
     "get_task",
     "modernize_env_args",
