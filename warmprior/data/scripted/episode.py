@@ -1,0 +1,140 @@
+"""One scripted demonstration: everything about it follows from its task, style and seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from warmprior.data.scripted.motion import ArmRunner, Plan
+from warmprior.data.scripted.operators import OPERATORS, SKILLED, Demonstrator
+from warmprior.data.scripted.tasks_single import can, lift, square, stack
+from warmprior.data.scripted.transport import transport
+from warmprior.data.tasks import get_task
+from warmprior.envs._simulator import make_simulator, task_env_args
+from warmprior.envs.control_loop import ControlLoop, StepLoop
+from warmprior.envs.rendering import render_camera
+
+__all__ = ["PLANS", "Episode", "expert_loop", "operator_of", "run_episode"]
+
+PLANS: dict[str, Callable[[StepLoop, Demonstrator], list[Plan]]] = {
+    "lift": lift,
+    "can": can,
+    "square": square,
+    "stack": stack,
+    "transport": transport,
+}
+_EXTRA_KEYS = ("eef_quat_site", "gripper_qvel", "joint_pos", "joint_vel")
+_HOLD = 6  # steps that the task must stay solved for before the episode ends
+
+
+@dataclass
+class Episode:
+    """A recorded demonstration of ``N`` steps.
+
+    Attributes:
+        seed: the simulator's seed.
+        operator: index of the operator, 0 for ``ph``.
+        level: the operator's level.
+        success: whether the task stayed solved to the end.
+        actions: ``[N, d_a]`` float64 in ``[-1, 1]``.
+        states: ``[N, 1 + nq + nv]`` float64, the simulator before each action.
+        rewards: ``[N]`` float64, 1 where the action led to a solved state.
+        observations: name to ``[N + 1, ...]``, the last row after the last action.
+    """
+
+    seed: int
+    operator: int
+    level: str
+    success: bool
+    actions: np.ndarray
+    states: np.ndarray
+    rewards: np.ndarray
+    observations: dict[str, np.ndarray]
+
+
+def expert_loop(task: str) -> ControlLoop:
+    """Make the simulation that a task's expert acts in.
+
+    Raises:
+        ImportError: if robosuite is not installed.
+
+    Examples:
+        >>> expert_loop("lift").reset(seed=0)["object"].shape  # doctest: +SKIP
+        (10,)
+    """
+    spec = get_task(task)
+    extra = (f"robot{i}_{key}" for i in range(spec.arms) for key in _EXTRA_KEYS)
+    return ControlLoop(make_simulator(task_env_args(task)), (*spec.low_dim_keys, *extra))
+
+
+def operator_of(style: str, seed: int) -> int:
+    """Index of the operator who plays a seed: they take turns in ``mh`` data.
+
+    Examples:
+        >>> [operator_of("mh", seed) for seed in (0, 1, 7)], operator_of("ph", 7)
+        ([0, 1, 1], 0)
+    """
+    return seed % len(OPERATORS) if style == "mh" else 0
+
+
+def run_episode(loop: StepLoop, task: str, style: str, seed: int, image_size: int = 0) -> Episode:
+    """Play one scripted episode.
+
+    Args:
+        loop: from :func:`expert_loop`.
+        task: one of :data:`PLANS`.
+        style: ``"ph"`` or ``"mh"``.
+        seed: of the initial state and of the demonstrator; the same one gives the same episode.
+        image_size: side of the task's camera images in pixels; 0 for none.
+
+    Returns:
+        The episode, successful or not. It ends six steps after the task is solved, when the plan
+        is exhausted, or at the task's time limit.
+
+    Examples:
+        >>> run_episode(expert_loop("lift"), "lift", "ph", seed=0).success  # doctest: +SKIP
+        True
+    """
+    spec = get_task(task)
+    cameras = spec.cameras if image_size else ()
+
+    def observe(low_dim: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        for camera in cameras:
+            image = render_camera(loop.env, camera, image_size, image_size)
+            low_dim[f"{camera}_image"] = image
+        return low_dim
+
+    index = operator_of(style, seed)
+    operator = OPERATORS[index] if style == "mh" else SKILLED
+    # The sequence keeps the stream apart from the simulator's own default_rng(seed)-like ones.
+    person = Demonstrator(operator, np.random.default_rng([7919, seed]))
+    observations = [observe(loop.reset(seed))]
+    runners = [
+        ArmRunner(loop, arm, plan, person) for arm, plan in enumerate(PLANS[task](loop, person))
+    ]
+    states, actions, rewards = [], [], []
+    solved = 0
+    for _ in range(spec.horizon(style)):
+        states.append(loop.state())
+        action = np.concatenate([runner.act() for runner in runners])
+        low_dim, success = loop.step(action)
+        actions.append(action)
+        rewards.append(float(success))
+        observations.append(observe(low_dim))
+        solved = solved + 1 if success else 0
+        if solved >= _HOLD or (not success and all(runner.given_up for runner in runners)):
+            break
+    return Episode(
+        seed=seed,
+        operator=index,
+        level=person.level,
+        success=solved > 0,
+        actions=np.stack(actions),
+        states=np.stack(states),
+        rewards=np.array(rewards),
+        observations={
+            key: np.stack([entry[key] for entry in observations]) for key in observations[0]
+        },
+    )
