@@ -2,6 +2,9 @@
 
 from importlib.metadata import version as _version
 
+from sphinx.util.inspect import signature as _signature
+from sphinx.util.inspect import stringify_signature
+
 project = "warmprior"
 author = "the warmprior developers"
 release = version = _version("warmprior")
@@ -31,3 +34,15 @@ toc_object_entries_show_parents = "hide"
 doctest_test_doctest_blocks = ""
 myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3
+
+
+def _show_own_signature(app, what, name, obj, options, signature, return_annotation):
+    """Show what a class takes where a base class or metaclass hides it behind ``*args``."""
+    if what == "class" and (signature or "").startswith("(*args") and "__init__" in vars(obj):
+        signature = stringify_signature(_signature(obj.__init__, bound_method=True))
+    return signature, return_annotation
+
+
+def setup(app):
+    """Connect the handler above."""
+    app.connect("autodoc-process-signature", _show_own_signature)
