@@ -2,8 +2,8 @@
 
 robosuite spends two thirds of ``env.step`` in the Python of its controllers, 25 times per control
 step. :class:`ControlLoop` computes the same operational-space torques in one compiled function and
-reads the observations once, at the end. Robot positions agree with ``env.step`` to 1e-6 over ten
-control steps; contacts amplify the remainder after that, as they do any rounding.
+reads the observations once, at the end. Robot positions agree with ``env.step`` to rounding over
+ten control steps; contacts amplify the rounding after that.
 """
 
 from __future__ import annotations
@@ -210,8 +210,17 @@ class ControlLoop(StepLoop):
         env, mujoco, model, data = self.env, self._mujoco, self._model, self._data
         if len(action) != env.action_dim:
             raise ValueError(f"expected an action of width {env.action_dim}, got {len(action)}")
+        # The first torques after a reset come from what the controllers measured during the reset,
+        # before the joints were in place: leave them to robosuite.
+        stale = not all(arm.controller.new_update for arm in self._arms)
         for substep in range(self._substeps):
             mujoco.mj_step1(model, data)
+            if substep == 0 and stale:
+                env._pre_action(action, True)
+                for arm in self._arms:
+                    arm.read_goal()
+                mujoco.mj_step2(model, data)
+                continue
             mujoco.mj_fullM(model, self._mass, data.qM)
             for arm in self._arms:
                 if substep == 0:
@@ -283,14 +292,19 @@ class _Arm:
         controller.new_update = False  # the pose above is all that a goal depends on
         controller.set_goal(np.asarray(action[self.split["right"]], dtype=np.float64))
         controller.new_update = True  # env.step may follow
+        self.read_goal()
+        fingers = self.gripper.format_action(action[self.split["right_gripper"]])
+        ctrl[self.fingers] = self.finger_middle + self.finger_range * fingers
+
+    def read_goal(self) -> None:
+        """Take the controller's goal pose over, in the world frame."""
+        controller = self.controller
         goal_pos, goal_mat = controller.goal_pos, controller.goal_ori
         if controller.input_ref_frame == "base":
             goal_pos = controller.origin_pos + controller.origin_ori @ goal_pos
             goal_mat = controller.origin_ori @ goal_mat
         self.goal_pos = np.ascontiguousarray(goal_pos, dtype=np.float64)
         self.goal_mat = np.ascontiguousarray(goal_mat, dtype=np.float64)
-        fingers = self.gripper.format_action(action[self.split["right_gripper"]])
-        ctrl[self.fingers] = self.finger_middle + self.finger_range * fingers
 
 
 def _check_supported(env: Any) -> None:

@@ -68,8 +68,9 @@ class RobosuiteWrapper(_EnvWrapper):
 
     Examples:
         >>> import robosuite  # doctest: +SKIP
-        >>> env = RobosuiteWrapper(robosuite.make("Door", robots="Panda"))  # doctest: +SKIP
-        >>> env.rollout(3)["observation"].shape  # doctest: +SKIP
+        >>> options = {"has_renderer": False, "has_offscreen_renderer": False}
+        >>> door = robosuite.make("Door", "Panda", use_camera_obs=False, **options)  # doctest: +SKIP
+        >>> RobosuiteWrapper(door).rollout(3)["observation"].shape  # doctest: +SKIP
         torch.Size([3, 23])
     """
 

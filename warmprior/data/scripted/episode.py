@@ -101,14 +101,14 @@ def run_episode(loop: StepLoop, task: str, style: str, seed: int, image_size: in
     cameras = spec.cameras if image_size else ()
 
     def observe(low_dim: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        found = {key: value.astype(np.float64) for key, value in low_dim.items()}
         for camera in cameras:
-            image = render_camera(loop.env, camera, image_size, image_size)
-            low_dim[f"{camera}_image"] = image
-        return low_dim
+            found[f"{camera}_image"] = render_camera(loop.env, camera, image_size, image_size)
+        return found
 
     index = operator_of(style, seed)
     operator = OPERATORS[index] if style == "mh" else SKILLED
-    # The sequence keeps the stream apart from the simulator's own default_rng(seed)-like ones.
+    # The first number keeps this stream apart from others that are seeded with the same integer.
     person = Demonstrator(operator, np.random.default_rng([7919, seed]))
     observations = [observe(loop.reset(seed))]
     runners = [

@@ -1,0 +1,154 @@
+"""The lean control loop against robosuite's own ``env.step``."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+
+pytest.importorskip("robosuite")
+
+from warmprior.data.tasks import TASKS
+from warmprior.envs._simulator import make_simulator, task_env_args
+from warmprior.envs.control_loop import ControlLoop, StepLoop
+
+TOLERANCE = 1e-9  # radians, over ten control steps
+
+
+def random_actions(width: int, count: int = 10) -> np.ndarray:
+    return np.random.default_rng(0).normal(0, 0.5, (count, width)).clip(-1, 1)
+
+
+def joint_path(loop: StepLoop, actions: np.ndarray, seed: int = 3) -> np.ndarray:
+    loop.reset(seed)
+    joints = np.concatenate([robot._ref_joint_pos_indexes for robot in loop.env.robots])
+    path = []
+    for action in actions:
+        loop.step(action)
+        path.append(loop.env.sim.data.qpos[joints].copy())
+    return np.stack(path)
+
+
+@pytest.fixture(scope="module")
+def lift_env():
+    return make_simulator(task_env_args("lift"))
+
+
+@pytest.mark.parametrize("task", ["lift", "can", "square", "stack", "transport"])
+def test_agrees_with_env_step(task):
+    env = make_simulator(task_env_args(task))
+    actions = random_actions(TASKS[task].action_dim)
+    expected = joint_path(StepLoop(env), actions)
+    assert np.abs(expected - expected[0]).max() > 0.01, "the robot did not move"
+    np.testing.assert_allclose(joint_path(ControlLoop(env), actions), expected, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"input_ref_frame": "base"}, {"input_type": "absolute"}],
+    ids=["base frame", "absolute"],
+)
+def test_agrees_for_other_inputs(changes):
+    env_args = task_env_args("lift")
+    env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"].update(changes)
+    env = make_simulator(env_args)
+    actions = random_actions(7)
+    if "input_type" in changes:
+        loop = StepLoop(env)
+        loop.reset(3)
+        actions[:, :3] = loop.eef()[0] + 0.05 * actions[:, :3]
+        actions[:, 3:6] = [np.pi / np.sqrt(2), np.pi / np.sqrt(2), 0]  # pointing down
+    np.testing.assert_allclose(
+        joint_path(ControlLoop(env), actions), joint_path(StepLoop(env), actions), atol=TOLERANCE
+    )
+
+
+def test_env_step_may_follow_lean_steps(lift_env):
+    actions = random_actions(7)
+    expected = joint_path(StepLoop(lift_env), actions)
+    loop = ControlLoop(lift_env)
+    loop.reset(3)
+    for action in actions[:5]:
+        loop.step(action)
+    for action in actions[5:]:
+        lift_env.step(action)
+    np.testing.assert_allclose(lift_env.sim.data.qpos[:7], expected[-1], atol=TOLERANCE)
+
+
+def test_same_seed_and_actions_are_bit_identical(lift_env):
+    actions = random_actions(7)
+    other = ControlLoop(make_simulator(task_env_args("lift")))
+    loop = ControlLoop(lift_env)
+    loop.reset(99)
+    loop.step(actions[0])  # what was played before must not matter
+    states = []
+    for each in (loop, other, loop):
+        each.reset(7)
+        for action in actions:
+            each.step(action)
+        states.append(each.state())
+    np.testing.assert_array_equal(states[0], states[1])
+    np.testing.assert_array_equal(states[0], states[2])
+    loop.reset(8)
+    assert not np.array_equal(loop.state()[1:8], states[0][1:8])
+
+
+def test_observations_describe_the_end_of_the_step(lift_env):
+    import mujoco
+
+    loop = ControlLoop(lift_env)
+    loop.reset(0)
+    for action in random_actions(7):
+        observations, _ = loop.step(action)
+    data = copy.copy(lift_env.sim.data._data)
+    mujoco.mj_forward(lift_env.sim.model._model, data)
+    site = lift_env.sim.model.site_name2id("gripper0_right_grip_site")
+    cube = lift_env.sim.model.body_name2id("cube_main")
+    np.testing.assert_allclose(observations["robot0_eef_pos"], data.site_xpos[site], atol=1e-9)
+    np.testing.assert_allclose(observations["object"][:3], data.xpos[cube], atol=1e-9)
+    np.testing.assert_allclose(loop.eef()[0], data.site_xpos[site], atol=1e-9)
+    np.testing.assert_allclose(loop.body("cube_main")[1].ravel(), data.xmat[cube], atol=1e-9)
+    np.testing.assert_allclose(
+        loop.site("gripper0_right_grip_site"), data.site_xpos[site], atol=1e-9
+    )
+
+
+def test_state_round_trip(lift_env):
+    loop = ControlLoop(lift_env)
+    before = loop.reset(5)
+    state = loop.state()
+    assert state.shape == (1 + lift_env.sim.model.nq + lift_env.sim.model.nv,)
+    for action in random_actions(7):
+        loop.step(action)
+    after = loop.set_state(state)
+    np.testing.assert_array_equal(loop.state(), state)
+    for key, value in before.items():
+        np.testing.assert_allclose(after[key], value, atol=1e-9, err_msg=key)
+    with pytest.raises(ValueError, match=r"expected a state of shape \[32\], got \[3\]"):
+        loop.set_state(np.zeros(3))
+
+
+def test_computes_only_what_is_asked_for():
+    env = make_simulator(task_env_args("lift"))
+    keys = ("object", "robot0_eef_pos")
+    loop = ControlLoop(env, keys)
+    assert tuple(sorted(loop.reset(0))) == keys
+    assert not env._observables["robot0_joint_vel"].is_enabled()
+    with pytest.raises(ValueError, match="no observation robot1_eef_pos"):
+        ControlLoop(env, ("robot1_eef_pos",))
+
+
+def test_refuses_what_it_does_not_implement():
+    env_args = task_env_args("lift")
+    part = env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"]
+    part["impedance_mode"] = "variable"
+    with pytest.raises(ValueError, match="control_loop='robosuite'"):
+        ControlLoop(make_simulator(env_args))
+
+
+def test_refuses_an_action_of_another_width(lift_env):
+    loop = ControlLoop(lift_env)
+    loop.reset(0)
+    with pytest.raises(ValueError, match="width 7, got 14"):
+        loop.step(np.zeros(14))
