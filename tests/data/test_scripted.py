@@ -1,0 +1,264 @@
+"""Scripted experts and the demonstration files they fill."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import Future
+
+import numpy as np
+import pytest
+
+pytest.importorskip("robosuite")
+pytest.importorskip("h5py")
+
+import h5py
+
+from warmprior.data.scripted import generate as generate_module
+from warmprior.data.scripted import generate_demonstrations
+from warmprior.data.scripted.episode import Episode, expert_loop, operator_of, run_episode
+from warmprior.data.scripted.geometry import nearest_yaw, rotation_matrix, rotation_vector
+from warmprior.data.scripted.writer import write_robomimic
+from warmprior.data.tasks import EVALUATION_SEED, TASKS
+from warmprior.envs import rendering_backend
+from warmprior.envs._simulator import make_simulator
+
+
+@pytest.fixture(scope="module")
+def lift_file(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("cache")
+    return generate_demonstrations("lift", n=3, cache_dir=folder, workers=1, progress=False)
+
+
+def contents(path):
+    """Everything in a file: datasets as arrays, attributes as they are."""
+    found = {}
+    with h5py.File(path) as file:
+
+        def visit(name, item):
+            if isinstance(item, h5py.Dataset):
+                found[name] = item[()]
+            found.update({f"{name}@{key}": value for key, value in item.attrs.items()})
+
+        file.visititems(visit)
+    return found
+
+
+def test_the_number_of_workers_does_not_matter(lift_file, tmp_path):
+    other = generate_demonstrations(
+        "lift", n=3, path=tmp_path / "deep" / "two.hdf5", workers=2, progress=False
+    )
+    first, second = contents(lift_file), contents(other)
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        np.testing.assert_array_equal(value, second[name], err_msg=name)
+
+
+def test_layout_is_robomimics(lift_file):
+    with h5py.File(lift_file) as file:
+        data = file["data"]
+        demos = sorted(data, key=lambda name: int(name[5:]))
+        assert demos == ["demo_0", "demo_1", "demo_2"]
+        assert data.attrs["total"] == sum(data[name].attrs["num_samples"] for name in demos)
+        env_args = json.loads(data.attrs["env_args"])
+        assert env_args["env_name"] == "Lift"
+        assert env_args["type"] == 1
+        arm = env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"]
+        assert (arm["input_type"], arm["input_ref_frame"]) == ("delta", "world")
+        for name in demos:
+            demo = data[name]
+            steps = demo.attrs["num_samples"]
+            assert demo.attrs["model_file"].lstrip().startswith("<mujoco")
+            assert json.loads(demo.attrs["ep_meta"]) == {}
+            shapes = {"actions": (steps, 7), "states": (steps, 32), "rewards": (steps,)}
+            for key, shape in shapes.items():
+                assert demo[key].shape == shape
+                assert demo[key].dtype == np.float64
+            assert demo["dones"].dtype == np.int64
+            assert np.abs(demo["actions"][()]).max() <= 1
+            rewards, dones = demo["rewards"][()], demo["dones"][()]
+            assert rewards[-1] == 1
+            assert dones[-1] == 1
+            np.testing.assert_array_equal(dones[:-1], rewards[:-1] == 1)
+            assert set(demo["obs"]) == set(demo["next_obs"]) >= set(TASKS["lift"].low_dim_keys)
+            for key in demo["obs"]:
+                here, after = demo["obs"][key][()], demo["next_obs"][key][()]
+                assert here.dtype == np.float64
+                np.testing.assert_array_equal(here[1:], after[:-1], err_msg=key)
+        masks = {key: {name.decode() for name in file["mask"][key][()]} for key in file["mask"]}
+    assert masks["train"] | masks["valid"] == set(demos)
+    assert not masks["train"] & masks["valid"]
+    assert {"20_percent", "50_percent"} <= masks.keys()
+    assert not {"better", "okay", "worse"} & masks.keys()
+
+
+def test_recorded_states_and_actions_replay(lift_file):
+    """The stored observations are those of the simulator that the file itself describes."""
+    with h5py.File(lift_file) as file:
+        env_args = json.loads(file["data"].attrs["env_args"])
+        demo = file["data/demo_1"]
+        states, actions = demo["states"][()], demo["actions"][()]
+        seed, positions = int(demo.attrs["seed"]), demo["next_obs/robot0_eef_pos"][()]
+    env = make_simulator(env_args)
+    np.random.seed(seed)
+    env.reset()
+    for action, state in zip(actions, states, strict=True):
+        found = env.sim.get_state().flatten()
+        # Contacts amplify rounding: compare until the fingers close.
+        if action[6] > 0:
+            break
+        np.testing.assert_allclose(found, state, atol=1e-6)
+        observations, *_ = env.step(action)
+    assert env.timestep > 10
+    # env.step reports poses from the start of its last 2 ms.
+    np.testing.assert_allclose(
+        observations["robot0_eef_pos"], positions[env.timestep - 1], atol=3e-3
+    )
+
+
+def test_cached_file_is_returned_at_once(lift_file, monkeypatch):
+    def fail(*_):
+        raise AssertionError("generated again")
+
+    monkeypatch.setattr(generate_module, "_players", fail)
+    folder = lift_file.parent.parent
+    assert generate_demonstrations("lift", n=3, cache_dir=folder) == lift_file
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(folder))
+    assert generate_demonstrations("lift", n=3) == lift_file
+    for options in ({"n": 4}, {"n": 3, "seed": 1}, {"n": 3, "style": "mh"}):
+        with pytest.raises(AssertionError, match="generated again"):
+            generate_demonstrations("lift", **options)
+
+
+def test_interruption_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(generate_module, "run_episode", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        generate_demonstrations("lift", n=2, cache_dir=tmp_path, workers=1, progress=False)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+@pytest.mark.parametrize(
+    ("task", "options", "message"),
+    [
+        ("tool_hang", {}, "no scripted expert for 'tool_hang'.*download=True"),
+        ("juggle", {}, "unknown task 'juggle'"),
+        ("lift", {"style": "mg"}, "style is 'ph' or 'mh', got 'mg'"),
+        ("lift", {"n": 0}, "n must be at least 1, got 0"),
+        ("lift", {"workers": 0}, "workers must be at least 1, got 0"),
+        ("lift", {"seed": 100}, "seed must be between 0 and 99, got 100"),
+    ],
+)
+def test_bad_arguments(task, options, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        generate_demonstrations(task, cache_dir=tmp_path, **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_generation_seeds_stay_below_evaluation_seeds():
+    last = 99 * generate_module.SEEDS_PER_FILE + generate_module.SEEDS_PER_FILE
+    assert last <= EVALUATION_SEED
+
+
+def fake_episode(seed, style="mh", success=True):
+    operator = operator_of(style, seed)
+    level = ("better", "better", "okay", "okay", "worse", "worse")[operator]
+    ones = np.ones((4, 7))
+    return Episode(
+        seed, operator, level, success, ones, ones, np.array([0.0, 0, 1, 1]), {"object": ones[:1]}
+    )
+
+
+@pytest.mark.parametrize("ahead", [1, 2, 7])
+def test_operators_contribute_equally(ahead):
+    def play(seed):
+        future = Future()
+        # The last operator succeeds every fourth time only.
+        future.set_result(fake_episode(seed, success=seed % 6 != 5 or seed % 24 == 5))
+        return future
+
+    kept = list(generate_module._successes(play, "mh", 14, 0, ahead, lambda _: None))
+    assert [kept.count(e) for e in kept] == [1] * 14
+    assert [sum(e.operator == i for e in kept) for i in range(6)] == [3, 3, 2, 2, 2, 2]
+    seeds = [episode.seed for episode in kept]
+    assert seeds == sorted(seeds)
+    assert max(seeds) == 29
+
+
+def test_gives_up_when_the_expert_never_succeeds():
+    def play(seed):
+        future = Future()
+        future.set_result(fake_episode(seed, "ph", success=False))
+        return future
+
+    with pytest.raises(RuntimeError, match="only 0 of 2 demonstrations succeeded in 140"):
+        list(generate_module._successes(play, "ph", 2, 0, 1, lambda _: None))
+
+
+def test_filter_keys_of_several_operators(tmp_path):
+    path = tmp_path / "mh.hdf5"
+    episodes = [fake_episode(seed) for seed in range(12)]
+    assert write_robomimic(path, episodes, env_args={}, model_file="<mujoco/>") == 48
+    with h5py.File(path) as file:
+        masks = {key: {name.decode() for name in file["mask"][key][()]} for key in file["mask"]}
+    everything = {f"demo_{i}" for i in range(12)}
+    assert masks["better"] == {"demo_0", "demo_1", "demo_6", "demo_7"}
+    assert masks["better"] | masks["okay"] | masks["worse"] == everything
+    assert masks["okay_better"] == masks["okay"] | masks["better"]
+    for name in ("better", "okay", "worse", "50_percent"):
+        for split in ("train", "valid"):
+            assert masks.get(f"{name}_{split}", set()) == masks[name] & masks[split]
+
+
+def test_images(tmp_path):
+    if rendering_backend() is None:
+        pytest.skip("no OpenGL backend")
+    loop = expert_loop("lift")
+    episode = run_episode(loop, "lift", "ph", 0, image_size=16)
+    assert episode.success
+    images = episode.observations["agentview_image"]
+    assert images.shape == (len(episode.actions) + 1, 16, 16, 3)
+    assert images.dtype == np.uint8
+    plain = run_episode(loop, "lift", "ph", 0)
+    np.testing.assert_array_equal(plain.actions, episode.actions)
+
+
+def test_rotations_agree_with_scipy():
+    rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+    rng = np.random.default_rng(0)
+    axes = rng.normal(size=(50, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    for angle in (0.0, 1e-10, 1e-4, 1.0, 3.0, np.pi - 1e-6):
+        for axis in axes:
+            matrix = rotation.from_rotvec(angle * axis).as_matrix()
+            np.testing.assert_allclose(rotation_matrix(angle * axis), matrix, atol=1e-9)
+            np.testing.assert_allclose(rotation_vector(matrix), angle * axis, atol=1e-6)
+
+
+def test_nearest_yaw():
+    for yaw in np.linspace(-9, 9, 37):
+        found = nearest_yaw(yaw, 1.0, np.pi / 2)
+        assert abs(found - 1.0) <= np.pi / 4 + 1e-9
+        assert abs(np.sin(2 * (found - yaw))) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("task", "style", "count", "least"),
+    [
+        ("lift", "ph", 60, 0.95),
+        ("lift", "mh", 60, 0.90),
+        ("can", "ph", 60, 0.95),
+        ("can", "mh", 60, 0.90),
+        ("square", "ph", 60, 0.95),
+        ("square", "mh", 60, 0.90),
+        ("stack", "ph", 60, 0.95),
+        ("stack", "mh", 60, 0.90),
+        ("transport", "ph", 40, 0.85),
+    ],
+)
+def test_success_rate(task, style, count, least):
+    loop = expert_loop(task)
+    successes = sum(run_episode(loop, task, style, seed).success for seed in range(count))
+    assert successes / count >= least
