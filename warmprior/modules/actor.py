@@ -206,9 +206,13 @@ def _read_config(path: Path) -> dict[str, Any]:
         config = json.loads(path.read_text())
     except json.JSONDecodeError as error:
         raise ValueError(f"{path} is not valid JSON: {error}") from error
-    if config.get("format") != FORMAT:
+    found = config.get("format") if isinstance(config, dict) else None
+    if found != FORMAT:
         raise ValueError(
-            f"{path} has format {config.get('format')}, this version of warmprior reads {FORMAT}: "
+            f"{path} has format {found}, this version of warmprior reads {FORMAT}: "
             "save the policy again with a matching version"
         )
+    missing = [part for part in ("prior", "network", "actor", "normalizer") if part not in config]
+    if missing:
+        raise ValueError(f"{path} is incomplete: it lacks {', '.join(missing)}")
     return config

@@ -25,6 +25,9 @@ class PriorSampler(TensorDictModuleBase):
         noise_key: key written, ``[*B, P, d_a]``.
         generator: source of randomness; PyTorch's global generator by default.
 
+    Raises:
+        KeyError: if an input key is missing.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -53,5 +56,11 @@ class PriorSampler(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the source sample."""
-        loc, warm = (tensordict.get(key) for key in self.in_keys)
+        loc, warm = (tensordict.get(key, None) for key in self.in_keys)
+        if loc is None or warm is None:
+            missing = [key for key, v in zip(self.in_keys, (loc, warm), strict=True) if v is None]
+            raise KeyError(
+                f"PriorSampler needs the keys {self.in_keys}; missing: {missing}. ActionHistory "
+                "writes them in an environment, ActionWindow in a replay buffer"
+            )
         return tensordict.set(self.out_keys[0], self.prior.sample(loc, warm, self.generator))

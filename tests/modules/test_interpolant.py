@@ -1,0 +1,69 @@
+"""Interpolants: ends, velocity by automatic differentiation, broadcasting."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from warmprior import LinearInterpolant, PolynomialInterpolant, TrigonometricInterpolant
+
+ALL = [
+    LinearInterpolant(),
+    TrigonometricInterpolant(),
+    PolynomialInterpolant(1.0),
+    PolynomialInterpolant(2.0),
+    PolynomialInterpolant(3.5),
+]
+BY_NAME = pytest.mark.parametrize("interpolant", ALL, ids=lambda i: str(i.config()))
+
+
+@BY_NAME
+def test_starts_at_the_source_and_ends_at_the_data(interpolant):
+    a0, a1 = torch.randn(2, 3, 4, 2).double().unbind(0)
+    torch.testing.assert_close(interpolant(a0, a1, torch.zeros(3).double())[0], a0)
+    torch.testing.assert_close(interpolant(a0, a1, torch.ones(3).double())[0], a1)
+
+
+@BY_NAME
+def test_velocity_is_the_derivative_of_the_path(interpolant):
+    a0, a1 = torch.randn(2, 1, 4, 2).double().unbind(0)
+    for time in (0.1, 0.37, 0.5, 0.99):
+        t = torch.tensor([time]).double()
+        derivative = torch.autograd.functional.jacobian(
+            lambda t: interpolant(a0, a1, t)[0], t
+        ).squeeze(-1)
+        torch.testing.assert_close(interpolant(a0, a1, t)[1], derivative)
+
+
+def test_linear_is_algorithm_one():
+    a0, a1, t = torch.randn(6, 4, 2), torch.randn(6, 4, 2), torch.rand(6)
+    a_t, velocity = LinearInterpolant()(a0, a1, t)
+    for i in range(6):
+        torch.testing.assert_close(a_t[i], (1 - t[i]) * a0[i] + t[i] * a1[i])
+        torch.testing.assert_close(velocity[i], a1[i] - a0[i])
+
+
+def test_trigonometric_keeps_the_variance():
+    alpha, beta, *_ = TrigonometricInterpolant().coefficients(torch.linspace(0, 1, 11))
+    torch.testing.assert_close(alpha**2 + beta**2, torch.ones(11))
+
+
+def test_power_one_is_the_straight_line():
+    a0, a1, t = torch.randn(6, 4, 2), torch.randn(6, 4, 2), torch.rand(6)
+    linear, power = LinearInterpolant(), PolynomialInterpolant(1.0)
+    for one, other in zip(linear(a0, a1, t), power(a0, a1, t), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+@BY_NAME
+@pytest.mark.parametrize("batch", [(), (5,), (2, 5)])
+def test_any_batch_shape(interpolant, batch):
+    a = torch.randn(*batch, 4, 2)
+    a_t, velocity = interpolant(a, a, torch.rand(batch))
+    assert a_t.shape == velocity.shape == a.shape
+
+
+@pytest.mark.parametrize("power", [0.0, -1.0])
+def test_bad_power(power):
+    with pytest.raises(ValueError, match="power"):
+        PolynomialInterpolant(power)

@@ -1,0 +1,87 @@
+"""What every velocity network shares."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from torch import nn
+
+from warmprior import ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior.modules import TimestepEmbedding
+
+
+class Linear(VelocityNetwork):
+    def __init__(self, action_dim, observation_dim, prediction_length, observation_steps=2, *, k=3):
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps, k=k)
+        self.position = nn.Parameter(torch.zeros(1, prediction_length, action_dim))
+        self.layer = nn.Linear(action_dim, action_dim)
+        self.norm = nn.LayerNorm(action_dim)
+
+    def forward(self, t, a, observation):
+        self.check_shapes(a, observation)
+        return self.norm(self.layer(a + self.position))
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        Linear(2, 3, 4, k=5),
+        VelocityMLP(2, 3, 4, 1, hidden_dim=16, num_layers=2, timestep_embedding_dim=8),
+        ChiTransformer(2, 3, 4, embedding_dim=12, num_layers=1, num_heads=3, dropout=0.0),
+    ],
+    ids=lambda network: type(network).__name__,
+)
+def test_config_survives_json(network):
+    config = json.loads(json.dumps(network.config()))
+    again = VelocityNetwork.from_config(config)
+    assert type(again) is type(network) and again.config() == network.config()
+    again.load_state_dict(network.state_dict())
+    inputs = torch.rand(3), torch.randn(3, 4, 2), torch.randn(3, network.observation_steps, 3)
+    assert torch.equal(network.eval()(*inputs), again.eval()(*inputs))
+
+
+def test_unknown_name():
+    with pytest.raises(ValueError, match="unknown network 'Nope'.*ChiTransformer.*VelocityMLP"):
+        VelocityNetwork.from_config({"name": "Nope"})
+
+
+@pytest.mark.parametrize("position", range(4))
+@pytest.mark.parametrize("size", [0, -1])
+def test_sizes_must_be_positive(position, size):
+    sizes = [2, 3, 4, 2]
+    sizes[position] = size
+    names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
+    with pytest.raises(ValueError, match=names[position]):
+        Linear(*sizes)
+
+
+def test_groups_of_a_user_s_network():
+    network = Linear(2, 3, 4)
+    decay, rest = network.parameter_groups(0.1)
+    assert decay["weight_decay"] == 0.1 and rest["weight_decay"] == 0.0
+    assert [id(p) for p in decay["params"]] == [id(network.layer.weight)]
+    expected = {network.position, network.layer.bias, network.norm.weight, network.norm.bias}
+    assert set(rest["params"]) == expected
+
+
+@pytest.mark.parametrize("dim", [4, 8, 128])
+def test_timestep_embedding_closed_form(dim):
+    times = [0.0, 0.1, 0.5, 1.0]
+    half = dim // 2
+    rows = []
+    for t in times:
+        angles = [1000 * t * 10_000 ** (-i / (half - 1)) for i in range(half)]
+        rows.append([math.sin(x) for x in angles] + [math.cos(x) for x in angles])
+    # float32 angles reach 1000: their last digit is 6e-5.
+    torch.testing.assert_close(
+        TimestepEmbedding(dim)(torch.tensor(times)), torch.tensor(rows), atol=2e-4, rtol=0
+    )
+
+
+@pytest.mark.parametrize("dim", [0, 2, 3, 7])
+def test_bad_embedding_width(dim):
+    with pytest.raises(ValueError, match="even and >= 4"):
+        TimestepEmbedding(dim)
