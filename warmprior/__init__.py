@@ -31,6 +31,7 @@ from warmprior.transforms import (
     ActionWindow,
     ChunkStep,
     Normalizer,
+    policy_transforms,
     window_replay_buffer,
 )
 
@@ -58,5 +59,6 @@ __all__ = [
     "WarmPriorActor",
     "__version__",
     "integrate",
+    "policy_transforms",
     "window_replay_buffer",
 ]

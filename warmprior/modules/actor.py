@@ -15,6 +15,7 @@ from tensordict.utils import NestedKey
 from torch import nn
 
 from warmprior import keys
+from warmprior._files import write_atomic
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.ode import ODEActor, Solver
 from warmprior.modules.prior import Prior
@@ -122,6 +123,7 @@ class WarmPriorActor(TensorDictModuleBase):
             directory: created if needed.
 
         Raises:
+            OSError: if the folder cannot be written to.
             TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed).
         """
         if not isinstance(self.network, VelocityNetwork):
@@ -143,12 +145,10 @@ class WarmPriorActor(TensorDictModuleBase):
             "normalizer": None if self.normalizer is None else self.normalizer.config(),
         }
         directory = Path(directory)
-        directory.mkdir(parents=True, exist_ok=True)
-        (directory / "config.json").write_text(json.dumps(config, indent=2) + "\n")
-        save_file(
-            {name: value.contiguous() for name, value in self.state_dict().items()},
-            directory / "model.safetensors",
-        )
+        text = json.dumps(config, indent=2) + "\n"
+        tensors = {name: value.contiguous() for name, value in self.state_dict().items()}
+        write_atomic(directory / "model.safetensors", lambda path: save_file(tensors, path))
+        write_atomic(directory / "config.json", lambda path: path.write_text(text))
 
     @classmethod
     def from_pretrained(

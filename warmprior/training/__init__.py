@@ -1,0 +1,26 @@
+"""Behaviour cloning, evaluation and comparisons of priors.
+
+:class:`~warmprior.training.comparison.Comparison` is imported from its module: it needs
+``warmprior[sim]``.
+"""
+
+from warmprior.training.behaviour_cloning import BehaviourCloning, TrainingConfig
+from warmprior.training.evaluation import Episode, evaluate, parallel_env
+from warmprior.training.filmstrip import Filmstrip, record_filmstrip
+from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.presets import PRESETS, Preset
+
+__all__ = [
+    "PRESETS",
+    "BehaviourCloning",
+    "Episode",
+    "Filmstrip",
+    "Preset",
+    "TrainingConfig",
+    "ema_of",
+    "evaluate",
+    "make_optimizer",
+    "parallel_env",
+    "record_filmstrip",
+    "warmup_cosine",
+]

@@ -3,6 +3,14 @@
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.normalize import Normalizer
+from warmprior.transforms.policy import policy_transforms
 from warmprior.transforms.window import ActionWindow, window_replay_buffer
 
-__all__ = ["ActionHistory", "ActionWindow", "ChunkStep", "Normalizer", "window_replay_buffer"]
+__all__ = [
+    "ActionHistory",
+    "ActionWindow",
+    "ChunkStep",
+    "Normalizer",
+    "policy_transforms",
+    "window_replay_buffer",
+]

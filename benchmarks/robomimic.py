@@ -1,0 +1,208 @@
+"""The paper's Table 1: Gaussian source, WP-Past and WP-Preview on Robomimic tasks from state.
+
+python benchmarks/robomimic.py                                   # a first table within 15 minutes
+python benchmarks/robomimic.py --task can --data mh --preset cpu
+python benchmarks/robomimic.py --download --preset paper --device cuda --out runs/paper
+python benchmarks/robomimic.py --resume --out runs/paper         # after an interruption
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior.data import TASKS, download_robomimic, generate_demonstrations, get_task
+from warmprior.data.tasks import EVALUATION_SEED
+from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
+from warmprior.diagnostics.results import PRIOR_LABELS, success_table
+from warmprior.envs import rendering_backend
+from warmprior.training.comparison import Comparison, Demonstrations
+from warmprior.training.filmstrip import record_filmstrip
+from warmprior.training.presets import PRESETS, Preset
+
+PRIORS: dict[str, type[Prior]] = {p.name: p for p in (GaussianPrior, PastPrior, PreviewPrior)}
+
+
+def parse(argv: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--task", default="square", choices=TASKS, help="manipulation task (default: square)")
+    add("--data", default="ph", choices=("ph", "mh"), help="one proficient or six mixed operators")
+    add("--dataset", type=Path, help="a robomimic HDF5 file, instead of generated data")
+    add("--download", action="store_true", help="fetch the official file from the hub")
+    add("--prior", nargs="+", default=list(PRIORS), choices=PRIORS, help="sources (default: all)")
+    add("--sigma", type=float, help="noise of the warm priors (default: past 0.5, preview 1.0)")
+    add(
+        "--cold-probability", type=float, default=0.0, help="share of training samples without mean"
+    )
+    add("--nfe", nargs="+", type=int, default=[9, 3, 1], help="network evaluations per chunk")
+    add("--chunk", type=int, default=8, help="chunk length H (default: 8)")
+    add("--preset", default="quick", choices=PRESETS, help=_describe_presets())
+    add("--seeds", type=int, help="number of training seeds (default: the preset's)")
+    add("--episodes", type=int, help="evaluation episodes per cell (default: the preset's)")
+    add("--envs", type=int, help="parallel environments (default: the preset's, or one per core)")
+    add("--iterations", type=int, help="gradient steps (default: the preset's)")
+    add("--demonstrations", type=int, help="scripted demonstrations (default: the preset's)")
+    add("--out", type=Path, help="output folder (default: runs/TASK-DATA-PRESET, numbered)")
+    add("--resume", action="store_true", help="continue in the output folder, or the latest one")
+    add("--device", default="cpu", help="device of networks and data, such as cuda")
+    add("--compile", action="store_true", help="torch.compile the network")
+    add("--logger", default="csv", choices=("csv", "tensorboard", "wandb", "none"))
+    return parser.parse_args(argv)
+
+
+def _describe_presets() -> str:
+    return "; ".join(f"{name}: {preset.summary}" for name, preset in PRESETS.items())
+
+
+def make_priors(args: argparse.Namespace) -> list[Prior]:
+    priors = []
+    for name in sorted(set(args.prior), key=list(PRIORS).index):
+        options = (
+            {}
+            if name == "gaussian"
+            else {"sigma": args.sigma, "cold_probability": args.cold_probability}
+        )
+        priors.append(PRIORS[name](args.chunk, **options))
+    return priors
+
+
+def make_preset(args: argparse.Namespace) -> Preset:
+    preset = PRESETS[args.preset]
+    if args.iterations is not None:
+        kept = min(preset.training.checkpoints, args.iterations)
+        preset = replace(
+            preset,
+            training=replace(preset.training, iterations=args.iterations, checkpoints=kept),
+        )
+    for option in ("seeds", "episodes", "envs"):
+        value = getattr(args, option)
+        if value is not None:
+            if value < 1:
+                raise ValueError(f"--{option} must be at least 1, got {value}")
+            preset = replace(preset, **{option: value})
+    return preset
+
+
+def output_folder(args: argparse.Namespace) -> Path:
+    if args.out is not None:
+        if (args.out / "results.json").exists() and not args.resume:
+            raise ValueError(
+                f"{args.out} holds the results of a run: add --resume to continue it, or choose "
+                "another --out"
+            )
+        return args.out
+    name = f"{args.task}-{args.data}-{args.preset}"
+    root = Path("runs")
+    taken = [
+        d for d in root.glob(f"{name}*") if d.name == name or d.name[len(name) + 1 :].isdigit()
+    ]
+    latest = max(taken, key=lambda d: int(d.name[len(name) + 1 :] or 1), default=None)
+    if args.resume and latest is not None:
+        return latest
+    return root / name if latest is None else root / f"{name}-{len(taken) + 1}"
+
+
+def find_demonstrations(args: argparse.Namespace, preset: Preset) -> Demonstrations:
+    if args.dataset is not None:
+        return Demonstrations(args.dataset, "file", args.data)
+    if args.download:
+        return Demonstrations(download_robomimic(args.task, args.data), "official", args.data)
+    if not get_task(args.task).scripted:
+        raise ValueError(
+            f"there is no scripted expert for {args.task}: add --download for the official data, or "
+            "--dataset FILE"
+        )
+    n = args.demonstrations or preset.demonstrations[args.data]
+    print(
+        f"Data: {n} scripted demonstrations. They stand in for the official human data (--download); "
+        "success rates on them are not comparable with the paper's.",
+        flush=True,
+    )
+    return Demonstrations(generate_demonstrations(args.task, args.data, n), "scripted", args.data)
+
+
+def draw(comparison: Comparison) -> None:
+    results, out = comparison.results, comparison.directory
+    priors = [prior.name for prior in comparison.priors]
+    first = results.rows[0]
+    title = f"{first.task} {first.data} ({results.meta['data']['source']} data), H = {first.chunk}"
+    plot_success(
+        results.rows, out / "success.png", priors=priors, nfes=comparison.nfes, title=title
+    )
+    plot_learning_curves(
+        comparison.losses,
+        results.rows,
+        out / "learning_curves.png",
+        nfe=min(comparison.nfes),
+        title=title,
+    )
+    if rendering_backend() is None:
+        print(
+            "No filmstrips: neither EGL nor OSMesa works here. On Debian or Ubuntu: "
+            "apt-get install libegl1 libegl-mesa0 (or libosmesa6)."
+        )
+        return
+    for prior in comparison.priors:
+        checkpoint = comparison.preset.training.iterations
+        strip = record_filmstrip(
+            comparison.policy(prior, comparison.seeds[0], checkpoint),
+            comparison.make_env,
+            comparison.transforms(prior),
+            seed=EVALUATION_SEED,
+            nfe=min(comparison.nfes),
+        )
+        outcome = "solved" if strip.success else "not solved"
+        plot_filmstrip(
+            strip.frames,
+            [f"step {step}" for step in strip.steps],
+            out / f"filmstrip_{prior.name}.png",
+            title=f"{PRIOR_LABELS[prior.name]}, NFE {min(comparison.nfes)}, episode "
+            f"{EVALUATION_SEED}: {outcome}",
+        )
+
+
+def main(argv: list[str] | None = None) -> int:
+    args = parse(argv)
+    try:
+        preset, priors = make_preset(args), make_priors(args)
+        if min(args.nfe) < 1:
+            raise ValueError(f"--nfe must be at least 1, got {min(args.nfe)}")
+        out = output_folder(args)
+        print(f"Output folder: {out}", flush=True)
+        comparison = Comparison(
+            demonstrations=find_demonstrations(args, preset),
+            preset=preset,
+            priors=priors,
+            nfes=sorted(set(args.nfe), reverse=True),
+            directory=out,
+            seeds=range(preset.seeds),
+            device=args.device,
+            compile=args.compile,
+            logger=args.logger,
+            resume=args.resume,
+            options={key: str(value) for key, value in vars(args).items() if value is not None},
+        )
+        results = comparison.run()
+    except (ValueError, OSError, ImportError) as error:
+        print(f"robomimic.py: error: {error}", file=sys.stderr)
+        return 2
+    table = success_table(
+        results, priors=[p.name for p in priors], nfes=comparison.nfes, top_k=preset.top_k
+    )
+    (out / "table.md").write_text(table)
+    draw(comparison)
+    print(f"\n{table}\nResults, table and pictures: {out}")
+    return 0
+
+
+if __name__ == "__main__":
+    torch.set_float32_matmul_precision("high")
+    sys.exit(main())

@@ -1,0 +1,218 @@
+"""Measured success rates: rows on disk, and the table of the paper made from them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from warmprior._files import write_atomic
+from warmprior.diagnostics.paper import paper_success
+from warmprior.diagnostics.statistics import (
+    SeedSummary,
+    exceeds_one_sigma,
+    summarize_seeds,
+    top_k_mean,
+)
+
+__all__ = ["PRIOR_LABELS", "Results", "Row", "success_table", "summarize"]
+
+PRIOR_LABELS = {"gaussian": "Base", "past": "WP-Past", "preview": "WP-Preview"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One evaluation of one checkpoint.
+
+    Attributes:
+        task: short task name.
+        data: ``"ph"`` or ``"mh"``.
+        prior: name of the source distribution.
+        sigma: its residual noise.
+        chunk: ``H``.
+        nfe: network evaluations per chunk.
+        seed: training seed.
+        checkpoint: iteration of the policy.
+        episodes: how many were played.
+        successes: how many succeeded.
+        mean_steps: mean number of control steps of an episode.
+    """
+
+    task: str
+    data: str
+    prior: str
+    sigma: float
+    chunk: int
+    nfe: int
+    seed: int
+    checkpoint: int
+    episodes: int
+    successes: int
+    mean_steps: float
+
+    @property
+    def success_rate(self) -> float:
+        """Share of successful episodes."""
+        return self.successes / self.episodes
+
+    @property
+    def cell(self) -> tuple[Any, ...]:
+        """What was evaluated, without the outcome."""
+        return (
+            self.task,
+            self.data,
+            self.prior,
+            self.sigma,
+            self.chunk,
+            self.nfe,
+            self.seed,
+            self.checkpoint,
+            self.episodes,
+        )
+
+
+class Results:
+    """``results.json``: facts about the run and one row per evaluation, saved after every row.
+
+    Args:
+        path: the file.
+        meta: facts about the run.
+        resume: keep the rows that the file has.
+
+    Raises:
+        ValueError: if the file to resume from is damaged.
+    """
+
+    def __init__(self, path: str | Path, meta: dict[str, Any], *, resume: bool = False) -> None:
+        self.path = Path(path)
+        self.meta = meta
+        self.rows: list[Row] = []
+        if resume and self.path.exists():
+            try:
+                stored = json.loads(self.path.read_text())
+                for row in stored["rows"]:
+                    del row["success_rate"]
+                    self.rows.append(Row(**row))
+                self.meta = meta | {"wall_time_s": stored["meta"].get("wall_time_s", 0.0)}
+            except (json.JSONDecodeError, KeyError, TypeError) as error:
+                raise ValueError(
+                    f"{self.path} is not a results file of this version: {error!r}"
+                ) from error
+
+    def find(self, cell: tuple[Any, ...]) -> Row | None:
+        """The row of a cell (see :attr:`Row.cell`), if it was evaluated already."""
+        return next((row for row in self.rows if row.cell == cell), None)
+
+    def add(self, row: Row) -> None:
+        """Append a row and save."""
+        self.rows.append(row)
+        self.save()
+
+    def save(self) -> None:
+        """Write the file atomically."""
+        rows = [asdict(row) | {"success_rate": row.success_rate} for row in self.rows]
+        text = json.dumps({"meta": self.meta, "rows": rows}, indent=1) + "\n"
+        write_atomic(self.path, lambda temporary: temporary.write_text(text))
+
+
+def summarize(rows: Iterable[Row], top_k: int) -> dict[tuple[str, int], SeedSummary]:
+    """Average the best ``top_k`` checkpoints per seed, then summarise over seeds.
+
+    Args:
+        rows: of one task, data and chunk length.
+        top_k: how many checkpoints to average.
+
+    Returns:
+        ``{(prior, nfe): summary of success rates}``.
+    """
+    by_seed: dict[tuple[str, int], dict[int, list[float]]] = {}
+    for row in rows:
+        by_seed.setdefault((row.prior, row.nfe), {}).setdefault(row.seed, []).append(
+            row.success_rate
+        )
+    return {
+        cell: summarize_seeds([top_k_mean(rates, top_k) for rates in seeds.values()])
+        for cell, seeds in by_seed.items()
+    }
+
+
+def _cell(summary: SeedSummary | None, base: SeedSummary | None, best: bool) -> str:
+    if summary is None:
+        return "-"
+    text = f"{100 * summary.mean:.1f}"
+    text = f"**{text}**" if best else text
+    if base is None or summary is base:
+        return text
+    mark = "*" if exceeds_one_sigma(summary, base) else ""
+    return f"{text} ({100 * (summary.mean - base.mean):+.1f}{mark})"
+
+
+def _paper_cell(task: str, data: str, prior: str, nfe: int) -> str:
+    value, base = paper_success(task, data, prior, nfe), paper_success(task, data, "gaussian", nfe)
+    if value is None or base is None:
+        return "-"
+    return f"{value:.1f}" if prior == "gaussian" else f"{value:.1f} ({value - base:+.1f})"
+
+
+def success_table(
+    results: Results, *, priors: Sequence[str], nfes: Sequence[int], top_k: int
+) -> str:
+    """The layout of the paper's Table 1 in Markdown, with the paper's own numbers in a row of their own.
+
+    Args:
+        results: rows of one task, data and chunk length; ``meta["data"]["source"]`` says where the
+            demonstrations come from.
+
+    Keyword Args:
+        priors: columns, the baseline first.
+        nfes: column groups.
+        top_k: checkpoints averaged per seed.
+    """
+    meta, summaries = results.meta, summarize(results.rows, top_k)
+    first = results.rows[0]
+    columns = [(nfe, prior) for nfe in nfes for prior in priors]
+    head = ["Success rate (%)"] + [f"NFE {nfe}: {PRIOR_LABELS.get(p, p)}" for nfe, p in columns]
+    measured = []
+    for nfe, prior in columns:
+        group = [s for p in priors if (s := summaries.get((p, nfe))) is not None]
+        summary, base = summaries.get((prior, nfe)), summaries.get((priors[0], nfe))
+        best = summary is not None and summary.mean == max(s.mean for s in group)
+        measured.append(_cell(summary, base, best))
+    name = f"{first.task.replace('_', '-').title()}-{first.data.upper()}"
+    source = meta["data"]["source"]
+    lines = [
+        "| " + " | ".join(head) + " |",
+        "|" + "---|" * len(head),
+        f"| {name}, measured ({source} data) | " + " | ".join(measured) + " |",
+    ]
+    if source != "official" or any(paper_success(first.task, first.data, p, n) for n, p in columns):
+        reported = [_paper_cell(first.task, first.data, prior, nfe) for nfe, prior in columns]
+        lines.append(f"| {name}, paper (official data) | " + " | ".join(reported) + " |")
+    return "\n".join([*lines, "", *_notes(results, summaries, top_k)]) + "\n"
+
+
+def _notes(results: Results, summaries: dict[Any, SeedSummary], top_k: int) -> list[str]:
+    seeds = max(summary.seeds for summary in summaries.values())
+    episodes = {row.episodes for row in results.rows}
+    checkpoints = len({row.checkpoint for row in results.rows})
+    chosen = (
+        f"the best {min(top_k, checkpoints)} of {checkpoints} checkpoints"
+        if checkpoints > 1
+        else "the last checkpoint"
+    )
+    notes = [
+        f"- H = {results.rows[0].chunk}; {seeds} seed(s); {max(episodes)} episodes per cell; {chosen} "
+        "per seed. In parentheses the gain over the first column of each group, in bold the best.",
+        "- `*` marks gains above the sum of both seed standard deviations (one-sigma rule)."
+        if seeds > 1
+        else "- One seed has no spread: no gain is marked. The intervals below come from the episodes.",
+    ]
+    if results.meta["data"]["source"] != "official":
+        notes.append(
+            "- The measured row is from other demonstrations, another network and another budget than "
+            "the paper's row, which was obtained on the official human data: compare gains within a "
+            "row, not numbers across rows."
+        )
+    return notes

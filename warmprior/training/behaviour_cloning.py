@@ -1,0 +1,293 @@
+"""Behaviour cloning: the training loop, resumable at any moment with the same result."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl.record.loggers.common import Logger
+from tqdm import tqdm
+
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.objectives.flow_matching import FlowMatchingLoss
+from warmprior.training.checkpoint import (
+    load_state,
+    module_tensors,
+    named,
+    restore_optimizer,
+    rng_tensors,
+    save_state,
+    select,
+    snapshot_optimizer,
+)
+from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.transforms.window import window_replay_buffer
+
+__all__ = ["BehaviourCloning", "TrainingConfig"]
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """The recipe; the defaults are the paper's (Table 4, Robomimic, state observations).
+
+    Attributes:
+        iterations: gradient steps.
+        batch_size: windows per step.
+        learning_rate: peak of the schedule.
+        weight_decay: AdamW's decay of matrix weights.
+        betas: AdamW's decay rates.
+        eps: AdamW's epsilon.
+        warmup_ratio: share of the iterations over which the learning rate rises.
+        ema_rate: decay of the averaged weights that are evaluated.
+        checkpoints: how many policies to keep, evenly spaced, the last at the end.
+        save_every: iterations between saves of the training state; ``None`` for ten per checkpoint.
+        log_every: iterations per logged mean loss.
+        seed: of sampling, source, times and dropout.
+    """
+
+    iterations: int = 200_000
+    batch_size: int = 1024
+    learning_rate: float = 1e-4
+    weight_decay: float = 1e-5
+    betas: tuple[float, float] = (0.9, 0.999)
+    eps: float = 1e-8
+    warmup_ratio: float = 0.2
+    ema_rate: float = 0.995
+    checkpoints: int = 10
+    save_every: int | None = None
+    log_every: int = 100
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "batch_size", "checkpoints", "log_every"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.checkpoints > self.iterations:
+            raise ValueError(
+                f"cannot keep {self.checkpoints} checkpoints of {self.iterations} iterations"
+            )
+
+    @property
+    def checkpoint_iterations(self) -> list[int]:
+        """After which iterations a policy is kept.
+
+        Examples:
+            >>> TrainingConfig(iterations=1000, checkpoints=4).checkpoint_iterations
+            [250, 500, 750, 1000]
+        """
+        n = self.checkpoints
+        return [round(self.iterations * (i + 1) / n) for i in range(n)]
+
+
+class BehaviourCloning:
+    """Trains a :class:`~warmprior.WarmPriorActor` on demonstrations by flow matching.
+
+    The folder receives ``state.safetensors`` (everything needed to continue, replaced atomically) and
+    one policy of averaged weights per checkpoint, ``policy_000250/`` and so on. Constructing the same
+    training on a folder with a state continues it; on CPU the result is bitwise that of an
+    uninterrupted run with the same number of threads.
+
+    Args:
+        actor: the policy; its network is trained in place.
+        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`.
+        config: the recipe.
+        directory: the folder.
+
+    Keyword Args:
+        observation_steps: ``To``.
+        logger: a TorchRL logger for the loss, the learning rate and the speed.
+        resume: continue from the folder's state if there is one; otherwise start over.
+        compile: compile the velocity network with :func:`torch.compile`.
+
+    Raises:
+        ValueError: if the folder's state belongs to another recipe, prior or network.
+    """
+
+    def __init__(
+        self,
+        actor: WarmPriorActor,
+        data: TensorDictBase,
+        config: TrainingConfig,
+        directory: str | Path,
+        *,
+        observation_steps: int = 2,
+        logger: Logger | None = None,
+        resume: bool = True,
+        compile: bool = False,
+    ) -> None:
+        self.actor = actor
+        self.config = config
+        self.directory = Path(directory)
+        self.logger = logger
+        device = data.device or torch.device("cpu")
+        self.generator = torch.Generator(device).manual_seed(config.seed)
+        self.replay_buffer = window_replay_buffer(
+            data,
+            actor.prior,
+            batch_size=config.batch_size,
+            observation_steps=observation_steps,
+            generator=self.generator,
+        )
+        self.loss_module = FlowMatchingLoss(actor, generator=self.generator)
+        self.ema = ema_of(actor.network, config.ema_rate)
+        self.optimizer = make_optimizer(
+            actor.network,
+            learning_rate=config.learning_rate,
+            weight_decay=config.weight_decay,
+            betas=config.betas,
+            eps=config.eps,
+        )
+        self.schedule = warmup_cosine(self.optimizer, config.iterations, config.warmup_ratio)
+        self.iteration = 0
+        self.losses: list[tuple[int, float]] = []
+        self._running: list[torch.Tensor] = []  # losses since the last logged mean
+        self.identity = {
+            "config": asdict(config) | {"betas": list(config.betas)},
+            "prior": actor.prior.config(),
+            "network": _network_identity(actor.network),
+        }
+        torch.manual_seed(config.seed)
+        if resume and self.state_path.exists():
+            self._restore()
+        if compile:
+            self.loss_module.velocity_network.compile()
+
+    @property
+    def state_path(self) -> Path:
+        """Where the training state lies."""
+        return self.directory / "state.safetensors"
+
+    def policy_path(self, iteration: int) -> Path:
+        """Where the policy kept after ``iteration`` lies."""
+        return self.directory / f"policy_{iteration:06d}"
+
+    def step(self) -> torch.Tensor:
+        """One gradient step: sample, loss, backward, optimiser, schedule, averaging.
+
+        Returns:
+            The loss, a detached scalar.
+        """
+        loss = self.loss_module(self.replay_buffer.sample())["loss_flow_matching"]
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        self.schedule.step()
+        self.ema.update_parameters(self.actor.network)
+        self.iteration += 1
+        return loss.detach()
+
+    def run(self, description: str = "train") -> None:
+        """Train to the end.
+
+        Args:
+            description: of the progress bar.
+
+        Raises:
+            FloatingPointError: if the loss becomes NaN or infinite; the last saved state and all
+                kept policies stay.
+        """
+        config = self.config
+        keep = set(config.checkpoint_iterations)
+        save_every = config.save_every or max(1, config.iterations // config.checkpoints // 10)
+        self.actor.train()
+        bar = tqdm(
+            total=config.iterations,
+            initial=self.iteration,
+            desc=description,
+            unit="it",
+            dynamic_ncols=True,
+        )
+        with bar:
+            while self.iteration < config.iterations:
+                self._running.append(self.step())
+                bar.update()
+                i = self.iteration
+                if i % config.log_every == 0 or i == config.iterations:
+                    self._log(torch.stack(self._running).mean().item(), bar)
+                    self._running.clear()
+                if i in keep:
+                    self._averaged_actor().save_pretrained(self.policy_path(i))
+                if i in keep or i % save_every == 0:
+                    self._save()
+
+    def _log(self, loss: float, bar: Any) -> None:
+        if not torch.isfinite(torch.tensor(loss)):
+            raise FloatingPointError(
+                f"the loss became {loss} at iteration {self.iteration}; the last good state is "
+                f"{self.state_path}. Lower the learning rate or check the data."
+            )
+        self.losses.append((self.iteration, loss))
+        bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
+        if self.logger is not None:
+            rate = bar.format_dict["rate"]
+            values = {"train/loss": loss, "train/learning_rate": self.schedule.get_last_lr()[0]}
+            for name, value in values.items():
+                self.logger.log_scalar(name, value, step=self.iteration)
+            if rate:
+                self.logger.log_scalar("train/iterations_per_second", rate, step=self.iteration)
+
+    def _averaged_actor(self) -> WarmPriorActor:
+        ode = self.actor.ode
+        return WarmPriorActor(
+            self.ema.module,
+            self.actor.prior,
+            nfe=ode.nfe,
+            solver=ode.solver,
+            clip=ode.clip,
+            normalizer=self.actor.normalizer,
+            observation_key=self.actor.in_keys[0],
+        )
+
+    def _save(self) -> None:
+        tensors = {
+            **named("network", module_tensors(self.actor.network)),
+            **named("ema", module_tensors(self.ema)),
+            **named("optimizer", snapshot_optimizer(self.optimizer)),
+            **named("rng", rng_tensors(self.generator)),
+            "running": torch.stack(self._running) if self._running else torch.empty(0),
+        }
+        schedule = self.schedule.state_dict()
+        del schedule["lr_lambdas"]
+        facts = {
+            "identity": self.identity,
+            "iteration": self.iteration,
+            "losses": self.losses,
+            "schedule": schedule,
+        }
+        save_state(self.state_path, tensors, facts)
+
+    def _restore(self) -> None:
+        tensors, facts = load_state(self.state_path)
+        for part, mine in self.identity.items():
+            theirs = facts["identity"][part]
+            if theirs != mine:
+                raise ValueError(
+                    f"{self.state_path} belongs to another {part}: it has {theirs}, this run has "
+                    f"{mine}. Use the same options, another output folder, or do not resume."
+                )
+        self.actor.network.load_state_dict(select("network", tensors))
+        self.ema.load_state_dict(select("ema", tensors))
+        restore_optimizer(self.optimizer, select("optimizer", tensors))
+        self.iteration = facts["iteration"]
+        self.losses = [(int(i), float(loss)) for i, loss in facts["losses"]]
+        # The factors are functions and not saved; a restored schedule keeps its own.
+        self.schedule.load_state_dict(facts["schedule"] | {"lr_lambdas": [None, None]})
+        for group, rate in zip(
+            self.optimizer.param_groups, self.schedule.get_last_lr(), strict=True
+        ):
+            group["lr"] = rate
+        self._running = list(tensors["running"])
+        rng = select("rng", tensors)
+        self.generator.set_state(rng["generator"])
+        torch.set_rng_state(rng["global"])
+
+
+def _network_identity(network: nn.Module) -> Any:
+    config = getattr(network, "config", None)
+    if callable(config):
+        return config()
+    return {name: list(value.shape) for name, value in network.state_dict().items()}

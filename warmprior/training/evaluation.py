@@ -1,0 +1,187 @@
+"""Success rates in parallel environments, the same episodes for every policy."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
+from torchrl.envs.transforms import Compose
+from tqdm import tqdm
+
+from warmprior import keys
+from warmprior.modules.actor import WarmPriorActor
+
+__all__ = ["Episode", "evaluate", "parallel_env"]
+
+
+@dataclass(frozen=True)
+class Episode:
+    """Outcome of one evaluation episode.
+
+    Attributes:
+        seed: simulator seed of the reset.
+        success: whether the task was solved.
+        steps: control steps executed.
+    """
+
+    seed: int
+    success: bool
+    steps: int
+
+
+def _transformed(
+    make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]
+) -> EnvBase:
+    return TransformedEnv(make_env(), make_transforms())
+
+
+def parallel_env(
+    make_env: Callable[..., EnvBase],
+    make_transforms: Callable[[], Compose],
+    num_envs: int,
+) -> ParallelEnv:
+    """Environments in worker processes, with the policy's transforms inside the workers.
+
+    Whole chunks are executed inside a worker, so there is one exchange per decision. Worker ``i`` of
+    ``n`` plays the episodes ``i, i + n, i + 2n, ...`` after ``set_seed(seed, static_seed=True)``.
+
+    Args:
+        make_env: called as ``make_env(seed_offset=i, seed_stride=n)`` in each worker, see
+            :class:`~warmprior.envs.RobosuiteEnv`.
+        make_transforms: builds the policy's transforms, see :func:`~warmprior.policy_transforms`.
+        num_envs: number of workers.
+
+    Raises:
+        ValueError: if ``num_envs < 1``.
+    """
+    if num_envs < 1:
+        raise ValueError(f"the number of environments must be at least 1, got {num_envs}")
+    workers = [
+        partial(
+            _transformed, partial(make_env, seed_offset=i, seed_stride=num_envs), make_transforms
+        )
+        for i in range(num_envs)
+    ]
+    # Forking starts in a second instead of a minute, but a process that uses CUDA must not fork.
+    # Without shared buffers the parent sleeps while workers simulate; with them it polls and would
+    # take a core from the workers.
+    method = "spawn" if torch.cuda.is_initialized() else "fork"
+    return ParallelEnv(num_envs, workers, mp_start_method=method, use_buffers=False)
+
+
+@contextmanager
+def _watched(env: EnvBase) -> Iterator[None]:
+    """Turn the death of a worker into an error: TorchRL alone would wait for it for hours."""
+    if isinstance(env, ParallelEnv) and env.is_closed:
+        env.start()
+    workers = list(env._workers) if isinstance(env, ParallelEnv) else []
+    finished = threading.Event()
+    dead: list[str] = []
+
+    def watch() -> None:
+        while not finished.wait(0.5):
+            for i, worker in enumerate(workers):
+                if not worker.is_alive():
+                    dead.append(f"worker {i} of {len(workers)} (exit code {worker.exitcode})")
+            if dead:
+                for worker in workers:
+                    worker.terminate()  # closes the pipes that the parent waits on
+                return
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    watcher.start()
+    try:
+        yield
+    except BaseException as error:
+        # Without this, idle workers would keep the interpreter from exiting.
+        if not env.is_closed:
+            env.close(raise_if_closed=False)
+        if dead:
+            raise RuntimeError(
+                f"an environment worker died: {dead[0]}. It may have been killed for lack of memory; "
+                "use fewer --envs, or run one environment in this process to see its own error."
+            ) from error
+        raise
+    finally:
+        finished.set()
+        watcher.join()
+
+
+@torch.no_grad()
+def evaluate(
+    actor: WarmPriorActor,
+    env: EnvBase,
+    *,
+    episodes: int,
+    first_seed: int,
+    nfe: int | None = None,
+    policy_seed: int = 0,
+    description: str | None = None,
+) -> list[Episode]:
+    """Play episodes and report each one's outcome.
+
+    Args:
+        actor: the policy; set to evaluation mode.
+        env: a batched environment ``[n]`` from :func:`parallel_env`.
+
+    Keyword Args:
+        episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
+        first_seed: seed of the first episode; keep it away from the data's seeds.
+        nfe: network evaluations per chunk; the actor's own by default.
+        policy_seed: of the source samples.
+        description: of the progress bar; no bar if ``None``.
+
+    Returns:
+        The episodes in order of their seeds. The same arguments give the same result.
+
+    Raises:
+        ValueError: if ``episodes < 1``.
+        RuntimeError: if a worker process dies.
+    """
+    if episodes < 1:
+        raise ValueError(f"episodes must be at least 1, got {episodes}")
+    num_envs = env.batch_size[0]
+    actor.eval()
+    device = next(actor.parameters()).device
+    generator = torch.Generator(device).manual_seed(policy_seed)
+    previous, actor.sampler.generator = actor.sampler.generator, generator
+    played = [0] * num_envs
+    outcomes: list[Episode] = []
+    bar = tqdm(total=episodes, desc=description, unit="ep", disable=description is None)
+    try:
+        with bar, _watched(env):
+            env.set_seed(first_seed, static_seed=True)
+            data = env.reset()
+            while len(outcomes) < episodes:
+                # A worker whose episodes are all played rests; its episode numbers are i + n * played.
+                active = torch.tensor(
+                    [i + num_envs * played[i] < episodes for i in range(num_envs)]
+                )
+                if not active.all():
+                    data.set("_step", active)
+                data = env.step(actor(data.to(device), nfe=nfe).to("cpu"))
+                done = data["next", "done"].flatten() & active
+                for i in done.nonzero().flatten().tolist():
+                    outcomes.append(
+                        _outcome(data["next"][i], first_seed + i + num_envs * played[i])
+                    )
+                    played[i] += 1
+                    bar.update()
+                    wins = sum(outcome.success for outcome in outcomes)
+                    bar.set_postfix(success=f"{wins / len(outcomes):.2f}", refresh=False)
+                data = env.step_mdp(data)
+                if done.any() and len(outcomes) < episodes:
+                    data = env.reset(data.set("_reset", done.unsqueeze(-1)))
+    finally:
+        actor.sampler.generator = previous
+    return sorted(outcomes, key=lambda outcome: outcome.seed)
+
+
+def _outcome(data: TensorDictBase, seed: int) -> Episode:
+    return Episode(seed, bool(data["success"]), int(data[keys.ELAPSED]))

@@ -1,0 +1,84 @@
+"""One episode in pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from warmprior import keys
+from warmprior.modules.actor import WarmPriorActor
+
+__all__ = ["Filmstrip", "record_filmstrip"]
+
+
+@dataclass(frozen=True)
+class Filmstrip:
+    """Evenly spaced frames of one episode.
+
+    Attributes:
+        frames: uint8 ``[h, w, 3]`` each; the first before the first action, the last at the end.
+        steps: control steps executed before each frame.
+        success: whether the task was solved.
+    """
+
+    frames: list[np.ndarray]
+    steps: list[int]
+    success: bool
+
+
+@torch.no_grad()
+def record_filmstrip(
+    actor: WarmPriorActor,
+    make_env: Callable[..., EnvBase],
+    make_transforms: Callable[[], Compose],
+    *,
+    seed: int,
+    nfe: int,
+    frames: int = 9,
+    size: int = 160,
+) -> Filmstrip:
+    """Play one episode and render it at evenly spaced decisions.
+
+    Args:
+        actor: the policy.
+        make_env: builds the environment, see :class:`~warmprior.envs.RobosuiteEnv`.
+        make_transforms: builds the policy's transforms.
+
+    Keyword Args:
+        seed: simulator seed of the episode, and of the source samples.
+        nfe: network evaluations per chunk.
+        frames: how many pictures.
+        size: side of a picture in pixels.
+
+    Raises:
+        RuntimeError: if nothing on this machine can render; the message names the packages to install.
+    """
+    actor.eval()
+    device = next(actor.parameters()).device
+    env = TransformedEnv(make_env(seed=seed), make_transforms())
+    previous = actor.sampler.generator
+    actor.sampler.generator = torch.Generator(device).manual_seed(seed)
+    try:
+        data = env.reset()
+        pictures = [(0, env.base_env.render_frame(size=size))]
+        while True:
+            data = env.step(actor(data.to(device), nfe=nfe).to("cpu"))
+            after = data["next"]
+            pictures.append((int(after[keys.ELAPSED]), env.base_env.render_frame(size=size)))
+            if after["done"].any():
+                break
+            data = env.step_mdp(data)
+    finally:
+        actor.sampler.generator = previous
+        env.close()
+    chosen = np.unique(np.linspace(0, len(pictures) - 1, frames).round().astype(int))
+    return Filmstrip(
+        [pictures[i][1] for i in chosen],
+        [pictures[i][0] for i in chosen],
+        bool(after["success"]),
+    )

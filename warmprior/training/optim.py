@@ -1,0 +1,98 @@
+"""Optimiser, learning-rate schedule and weight averaging of the paper's recipe (Table 4)."""
+
+from __future__ import annotations
+
+import math
+
+from torch import nn
+from torch.optim import AdamW, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from warmprior.modules.network import VelocityNetwork
+
+__all__ = ["ema_of", "make_optimizer", "warmup_cosine"]
+
+
+def make_optimizer(
+    network: nn.Module,
+    *,
+    learning_rate: float = 1e-4,
+    weight_decay: float = 1e-5,
+    betas: tuple[float, float] = (0.9, 0.999),
+    eps: float = 1e-8,
+) -> AdamW:
+    """AdamW with the paper's values; no decay on biases, norms and position embeddings.
+
+    Args:
+        network: the velocity network.
+
+    Keyword Args:
+        learning_rate: peak learning rate.
+        weight_decay: decay of matrix weights.
+        betas: decay rates of the moments.
+        eps: added to the root of the second moment.
+
+    Examples:
+        >>> from warmprior import VelocityMLP
+        >>> optimizer = make_optimizer(VelocityMLP(2, 3, 8))
+        >>> [group["weight_decay"] for group in optimizer.param_groups]
+        [1e-05, 0.0]
+    """
+    if isinstance(network, VelocityNetwork):
+        groups = network.parameter_groups(weight_decay)
+    else:
+        groups = [{"params": list(network.parameters()), "weight_decay": weight_decay}]
+    return AdamW(groups, lr=learning_rate, betas=betas, eps=eps)
+
+
+def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0.2) -> LambdaLR:
+    """Linear warm-up over the first share of the iterations, then a cosine to zero.
+
+    Args:
+        optimizer: its learning rates are the peaks.
+        iterations: length of the whole training.
+        warmup_ratio: share of the warm-up; 0 starts at the peak.
+
+    Raises:
+        ValueError: if ``iterations < 1`` or ``warmup_ratio`` is not in [0, 1).
+
+    Examples:
+        >>> import torch
+        >>> optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
+        >>> schedule = warmup_cosine(optimizer, iterations=10, warmup_ratio=0.2)
+        >>> rates = []
+        >>> for _ in range(10):
+        ...     optimizer.step(); rates.append(round(schedule.get_last_lr()[0], 2)); schedule.step()
+        >>> rates
+        [0.5, 1.0, 1.0, 0.96, 0.85, 0.69, 0.5, 0.31, 0.15, 0.04]
+    """
+    if iterations < 1:
+        raise ValueError(f"iterations must be at least 1, got {iterations}")
+    if not 0.0 <= warmup_ratio < 1.0:
+        raise ValueError(f"warmup_ratio must be in [0, 1), got {warmup_ratio}")
+    warmup = round(iterations * warmup_ratio)
+
+    def factor(step: int) -> float:
+        if step < warmup:
+            return (step + 1) / warmup
+        return 0.5 * (1 + math.cos(math.pi * (step - warmup) / (iterations - warmup)))
+
+    return LambdaLR(optimizer, factor)
+
+
+def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
+    """Exponential moving average of a network's weights; the averaged copy is ``.module``.
+
+    Args:
+        network: the network being trained.
+        rate: decay per update. The first update copies the weights.
+
+    Raises:
+        ValueError: if ``rate`` is not in [0, 1).
+    """
+    if not 0.0 <= rate < 1.0:
+        raise ValueError(f"the EMA rate must be in [0, 1), got {rate}")
+    averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(rate))
+    averaged.module.eval()
+    return averaged.requires_grad_(False)

@@ -1,0 +1,103 @@
+"""How much of everything a comparison spends: presets from a quick look to the paper's recipe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from warmprior.modules import ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior.training.behaviour_cloning import TrainingConfig
+
+__all__ = ["PRESETS", "Preset"]
+
+_NETWORKS: dict[str, type[VelocityNetwork]] = {
+    "mlp": VelocityMLP,
+    "chi_transformer": ChiTransformer,
+}
+
+
+@dataclass(frozen=True)
+class Preset:
+    """One budget.
+
+    Attributes:
+        summary: one line for ``--help``.
+        demonstrations: scripted demonstrations to generate, per data style.
+        training: the recipe.
+        network: ``"mlp"`` or ``"chi_transformer"``.
+        network_options: constructor options of the network.
+        seeds: number of training seeds.
+        episodes: evaluation episodes per cell.
+        top_k: checkpoints averaged per seed.
+        envs: parallel environments; ``None`` for one per core.
+        observation_steps: ``To``.
+    """
+
+    summary: str
+    demonstrations: dict[str, int]
+    training: TrainingConfig
+    network: str
+    seeds: int
+    episodes: int
+    top_k: int
+    envs: int | None = None
+    observation_steps: int = 2
+    network_options: dict[str, Any] = field(default_factory=dict)
+
+    def make_network(
+        self, action_dim: int, observation_dim: int, prediction_length: int
+    ) -> VelocityNetwork:
+        """A network with fresh weights for the given widths."""
+        return _NETWORKS[self.network](
+            action_dim,
+            observation_dim,
+            prediction_length,
+            self.observation_steps,
+            **self.network_options,
+        )
+
+
+PRESETS: dict[str, Preset] = {
+    "quick": Preset(
+        summary="one seed, small network: a first table within 15 minutes on two cores",
+        demonstrations={"ph": 150, "mh": 150},
+        training=TrainingConfig(
+            iterations=6_000,
+            batch_size=256,
+            learning_rate=1e-3,
+            warmup_ratio=0.1,
+            checkpoints=1,
+        ),
+        network="mlp",
+        network_options={"hidden_dim": 512},
+        seeds=1,
+        episodes=30,
+        top_k=1,
+    ),
+    "cpu": Preset(
+        summary="three seeds, wider network: a night on a few cores",
+        demonstrations={"ph": 200, "mh": 300},
+        training=TrainingConfig(
+            iterations=40_000,
+            batch_size=256,
+            learning_rate=1e-3,
+            warmup_ratio=0.1,
+            checkpoints=5,
+        ),
+        network="mlp",
+        network_options={"hidden_dim": 1024},
+        seeds=3,
+        episodes=50,
+        top_k=3,
+    ),
+    "paper": Preset(
+        summary="the paper's recipe (Table 4): 20M parameters, 200k iterations, three seeds",
+        demonstrations={"ph": 200, "mh": 300},
+        training=TrainingConfig(),
+        network="chi_transformer",
+        seeds=3,
+        episodes=200,
+        top_k=3,
+        envs=20,
+    ),
+}

@@ -1,0 +1,58 @@
+"""The transforms between a base environment and a policy, in the order that makes them right."""
+
+from __future__ import annotations
+
+from torchrl.envs.transforms import CatFrames, Compose, UnsqueezeTransform
+
+from warmprior import keys
+from warmprior.modules.prior import Prior
+from warmprior.transforms.chunk import ChunkStep
+from warmprior.transforms.history import ActionHistory
+from warmprior.transforms.normalize import Normalizer
+
+__all__ = ["policy_transforms"]
+
+
+def policy_transforms(
+    prior: Prior,
+    *,
+    normalizer: Normalizer | None = None,
+    observation_steps: int = 2,
+    execute: int | None = None,
+    gamma: float = 1.0,
+) -> Compose:
+    """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
+
+    In this order: normalisation of observations and denormalisation of actions, a stack of the last
+    ``To`` observations (the first one repeated at the start), :class:`ChunkStep`, and
+    :class:`ActionHistory`. It works around a single environment, and inside or outside of batched ones.
+
+    Args:
+        prior: the policy's source distribution.
+
+    Keyword Args:
+        normalizer: the normaliser of the training data; none if the environment is normalised already.
+        observation_steps: ``To``.
+        execute: actions executed per decision; all ``H`` by default.
+        gamma: discount per control step inside a chunk.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from warmprior import PreviewPrior
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(PreviewPrior(4)))
+        >>> env.reset()["observation"].shape
+        torch.Size([2, 3])
+    """
+    per_step = [] if normalizer is None else normalizer.env_transforms()
+    return Compose(
+        *per_step,
+        UnsqueezeTransform(-2, in_keys=[keys.OBSERVATION]),
+        CatFrames(observation_steps, dim=-2, in_keys=[keys.OBSERVATION]),
+        ChunkStep(
+            prior.chunk_length,
+            execute=execute,
+            prediction_length=prior.prediction_length,
+            gamma=gamma,
+        ),
+        ActionHistory(prior),
+    )
