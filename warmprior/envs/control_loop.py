@@ -8,14 +8,13 @@ ten control steps; contacts amplify the rounding after that.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from warmprior._extras import require
+from warmprior.envs._osc import Arm, check_supported, compiled_torques
 from warmprior.envs._simulator import isolated_numpy_seed
 
 __all__ = ["ControlLoop", "StepLoop"]
@@ -73,7 +72,7 @@ class StepLoop:
         self._model, self._data = sim.model._model, sim.data._data
         self._sites: dict[str, int] = {}
         self._bodies: dict[str, int] = {}
-        self._arms = [_Arm(self.env, robot) for robot in self.env.robots]
+        self._arms = [Arm(self.env, robot) for robot in self.env.robots]
 
     def reset(self, seed: int) -> Observations:
         """Start the episode that belongs to a seed, leaving the global generators as they were.
@@ -186,9 +185,9 @@ class ControlLoop(StepLoop):
     """
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
-        _check_supported(env)
+        check_supported(env)
         self._mujoco = require("mujoco", "sim")
-        self._torques = _compiled_torques()
+        self._torques = compiled_torques()
         super().__init__(env, keys)
 
     def _bind(self) -> None:
@@ -200,9 +199,7 @@ class ControlLoop(StepLoop):
             np.zeros((3, nv)),
         )
         self._substeps = int(self.env.control_timestep / self.env.model_timestep)
-        # Views into the simulator's memory: looking attributes up costs more than using them.
         data = self._data
-        self._views = (data.qvel, data.qpos, data.qfrc_bias, data.ctrl)
         self._site_pos, self._site_mat = data.site_xpos, data.site_xmat.reshape(-1, 3, 3)
 
     def step(self, action: np.ndarray) -> tuple[Observations, bool]:
@@ -210,29 +207,26 @@ class ControlLoop(StepLoop):
         env, mujoco, model, data = self.env, self._mujoco, self._model, self._data
         if len(action) != env.action_dim:
             raise ValueError(f"expected an action of width {env.action_dim}, got {len(action)}")
-        # The first torques after a reset come from what the controllers measured during the reset,
-        # before the joints were in place: leave them to robosuite.
-        stale = not all(arm.controller.new_update for arm in self._arms)
         for substep in range(self._substeps):
             mujoco.mj_step1(model, data)
-            if substep == 0 and stale:
-                env._pre_action(action, True)
-                for arm in self._arms:
-                    arm.read_goal()
-                mujoco.mj_step2(model, data)
-                continue
             mujoco.mj_fullM(model, self._mass, data.qM)
             for arm in self._arms:
+                remembered = substep == 0 and not arm.controller.new_update
                 if substep == 0:
                     arm.set_goal(action, self._site_pos, self._site_mat, data.ctrl)
                 mujoco.mj_jacSite(model, data, self._jacp, self._jacr, arm.site)
+                pose = self._site_pos[arm.site], self._site_mat[arm.site]
+                motion = data.qvel, data.qpos
+                if remembered:
+                    pose, motion = arm.remembered(self._jacp, self._jacr, self._mass, *motion)
                 self._torques(
-                    self._site_pos[arm.site],
-                    self._site_mat[arm.site],
+                    *pose,
                     self._jacp,
                     self._jacr,
                     self._mass,
-                    *self._views,
+                    *motion,
+                    data.qfrc_bias,
+                    data.ctrl,
                     *arm.constants,
                     arm.goal_pos,
                     arm.goal_mat,
@@ -245,126 +239,3 @@ class ControlLoop(StepLoop):
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         return self.observations(refresh=True), success
-
-
-@dataclass(init=False)
-class _Arm:
-    """One robot's indices, controller and current goal."""
-
-    site: int
-    constants: tuple[np.ndarray, ...]
-    goal_pos: np.ndarray
-    goal_mat: np.ndarray
-
-    def __init__(self, env: Any, robot: Any) -> None:
-        composite = robot.composite_controller
-        self.controller = controller = composite.part_controllers["right"]
-        self.gripper = robot.gripper["right"]
-        self.site = env.sim.model.site_name2id(controller.ref_name)
-        composite.update_state()  # where the base is, for goals in its frame
-        limits = env.sim.model._model.actuator_ctrlrange
-        index = robot._ref_actuators_indexes_dict
-        arm, self.fingers = np.array(index["right"]), np.array(index["right_gripper"])
-        self.constants = (
-            np.array(controller.qpos_index),
-            np.array(controller.qvel_index),
-            arm,
-            limits[arm].copy(),
-            np.array(controller.initial_joint, dtype=np.float64),
-            np.array(controller.kp, dtype=np.float64),
-            np.array(controller.kd, dtype=np.float64),
-        )
-        low, high = limits[self.fingers].T
-        self.finger_middle, self.finger_range = (high + low) / 2, (high - low) / 2
-        start = sum(r.action_dim for r in env.robots[: env.robots.index(robot)])
-        self.split = {
-            part: slice(start + first, start + last)
-            for part, (first, last) in composite._action_split_indexes.items()
-        }
-
-    def set_goal(
-        self, action: np.ndarray, positions: np.ndarray, matrices: np.ndarray, ctrl: np.ndarray
-    ) -> None:
-        """Resolve an action into a goal pose in the world and the fingers' command."""
-        controller = self.controller
-        controller.ref_pos = positions[self.site].copy()
-        controller.ref_ori_mat = matrices[self.site].copy()
-        controller.new_update = False  # the pose above is all that a goal depends on
-        controller.set_goal(np.asarray(action[self.split["right"]], dtype=np.float64))
-        controller.new_update = True  # env.step may follow
-        self.read_goal()
-        fingers = self.gripper.format_action(action[self.split["right_gripper"]])
-        ctrl[self.fingers] = self.finger_middle + self.finger_range * fingers
-
-    def read_goal(self) -> None:
-        """Take the controller's goal pose over, in the world frame."""
-        controller = self.controller
-        goal_pos, goal_mat = controller.goal_pos, controller.goal_ori
-        if controller.input_ref_frame == "base":
-            goal_pos = controller.origin_pos + controller.origin_ori @ goal_pos
-            goal_mat = controller.origin_ori @ goal_mat
-        self.goal_pos = np.ascontiguousarray(goal_pos, dtype=np.float64)
-        self.goal_mat = np.ascontiguousarray(goal_mat, dtype=np.float64)
-
-
-def _check_supported(env: Any) -> None:
-    for robot in env.robots:
-        composite = robot.composite_controller
-        parts = composite.part_controllers
-        controller = parts.get("right")
-        supported = (
-            composite.name == "BASIC"
-            and set(parts) == {"right", "right_gripper"}
-            and controller.name == "OSC_POSE"
-            and controller.impedance_mode == "fixed"
-            and controller.uncoupling
-            and controller.interpolator_pos is None
-            and controller.interpolator_ori is None
-        )
-        if not supported:
-            raise ValueError(
-                "the lean control loop supports one-handed arms with a fixed-impedance, uncoupled "
-                "OSC_POSE controller without interpolation; use control_loop='robosuite' for "
-                f"{type(composite).__name__} with {sorted(parts)}"
-            )
-
-
-@functools.cache
-def _compiled_torques() -> Callable[..., None]:
-    # Compiled on first use, not on import: robosuite is optional.
-    return require("robosuite.utils.numba", "sim").jit_decorator(_osc_torques)
-
-
-def _osc_torques(
-    pos, mat, jacp, jacr, mass_full, qvel, qpos, bias, ctrl,  # the simulation
-    qpos_index, qvel_index, actuators, limits, rest, kp, kd,  # the arm
-    goal_pos, goal_mat,
-):  # fmt: skip
-    """Write the clipped operational-space torques of one arm into ``ctrl``."""
-    joints = qvel_index.shape[0]
-    jac, mass = np.zeros((6, joints)), np.zeros((joints, joints))
-    velocity, offset, gravity = np.zeros(joints), np.zeros(joints), np.zeros(joints)
-    for i in range(joints):
-        column = qvel_index[i]
-        velocity[i], gravity[i] = qvel[column], bias[column]
-        offset[i] = rest[i] - qpos[qpos_index[i]]
-        for k in range(3):
-            jac[k, i], jac[k + 3, i] = jacp[k, column], jacr[k, column]
-        for j in range(joints):
-            mass[i, j] = mass_full[column, qvel_index[j]]
-    turn = np.zeros(3)
-    for k in range(3):
-        turn += 0.5 * np.cross(mat[:, k], goal_mat[:, k])
-    twist = jac @ velocity
-    force = kp[:3] * (goal_pos - pos) - kd[:3] * twist[:3]
-    torque = kp[3:] * turn - kd[3:] * twist[3:]
-    inv_mass_jac = np.linalg.inv(mass) @ jac.T
-    inertia_inv = jac @ inv_mass_jac
-    wrench = np.zeros(6)
-    wrench[:3] = np.linalg.inv(np.ascontiguousarray(inertia_inv[:3, :3])) @ force
-    wrench[3:] = np.linalg.inv(np.ascontiguousarray(inertia_inv[3:, 3:])) @ torque
-    nullspace = np.eye(joints) - (inv_mass_jac @ np.linalg.pinv(inertia_inv)) @ jac
-    posture = mass @ (10.0 * offset - 2.0 * np.sqrt(10.0) * velocity)
-    torques = jac.T @ wrench + gravity + nullspace.T @ posture
-    for i in range(joints):
-        ctrl[actuators[i]] = min(max(torques[i], limits[i, 0]), limits[i, 1])
