@@ -1,0 +1,291 @@
+"""Flow matching against the left column of Algorithm 1, written down with the same random numbers."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from warmprior import (
+    FlowMatchingLoss,
+    GaussianPrior,
+    LinearInterpolant,
+    PastPrior,
+    PolynomialInterpolant,
+    PreviewPrior,
+    Prior,
+    TrigonometricInterpolant,
+    VelocityMLP,
+    WarmPriorActor,
+    window_replay_buffer,
+)
+
+PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
+H, D_A, D_O = 3, 2, 5
+COEFFICIENTS = {
+    LinearInterpolant: lambda t: (1 - t, t, -1.0, 1.0),
+    PolynomialInterpolant: lambda t: (1 - t**2, t**2, -2 * t, 2 * t),
+    TrigonometricInterpolant: lambda t: (
+        torch.cos(torch.pi / 2 * t),
+        torch.sin(torch.pi / 2 * t),
+        -torch.pi / 2 * torch.sin(torch.pi / 2 * t),
+        torch.pi / 2 * torch.cos(torch.pi / 2 * t),
+    ),
+}
+
+
+def dataset(lengths=(9, 2, 14)):
+    torch.manual_seed(0)
+    n = sum(lengths)
+    return TensorDict(
+        {
+            "observation": torch.randn(n, D_O),
+            "action": torch.randn(n, D_A),
+            "episode": torch.repeat_interleave(torch.arange(len(lengths)), torch.tensor(lengths)),
+        },
+        [n],
+    )
+
+
+def actor_for(prior, **options):
+    torch.manual_seed(11)
+    network = VelocityMLP(D_A, D_O, prior.prediction_length, hidden_dim=16)
+    return WarmPriorActor(network, prior, **options)
+
+
+def algorithm_one(data, frames, prior, network, generator, coefficients):
+    """Algorithm 1, lines 3 to 12: squared errors ``[B, P, d_a]`` and where they count."""
+    episode = data["episode"].tolist()
+    length = prior.prediction_length
+    epsilon = torch.randn(len(frames), length, D_A, generator=generator)
+    times = torch.rand(len(frames), generator=generator)
+    errors, counted = [], []
+    for b, i in enumerate(frames):
+        last = max(j for j in range(len(data)) if episode[j] == episode[i])
+        first = min(j for j in range(len(data)) if episode[j] == episode[i])
+        a1 = torch.stack([data["action"][min(j, last)] for j in range(i, i + length)])
+        a0 = epsilon[b].clone()
+        if isinstance(prior, PastPrior) and i - H >= first:
+            a0 = data["action"][i - H : i] + prior.sigma * epsilon[b]
+        if isinstance(prior, PreviewPrior):
+            a0[:H] = a1[:H] + prior.sigma * epsilon[b, :H]
+        alpha, beta, d_alpha, d_beta = coefficients(times[b])
+        o = torch.stack([data["observation"][max(i - 1, first)], data["observation"][i]])
+        v = network(times[b : b + 1], (alpha * a0 + beta * a1)[None], o[None])[0]
+        errors.append((v - (d_alpha * a0 + d_beta * a1)) ** 2)
+        counted.append(torch.tensor([[j <= last] for j in range(i, i + length)]).expand(-1, D_A))
+    return torch.stack(errors), torch.stack(counted)
+
+
+@pytest.mark.parametrize("interpolant", COEFFICIENTS)
+@pytest.mark.parametrize("prior_class", PRIORS)
+def test_training_of_algorithm_one(prior_class, interpolant):
+    data = dataset()
+    prior = prior_class(H, sigma=0.4)
+    actor = actor_for(prior)
+    generator = torch.Generator().manual_seed(1)
+    batch = window_replay_buffer(data, prior, batch_size=40, generator=generator).sample()
+    assert batch["action_is_pad"].any()
+    errors, counted = algorithm_one(
+        data,
+        batch["frame"].tolist(),
+        prior,
+        actor.network,
+        torch.Generator().manual_seed(2),
+        COEFFICIENTS[interpolant],
+    )
+    expected = {
+        "none": errors * counted,
+        "sum": errors[counted].sum(),
+        "mean": errors[counted].mean(),
+    }
+    gradients = torch.autograd.grad(expected["mean"], list(actor.network.parameters()))
+    for reduction, value in expected.items():
+        loss = FlowMatchingLoss(
+            actor,
+            interpolant=interpolant(),
+            reduction=reduction,
+            generator=torch.Generator().manual_seed(2),
+        )
+        out = loss(batch)["loss_flow_matching"]
+        torch.testing.assert_close(out, value, rtol=1e-4, atol=1e-5)
+        if reduction == "mean":
+            out.backward()
+    for parameter, gradient in zip(actor.network.parameters(), gradients, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-6)
+
+
+def sample(prior, *shape):
+    length = prior.prediction_length
+    torch.manual_seed(4)
+    return TensorDict(
+        {
+            "observation": torch.randn(*shape, 2, D_O),
+            "vla_action": {"chunk": torch.randn(*shape, length, D_A)},
+            "action_is_pad": torch.rand(*shape, length) < 0.3,
+            "prior": {
+                "loc": torch.randn(*shape, length, D_A),
+                "warm": torch.rand(*shape, length, 1) < 0.5,
+            },
+        },
+        shape,
+    )
+
+
+def loss_of(actor, data, **options):
+    options.setdefault("generator", torch.Generator().manual_seed(2))
+    return FlowMatchingLoss(actor, **options)(data)["loss_flow_matching"]
+
+
+@pytest.mark.parametrize("shape", [(), (6,), (2, 3)])
+def test_batch_shapes(shape):
+    prior = PastPrior(H)
+    actor, data = actor_for(prior), sample(prior, *shape)
+    assert loss_of(actor, data).shape == ()
+    assert loss_of(actor, data, reduction="none").shape == (*shape, H, D_A)
+
+
+def test_batch_shapes_agree():
+    prior = PastPrior(H)
+    actor, data = actor_for(prior), sample(prior, 2, 3)
+    torch.testing.assert_close(loss_of(actor, data), loss_of(actor, data.reshape(6)))
+
+
+def test_padding_does_not_reach_the_loss():
+    prior = PreviewPrior(H)
+    actor, data = actor_for(prior), sample(prior, 6)
+    pad = data["action_is_pad"]
+    out = loss_of(actor, data, reduction="none")
+    assert (out[pad] == 0).all() and (out[~pad] > 0).all()
+
+
+def test_no_pad_mask_counts_everything():
+    prior = PastPrior(H)
+    actor, data = actor_for(prior), sample(prior, 6)
+    none = data.clone()
+    none["action_is_pad"] = torch.zeros(6, H, dtype=torch.bool)
+    del data["action_is_pad"]
+    assert torch.equal(loss_of(actor, data), loss_of(actor, none))
+
+
+@pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
+def test_only_padding_is_zero_and_not_nan(reduction):
+    prior = PastPrior(H)
+    actor, data = actor_for(prior), sample(prior, 6)
+    data["action_is_pad"] = torch.ones(6, H, dtype=torch.bool)
+    loss = loss_of(actor, data, reduction=reduction)
+    assert (loss == 0).all()
+    loss.sum().backward()
+    assert all((p.grad == 0).all() for p in actor.network.parameters())
+
+
+def test_gradients_reach_every_parameter_of_the_actor_s_network():
+    prior = PastPrior(H)
+    actor = actor_for(prior)
+    loss_of(actor, sample(prior, 64)).backward()
+    assert all(p.grad is not None and p.grad.any() for p in actor.network.parameters())
+
+
+def test_the_loss_trains_the_actor_itself():
+    prior = PastPrior(H)
+    actor = actor_for(prior)
+    loss = FlowMatchingLoss(actor)
+    assert {p.data_ptr() for p in loss.parameters()} == {
+        p.data_ptr() for p in actor.network.parameters()
+    }
+    optimizer = torch.optim.SGD(loss.parameters(), 0.1)
+    before = actor.network.net[0].weight.clone()
+    loss(sample(prior, 8))["loss_flow_matching"].backward()
+    optimizer.step()
+    assert not torch.equal(before, actor.network.net[0].weight)
+
+
+def test_generator_repeats_and_defaults_to_the_actor_s():
+    prior = PastPrior(H)
+    data = sample(prior, 6)
+    actor = actor_for(prior, generator=torch.Generator().manual_seed(2))
+    explicit = loss_of(actor, data)
+    implicit = FlowMatchingLoss(actor)(data)["loss_flow_matching"]
+    assert torch.equal(explicit, implicit)
+    torch.manual_seed(2)
+    plain = FlowMatchingLoss(actor_for(prior))
+    torch.manual_seed(2)
+    assert torch.equal(plain(data)["loss_flow_matching"], explicit)
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_set_keys(nested):
+    prior = PastPrior(H)
+    actor, data = actor_for(prior), sample(prior, 6)
+    expected = loss_of(actor, data)
+    old = {
+        "observation": "observation",
+        "chunk": ("vla_action", "chunk"),
+        "pad_mask": "action_is_pad",
+        "loc": ("prior", "loc"),
+        "warm": ("prior", "warm"),
+    }
+    new = {name: ("deep", "er", name) if nested else f"my_{name}" for name in old}
+    renamed = TensorDict({}, [6])
+    for name in old:
+        renamed[new[name]] = data[old[name]]
+    loss = FlowMatchingLoss(actor, generator=torch.Generator().manual_seed(2))
+    loss.set_keys(**new)
+    assert set(loss.in_keys) == set(new.values())
+    assert torch.equal(loss(renamed)["loss_flow_matching"], expected)
+
+
+def test_in_keys_follow_set_keys_after_they_were_read():
+    loss = FlowMatchingLoss(actor_for(PastPrior(H)))
+    assert ("prior", "loc") in loss.in_keys
+    loss.set_keys(loc="elsewhere")
+    assert "elsewhere" in loss.in_keys and ("prior", "loc") not in loss.in_keys
+    assert loss.out_keys == ["loss_flow_matching"]
+
+
+def test_observation_key_of_the_actor():
+    prior = PastPrior(H)
+    data = sample(prior, 6)
+    expected = loss_of(actor_for(prior), data)
+    data["state", "low"] = data.pop("observation")
+    assert torch.equal(loss_of(actor_for(prior, observation_key=("state", "low")), data), expected)
+
+
+@pytest.mark.parametrize(
+    "missing", [("vla_action", "chunk"), ("prior", "loc"), ("prior", "warm"), "observation"]
+)
+def test_missing_key(missing):
+    prior = PastPrior(H)
+    data = sample(prior, 6)
+    del data[missing]
+    name = missing if isinstance(missing, str) else missing[-1]
+    with pytest.raises(KeyError, match=f"missing: .*{name}"):
+        loss_of(actor_for(prior), data)
+
+
+def test_unknown_reduction():
+    with pytest.raises(ValueError, match="reduction must be 'none', 'mean' or 'sum', got 'avg'"):
+        FlowMatchingLoss(actor_for(PastPrior(H)), reduction="avg")
+
+
+def test_any_callable_module_and_any_prior():
+    """A learned or heuristic source needs nothing but a subclass of Prior."""
+
+    class Double(Prior):
+        name = "double-for-this-test"
+
+        def training_mean(self, history, history_valid, target):
+            return 2 * target, torch.ones_like(target[..., :1], dtype=torch.bool)
+
+    class Exact(nn.Module):
+        """The true velocity of the flow from 2a to a: -a = -a_t / (2 - t)."""
+
+        def forward(self, t, a, observation):
+            return -a / (2 - t)[:, None, None]
+
+    prior = Double(H, sigma=0.0)
+    batch = window_replay_buffer(dataset(), prior, batch_size=32).sample()
+    loss = FlowMatchingLoss(WarmPriorActor(Exact(), prior))(batch)["loss_flow_matching"]
+    del Prior._registry["double-for-this-test"]
+    assert loss < 1e-10

@@ -1,0 +1,142 @@
+"""Normalizer: closed form, both sides equal, constants, errors."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.toy_env import ACTION_DIM, CountingEnv
+from warmprior import Normalizer
+
+
+def data(n=40):
+    torch.manual_seed(0)
+    scale = torch.tensor([1.0, 100.0, 0.01, 3.0])
+    return TensorDict(
+        {
+            "observation": torch.randn(n, 4) * scale + 5 * scale,
+            "action": torch.rand(n, 2) * torch.tensor([0.4, 2.0]) - 0.3,
+            "episode": torch.arange(n) // 10,
+        },
+        [n],
+    )
+
+
+def test_closed_form():
+    raw = data()
+    out = Normalizer.fit(raw).normalize(raw)
+    for key in ("observation", "action"):
+        for d in range(raw[key].shape[-1]):
+            column = raw[key][:, d]
+            low, high = min(column.tolist()), max(column.tolist())
+            expected = 2 * (column - low) / (high - low) - 1
+            torch.testing.assert_close(out[key][:, d], expected, rtol=1e-4, atol=1e-5)
+        assert out[key].min() >= -1 - 1e-5 and out[key].max() <= 1 + 1e-5
+    assert torch.equal(out["episode"], raw["episode"])
+
+
+def test_round_trip_and_inputs_untouched():
+    raw = data()
+    before = raw.clone()
+    normalizer = Normalizer.fit(raw)
+    again = normalizer.denormalize(normalizer.normalize(raw))
+    for key in ("observation", "action"):
+        torch.testing.assert_close(again[key], before[key])
+        assert torch.equal(raw[key], before[key])
+
+
+def test_constant_dimension():
+    raw = data()
+    raw["observation"][:, 1] = 7.5
+    normalizer = Normalizer.fit(raw)
+    out = normalizer.normalize(raw)
+    assert (out["observation"][:, 1] == 0).all()
+    assert (normalizer.denormalize(out)["observation"][:, 1] == 7.5).all()
+    moved = raw.clone()
+    moved["observation"][:, 1] += 0.25  # a value that the data never showed stays finite
+    assert torch.allclose(normalizer.normalize(moved)["observation"][:, 1], torch.tensor(0.25))
+
+
+def test_missing_keys_are_skipped():
+    normalizer = Normalizer.fit(data())
+    out = normalizer.normalize(TensorDict({"action": torch.zeros(3, 2)}, [3]))
+    assert list(out.keys()) == ["action"]
+
+
+def test_refitting_data_does_not_move_the_statistics():
+    """The buffers are copies: the data may be changed or freed afterwards."""
+    raw = data()
+    normalizer = Normalizer.fit(raw)
+    before = normalizer.loc("observation").clone()
+    raw["observation"].fill_(99.0)
+    assert torch.equal(normalizer.loc("observation"), before)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+def test_environment_side_equals_data_side(batched):
+    raw = data()
+    normalizer = Normalizer.fit(raw)
+
+    def make():
+        return TransformedEnv(CountingEnv(5), Compose(*normalizer.env_transforms()))
+
+    env = SerialEnv(2, make) if batched else make()
+    plain = CountingEnv(5)
+    check_env_specs(env)
+    torch.manual_seed(1)
+    data_ = env.reset()
+    plain.episode = int(
+        normalizer.denormalize(data_)["observation"].reshape(-1, 4)[0, 1].round() - 1
+    )
+    expected = plain.reset()
+    for _ in range(4):
+        first = data_["observation"].reshape(-1, 4)[0]
+        torch.testing.assert_close(first, normalizer.normalize(expected)["observation"])
+        action = torch.rand(*env.batch_size, ACTION_DIM) * 2 - 1
+        normalized = TensorDict({"action": action.reshape(-1, ACTION_DIM)[0]}, [])
+        data_ = env.step(data_.set("action", action))["next"]
+        expected["action"] = normalizer.denormalize(normalized)["action"]
+        expected = plain.step(expected)["next"]
+    # What reached the simulator is the denormalised action: the toy shows it in its observation.
+    torch.testing.assert_close(
+        normalizer.denormalize(data_)["observation"].reshape(-1, 4)[0, 2:],
+        normalizer.denormalize(normalized)["action"],
+    )
+
+
+def test_action_spec_lives_in_the_normalised_space():
+    normalizer = Normalizer.fit(data())
+    env = TransformedEnv(CountingEnv(5), Compose(*normalizer.env_transforms()))
+    space = env.action_spec.space
+    loc, scale = normalizer.loc("action"), normalizer.scale("action")
+    torch.testing.assert_close(space.low, (-1 - loc) / scale)
+    torch.testing.assert_close(space.high, (1 - loc) / scale)
+
+
+def test_state_dict_and_config():
+    normalizer = Normalizer.fit(data())
+    again = Normalizer.from_config(normalizer.config())
+    again.load_state_dict(normalizer.state_dict())
+    raw = data()
+    for key in ("observation", "action"):
+        assert torch.equal(again.normalize(raw)[key], normalizer.normalize(raw)[key])
+
+
+def test_errors():
+    raw = data()
+    with pytest.raises(ValueError, match="empty dataset"):
+        Normalizer.fit(raw[:0])
+    with pytest.raises(KeyError, match="the data lack \\['state'\\]"):
+        Normalizer.fit(raw, ("state", "action"))
+    broken = raw.clone()
+    broken["action"][3, 1] = float("nan")
+    with pytest.raises(ValueError, match="action: the minimum or maximum is NaN"):
+        Normalizer.fit(broken)
+    one, two = {"a": torch.zeros(2)}, {"a": torch.zeros(3)}
+    with pytest.raises(ValueError, match=r"a: low has shape \(2,\), high \(3,\)"):
+        Normalizer(one, two)
+    with pytest.raises(ValueError, match=r"low has the keys \['a'\], high has \['b'\]"):
+        Normalizer(one, {"b": torch.zeros(2)})
