@@ -194,6 +194,14 @@ def test_built_from_the_env_args_of_a_file(lift):
     assert set(rollout["next", "reward"].unique().tolist()) <= {0.0, 1.0}
 
 
+def test_absolute_actions_are_not_limited_to_fractions():
+    env_args = task_env_args("lift")
+    arm = env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"]
+    arm["input_type"] = "absolute"
+    high = RobosuiteEnv(env_args=env_args).action_spec.space.high
+    torch.testing.assert_close(high, torch.tensor([2.0] * 3 + [np.pi] * 3 + [1.0]))
+
+
 def test_environment_outside_the_table():
     env_args = task_env_args("lift")
     env_args["env_name"] = "Door"

@@ -16,6 +16,7 @@ from warmprior._extras import require
 from warmprior.data.tasks import get_task
 
 __all__ = [
+    "action_limits",
     "import_robosuite",
     "isolated_numpy_seed",
     "make_simulator",
@@ -194,3 +195,29 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
     )
     with _without_warnings(), isolated_numpy_seed(_MODEL_SEED):
         return robosuite.make(name, **kwargs)
+
+
+def action_limits(env: Any) -> list[float]:
+    """List the largest magnitude of each entry of an environment's action.
+
+    Deltas are fractions of the largest delta. Absolute poses are in metres and radians, and their
+    limits only say what is worth sampling.
+
+    Args:
+        env: a robosuite environment.
+
+    Returns:
+        One number per entry of the action.
+
+    Examples:
+        >>> action_limits(make_simulator(task_env_args("lift")))  # doctest: +SKIP
+        [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
+    """
+    limits: list[float] = []
+    for robot in env.robots:
+        controller = robot.composite_controller.part_controllers.get("right")
+        if getattr(controller, "input_type", "delta") == "absolute":
+            limits += [2.0] * 3 + [np.pi] * 3 + [1.0] * (robot.action_dim - 6)
+        else:
+            limits += [1.0] * robot.action_dim
+    return limits

@@ -15,7 +15,12 @@ from torchrl.envs.utils import _classproperty
 from warmprior import keys
 from warmprior.data.tasks import TASKS, TaskSpec, get_task
 from warmprior.data.tasks import low_dim_keys as default_keys
-from warmprior.envs._simulator import import_robosuite, make_simulator, task_env_args
+from warmprior.envs._simulator import (
+    action_limits,
+    import_robosuite,
+    make_simulator,
+    task_env_args,
+)
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.rendering import render_camera, rendering_backend
 
@@ -188,7 +193,7 @@ class RobosuiteWrapper(_EnvWrapper):
             self.observation_spec["pixels"] = Bounded(
                 0, 255, shape=(*self.camera_size, 3), dtype=torch.uint8, device=self.device
             )
-        limit = torch.tensor(_action_limits(env))
+        limit = torch.tensor(action_limits(env))
         self.action_spec = Bounded(-limit, limit, device=self.device)
         self.reward_spec = Bounded(0.0, 1.0, shape=(1,), device=self.device)
         self.done_spec = Composite(done=flag(), terminated=flag(), truncated=flag())
@@ -225,19 +230,6 @@ class RobosuiteWrapper(_EnvWrapper):
         out["truncated"] = torch.tensor([truncated])
         out["done"] = torch.tensor([terminated or truncated])
         return TensorDict(out, [], device=self.device)
-
-
-def _action_limits(env: Any) -> list[float]:
-    limits: list[float] = []
-    for robot in env.robots:
-        controller = robot.composite_controller.part_controllers.get("right")
-        width = robot.action_dim
-        if getattr(controller, "input_type", "delta") == "absolute":
-            # Metres and radians, not fractions of the largest delta.
-            limits += [2.0] * 3 + [np.pi] * 3 + [1.0] * (width - 6)
-        else:
-            limits += [1.0] * width
-    return limits
 
 
 class RobosuiteEnv(RobosuiteWrapper):
