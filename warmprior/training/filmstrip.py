@@ -63,22 +63,23 @@ def record_filmstrip(
     env = TransformedEnv(make_env(seed=seed), make_transforms())
     previous = actor.sampler.generator
     actor.sampler.generator = torch.Generator(device).manual_seed(seed)
+    loop = env.base_env.loop
+    states, steps = [], []
     try:
         data = env.reset()
-        pictures = [(0, env.base_env.render_frame(size=size))]
         while True:
-            data = env.step(actor(data.to(device), nfe=nfe).to("cpu"))
-            after = data["next"]
-            pictures.append((int(after[keys.ELAPSED]), env.base_env.render_frame(size=size)))
-            if after["done"].any():
+            states.append(loop.state())
+            steps.append(int(data[keys.ELAPSED]))
+            if bool(data["done"].any()):
                 break
-            data = env.step_mdp(data)
+            data = env.step_mdp(env.step(actor(data.to(device), nfe=nfe).to("cpu")))
+        # Rendering is slow, and only now is it known which states are evenly spaced.
+        chosen = np.unique(np.linspace(0, len(states) - 1, frames).round().astype(int))
+        pictures = []
+        for i in chosen:
+            loop.set_state(states[i])
+            pictures.append(env.base_env.render_frame(size=size))
     finally:
         actor.sampler.generator = previous
         env.close()
-    chosen = np.unique(np.linspace(0, len(pictures) - 1, frames).round().astype(int))
-    return Filmstrip(
-        [pictures[i][1] for i in chosen],
-        [pictures[i][0] for i in chosen],
-        bool(after["success"]),
-    )
+    return Filmstrip(pictures, [steps[i] for i in chosen], bool(data["success"]))

@@ -1,0 +1,40 @@
+# Everything runs in .venv, which `make install` prepares once; pinned versions are in constraints.txt.
+PYTHON ?= $(shell command -v python3.12 || command -v python3 || command -v python)
+BIN := .venv/bin
+ARGS ?=
+EXTRAS := sim,lerobot,docs,dev
+
+.PHONY: install benchmark throughput test test-slow lint docs clean
+
+install: .venv/installed
+
+.venv/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] < (3, 12))' || \
+		{ echo "warmprior needs Python 3.12 or newer; name it: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	@touch $@
+
+benchmark: install
+	$(BIN)/python benchmarks/robomimic.py $(ARGS)
+
+throughput: install
+	$(BIN)/python benchmarks/throughput.py $(ARGS)
+
+test: install
+	$(BIN)/python -m pytest $(ARGS)
+
+test-slow: install
+	$(BIN)/python -m pytest -m slow $(ARGS)
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy warmprior
+
+docs: install
+	$(BIN)/sphinx-build -W -q -b html docs docs/_build
+
+clean:
+	rm -rf .venv docs/_build build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -1,0 +1,147 @@
+"""The benchmark from the command line: files, table, errors, and resuming after SIGKILL."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from safetensors.torch import load_file
+
+from tests.data.synthetic import write_robomimic_file
+
+pytest.importorskip("robosuite")
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "robomimic.py"
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    spec = importlib.util.spec_from_file_location("benchmark_robomimic", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "lift.hdf5"
+    write_robomimic_file(path, lengths=(30, 5, 40), task="lift")
+    return path
+
+
+def options(path, out, **extra):
+    values = {
+        "dataset": path,
+        "task": "lift",
+        "out": out,
+        "iterations": 30,
+        "episodes": 1,
+        "envs": 1,
+        "nfe": 1,
+        "logger": "none",
+    } | extra
+    return [word for key, value in values.items() for word in (f"--{key}", str(value))]
+
+
+def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, capsys, monkeypatch):
+    out = tmp_path / "runs" / "first"
+    assert benchmark.main(options(dataset, out)) == 0
+    stored = json.loads((out / "results.json").read_text())
+    assert {row["prior"] for row in stored["rows"]} == {"gaussian", "past", "preview"}
+    row = stored["rows"][0]
+    fields = "task data prior sigma chunk nfe seed checkpoint episodes successes success_rate"
+    assert set(fields.split()) <= set(row)
+    assert row["success_rate"] == row["successes"] / row["episodes"]
+    meta = stored["meta"]
+    assert meta["data"]["source"] == "file"
+    assert {"versions", "options", "hardware", "wall_time_s"} <= set(meta)
+    table = (out / "table.md").read_text()
+    assert "WP-Past" in table and table in capsys.readouterr().out
+    assert (out / "success.png").read_bytes().startswith(b"\x89PNG")
+    assert (out / "learning_curves.png").exists()
+    if benchmark.rendering_backend() is not None:
+        assert len(list(out.glob("filmstrip_*.png"))) == 3
+
+    # The folder is never overwritten, and a second run of the same options trains nothing again.
+    assert benchmark.main(options(dataset, out)) == 2
+    assert "--resume" in capsys.readouterr().err
+    policies = sorted((out.parent / "policies").iterdir())
+    written = [path.stat().st_mtime_ns for p in policies for path in p.rglob("*.safetensors")]
+    monkeypatch.setattr(benchmark, "rendering_backend", lambda: None)
+    assert benchmark.main(options(dataset, tmp_path / "runs" / "second", prior="past")) == 0
+    assert "libegl1" in capsys.readouterr().out
+    again = [path.stat().st_mtime_ns for p in policies for path in p.rglob("*.safetensors")]
+    assert again == written
+    second = json.loads((tmp_path / "runs" / "second" / "results.json").read_text())
+    assert second["rows"] == [row for row in stored["rows"] if row["prior"] == "past"]
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"sigma": -1}, "sigma"),
+        ({"nfe": 0}, "nfe"),
+        ({"episodes": 0}, "episodes"),
+        ({"iterations": 0}, "checkpoints|iterations"),
+        ({"chunk": 0}, "chunk_length"),
+        ({"dataset": "missing.hdf5"}, "missing.hdf5"),
+    ],
+)
+def test_bad_options_stop_before_any_work(benchmark, dataset, tmp_path, capsys, extra, message):
+    assert benchmark.main(options(dataset, tmp_path / "out", **extra)) == 2
+    error = capsys.readouterr().err
+    assert any(word in error for word in message.split("|")), error
+    assert not (tmp_path / "policies").exists()
+
+
+def test_task_without_expert_names_the_official_data(benchmark, tmp_path, capsys):
+    argv = ["--task", "tool_hang", "--out", str(tmp_path / "out")]
+    assert benchmark.main(argv) == 2
+    assert "--download" in capsys.readouterr().err
+
+
+def test_output_folder_that_is_a_file_is_refused_first(benchmark, dataset, tmp_path, capsys):
+    (tmp_path / "out").write_text("not a folder")
+    assert benchmark.main(options(dataset, tmp_path / "out")) == 2
+    assert str(tmp_path / "out") in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_killed_run_resumes_to_the_same_result(dataset, tmp_path):
+    """Kill the process at several moments; rows and weights equal those of an undisturbed run."""
+
+    def launch(out, *extra):
+        argv = [*options(dataset, out, iterations=3000, episodes=2, prior="past"), *extra]
+        return subprocess.Popen(
+            [sys.executable, str(SCRIPT), *argv],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+
+    undisturbed, killed = tmp_path / "a" / "out", tmp_path / "b" / "out"
+    started = time.monotonic()
+    assert launch(undisturbed).wait() == 0
+    duration = time.monotonic() - started
+    for share in (0.4, 0.6, 0.8):
+        process = launch(killed, "--resume")
+        time.sleep(share * duration)
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    assert launch(killed, "--resume").wait() == 0
+
+    rows = [json.loads((out / "results.json").read_text())["rows"] for out in (undisturbed, killed)]
+    assert rows[0] == rows[1]
+    weights = [
+        load_file(next((out.parent / "policies").rglob("policy_*/model.safetensors")))
+        for out in (undisturbed, killed)
+    ]
+    assert weights[0].keys() == weights[1].keys()
+    assert all((weights[0][name] == weights[1][name]).all() for name in weights[0])
