@@ -1,0 +1,81 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from warmprior.diagnostics import Results, Row, paper_success, success_table, summarize
+from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
+
+META = {"data": {"source": "scripted"}}
+ROW = Row("square", "ph", "gaussian", 1.0, 8, 1, 0, 100, 10, 5, 200.0)
+
+
+def filled(tmp_path, meta=META):
+    """Three seeds, two checkpoints; WP-Past is better by 30 points, and less spread than that."""
+    results = Results(tmp_path / "results.json", meta)
+    for prior, wins in (("gaussian", (4, 5, 6)), ("past", (7, 8, 9)), ("preview", (5, 5, 5))):
+        for seed, k in enumerate(wins):
+            for checkpoint, successes in ((50, 0), (100, k)):
+                results.add(
+                    replace(ROW, prior=prior, seed=seed, checkpoint=checkpoint, successes=successes)
+                )
+    return results
+
+
+def test_rows_survive_and_resume(tmp_path):
+    results = filled(tmp_path)
+    stored = json.loads(results.path.read_text())
+    assert stored["meta"] == META
+    assert stored["rows"][1]["success_rate"] == 0.4
+    again = Results(results.path, META, resume=True)
+    assert again.rows == results.rows
+    assert again.find(replace(ROW, successes=-1, mean_steps=0.0).cell).successes == 4
+    assert again.find(replace(ROW, nfe=3).cell) is None
+    assert Results(results.path, META).rows == []  # without resume
+
+
+def test_damaged_file_is_named(tmp_path):
+    path = tmp_path / "results.json"
+    path.write_text('{"meta": {}, "rows": [{"task": 1}]}')
+    with pytest.raises(ValueError, match=r"results\.json"):
+        Results(path, META, resume=True)
+
+
+def test_summary_takes_the_best_checkpoints_of_each_seed(tmp_path):
+    summary = summarize(filled(tmp_path).rows, top_k=1)["past", 1]
+    assert summary.mean == pytest.approx(0.8)
+    assert summary.std == pytest.approx(0.1)
+    assert summarize(filled(tmp_path).rows, top_k=2)["past", 1].mean == pytest.approx(0.4)
+
+
+def test_table_shows_gains_marks_and_the_papers_row(tmp_path):
+    table = success_table(
+        filled(tmp_path), priors=["gaussian", "past", "preview"], nfes=[1], top_k=1
+    )
+    measured, paper = (line for line in table.splitlines() if line.startswith("| Square-PH"))
+    assert measured == (
+        "| Square-PH, measured (scripted data) | 50.0 | **80.0** (+30.0*) | 50.0 (+0.0) |"
+    )
+    assert paper == "| Square-PH, paper (official data) | 83.6 | 86.6 (+3.0) | 87.3 (+3.7) |"
+    assert "compare gains within a row" in table
+
+
+def test_paper_numbers_cover_table_1():
+    assert paper_success("transport", "mh", "preview", 3) == 30.4
+    assert paper_success("lift", "ph", "past", 1) is None
+    assert paper_success("square", "ph", "regression", 1) is None
+
+
+def test_figures_are_written(tmp_path):
+    np = pytest.importorskip("numpy")
+    pytest.importorskip("matplotlib")
+    results, priors = filled(tmp_path), ["gaussian", "past", "preview"]
+    plot_success(results.rows, tmp_path / "a.png", priors=priors, nfes=[1], title="t")
+    losses = {prior: [[(10, 1.0), (20, 0.5)]] * 3 for prior in priors}
+    plot_learning_curves(losses, results.rows, tmp_path / "b.png", nfe=1, title="t")
+    frames = [np.zeros((8, 8, 3), dtype=np.uint8)] * 2
+    plot_filmstrip(frames, ["0", "8"], tmp_path / "c.png", title="t")
+    for name in "abc":
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import math
+import statistics
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from warmprior.diagnostics import (
+    SeedSummary,
+    exceeds_one_sigma,
+    success_posterior,
+    summarize_seeds,
+    top_k_mean,
+)
+
+rates = st.lists(st.floats(0, 1), min_size=1, max_size=8)
+
+
+@given(st.integers(0, 600), st.integers(1, 600))
+def test_posterior_has_the_closed_form_moments(k, n):
+    k = min(k, n)
+    posterior = success_posterior(k, n)
+    a, b = k + 1, n - k + 1
+    assert posterior.mean() == pytest.approx(a / (a + b))
+    assert posterior.var() == pytest.approx(a * b / ((a + b) ** 2 * (a + b + 1)))
+
+
+def test_posterior_density_is_the_binomial_likelihood_normalised():
+    k, n, p = 3, 10, 0.4
+    likelihood = math.comb(n, k) * p**k * (1 - p) ** (n - k)
+    assert success_posterior(k, n).pdf(p) == pytest.approx((n + 1) * likelihood)
+
+
+@pytest.mark.parametrize(("k", "n"), [(-1, 5), (6, 5)])
+def test_posterior_refuses_impossible_counts(k, n):
+    with pytest.raises(ValueError, match="successes"):
+        success_posterior(k, n)
+
+
+@given(rates, st.integers(1, 10))
+def test_top_k_mean_is_the_largest_mean_of_any_k(values, k):
+    from itertools import combinations
+
+    k_used = min(k, len(values))
+    brute = max(sum(c) / k_used for c in combinations(values, k_used))
+    assert top_k_mean(values, k) == pytest.approx(brute)
+
+
+@given(rates)
+def test_seed_summary_matches_the_statistics_module(values):
+    summary = summarize_seeds(values)
+    assert summary.mean == pytest.approx(statistics.fmean(values))
+    if len(values) == 1:
+        assert math.isnan(summary.std)
+    else:
+        assert summary.std == pytest.approx(statistics.stdev(values), abs=1e-12)
+
+
+def test_one_sigma_rule():
+    base = SeedSummary(0.80, 0.02, 3)
+    assert exceeds_one_sigma(SeedSummary(0.86, 0.03, 3), base)
+    assert not exceeds_one_sigma(SeedSummary(0.84, 0.03, 3), base)
+    assert not exceeds_one_sigma(SeedSummary(0.99, math.nan, 1), base)  # one seed has no spread
+
+
+def test_empty_inputs_are_refused():
+    with pytest.raises(ValueError, match="rate"):
+        top_k_mean([], 3)
+    with pytest.raises(ValueError, match="seed"):
+        summarize_seeds([])
