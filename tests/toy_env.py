@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
@@ -53,3 +54,15 @@ class CountingEnv(EnvBase):
 
     def _set_seed(self, seed):
         return seed
+
+
+class ChunkPolicy(TensorDictModuleBase):
+    """A policy from a function ``tensordict -> chunk [*B, P, d_a]``."""
+
+    def __init__(self, chunk) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = ["observation"], [("vla_action", "chunk")]
+        self.chunk = chunk
+
+    def forward(self, tensordict):
+        return tensordict.set(self.out_keys[0], self.chunk(tensordict))

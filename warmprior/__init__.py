@@ -31,6 +31,7 @@ from warmprior.transforms import (
     ActionWindow,
     ChunkStep,
     Normalizer,
+    ObservationStack,
     policy_transforms,
     window_replay_buffer,
 )
@@ -48,6 +49,7 @@ __all__ = [
     "LinearInterpolant",
     "Normalizer",
     "ODEActor",
+    "ObservationStack",
     "PastPrior",
     "PolynomialInterpolant",
     "PreviewPrior",

@@ -193,7 +193,7 @@ def test_a_user_s_prior_travels(tmp_path):
     saved(tmp_path, Still(H))
     assert type(WarmPriorActor.from_pretrained(tmp_path).prior) is Still
     del Prior._registry["still-for-this-test"]
-    with pytest.raises(ValueError, match="unknown prior 'still-for-this-test'.*Import the module"):
+    with pytest.raises(ValueError, match=r"unknown prior 'still-for-this-test'.*Import the module"):
         WarmPriorActor.from_pretrained(tmp_path)
 
 

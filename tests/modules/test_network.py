@@ -44,7 +44,7 @@ def test_config_survives_json(network):
 
 
 def test_unknown_name():
-    with pytest.raises(ValueError, match="unknown network 'Nope'.*ChiTransformer.*VelocityMLP"):
+    with pytest.raises(ValueError, match=r"unknown network 'Nope'.*ChiTransformer.*VelocityMLP"):
         VelocityNetwork.from_config({"name": "Nope"})
 
 

@@ -4,6 +4,7 @@ from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.normalize import Normalizer
 from warmprior.transforms.policy import policy_transforms
+from warmprior.transforms.stack import ObservationStack
 from warmprior.transforms.window import ActionWindow, window_replay_buffer
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "ActionWindow",
     "ChunkStep",
     "Normalizer",
+    "ObservationStack",
     "policy_transforms",
     "window_replay_buffer",
 ]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import Transform, TransformedEnv
 
 from warmprior import keys
 
@@ -114,25 +114,33 @@ class ChunkStep(Transform):
         done: Tensor = next_tensordict.get(done_key)
         reward: Tensor = next_tensordict.get(reward_key)
         alive = ~done
+        asked = tensordict.get("_step", None)
+        if asked is not None:  # the caller skips some environments in this step
+            alive = alive & asked.view(alive.shape)
         steps = torch.ones_like(done, dtype=torch.int64)
+        if asked is not None:
+            steps = steps * asked.view(steps.shape)
         discount = self.gamma
+        current = tensordict.copy()
         for i in range(1, self.execute):
             if not alive.any():
                 break
             all_alive = bool(alive.all())
-            current = parent.step_mdp(tensordict.copy().set("next", next_tensordict))
+            _advance(current, next_tensordict, reward_key)
             current.set(self.action_key, chunk[..., i, :])
-            if not all_alive:
+            if all_alive and isinstance(parent, TransformedEnv):
+                # What EnvBase.step adds to this are checks, which the outer step makes.
+                out = parent._step(current)
+            elif all_alive:
+                out = parent.step(current.copy()).get("next")
+            else:
                 # A partial step: batched environments leave the finished ones alone.
                 current.set("_step", alive.view(current.shape))
-            out = parent.step(current).get("next")
+                out = parent.step(current.copy()).get("next")
             reward = reward + torch.where(alive, out.get(reward_key), 0.0) * discount
             steps = steps + alive
             discount *= self.gamma
-            if all_alive:
-                next_tensordict = next_tensordict.copy().update(out)
-            else:
-                next_tensordict = _update_where(alive, next_tensordict, out)
+            next_tensordict = out if all_alive else _update_where(alive, next_tensordict, out)
             alive = alive & ~next_tensordict.get(done_key)
         next_tensordict.set(reward_key, reward)
         return next_tensordict.set(self.executed_key, steps)
@@ -165,6 +173,20 @@ class ChunkStep(Transform):
             (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device
         )
         return observation_spec
+
+
+def _advance(
+    current: TensorDictBase, next_tensordict: TensorDictBase, reward_key: NestedKey
+) -> None:
+    """As ``step_mdp``, in place and without its generality: it runs at every control step."""
+    for key, value in next_tensordict.items():
+        if key == reward_key:
+            continue
+        mine = current.get(key, None) if is_tensor_collection(value) else None
+        if mine is None:
+            current.set(key, value)
+        else:
+            mine.update(value)
 
 
 def _update_where(mask: Tensor, old: TensorDictBase, new: TensorDictBase) -> TensorDictBase:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from torchrl.envs.transforms import CatFrames, Compose, UnsqueezeTransform
+from torchrl.envs.transforms import Compose
 
-from warmprior import keys
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.normalize import Normalizer
+from warmprior.transforms.stack import ObservationStack
 
 __all__ = ["policy_transforms"]
 
@@ -46,8 +46,7 @@ def policy_transforms(
     per_step = [] if normalizer is None else normalizer.env_transforms()
     return Compose(
         *per_step,
-        UnsqueezeTransform(-2, in_keys=[keys.OBSERVATION]),
-        CatFrames(observation_steps, dim=-2, in_keys=[keys.OBSERVATION]),
+        ObservationStack(observation_steps),
         ChunkStep(
             prior.chunk_length,
             execute=execute,

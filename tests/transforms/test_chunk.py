@@ -1,0 +1,228 @@
+"""ChunkStep against closed-form returns for random episode lengths, horizons and discounts."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, Unbounded
+from torchrl.envs import (
+    Compose,
+    InitTracker,
+    RewardSum,
+    SerialEnv,
+    StepCounter,
+    TransformedEnv,
+)
+from torchrl.envs.utils import check_env_specs
+
+from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
+from warmprior import ActionHistory, ChunkStep, PastPrior
+
+
+def ones(length):
+    """A policy whose chunk tells the decision's step: action i of a chunk is (step + i) / 100."""
+
+    def chunk(data):
+        start = data["observation"][..., :1, None] / 100
+        ramp = torch.arange(length).view(-1, 1) / 100
+        return (start + ramp).expand(*data.batch_size, length, ACTION_DIM).clone()
+
+    return ChunkPolicy(chunk)
+
+
+def geometric(gamma, first, count):
+    """Discounted sum of the rewards first + 1, ..., first + count."""
+    return sum(gamma**i * (first + i + 1) for i in range(count))
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    lengths=st.lists(st.integers(1, 11), min_size=1, max_size=3),
+    horizon=st.integers(1, 5),
+    data=st.data(),
+    gamma=st.sampled_from([1.0, 0.9, 0.5]),
+    truncate=st.booleans(),
+)
+def test_returns_in_closed_form(lengths, horizon, data, gamma, truncate):
+    execute = data.draw(st.integers(1, horizon))
+    prediction = data.draw(st.integers(horizon, 2 * horizon))
+    base = SerialEnv(len(lengths), [partial(CountingEnv, n, truncate) for n in lengths])
+    chunk = ChunkStep(horizon, execute=execute, prediction_length=prediction, gamma=gamma)
+    env = TransformedEnv(base, Compose(StepCounter(), RewardSum(), chunk))
+    rollout = env.rollout(8, ones(prediction), break_when_any_done=False)
+    for row, length in zip(rollout, lengths, strict=True):
+        time = 0
+        for t in range(8):
+            step, after = row[t], row[t]["next"]
+            assert step["observation"][0] == time
+            k = min(execute, length - time)
+            assert after["executed_steps"].item() == k
+            assert after["reward"].item() == pytest.approx(geometric(gamma, time, k), rel=1e-5)
+            assert after["observation"][0] == time + k
+            # The last action that was executed is action k - 1 of the chunk.
+            assert after["observation"][2].item() == pytest.approx((time + k - 1) / 100, abs=1e-6)
+            # Per-step transforms before ChunkStep see every control step.
+            assert after["step_count"].item() == time + k
+            assert after["episode_reward"].item() == sum(range(1, time + k + 1))
+            done = time + k == length
+            assert after["done"].item() == done
+            assert after["truncated"].item() == (done and truncate)
+            assert after["terminated"].item() == (done and not truncate)
+            time = 0 if done else time + k
+    env.close()
+
+
+def test_undiscounted_return_does_not_depend_on_the_chunking():
+    for length in (1, 5, 12, 13):
+        for horizon in (1, 2, 4, 13):
+            env = TransformedEnv(CountingEnv(length), ChunkStep(horizon))
+            rollout = env.rollout(50, ones(horizon))
+            assert rollout["next", "reward"].sum() == length * (length + 1) / 2
+            assert rollout["next", "executed_steps"].sum() == length
+            assert rollout.shape[0] == -(-length // horizon)
+
+
+def test_executed_steps_are_zero_after_a_reset():
+    env = TransformedEnv(SerialEnv(2, partial(CountingEnv, 5)), ChunkStep(3))
+    assert env.reset()["executed_steps"].tolist() == [[0], [0]]
+
+
+def test_finished_environments_are_left_alone():
+    """Done after 1, 3 and 5 of 5 inner steps: none is stepped past its end."""
+    base = SerialEnv(3, [partial(CountingEnv, n) for n in (1, 3, 5)])
+    env = TransformedEnv(base, ChunkStep(5))
+    data = env.step(ones(5)(env.reset()))["next"]
+    assert data["observation"][:, 0].tolist() == [1, 3, 5]
+    assert data["reward"].flatten().tolist() == [1, 6, 15]
+    assert data["executed_steps"].flatten().tolist() == [1, 3, 5]
+    assert data["done"].all()
+
+
+def test_partial_reset_and_step():
+    base = SerialEnv(2, [partial(CountingEnv, n) for n in (3, 9)])
+    env = TransformedEnv(base, ChunkStep(3))
+    data = env.step(ones(3)(env.reset()))
+    assert data["next", "done"].flatten().tolist() == [True, False]
+    after = env.step_mdp(data)
+    after = env.reset(after.set("_reset", data["next", "done"]))
+    assert after["observation"][:, 0].tolist() == [0, 3]
+    after["_step"] = torch.tensor([False, True])
+    stepped = env.step(ones(3)(after))["next"]
+    assert stepped["observation"][:, 0].tolist() == [0, 6]
+    assert stepped["executed_steps"].flatten().tolist() == [0, 3]
+
+
+def test_chunk_one_is_the_plain_environment():
+    torch.manual_seed(0)
+    two = TransformedEnv(CountingEnv(4), ChunkStep(1)).rollout(20)
+    plain = CountingEnv(4)
+    data = plain.reset()
+    for t in range(two.shape[0]):
+        data["action"] = two["vla_action", "chunk"][t, 0]
+        data = plain.step(data)["next"]
+        for key in ("observation", "reward", "done", "terminated"):
+            assert torch.equal(data[key], two["next", key][t])
+    assert data["done"]
+
+
+@pytest.mark.parametrize("prediction", [3, 6])
+def test_specs(prediction):
+    env = TransformedEnv(
+        SerialEnv(2, partial(CountingEnv, 5)), ChunkStep(3, prediction_length=prediction)
+    )
+    check_env_specs(env)
+    spec = env.full_action_spec["vla_action", "chunk"]
+    assert spec.shape == (2, prediction, ACTION_DIM)
+    assert (spec.space.low == -1).all() and (spec.space.high == 1).all()
+    assert list(env.full_action_spec.keys(True, True)) == [("vla_action", "chunk")]
+    assert env.observation_spec["executed_steps"].dtype == torch.int64
+
+
+def test_renamed_keys():
+    env = TransformedEnv(CountingEnv(5), ChunkStep(2, chunk_key="plan", executed_key=("info", "k")))
+    check_env_specs(env)
+    rollout = env.rollout(3)
+    assert rollout["plan"].shape == (3, 2, ACTION_DIM)
+    assert rollout["next", "info", "k"].flatten().tolist() == [2, 2, 1]
+
+
+@pytest.mark.parametrize("length", [2, 4])
+def test_wrong_chunk_length(length):
+    env = TransformedEnv(CountingEnv(5), ChunkStep(3))
+    with pytest.raises(
+        ValueError, match=rf"expects a chunk \[\*B, 3, d_a\].*found shape \({length}, 2"
+    ):
+        env.step(ones(length)(env.reset()))
+
+
+def test_no_chunk():
+    env = TransformedEnv(CountingEnv(5), ChunkStep(3))
+    with pytest.raises((ValueError, KeyError), match="chunk"):
+        env.step(env.reset())
+
+
+@pytest.mark.parametrize(
+    ("horizon", "options"),
+    [
+        (3, {"execute": 4}),
+        (3, {"execute": 0}),
+        (3, {"prediction_length": 2}),
+        (0, {}),
+        (-1, {"execute": 1}),
+    ],
+)
+def test_bad_lengths(horizon, options):
+    with pytest.raises(ValueError, match="need 1 <= execute <= chunk_length <= prediction_length"):
+        ChunkStep(horizon, **options)
+
+
+def test_two_rewards_are_refused():
+    class TwoRewards(CountingEnv):
+        def __init__(self):
+            super().__init__(4)
+            self.reward_spec = Composite(a=Unbounded((1,)), b=Unbounded((1,)))
+
+        def _step(self, tensordict):
+            out = super()._step(tensordict)
+            reward = out.pop("reward")
+            return out.set("a", reward).set("b", reward)
+
+    env = TransformedEnv(TwoRewards(), ChunkStep(2))
+    with pytest.raises(RuntimeError, match="ChunkStep needs one reward"):
+        env.step(ones(2)(env.reset()))
+
+
+def test_outside_environments_nothing_happens():
+    data = TensorDict({"a": torch.zeros(3)}, [3])
+    assert ChunkStep(3)(data) is data
+
+
+def test_collector_fills_a_replay_buffer():
+    """Decisions, discounts by executed steps and the next mean come back out as they went in."""
+    prior = PastPrior(3)
+    base = SerialEnv(2, [partial(CountingEnv, n) for n in (7, 4)])
+    env = TransformedEnv(
+        base, Compose(StepCounter(), ChunkStep(3, gamma=0.9), ActionHistory(prior), InitTracker())
+    )
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1000), batch_size=500)
+    collector = Collector(env, ones(3), frames_per_batch=24, total_frames=96)
+    for batch in collector:
+        buffer.extend(batch.reshape(-1))
+    sample = buffer.sample()
+    start = sample["observation"][:, 0]
+    k = sample["next", "executed_steps"].squeeze(-1)
+    assert set(k.tolist()) == {1, 3}
+    expected = [geometric(0.9, int(s), int(n)) for s, n in zip(start, k, strict=True)]
+    torch.testing.assert_close(sample["next", "reward"].squeeze(-1), torch.tensor(expected))
+    whole = k == 3
+    torch.testing.assert_close(
+        sample["next", "prior", "loc"][whole], sample["vla_action", "chunk"][whole]
+    )
+    assert (sample["prior", "warm"].all(1).squeeze(-1) == (start >= 3)).all()
+    collector.shutdown()
