@@ -206,20 +206,33 @@ class BehaviourCloning:
                 self._running.append(self.step())
                 bar.update()
                 i = self.iteration
-                if i % config.log_every == 0 or i == config.iterations:
+                logs = i % config.log_every == 0 or i == config.iterations
+                saves = i in keep or i % save_every == 0
+                if logs or saves:
+                    self._check_finite()
+                if logs:
                     self._log(torch.stack(self._running).mean().item(), bar)
                     self._running.clear()
                 if i in keep:
                     self._averaged_actor().save_pretrained(self.policy_path(i))
-                if i in keep or i % save_every == 0:
+                if saves:
                     self._save()
 
+    def _check_finite(self) -> None:
+        # Before every save and not only before logs: a saved NaN could not be resumed from.
+        losses = torch.stack(self._running)
+        finite = bool(torch.isfinite(losses).all())
+        if finite and all(bool(torch.isfinite(p).all()) for p in self.actor.network.parameters()):
+            return
+        what = "the weights became NaN or infinite"
+        if not finite:
+            what = f"the loss became {losses[~torch.isfinite(losses)][0].item()}"
+        raise FloatingPointError(
+            f"{what} at or before iteration {self.iteration}; the last good state is "
+            f"{self.state_path}. Lower the learning rate or check the data."
+        )
+
     def _log(self, loss: float, bar: Any) -> None:
-        if not torch.isfinite(torch.tensor(loss)):
-            raise FloatingPointError(
-                f"the loss became {loss} at iteration {self.iteration}; the last good state is "
-                f"{self.state_path}. Lower the learning rate or check the data."
-            )
         self.losses.append((self.iteration, loss))
         bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
         if self.logger is not None:

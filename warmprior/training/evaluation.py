@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -84,11 +84,14 @@ def _watched(env: EnvBase) -> Iterator[None]:
     finished = threading.Event()
     dead: list[str] = []
 
+    def look() -> None:
+        for i, worker in enumerate(workers):
+            if not dead and not worker.is_alive():
+                dead.append(f"worker {i} of {len(workers)} (exit code {worker.exitcode})")
+
     def watch() -> None:
         while not finished.wait(0.5):
-            for i, worker in enumerate(workers):
-                if not worker.is_alive():
-                    dead.append(f"worker {i} of {len(workers)} (exit code {worker.exitcode})")
+            look()
             if dead:
                 for worker in workers:
                     worker.terminate()  # closes the pipes that the parent waits on
@@ -99,9 +102,18 @@ def _watched(env: EnvBase) -> Iterator[None]:
     try:
         yield
     except BaseException as error:
+        if isinstance(error, (ConnectionError, EOFError)):
+            for worker in workers:  # TorchRL may notice before the process is reaped
+                worker.join(0.2)
+        look()
+        finished.set()
         # Without this, idle workers would keep the interpreter from exiting.
-        if not env.is_closed:
+        try:
             env.close(raise_if_closed=False)
+        except Exception:  # closing complains about dead workers itself
+            for worker in workers:
+                with suppress(ValueError):  # already closed
+                    worker.terminate()
         if dead:
             raise RuntimeError(
                 f"an environment worker died: {dead[0]}. It may have been killed for lack of memory; "

@@ -1,0 +1,432 @@
+"""Training: the loop by hand, and the same result however often it is killed."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.record.loggers.common import Logger
+
+from warmprior import (
+    ChiTransformer,
+    FlowMatchingLoss,
+    Normalizer,
+    PastPrior,
+    PreviewPrior,
+    VelocityMLP,
+    WarmPriorActor,
+    window_replay_buffer,
+)
+from warmprior.training import BehaviourCloning, TrainingConfig, ema_of, make_optimizer
+from warmprior.training.checkpoint import load_state
+
+CONFIG = TrainingConfig(
+    iterations=40, batch_size=16, learning_rate=1e-2, checkpoints=2, save_every=7, log_every=10
+)
+
+
+def dataset():
+    generator = torch.Generator().manual_seed(0)
+    return TensorDict(
+        {
+            "observation": torch.randn(120, 3, generator=generator),
+            "action": torch.randn(120, 2, generator=generator).clamp(-1, 1),
+            "episode": torch.arange(120) // 30,
+        },
+        [120],
+    )
+
+
+def actor_for(prior=None, network=None):
+    prior = PastPrior(4, cold_probability=0.25) if prior is None else prior
+    torch.manual_seed(7)
+    if network is None:  # with dropout: the global generator has to be restored too
+        network = ChiTransformer(
+            2, 3, prior.prediction_length, embedding_dim=8, num_layers=1, num_heads=2, dropout=0.2
+        )
+    return WarmPriorActor(network, prior, nfe=2)
+
+
+def training(folder, config=CONFIG, **options):
+    actor = options.pop("actor", None) or actor_for()
+    return BehaviourCloning(actor, dataset(), config, folder, **options)
+
+
+def weights(cloning):
+    return {
+        **{f"net.{n}": v.clone() for n, v in cloning.actor.network.state_dict().items()},
+        **{f"ema.{n}": v.clone() for n, v in cloning.ema.state_dict().items()},
+    }
+
+
+def same(one, two):
+    return one.keys() == two.keys() and all(torch.equal(one[k], two[k]) for k in one)
+
+
+def test_the_loop_by_hand(tmp_path):
+    """Sample, loss, AdamW at the scheduled rate, EMA: written out with PyTorch's own parts."""
+    config = dataclasses.replace(CONFIG, iterations=12, checkpoints=1, warmup_ratio=0.25)
+    network = VelocityMLP(2, 3, 4, hidden_dim=8)
+    start = {name: value.clone() for name, value in network.state_dict().items()}
+    cloning = training(tmp_path, config, actor=actor_for(network=network))
+    cloning.run()
+
+    other = VelocityMLP(2, 3, 4, hidden_dim=8)
+    other.load_state_dict(start)
+    actor = actor_for(network=other)
+    generator = torch.Generator().manual_seed(config.seed)
+    buffer = window_replay_buffer(dataset(), actor.prior, batch_size=16, generator=generator)
+    loss = FlowMatchingLoss(actor, generator=generator)
+    optimizer = make_optimizer(other, learning_rate=config.learning_rate)
+    average, losses = None, []
+    for step in range(12):
+        progress = (step - 3) / 9
+        factor = (step + 1) / 3 if step < 3 else 0.5 * (1 + torch.tensor(progress * torch.pi).cos())
+        for group in optimizer.param_groups:
+            group["lr"] = float(config.learning_rate * factor)
+        value = loss(buffer.sample())["loss_flow_matching"]
+        losses.append(value.item())
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+        now = {name: p.detach().clone() for name, p in other.named_parameters()}
+        average = now if average is None else {n: 0.995 * average[n] + 0.005 * now[n] for n in now}
+    for name, value in other.state_dict().items():
+        torch.testing.assert_close(cloning.actor.network.state_dict()[name], value)
+    kept = WarmPriorActor.from_pretrained(cloning.policy_path(12)).network
+    for name, p in kept.named_parameters():
+        torch.testing.assert_close(p.detach(), average[name])
+    assert [i for i, _ in cloning.losses] == [10, 12]
+    assert cloning.losses[0][1] == pytest.approx(sum(losses[:10]) / 10, rel=1e-4)
+    assert cloning.losses[1][1] == pytest.approx(sum(losses[10:]) / 2, rel=1e-4)
+
+
+def test_files(tmp_path):
+    cloning = training(tmp_path / "run")
+    cloning.run()
+    names = sorted(p.name for p in (tmp_path / "run").iterdir())
+    assert names == ["policy_000020", "policy_000040", "state.safetensors"]
+    assert cloning.iteration == 40 and cloning.policy_path(20).name == "policy_000020"
+
+
+def test_normalizer_is_kept_with_the_policy(tmp_path):
+    actor = actor_for()
+    actor.normalizer = Normalizer.fit(dataset())
+    cloning = training(tmp_path, actor=actor)
+    cloning.run()
+    kept = WarmPriorActor.from_pretrained(cloning.policy_path(40))
+    assert torch.equal(kept.normalizer.loc("action"), actor.normalizer.loc("action"))
+    assert kept.ode.nfe == actor.ode.nfe
+
+
+@pytest.mark.parametrize("stop", [1, 6, 7, 8, 20, 23, 39])
+def test_stopping_anywhere_changes_nothing(tmp_path, stop):
+    """Without a kill: an exception in the middle of the loop, then a new object."""
+    whole = training(tmp_path / "whole")
+    whole.run()
+    part = training(tmp_path / "part")
+    take, calls = part.step, 0
+
+    def step():
+        nonlocal calls
+        calls += 1
+        if calls > stop:
+            raise KeyboardInterrupt
+        return take()
+
+    part.step = step
+    with pytest.raises(KeyboardInterrupt):
+        part.run()
+    torch.rand(100)  # whatever else uses the global generator in between
+    again = training(tmp_path / "part")
+    assert again.iteration == max(i for i in (0, 7, 14, 20, 21, 28, 35) if i <= stop)
+    again.run()
+    assert same(weights(again), weights(whole))
+    assert again.losses == whole.losses
+    for i in (20, 40):
+        one, two = whole.policy_path(i), again.policy_path(i)
+        for name in ("config.json", "model.safetensors"):
+            assert (one / name).read_bytes() == (two / name).read_bytes()
+
+
+def test_a_finished_training_stays_as_it_is(tmp_path):
+    first = training(tmp_path)
+    first.run()
+    before = (tmp_path / "state.safetensors").read_bytes()
+    again = training(tmp_path)
+    again.run()
+    assert again.iteration == 40 and again.losses == first.losses
+    assert same(weights(again), weights(first))
+    assert (tmp_path / "state.safetensors").read_bytes() == before
+
+
+def test_starting_over(tmp_path):
+    first = training(tmp_path)
+    first.run()
+    again = training(tmp_path, resume=False)
+    assert again.iteration == 0
+    again.run()
+    assert same(weights(again), weights(first))  # the same seed
+
+
+def test_evaluation_between_steps_does_not_switch_dropout_off(tmp_path):
+    actor = actor_for().eval()
+    training(tmp_path / "a", actor=actor).run()
+    training(tmp_path / "b").run()
+    one, two = ((tmp_path / n / "state.safetensors").read_bytes() for n in "ab")
+    assert one == two
+
+
+SCRIPT = """
+import sys, torch
+torch.set_num_threads(1)
+from tests.training.test_behaviour_cloning import killed_training
+killed_training(sys.argv[1], int(sys.argv[2])).run()
+"""
+
+
+def killed_training(folder, iterations):
+    config = dataclasses.replace(CONFIG, iterations=iterations, save_every=3, checkpoints=5)
+    return training(folder, config)
+
+
+def start_process(folder, iterations):
+    root = Path(__file__).parents[2]
+    return subprocess.Popen(
+        [sys.executable, "-c", SCRIPT, str(folder), str(iterations)],
+        cwd=root,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+@pytest.mark.parametrize(
+    ("iterations", "moments"),
+    [(500, (0.4,)), pytest.param(2000, (0.0, 0.31, 1.13, 2.2), marks=pytest.mark.slow)],
+)
+def test_killed_and_resumed_is_bitwise_the_same(tmp_path, iterations, moments):
+    """SIGKILL that long after the first save; saves are so frequent that many hit one."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        whole = killed_training(tmp_path / "whole", iterations)
+        whole.run()
+        folder = tmp_path / "killed"
+        reached = 0
+        for moment in moments:
+            process = start_process(folder, iterations)
+            deadline = time.monotonic() + 120
+            while time.monotonic() < deadline and process.poll() is None:
+                if _iteration(folder) > reached:
+                    break
+                time.sleep(0.02)
+            time.sleep(moment)
+            process.send_signal(signal.SIGKILL)
+            process.wait(30)
+            assert process.returncode == -signal.SIGKILL, "finished before it was killed"
+            reached = _iteration(folder)
+        assert 0 < reached < iterations
+        again = killed_training(folder, iterations)
+        assert again.iteration == reached
+        again.run()
+    finally:
+        torch.set_num_threads(threads)
+    assert same(weights(again), weights(whole))
+    assert again.losses == whole.losses
+
+
+def _iteration(folder):
+    path = folder / "state.safetensors"
+    return load_state(path)[1]["iteration"] if path.exists() else 0
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("config", {"config": dataclasses.replace(CONFIG, learning_rate=2e-2)}),
+        ("config", {"config": dataclasses.replace(CONFIG, seed=1)}),
+        ("config", {"config": dataclasses.replace(CONFIG, iterations=80)}),
+        ("prior", {"actor": lambda: actor_for(PastPrior(4, sigma=0.1))}),
+        ("prior", {"actor": lambda: actor_for(PreviewPrior(4))}),
+        ("network", {"actor": lambda: actor_for(PastPrior(4, cold_probability=0.25), mlp())}),
+    ],
+)
+def test_a_state_of_another_run(tmp_path, part, change):
+    training(tmp_path).run()
+    before = (tmp_path / "state.safetensors").read_bytes()
+    change = {k: v() if callable(v) else v for k, v in change.items()}
+    with pytest.raises(ValueError, match=rf"belongs to another {part}: .*(folder|resume)"):
+        training(tmp_path, **change)
+    assert (tmp_path / "state.safetensors").read_bytes() == before
+
+
+def mlp():
+    torch.manual_seed(3)
+    return VelocityMLP(2, 3, 4, hidden_dim=8)
+
+
+def test_a_damaged_state(tmp_path):
+    training(tmp_path).run()
+    path = tmp_path / "state.safetensors"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="not a readable training state"):
+        training(tmp_path)
+
+
+@pytest.mark.parametrize("moment", [1, 2, 5])
+def test_a_full_disk(tmp_path, monkeypatch, moment):
+    cloning = training(tmp_path)
+    replace, calls = os.replace, 0
+
+    def failing(*args):
+        nonlocal calls
+        calls += 1
+        if calls >= moment:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return replace(*args)
+
+    monkeypatch.setattr(os, "replace", failing)
+    with pytest.raises(OSError, match=str(tmp_path)):
+        cloning.run()
+    monkeypatch.undo()
+    whole = training(tmp_path / "whole")
+    whole.run()
+    again = training(tmp_path)  # what was there before can be read, and training goes on
+    assert again.iteration <= 35
+    again.run()
+    assert same(weights(again), weights(whole))
+
+
+@pytest.mark.parametrize("bad", [8, 10, 13, 15, 21])
+def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
+    """Wherever it appears between two logs or two saves, no NaN reaches the disk."""
+    cloning = training(tmp_path)
+    forward = cloning.loss_module.forward
+    calls = 0
+
+    def broken(data):
+        nonlocal calls
+        calls += 1
+        out = forward(data)
+        if calls >= bad:
+            out["loss_flow_matching"] = out["loss_flow_matching"] * float("nan")
+        return out
+
+    cloning.loss_module.forward = broken
+    with pytest.raises(FloatingPointError, match=r"loss became nan .*state.safetensors"):
+        cloning.run()
+    tensors, facts = load_state(tmp_path / "state.safetensors")
+    assert facts["iteration"] < bad
+    assert all(torch.isfinite(v).all() for v in tensors.values() if v.is_floating_point())
+    for folder in tmp_path.glob("policy_*"):
+        network = WarmPriorActor.from_pretrained(folder).network
+        assert all(torch.isfinite(p).all() for p in network.parameters())
+    whole = training(tmp_path / "whole")
+    whole.run()
+    again = training(tmp_path)
+    again.run()
+    assert same(weights(again), weights(whole))
+
+
+class ListLogger(Logger):
+    def __init__(self):
+        super().__init__("list", None)
+        self.rows = []
+
+    def _create_experiment(self):
+        return None
+
+    def log_scalar(self, name, value, step=None, **kwargs):
+        self.rows.append((name, step, value))
+
+    def log_video(self, *args, **kwargs): ...
+
+    def log_hparams(self, *args, **kwargs): ...
+
+    def log_histogram(self, *args, **kwargs): ...
+
+    def __repr__(self):
+        return "ListLogger()"
+
+
+def test_logger(tmp_path):
+    logger = ListLogger()
+    cloning = training(tmp_path, logger=logger)
+    cloning.run()
+    assert [(s, v) for n, s, v in logger.rows if n == "train/loss"] == cloning.losses
+    rates = [v for n, _, v in logger.rows if n == "train/learning_rate"]
+    assert len(rates) == 4 and rates[-1] == pytest.approx(0, abs=1e-12)
+
+
+def test_compiled_training_is_close(tmp_path):
+    """The policy that is kept is the plain one, whatever ran it."""
+    config = dataclasses.replace(CONFIG, iterations=2, checkpoints=1)
+    plain = training(tmp_path / "a", config, actor=actor_for(network=mlp()))
+    plain.run()
+    compiled = training(tmp_path / "b", config, actor=actor_for(network=mlp()))
+    compiled.loss_module.velocity_network.compile(backend="eager")
+    compiled.run()
+    one = WarmPriorActor.from_pretrained(plain.policy_path(2)).state_dict()
+    two = WarmPriorActor.from_pretrained(compiled.policy_path(2)).state_dict()
+    assert one.keys() == two.keys()
+    for name in one:
+        torch.testing.assert_close(one[name], two[name])
+
+
+def test_infinite_weights_are_not_saved(tmp_path):
+    """A finite loss whose gradient is not: the weights are bad before any loss is."""
+    cloning = training(tmp_path)
+    step = cloning.step
+
+    def broken():
+        out = step()
+        if cloning.iteration == 14:
+            with torch.no_grad():
+                next(cloning.actor.network.parameters()).view(-1)[0] = float("inf")
+        return out
+
+    cloning.step = broken
+    with pytest.raises(FloatingPointError, match="weights became NaN or infinite"):
+        cloning.run()
+    assert load_state(tmp_path / "state.safetensors")[1]["iteration"] == 7
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"iterations": 0}, "iterations must be at least 1"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"checkpoints": 0}, "checkpoints"),
+        ({"log_every": 0}, "log_every"),
+        ({"iterations": 3, "checkpoints": 4}, "cannot keep 4 checkpoints of 3 iterations"),
+    ],
+)
+def test_bad_config(options, message):
+    with pytest.raises(ValueError, match=message):
+        TrainingConfig(**options)
+
+
+def test_default_config_is_the_paper_s():
+    config = TrainingConfig()
+    assert (config.iterations, config.batch_size, config.learning_rate) == (200_000, 1024, 1e-4)
+    assert (config.weight_decay, config.warmup_ratio, config.ema_rate) == (1e-5, 0.2, 0.995)
+    assert config.checkpoint_iterations == [20_000 * i for i in range(1, 11)]
+
+
+def test_average_starts_at_the_first_update(tmp_path):
+    network = mlp()
+    average = ema_of(network)
+    with torch.no_grad():
+        network.net[0].weight.add_(1.0)
+    average.update_parameters(network)
+    assert torch.equal(average.module.net[0].weight, network.net[0].weight)

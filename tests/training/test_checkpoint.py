@@ -1,0 +1,115 @@
+"""Training state on disk: round trip, damage, and a disk that fails."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+import torch
+from torch import nn
+
+from warmprior.training.checkpoint import (
+    load_state,
+    restore_optimizer,
+    save_state,
+    snapshot_optimizer,
+)
+
+TENSORS = {
+    "a/weight": torch.randn(3, 4),
+    "b": torch.arange(5),
+    "empty": torch.empty(0),
+    "scalar": torch.tensor(3.5, dtype=torch.float64),
+}
+FACTS = {"iteration": 7, "losses": [[1, 0.5]], "text": "grün"}
+
+
+def test_round_trip(tmp_path):
+    path = tmp_path / "deep" / "state.safetensors"
+    save_state(path, TENSORS, FACTS)
+    tensors, facts = load_state(path)
+    assert facts == FACTS and tensors.keys() == TENSORS.keys()
+    for name, value in TENSORS.items():
+        assert torch.equal(tensors[name], value) and tensors[name].dtype == value.dtype
+    assert [p.name for p in path.parent.iterdir()] == [path.name]  # no temporary file left
+
+
+def test_views_and_gradients_can_be_saved(tmp_path):
+    base = torch.randn(4, 4, requires_grad=True)
+    save_state(tmp_path / "s", {"t": base.T, "half": base[:2]}, {})
+    tensors, _ = load_state(tmp_path / "s")
+    assert torch.equal(tensors["t"], base.detach().T)
+    assert torch.equal(tensors["half"], base.detach()[:2])
+
+
+@pytest.mark.parametrize("keep", [0, 5, 40, -1])
+def test_damaged_file(tmp_path, keep):
+    path = tmp_path / "state.safetensors"
+    save_state(path, TENSORS, FACTS)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(ValueError, match=r"state.safetensors is not a readable training state"):
+        load_state(path)
+
+
+def test_a_file_of_something_else(tmp_path):
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.zeros(1)}, tmp_path / "state.safetensors")
+    with pytest.raises(ValueError, match="not a readable training state"):
+        load_state(tmp_path / "state.safetensors")
+
+
+def full(*args, **kwargs):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("where", ["replace", "save", "fsync"])
+def test_a_full_disk_keeps_the_old_state(tmp_path, monkeypatch, where):
+    path = tmp_path / "state.safetensors"
+    save_state(path, TENSORS, FACTS)
+    if where == "save":
+        monkeypatch.setattr("warmprior.training.checkpoint.save_file", full)
+    else:
+        monkeypatch.setattr(os, where, full)
+    with pytest.raises(OSError, match=r"cannot write .*state.safetensors: .*No space left"):
+        save_state(path, {"new": torch.zeros(1)}, {})
+    monkeypatch.undo()
+    assert load_state(path)[1] == FACTS
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"cannot write .*file/state.safetensors"):
+        save_state(tmp_path / "file" / "state.safetensors", TENSORS, FACTS)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="permissions do not bind the superuser")
+def test_read_only_folder(tmp_path):
+    tmp_path.chmod(0o500)
+    with pytest.raises(OSError, match=r"cannot write .*state.safetensors"):
+        save_state(tmp_path / "state.safetensors", TENSORS, FACTS)
+    tmp_path.chmod(0o700)
+
+
+def test_optimizer_round_trip_continues_bitwise():
+    def train(network, optimizer, steps, seed):
+        torch.manual_seed(seed)
+        for _ in range(steps):
+            optimizer.zero_grad()
+            network(torch.randn(4, 3)).square().sum().backward()
+            optimizer.step()
+
+    torch.manual_seed(0)
+    network = nn.Linear(3, 2)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=0.1)
+    train(network, optimizer, 3, 1)
+    copy = nn.Linear(3, 2)
+    copy.load_state_dict(network.state_dict())
+    again = torch.optim.AdamW(copy.parameters(), lr=0.1)
+    snapshot = {name: value.clone() for name, value in snapshot_optimizer(optimizer).items()}
+    restore_optimizer(again, snapshot)
+    train(network, optimizer, 3, 2)
+    train(copy, again, 3, 2)
+    assert torch.equal(network.weight, copy.weight) and torch.equal(network.bias, copy.bias)

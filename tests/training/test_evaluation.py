@@ -1,0 +1,242 @@
+"""Evaluation: every episode once, whatever the number of workers, and no hang when one dies."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+from torchrl.data import Categorical
+
+from tests.toy_env import ACTION_DIM, CountingEnv
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, WarmPriorActor, policy_transforms
+from warmprior.training import Episode, evaluate, parallel_env
+
+H = 3
+
+
+class SeededEnv(CountingEnv):
+    """Episode length, start and success follow from the seed as in a simulator.
+
+    Episode of seed ``s`` lasts ``3 + s % 5`` steps and is solved if ``s`` is divisible by 3. With
+    ``log`` every reset appends its seed to a file.
+    """
+
+    def __init__(self, seed_offset=0, seed_stride=1, log=None, sleep=0.0):
+        super().__init__()
+        self.offset, self.stride, self.log, self.sleep = seed_offset, seed_stride, log, sleep
+        self.base, self.count, self.seed_ = 0, 0, 0
+        self.observation_spec["success"] = Categorical(2, dtype=torch.bool, shape=(1,))
+
+    def _set_seed(self, seed):
+        self.base, self.count = seed, 0
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.seed_ = self.base + self.offset + self.count * self.stride
+        self.count += 1
+        self.length = length_of(self.seed_)
+        self.episode = self.seed_ - 1  # CountingEnv shows it in its observation
+        if self.log is not None:
+            with open(self.log, "a") as file:
+                file.write(f"{self.seed_}\n")
+        out = super()._reset(tensordict)
+        return out.set("success", torch.zeros(1, dtype=torch.bool))
+
+    def _step(self, tensordict):
+        time.sleep(self.sleep)
+        out = super()._step(tensordict)
+        solved = out["done"] & (self.seed_ % 3 == 0)
+        return out.set("success", solved)
+
+
+def length_of(seed):
+    return 3 + seed % 5
+
+
+def expected(first_seed, episodes):
+    seeds = range(first_seed, first_seed + episodes)
+    return [Episode(seed, seed % 3 == 0, length_of(seed)) for seed in seeds]
+
+
+class Recorder(nn.Module):
+    """A velocity that depends on the observation, and remembers which episodes it saw."""
+
+    def __init__(self, seen=None):
+        super().__init__()
+        self.weight = nn.Parameter(torch.tensor(0.1))
+        self.seen = set() if seen is None else seen
+
+    def forward(self, t, a, observation):
+        self.seen.update(observation[:, -1, 1].int().tolist())
+        return self.weight * observation.mean((1, 2))[:, None, None] - a
+
+
+def environments(num_envs, prior=None, **options):
+    prior = PastPrior(H) if prior is None else prior
+    return parallel_env(partial(SeededEnv, **options), partial(policy_transforms, prior), num_envs)
+
+
+def actor_for(prior=None):
+    prior = PastPrior(H) if prior is None else prior
+    return WarmPriorActor(Recorder(), prior, nfe=2)
+
+
+@pytest.mark.parametrize("num_envs", [1, 2, 3])
+def test_every_episode_once(num_envs):
+    env = environments(num_envs)
+    try:
+        for episodes in range(1, 8):
+            actor = actor_for()
+            result = evaluate(actor, env, episodes=episodes, first_seed=100)
+            assert result == expected(100, episodes)
+            assert set(range(100, 100 + episodes)) <= actor.network.seen
+    finally:
+        env.close(raise_if_closed=False)
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_more_episodes_and_other_seeds(num_envs):
+    env = environments(num_envs)
+    try:
+        assert evaluate(actor_for(), env, episodes=20, first_seed=7) == expected(7, 20)
+        assert evaluate(actor_for(), env, episodes=4, first_seed=0) == expected(0, 4)
+    finally:
+        env.close(raise_if_closed=False)
+
+
+@pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
+def test_all_priors_play_the_same_seeds(prior_class, tmp_path):
+    log = tmp_path / "resets"
+    prior = prior_class(H)
+    env = environments(2, prior, log=log)
+    try:
+        result = evaluate(actor_for(prior), env, episodes=5, first_seed=40)
+        assert result == expected(40, 5)
+        played = [int(line) for line in log.read_text().split()]
+        assert {40, 41, 42, 43, 44} <= set(played)
+    finally:
+        env.close(raise_if_closed=False)
+
+
+class NoiseSuccess(SeededEnv):
+    """Success depends on what the policy does, and so on its random numbers."""
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        return out.set("success", tensordict["action"].sum(-1, keepdim=True) > 0)
+
+
+def test_same_twice_and_other_with_another_policy_seed():
+    env = parallel_env(NoiseSuccess, partial(policy_transforms, PastPrior(H)), 2)
+    actor = actor_for()
+    actor.network.weight.data.zero_()  # what is executed is the noise, shrunk
+    try:
+        play = partial(evaluate, actor, env, episodes=12, first_seed=3)
+        torch.manual_seed(0)
+        one = play()
+        torch.rand(5)
+        assert play() == one
+        assert play(policy_seed=1) != one
+        assert play(policy_seed=0) == one
+        assert {episode.success for episode in one} == {True, False}
+    finally:
+        env.close(raise_if_closed=False)
+
+
+def test_actor_is_left_as_it_was_but_for_its_mode():
+    env = environments(1)
+    generator = torch.Generator().manual_seed(5)
+    actor = WarmPriorActor(Recorder(), PastPrior(H), nfe=2, generator=generator).train()
+    state, before = generator.get_state(), torch.get_rng_state()
+    try:
+        evaluate(actor, env, episodes=1, first_seed=0)
+    finally:
+        env.close(raise_if_closed=False)
+    assert actor.sampler.generator is generator
+    assert torch.equal(generator.get_state(), state)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert not actor.training and actor.ode.nfe == 2
+
+
+def test_nfe():
+    env = environments(1)
+    actor = actor_for()
+    calls = []
+    forward = actor.network.forward
+    actor.network.forward = lambda *args: calls.append(1) or forward(*args)
+    try:
+        decisions = -(-length_of(0) // H)
+        evaluate(actor, env, episodes=1, first_seed=0, nfe=5)
+        assert len(calls) == 5 * decisions
+    finally:
+        env.close(raise_if_closed=False)
+
+
+@pytest.mark.parametrize("moment", ["before", "during"])
+def test_a_killed_worker_is_an_error_and_not_a_hang(moment):
+    """TorchRL alone would wait for hours; the watcher looks twice a second."""
+    env = environments(2, sleep=0.02)
+    result: list[BaseException] = []
+
+    def kill():
+        worker = env._workers[1]
+        os.kill(worker.pid, signal.SIGKILL)
+
+    def run():
+        try:
+            evaluate(actor_for(), env, episodes=500, first_seed=0)
+        except BaseException as error:
+            result.append(error)
+
+    evaluate(actor_for(), env, episodes=2, first_seed=0)  # start the workers
+    pids = [worker.pid for worker in env._workers]
+    if moment == "before":
+        kill()
+    thread = threading.Thread(target=run, daemon=True)
+    started = time.monotonic()
+    thread.start()
+    if moment == "during":
+        time.sleep(0.5)
+        kill()
+    thread.join(30)
+    assert not thread.is_alive(), "evaluation hangs after its worker was killed"
+    assert time.monotonic() - started < 20
+    (error,) = result
+    assert isinstance(error, RuntimeError)
+    assert "worker 1 of 2 (exit code -9)" in str(error) and "memory" in str(error)
+    time.sleep(0.5)
+    for pid in pids:
+        state = Path(f"/proc/{pid}/stat")
+        assert not state.exists() or state.read_text().split()[2] == "Z", "a worker still runs"
+
+
+@pytest.mark.parametrize("episodes", [0, -1])
+def test_bad_number_of_episodes(episodes):
+    with pytest.raises(ValueError, match="episodes must be at least 1"):
+        evaluate(actor_for(), environments(1), episodes=episodes, first_seed=0)
+
+
+@pytest.mark.parametrize("num_envs", [0, -1])
+def test_bad_number_of_environments(num_envs):
+    with pytest.raises(ValueError, match="number of environments must be at least 1"):
+        environments(num_envs)
+
+
+def test_the_fake_simulator_itself():
+    """Offset and stride as the documentation of RobosuiteEnv has them."""
+    env = SeededEnv(seed_offset=1, seed_stride=3)
+    env.set_seed(10, static_seed=True)
+    seeds = []
+    for _ in range(3):
+        data = env.reset()
+        seeds.append(int(data["observation"][1]))
+        data["action"] = torch.zeros(ACTION_DIM)
+        assert isinstance(env.step(data)["next"], TensorDict)
+    assert seeds == [11, 14, 17]
