@@ -1,6 +1,7 @@
 """Priors, velocity networks and the actor."""
 
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.baselines import HistoryPrior, RegressionPrior
 from warmprior.modules.chi_transformer import ChiTransformer
 from warmprior.modules.interpolant import (
     Interpolant,
@@ -17,6 +18,7 @@ from warmprior.modules.sampler import PriorSampler
 __all__ = [
     "ChiTransformer",
     "GaussianPrior",
+    "HistoryPrior",
     "Interpolant",
     "LinearInterpolant",
     "ODEActor",
@@ -25,6 +27,7 @@ __all__ = [
     "PreviewPrior",
     "Prior",
     "PriorSampler",
+    "RegressionPrior",
     "TimestepEmbedding",
     "TrigonometricInterpolant",
     "VelocityMLP",

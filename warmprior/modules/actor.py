@@ -43,7 +43,8 @@ class WarmPriorActor(TensorDictModuleBase):
         prior: the source distribution.
 
     Keyword Args:
-        nfe: network evaluations per chunk; per call: ``actor(data, nfe=1)``.
+        nfe: network evaluations per chunk; per call: ``actor(data, nfe=1)``. 9 by default, or the
+            prior's maximum (:attr:`Prior.max_nfe`).
         solver: see :func:`~warmprior.modules.ode.integrate`.
         clip: see :class:`ODEActor`.
         normalizer: the normaliser of the data, kept here so that it is saved with the policy; its
@@ -53,7 +54,8 @@ class WarmPriorActor(TensorDictModuleBase):
         path_key: if given, the integration path is written there.
 
     Raises:
-        ValueError: if the network was built for another prediction length than the prior's.
+        ValueError: if the network was built for another prediction length than the prior's, or ``nfe``
+            exceeds what the prior allows.
 
     Examples:
         >>> import torch
@@ -74,7 +76,7 @@ class WarmPriorActor(TensorDictModuleBase):
         network: nn.Module,
         prior: Prior,
         *,
-        nfe: int = 9,
+        nfe: int | None = None,
         solver: Solver = "euler",
         clip: float | None = None,
         normalizer: Normalizer | None = None,
@@ -92,6 +94,7 @@ class WarmPriorActor(TensorDictModuleBase):
         self.sampler = PriorSampler(prior, generator=generator)
         self.ode = ODEActor(
             network,
+            prior=prior,
             nfe=nfe,
             solver=solver,
             clip=clip,

@@ -13,8 +13,12 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior import keys
+from warmprior.modules.prior import Prior
 
-__all__ = ["SOLVERS", "ODEActor", "integrate"]
+__all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "integrate"]
+
+DEFAULT_NFE = 9
+"""Network evaluations per chunk where nothing else is asked for."""
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 
@@ -116,19 +120,24 @@ class ODEActor(TensorDictModuleBase):
         network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``.
 
     Keyword Args:
+        prior: the source distribution, for priors that limit ``nfe`` or whose mean the network sees
+            (:attr:`Prior.conditions_network`; ``loc`` and ``warm`` are then inputs too).
         nfe: number of network evaluations per chunk; an attribute, and overridable per call:
-            ``actor(data, nfe=3)``.
+            ``actor(data, nfe=3)``. 9 by default, or the prior's maximum.
         solver: see :func:`integrate`.
         clip: the chunk is clamped to ``[-clip, clip]``; ``None`` (default) leaves it as integrated.
             Set it where the normalised data span ``[-1, 1]``, so that what the environment executes
             is what the prior remembers.
+        loc_key: key of the mean, ``[*B, P, d_a]``.
+        warm_key: key of the warm mask, bool ``[*B, P, 1]``.
         noise_key: key of the source, ``[*B, P, d_a]``.
         observation_key: key of the observation, ``[*B, To, d_o]``.
         chunk_key: key written, ``[*B, P, d_a]``.
         path_key: if given, the integration path ``[*B, steps + 1, P, d_a]`` is written there.
 
     Raises:
-        ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend, or an unknown solver.
+        ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend or that exceeds the prior's
+            maximum, or an unknown solver.
         KeyError: if an input key is missing.
 
     Examples:
@@ -147,15 +156,24 @@ class ODEActor(TensorDictModuleBase):
         self,
         network: nn.Module,
         *,
-        nfe: int = 9,
+        prior: Prior | None = None,
+        nfe: int | None = None,
         solver: Solver = "euler",
         clip: float | None = None,
+        loc_key: NestedKey = keys.LOC,
+        warm_key: NestedKey = keys.WARM,
         noise_key: NestedKey = keys.NOISE,
         observation_key: NestedKey = keys.OBSERVATION,
         chunk_key: NestedKey = keys.CHUNK,
         path_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
+        self.prior = prior
+        if nfe is None:
+            nfe = DEFAULT_NFE
+            if prior is not None and prior.max_nfe is not None:
+                nfe = min(nfe, prior.max_nfe)
+        self._check_nfe(nfe)
         _steps(nfe, solver)
         if clip is not None and clip <= 0:
             raise ValueError(f"clip must be > 0 or None, got {clip}")
@@ -165,20 +183,34 @@ class ODEActor(TensorDictModuleBase):
         self.clip = clip
         self.path_key = path_key
         self.in_keys = [noise_key, observation_key]
+        if prior is not None and prior.conditions_network:
+            self.in_keys += [loc_key, warm_key]
         self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
+
+    def _check_nfe(self, nfe: int) -> None:
+        limit = None if self.prior is None else self.prior.max_nfe
+        if limit is not None and nfe > limit:
+            raise ValueError(
+                f"{self.prior} is trained for at most {limit} network evaluation(s) per chunk, got "
+                f"nfe={nfe}"
+            )
 
     def forward(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
         """Write the chunk (and the path, where asked for)."""
-        a0, observation = (tensordict.get(key) for key in self.in_keys)
-        if a0 is None or observation is None:
-            missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
+        nfe = self.nfe if nfe is None else nfe
+        self._check_nfe(nfe)
+        a0, observation, *mean = (tensordict.get(key, None) for key in self.in_keys)
+        missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
+        if missing:
             raise KeyError(f"ODEActor needs the keys {self.in_keys}; missing: {missing}")
+        if self.prior is not None and mean:
+            observation = self.prior.extend_observation(observation, *mean)
         batch = a0.shape[:-2]
         observation = observation.reshape(-1, *observation.shape[len(batch) :])
         path_or_chunk = integrate(
             lambda t, a: self.network(t, a, observation),
             a0.reshape(-1, *a0.shape[-2:]),
-            nfe=self.nfe if nfe is None else nfe,
+            nfe=nfe,
             solver=self.solver,
             return_path=self.path_key is not None,
         )

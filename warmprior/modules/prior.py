@@ -61,6 +61,10 @@ class Prior:
     name: ClassVar[str]
     prediction_chunks: ClassVar[int] = 1
     default_sigma: ClassVar[float] = 1.0
+    max_nfe: ClassVar[int | None] = None
+    """The most network evaluations per chunk for which the trained field means anything."""
+    conditions_network: ClassVar[bool] = False
+    """Whether the network sees the mean as well, see :meth:`extend_observation`."""
     _registry: ClassVar[dict[str, type[Prior]]] = {}
 
     def __init__(
@@ -131,6 +135,52 @@ class Prior:
         """
         eps = torch.randn(loc.shape, generator=generator, dtype=loc.dtype, device=loc.device)
         return torch.where(warm, loc + self.sigma * eps, eps)
+
+    def sample_times(
+        self, batch_shape: torch.Size, generator: torch.Generator | None, like: Tensor
+    ) -> Tensor:
+        r"""Draw the times at which the field is trained: :math:`t \sim U(0, 1)` here.
+
+        Args:
+            batch_shape: ``*B``.
+            generator: source of randomness on ``like``'s device.
+            like: gives the device and dtype.
+
+        Returns:
+            Times in [0, 1], ``[*B]``.
+        """
+        return torch.rand(batch_shape, generator=generator, device=like.device, dtype=like.dtype)
+
+    def context_dim(self, action_dim: int) -> int:
+        """By how much :meth:`extend_observation` widens the observation: ``P * d_a + 1``, or 0.
+
+        Args:
+            action_dim: ``d_a``.
+        """
+        return self.prediction_length * action_dim + 1 if self.conditions_network else 0
+
+    def extend_observation(self, observation: Tensor, loc: Tensor, warm: Tensor) -> Tensor:
+        """What the network sees: the observation, and the mean where :attr:`conditions_network`.
+
+        The mean (zero on cold positions) is flattened, followed by 1 if anything is warm and else 0,
+        and repeated over the observation steps. The network is then built with
+        ``observation_dim = d_o + prior.context_dim(d_a)``.
+
+        Args:
+            observation: ``[*B, To, d_o]``.
+            loc: mean, ``[*B, P, d_a]``.
+            warm: bool ``[*B, P, 1]``.
+
+        Returns:
+            ``[*B, To, d_o + context_dim]``.
+        """
+        if not self.conditions_network:
+            return observation
+        mean = torch.where(warm, loc, 0.0).flatten(-2)
+        context = torch.cat([mean, warm.any(-2).to(mean)], dim=-1).unsqueeze(-2)
+        steps = observation.shape[-2]
+        context = context.expand(*context.shape[:-2], steps, -1)
+        return torch.cat([observation, context], dim=-1)
 
     def withhold(self, warm: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Turn a share ``cold_probability`` of the samples cold, whole samples at a time.

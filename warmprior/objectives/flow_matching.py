@@ -21,7 +21,8 @@ __all__ = ["FlowMatchingLoss"]
 class FlowMatchingLoss(LossModule):
     r"""Conditional flow matching with the actor's own source (Algorithm 1, training).
 
-    For each window: draw :math:`a_0` from the prior and :math:`t \sim U(0, 1)`, set
+    For each window: draw :math:`a_0` from the prior and :math:`t \sim U(0, 1)` (or what
+    :meth:`Prior.sample_times` draws instead), set
     :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regress
     :math:`v_\theta(t, a_t, o)` on :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's
     end do not count.
@@ -42,7 +43,8 @@ class FlowMatchingLoss(LossModule):
         and ``observation`` ``[*B, To, d_o]``.
 
     Raises:
-        ValueError: for an unknown ``reduction``.
+        ValueError: for an unknown ``reduction``, or a curved path with a prior whose field is used for
+            a single step.
 
     Examples:
         >>> import torch
@@ -90,6 +92,11 @@ class FlowMatchingLoss(LossModule):
         self.convert_to_functional(actor_network.network, "velocity_network")
         self.prior = actor_network.prior
         self.interpolant = LinearInterpolant() if interpolant is None else interpolant
+        if self.prior.max_nfe == 1 and not isinstance(self.interpolant, LinearInterpolant):
+            raise ValueError(
+                f"{self.prior} is evaluated with one step, which ends at the data only on a straight "
+                f"path: use LinearInterpolant, not {type(self.interpolant).__name__}"
+            )
         self.reduction = reduction
         self.generator = actor_network.sampler.generator if generator is None else generator
         self.set_keys(observation=actor_network.in_keys[0])
@@ -142,7 +149,8 @@ class FlowMatchingLoss(LossModule):
             raise KeyError(f"FlowMatchingLoss needs the keys {list(needed)}; missing: {missing}")
         batch = a1.shape[:-2]
         a0 = self.prior.sample(loc, warm, self.generator)
-        t = torch.rand(batch, generator=self.generator, device=a1.device, dtype=a1.dtype)
+        t = self.prior.sample_times(batch, self.generator, a1)
+        observation = self.prior.extend_observation(observation, loc, warm)
         a_t, velocity = self.interpolant(a0, a1, t)
         with self.velocity_network_params.to_module(
             self.velocity_network, preserve_module_state=False

@@ -144,9 +144,10 @@ class Comparison:
     def new_actor(self, prior: Prior, seed: int) -> WarmPriorActor:
         """An untrained policy; its initial weights depend on the seed alone."""
         torch.manual_seed(seed)
+        action_dim = self.data["action"].shape[-1]
         network = self.preset.make_network(
-            self.data["action"].shape[-1],
-            self.data["observation"].shape[-1],
+            action_dim,
+            self.data["observation"].shape[-1] + prior.context_dim(action_dim),
             prior.prediction_length,
         )
         # The normalised demonstrations span [-1, 1]: what leaves it is executed, and remembered, at
@@ -205,13 +206,17 @@ class Comparison:
         return WarmPriorActor.from_pretrained(directory, device=self.device)
 
     def evaluate(self, prior: Prior) -> None:
-        """Play the evaluation episodes of every checkpoint, seed and NFE of one prior."""
+        """Play the evaluation episodes of every checkpoint, seed and NFE of one prior.
+
+        NFEs above the prior's maximum are left out.
+        """
         preset = self.preset
+        nfes = [nfe for nfe in self.nfes if prior.max_nfe is None or nfe <= prior.max_nfe]
         todo = [
             (seed, checkpoint, nfe)
             for seed in self.seeds
             for checkpoint in preset.training.checkpoint_iterations
-            for nfe in self.nfes
+            for nfe in nfes
             if self.results.find(self._row(prior, seed, checkpoint, nfe).cell) is None
         ]
         if not todo:
