@@ -21,8 +21,8 @@ def test_predicts_a_residual():
     """With zeroed output weights the velocity is exactly minus the point."""
     network = VelocityMLP(2, 3, 4, hidden_dim=16)
     with torch.no_grad():
-        network.net[-1].weight.zero_()
-        network.net[-1].bias.zero_()
+        network.head[-1].weight.zero_()
+        network.head[-1].bias.zero_()
     a = torch.randn(5, 4, 2)
     assert torch.equal(network(torch.rand(5), a, torch.randn(5, 2, 3)), -a)
 
@@ -38,15 +38,15 @@ def test_every_input_matters():
         assert (value.grad.abs() > 0).all()
 
 
-@pytest.mark.parametrize("layers", [1, 2, 5])
-def test_parameter_count(layers):
-    hidden, dim = 24, 8
-    network = VelocityMLP(
-        2, 3, 4, 2, hidden_dim=hidden, num_layers=layers, timestep_embedding_dim=dim
-    )
-    inputs = 4 * 2 + 2 * 3 + dim
-    expected = inputs * hidden + hidden + (layers - 1) * (hidden * hidden + hidden)
-    expected += hidden * 4 * 2 + 4 * 2
+@pytest.mark.parametrize("blocks", [0, 1, 3])
+def test_parameter_count(blocks):
+    h, dim = 24, 8
+    chunk, observation = 4 * 2, 2 * 3
+    network = VelocityMLP(2, 3, 4, 2, hidden_dim=h, num_blocks=blocks, timestep_embedding_dim=dim)
+    expected = (chunk + dim) * h + h  # chunk and time
+    expected += observation * h + h + h * h + h  # observation encoder
+    expected += blocks * (2 * h + 2 * (h * h + h))  # norm and two layers
+    expected += 2 * h + h * chunk + chunk  # head
     assert sum(p.numel() for p in network.parameters()) == expected
 
 

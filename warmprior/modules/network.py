@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar
 
 import torch
@@ -121,10 +120,11 @@ class VelocityNetwork(nn.Module):
 
 
 class TimestepEmbedding(nn.Module):
-    """Sines and cosines of ``1000 t`` at log-spaced frequencies (Vaswani et al., 2017).
+    """Sines and cosines of ``t`` at frequencies from 1 to 100, log-spaced.
 
-    Flow times lie in [0, 1]; without the factor 1000 (the range of the diffusion step for which the
-    frequencies were chosen) all embeddings would nearly coincide.
+    The embedding of diffusion models (frequencies up to 1 per step of a thousand) would suit flow times
+    in [0, 1] badly: at ``1000 t`` the fastest features are noise to the network, and ``t = 0``, the only
+    time that a one-step sampler evaluates, becomes a point unlike all those seen in training.
 
     Args:
         dim: width of the embedding, even.
@@ -144,9 +144,7 @@ class TimestepEmbedding(nn.Module):
         super().__init__()
         if dim < 4 or dim % 2:
             raise ValueError(f"the timestep embedding must be even and >= 4, got {dim}")
-        half = dim // 2
-        exponent = torch.arange(half) * (-math.log(10_000.0) / (half - 1))
-        self.register_buffer("frequencies", 1000.0 * exponent.exp(), persistent=False)
+        self.register_buffer("frequencies", torch.logspace(0, 2, dim // 2), persistent=False)
 
     def forward(self, t: Tensor) -> Tensor:
         """Embed times ``t`` ``[B]`` as ``[B, dim]``."""

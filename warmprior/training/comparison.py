@@ -203,7 +203,7 @@ class Comparison:
     def policy(self, prior: Prior, seed: int, checkpoint: int) -> WarmPriorActor:
         """The averaged policy of one checkpoint, from disk."""
         directory = self._policies[prior.name, seed].policy_path(checkpoint)
-        return WarmPriorActor.from_pretrained(directory, device=self.device)
+        return WarmPriorActor.from_pretrained(directory, prior=prior, device=self.device)
 
     def evaluate(self, prior: Prior) -> None:
         """Play the evaluation episodes of every checkpoint, seed and NFE of one prior.

@@ -69,7 +69,7 @@ PRESETS: dict[str, Preset] = {
             checkpoints=1,
         ),
         network="mlp",
-        network_options={"hidden_dim": 512},
+        network_options={"hidden_dim": 384},
         seeds=1,
         episodes=30,
         top_k=1,
