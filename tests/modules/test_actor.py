@@ -299,3 +299,10 @@ def test_an_interrupted_save_leaves_the_old_policy(tmp_path, monkeypatch):
     with pytest.raises(OSError, match=str(tmp_path)):
         saved(tmp_path, PastPrior(H, sigma=0.7))
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_loading_for_another_prior_is_refused(tmp_path):
+    WarmPriorActor(network_for(PastPrior(H)), PastPrior(H)).save_pretrained(tmp_path)
+    WarmPriorActor.from_pretrained(tmp_path, prior=PastPrior(H))
+    with pytest.raises(ValueError, match=r"trained with PastPrior.*not with GaussianPrior"):
+        WarmPriorActor.from_pretrained(tmp_path, prior=GaussianPrior(H))

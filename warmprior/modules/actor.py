@@ -158,6 +158,7 @@ class WarmPriorActor(TensorDictModuleBase):
         cls,
         directory: str | Path,
         *,
+        prior: Prior | None = None,
         device: torch.device | str = "cpu",
         generator: torch.Generator | None = None,
     ) -> WarmPriorActor:
@@ -167,17 +168,24 @@ class WarmPriorActor(TensorDictModuleBase):
             directory: where ``config.json`` and ``model.safetensors`` lie.
 
         Keyword Args:
+            prior: the prior that the environment carries, if any: it must be the policy's own.
             device: where to put the weights.
             generator: source of randomness of the sampler.
 
         Raises:
             FileNotFoundError: if a file is missing.
-            ValueError: if the files are damaged, of another format version, or do not fit each other.
+            ValueError: if the files are damaged, of another format version, do not fit each other, or
+                belong to a policy with another prior.
         """
         from warmprior.transforms.normalize import Normalizer
 
         directory = Path(directory)
         config = _read_config(directory / "config.json")
+        if prior is not None and prior.config() != config["prior"]:
+            raise ValueError(
+                f"the policy at {directory} was trained with {Prior.from_config(config['prior'])}, not "
+                f"with {prior}"
+            )
         options: dict[str, Any] = dict(config["actor"])
         key = options.pop("observation_key")
         normalizer = config["normalizer"]
