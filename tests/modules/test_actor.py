@@ -268,7 +268,7 @@ def test_truncated_weights(tmp_path, keep):
 
 def test_weights_of_another_network(tmp_path):
     saved(tmp_path / "a")
-    other = WarmPriorActor(network_for(PastPrior(H), num_layers=1), PastPrior(H))
+    other = WarmPriorActor(network_for(PastPrior(H), num_blocks=1), PastPrior(H))
     other.save_pretrained(tmp_path / "b")
     weights = (tmp_path / "b" / "model.safetensors").read_bytes()
     (tmp_path / "a" / "model.safetensors").write_bytes(weights)
@@ -280,10 +280,10 @@ def test_weights_of_another_width(tmp_path):
     saved(tmp_path)
     path = tmp_path / "model.safetensors"
     tensors = load_file(path)
-    name = next(n for n in tensors if n.endswith("net.0.weight"))
+    name = next(n for n in tensors if n.endswith("embed_chunk.weight"))
     tensors[name] = tensors[name][:, :-1].contiguous()
     save_file(tensors, path)
-    with pytest.raises(ValueError, match=r"(?s)does not fit.*net.0.weight"):
+    with pytest.raises(ValueError, match=r"(?s)does not fit.*embed_chunk.weight"):
         WarmPriorActor.from_pretrained(tmp_path)
 
 
