@@ -111,37 +111,39 @@ class ChunkStep(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         parent, reward_key, done_key = self._keys_of_parent()
         chunk = tensordict.get(self.chunk_key)
-        done: Tensor = next_tensordict.get(done_key)
         reward: Tensor = next_tensordict.get(reward_key)
-        alive = ~done
+        done: Tensor = next_tensordict.get(done_key)
         asked = tensordict.get("_step", None)
-        if asked is not None:  # the caller skips some environments in this step
-            alive = alive & asked.view(alive.shape)
-        steps = torch.ones_like(done, dtype=torch.int64)
-        if asked is not None:
-            steps = steps * asked.view(steps.shape)
+        # Which environments go on; None for all of them, the usual case, which needs no masks.
+        alive = None if asked is None else asked.view(done.shape)
+        steps = torch.ones_like(done, dtype=torch.int64) if alive is None else alive.long()
         discount = self.gamma
         current = tensordict.copy()
         for i in range(1, self.execute):
-            if not alive.any():
+            if done.any():
+                alive = ~done if alive is None else alive & ~done
+            if alive is not None and not alive.any():
                 break
-            all_alive = bool(alive.all())
             _advance(current, next_tensordict, reward_key)
             current.set(self.action_key, chunk[..., i, :])
-            if all_alive and isinstance(parent, TransformedEnv):
-                # What EnvBase.step adds to this are checks, which the outer step makes.
-                out = parent._step(current)
-            elif all_alive:
-                out = parent.step(current.copy()).get("next")
+            if alive is None:
+                # What EnvBase.step adds to TransformedEnv._step are checks: the outer step makes them.
+                next_tensordict = (
+                    parent._step(current)
+                    if isinstance(parent, TransformedEnv)
+                    else parent.step(current.copy()).get("next")
+                )
+                reward = torch.add(reward, next_tensordict.get(reward_key), alpha=discount)
+                steps += 1
             else:
                 # A partial step: batched environments leave the finished ones alone.
                 current.set("_step", alive.view(current.shape))
                 out = parent.step(current.copy()).get("next")
-            reward = reward + torch.where(alive, out.get(reward_key), 0.0) * discount
-            steps = steps + alive
+                reward = reward + torch.where(alive, out.get(reward_key), 0.0) * discount
+                steps += alive
+                next_tensordict = _update_where(alive, next_tensordict, out)
             discount *= self.gamma
-            next_tensordict = out if all_alive else _update_where(alive, next_tensordict, out)
-            alive = alive & ~next_tensordict.get(done_key)
+            done = next_tensordict.get(done_key)
         next_tensordict.set(reward_key, reward)
         return next_tensordict.set(self.executed_key, steps)
 
