@@ -15,7 +15,14 @@ from pathlib import Path
 
 import torch
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior import (
+    GaussianPrior,
+    HistoryPrior,
+    PastPrior,
+    PreviewPrior,
+    Prior,
+    RegressionPrior,
+)
 from warmprior.data import TASKS, download_robomimic, generate_demonstrations, get_task
 from warmprior.data.tasks import EVALUATION_SEED
 from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
@@ -25,7 +32,9 @@ from warmprior.training.comparison import Comparison, Demonstrations
 from warmprior.training.filmstrip import record_filmstrip
 from warmprior.training.presets import PRESETS, Preset
 
-PRIORS: dict[str, type[Prior]] = {p.name: p for p in (GaussianPrior, PastPrior, PreviewPrior)}
+COMPARED = (GaussianPrior, PastPrior, PreviewPrior)
+BASELINES = (RegressionPrior, HistoryPrior)
+PRIORS: dict[str, type[Prior]] = {prior.name: prior for prior in COMPARED + BASELINES}
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -33,11 +42,17 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("--task", default="square", choices=TASKS, help="manipulation task (default: square)")
+    add("--task", choices=TASKS, help="manipulation task (default: square, or the file's)")
     add("--data", default="ph", choices=("ph", "mh"), help="one proficient or six mixed operators")
     add("--dataset", type=Path, help="a robomimic HDF5 file, instead of generated data")
     add("--download", action="store_true", help="fetch the official file from the hub")
-    add("--prior", nargs="+", default=list(PRIORS), choices=PRIORS, help="sources (default: all)")
+    add(
+        "--prior",
+        nargs="+",
+        default=[prior.name for prior in COMPARED],
+        choices=PRIORS,
+        help="sources and baselines; the first in this order is the base (default: the first three)",
+    )
     add("--sigma", type=float, help="noise of the warm priors (default: past 0.5, preview 1.0)")
     add(
         "--cold-probability", type=float, default=0.0, help="share of training samples without mean"
@@ -65,11 +80,9 @@ def _describe_presets() -> str:
 def make_priors(args: argparse.Namespace) -> list[Prior]:
     priors = []
     for name in sorted(set(args.prior), key=list(PRIORS).index):
-        options = (
-            {}
-            if name == "gaussian"
-            else {"sigma": args.sigma, "cold_probability": args.cold_probability}
-        )
+        options = {}
+        if name in ("past", "preview"):
+            options = {"sigma": args.sigma, "cold_probability": args.cold_probability}
         priors.append(PRIORS[name](args.chunk, **options))
     return priors
 
@@ -99,7 +112,7 @@ def output_folder(args: argparse.Namespace) -> Path:
                 "another --out"
             )
         return args.out
-    name = f"{args.task}-{args.data}-{args.preset}"
+    name = f"{args.task or args.dataset.stem}-{args.data}-{args.preset}"
     root = Path("runs")
     taken = [
         d for d in root.glob(f"{name}*") if d.name == name or d.name[len(name) + 1 :].isdigit()
@@ -151,6 +164,8 @@ def draw(comparison: Comparison) -> None:
         )
         return
     for prior in comparison.priors:
+        if prior.max_nfe is not None and prior.max_nfe < min(comparison.nfes):
+            continue
         checkpoint = comparison.preset.training.iterations
         strip = record_filmstrip(
             comparison.policy(prior, comparison.seeds[0], checkpoint),
@@ -171,7 +186,11 @@ def draw(comparison: Comparison) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     args = parse(argv)
+    if args.dataset is None and args.task is None:
+        args.task = "square"
     try:
+        if args.device.startswith("cuda") and not torch.cuda.is_available():
+            raise ValueError(f"--device {args.device}: PyTorch sees no CUDA device here")
         preset, priors = make_preset(args), make_priors(args)
         if min(args.nfe) < 1:
             raise ValueError(f"--nfe must be at least 1, got {min(args.nfe)}")
@@ -190,6 +209,11 @@ def main(argv: list[str] | None = None) -> int:
             resume=args.resume,
             options={key: str(value) for key, value in vars(args).items() if value is not None},
         )
+        if args.task not in (None, comparison.task):
+            raise ValueError(
+                f"{args.dataset} holds demonstrations of {comparison.task}, not of {args.task}: leave "
+                "--task out or correct it"
+            )
         results = comparison.run()
     except (ValueError, OSError, ImportError) as error:
         print(f"robomimic.py: error: {error}", file=sys.stderr)

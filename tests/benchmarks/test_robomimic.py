@@ -91,6 +91,8 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
         ({"episodes": 0}, "episodes"),
         ({"iterations": 0}, "checkpoints|iterations"),
         ({"chunk": 0}, "chunk_length"),
+        ({"device": "cuda:99"}, "CUDA device|device"),
+        ({"task": "can"}, "holds demonstrations of lift"),
         ({"dataset": "missing.hdf5"}, "missing.hdf5"),
     ],
 )

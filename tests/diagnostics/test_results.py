@@ -43,6 +43,15 @@ def test_damaged_file_is_named(tmp_path):
         Results(path, META, resume=True)
 
 
+def test_resuming_another_runs_file_is_refused(tmp_path):
+    results = filled(tmp_path, META | {"training": {"betas": (0.9, 0.999)}})
+    same = META | {"training": {"betas": (0.9, 0.999)}}
+    assert Results(results.path, same, resume=True, identity=("training",)).rows == results.rows
+    other = META | {"training": {"betas": (0.9, 0.99)}}
+    with pytest.raises(ValueError, match="other options: its training"):
+        Results(results.path, other, resume=True, identity=("training",))
+
+
 def test_summary_takes_the_best_checkpoints_of_each_seed(tmp_path):
     summary = summarize(filled(tmp_path).rows, top_k=1)["past", 1]
     assert summary.mean == pytest.approx(0.8)
@@ -60,6 +69,16 @@ def test_table_shows_gains_marks_and_the_papers_row(tmp_path):
     )
     assert paper == "| Square-PH, paper (official data) | 83.6 | 86.6 (+3.0) | 87.3 (+3.7) |"
     assert "compare gains within a row" in table
+    assert "WP-Preview is below" not in table
+
+
+def test_table_says_when_preview_loses(tmp_path):
+    results = filled(tmp_path)
+    results.rows = [
+        replace(row, successes=0) if row.prior == "preview" else row for row in results.rows
+    ]
+    table = success_table(results, priors=["gaussian", "past", "preview"], nfes=[1], top_k=1)
+    assert "WP-Preview is below the base" in table
 
 
 def test_paper_numbers_cover_table_1():

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from warmprior.diagnostics import (
     SeedSummary,
     exceeds_one_sigma,
+    probability_better,
     success_posterior,
     summarize_seeds,
     top_k_mean,
@@ -70,3 +71,26 @@ def test_empty_inputs_are_refused():
         top_k_mean([], 3)
     with pytest.raises(ValueError, match="seed"):
         summarize_seeds([])
+
+
+@given(st.integers(0, 60), st.integers(0, 60), st.integers(0, 60), st.integers(0, 60))
+def test_probability_better_is_the_integral_over_both_posteriors(k_a, n_a, k_b, n_b):
+    np, stats = pytest.importorskip("numpy"), pytest.importorskip("scipy.stats")
+    k_a, k_b = min(k_a, n_a), min(k_b, n_b)
+    a, b = stats.beta(k_a + 1, n_a - k_a + 1), stats.beta(k_b + 1, n_b - k_b + 1)
+    nodes, weights = np.polynomial.legendre.leggauss(200)
+    p = (nodes + 1) / 2
+    expected = float((weights / 2 * a.pdf(p) * b.cdf(p)).sum())
+    assert probability_better(k_a, n_a, k_b, n_b) == pytest.approx(expected, abs=1e-9)
+
+
+def test_probability_better_agrees_with_sampling_and_stays_a_probability():
+    np = pytest.importorskip("numpy")
+    rng = np.random.default_rng(0)
+    draws = rng.beta(171, 31, 10**6) > rng.beta(156, 46, 10**6)
+    assert probability_better(170, 200, 155, 200) == pytest.approx(draws.mean(), abs=2e-3)
+    for counts in [(600, 600, 0, 600), (0, 600, 600, 600), (2999, 3000, 2998, 3000)]:
+        p, q = probability_better(*counts), probability_better(*counts[2:], *counts[:2])
+        assert 0 <= p <= 1 and p + q == pytest.approx(1.0)
+    with pytest.raises(ValueError, match="successes"):
+        probability_better(3, 2, 0, 0)

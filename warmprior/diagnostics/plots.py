@@ -14,7 +14,13 @@ from warmprior.diagnostics.statistics import success_posterior
 
 __all__ = ["plot_filmstrip", "plot_learning_curves", "plot_success"]
 
-_COLORS = {"gaussian": "#7f7f7f", "past": "#1f77b4", "preview": "#d95f02"}
+_COLORS = {
+    "gaussian": "#7f7f7f",
+    "past": "#1f77b4",
+    "preview": "#d95f02",
+    "regression": "#b8860b",
+    "history": "#6a51a3",
+}
 
 
 def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, list[Any]]:

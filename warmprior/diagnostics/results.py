@@ -19,7 +19,13 @@ from warmprior.diagnostics.statistics import (
 
 __all__ = ["PRIOR_LABELS", "Results", "Row", "success_table", "summarize"]
 
-PRIOR_LABELS = {"gaussian": "Base", "past": "WP-Past", "preview": "WP-Preview"}
+PRIOR_LABELS = {
+    "gaussian": "Base",
+    "past": "WP-Past",
+    "preview": "WP-Preview",
+    "regression": "Regression",
+    "history": "History",
+}
 
 
 @dataclass(frozen=True)
@@ -80,12 +86,20 @@ class Results:
         path: the file.
         meta: facts about the run.
         resume: keep the rows that the file has.
+        identity: entries of ``meta`` that must be those of the file to resume.
 
     Raises:
-        ValueError: if the file to resume from is damaged.
+        ValueError: if the file to resume is damaged or belongs to a run with another identity.
     """
 
-    def __init__(self, path: str | Path, meta: dict[str, Any], *, resume: bool = False) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        meta: dict[str, Any],
+        *,
+        resume: bool = False,
+        identity: Sequence[str] = (),
+    ) -> None:
         self.path = Path(path)
         self.meta = meta
         self.rows: list[Row] = []
@@ -95,11 +109,20 @@ class Results:
                 for row in stored["rows"]:
                     del row["success_rate"]
                     self.rows.append(Row(**row))
+                theirs = {key: stored["meta"][key] for key in identity}
                 self.meta = meta | {"wall_time_s": stored["meta"].get("wall_time_s", 0.0)}
             except (json.JSONDecodeError, KeyError, TypeError) as error:
                 raise ValueError(
                     f"{self.path} is not a results file of this version: {error!r}"
                 ) from error
+            # Through JSON, as the stored values went: tuples become lists.
+            mine = json.loads(json.dumps({key: meta[key] for key in identity}))
+            for key in identity:
+                if theirs[key] != mine[key]:
+                    raise ValueError(
+                        f"{self.path} was made with other options: its {key} is {theirs[key]}, here it "
+                        f"is {mine[key]}. Give the same options, or another output folder."
+                    )
 
     def find(self, cell: tuple[Any, ...]) -> Row | None:
         """The row of a cell (see :attr:`Row.cell`), if it was evaluated already."""
@@ -209,6 +232,16 @@ def _notes(results: Results, summaries: dict[Any, SeedSummary], top_k: int) -> l
         if seeds > 1
         else "- One seed has no spread: no gain is marked. The intervals below come from the episodes.",
     ]
+    bases, previews = (
+        {nfe: summary.mean for (prior, nfe), summary in summaries.items() if prior == name}
+        for name in ("gaussian", "preview")
+    )
+    if any(previews[nfe] < bases.get(nfe, 0.0) for nfe in previews):
+        notes.append(
+            "- WP-Preview is below the base here. It trains on a perfect forecast of its target and "
+            "meets its own imperfect one; at small budgets it copies that instead of correcting it "
+            "(docs/benchmarks.md, 'WP-Preview at small budgets')."
+        )
     if results.meta["data"]["source"] != "official":
         notes.append(
             "- The measured row is from other demonstrations, another network and another budget than "

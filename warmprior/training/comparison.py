@@ -100,7 +100,10 @@ class Comparison:
         self.losses: dict[str, list[list[tuple[int, float]]]] = {}
         self._started = time.monotonic()
         self.results = Results(
-            self.directory / "results.json", self._meta(dataset), resume=self.resume
+            self.directory / "results.json",
+            self._meta(dataset),
+            resume=self.resume,
+            identity=("data", "training", "network"),
         )
         self._earlier = self.results.meta.get("wall_time_s", 0.0)
 

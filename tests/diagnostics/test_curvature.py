@@ -1,0 +1,189 @@
+"""Curvature against fields whose paths are known in closed form."""
+
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+
+from tests.diagnostics.fields import D_A, H, batch, policy
+from warmprior import HistoryPrior, PastPrior, PreviewPrior, RegressionPrior, VelocityMLP
+from warmprior.diagnostics import compare_curvature, curvature
+from warmprior.modules import WarmPriorActor
+
+
+def test_a_constant_field_is_straight():
+    out = curvature(policy(lambda t, a, o: torch.full_like(a, 2.0)), batch())
+    assert out["kappa"].abs().max() < 1e-9
+    torch.testing.assert_close(out["speed"], torch.full((5,), 4.0 * H * D_A))
+    assert out["one_step_error"].max() < 1e-4
+
+
+@pytest.mark.parametrize("n_steps", [10, 100])
+def test_a_linear_field_has_the_closed_form(n_steps):
+    """v = -a: v_k = -(1 - 1/N)^k a0 at step k, coordinate by coordinate."""
+    prior = PastPrior(H, sigma=0.0)  # the source is the mean itself
+    data = batch()
+    data["prior", "loc"] = torch.randn(5, H, D_A)
+    data["prior", "warm"] = torch.ones(5, H, 1, dtype=torch.bool)
+    out = curvature(policy(lambda t, a, o: -a, prior), data, n_steps)
+    length = data["prior", "loc"].double().square().sum((-1, -2))
+    factors = (1 - 1 / n_steps) ** torch.arange(n_steps, dtype=torch.float64)
+    torch.testing.assert_close(
+        out["kappa"].double(), length * factors.var(correction=0), rtol=1e-4, atol=1e-7
+    )
+    torch.testing.assert_close(
+        out["speed"].double(), length * factors.mean() ** 2, rtol=1e-4, atol=1e-7
+    )
+    gap = (1 - 1 / n_steps) ** n_steps  # one step ends at 0, the path at this share of a0
+    torch.testing.assert_close(
+        out["one_step_error"].double(), (length / (H * D_A)).sqrt() * gap, rtol=1e-4, atol=1e-6
+    )
+
+
+def test_a_quarter_turn_in_time_has_the_integral():
+    """v = cos(pi t / 2) on every coordinate: kappa = 1/2 - (2 / pi)^2 each, up to the grid."""
+    field = policy(lambda t, a, o: torch.cos(torch.pi / 2 * t) + torch.zeros_like(a))
+    out = curvature(field, batch(), 2000)
+    expected = torch.full((5,), H * D_A * (0.5 - (2 / torch.pi) ** 2))
+    torch.testing.assert_close(out["kappa"], expected, rtol=1e-2, atol=0)
+
+
+def test_executed_positions_and_padding_count_separately():
+    """Speed p at position p: sums over the counted positions only."""
+    prior = PreviewPrior(H)
+    weights = torch.arange(1.0, 2 * H + 1).view(1, -1, 1)
+    data = batch(length=2 * H)
+    pad = torch.zeros(5, 2 * H, dtype=torch.bool)
+    pad[0, 2:] = True
+    out = curvature(policy(lambda t, a, o: weights.expand_as(a), prior), data)
+    assert out["speed"][1] == pytest.approx(D_A * sum(p * p for p in range(1, 2 * H + 1)))
+    assert out["speed_executed"][1] == pytest.approx(D_A * (1 + 4 + 9))
+    data["action_is_pad"] = pad
+    out = curvature(policy(lambda t, a, o: weights.expand_as(a), prior), data, executed=1)
+    assert out["speed"].tolist() == pytest.approx([D_A * 5.0] + [D_A * 91.0] * 4)
+    assert out["speed_executed"].tolist() == pytest.approx([D_A * 1.0] * 5)
+
+
+def network_policy(prior=None, seed=0):
+    prior = PastPrior(H) if prior is None else prior
+    torch.manual_seed(0)
+    network = VelocityMLP(D_A, 4 + prior.context_dim(D_A), prior.prediction_length, 1, hidden_dim=8)
+    return WarmPriorActor(network, prior, generator=torch.Generator().manual_seed(seed))
+
+
+def test_the_split_changes_nothing():
+    data, results = batch(7), []
+    for split in (1, 3, 10_000):
+        generator = torch.Generator().manual_seed(3)
+        results.append(
+            curvature(network_policy(), data, 20, draws=3, split=split, generator=generator)
+        )
+    for other in results[1:]:
+        for key, value in results[0].items():
+            torch.testing.assert_close(other[key], value, rtol=1e-4, atol=1e-6)
+
+
+def test_draws_average_independent_sources():
+    generator = torch.Generator().manual_seed(3)
+    both = curvature(network_policy(), batch(), 20, draws=2, generator=generator)
+    generator = torch.Generator().manual_seed(3)
+    singles = [curvature(network_policy(), batch(), 20, generator=generator) for _ in range(2)]
+    expected = (singles[0]["kappa"] + singles[1]["kappa"]) / 2
+    torch.testing.assert_close(both["kappa"], expected)
+
+
+def test_batch_shape_mode_and_generator_are_respected():
+    actor = network_policy(HistoryPrior(H)).train()
+    flat = curvature(actor, batch(6), 10, generator=torch.Generator().manual_seed(0))
+    shaped = curvature(
+        actor, batch(6).reshape(2, 3), 10, generator=torch.Generator().manual_seed(0)
+    )
+    torch.testing.assert_close(shaped["kappa"].flatten(), flat["kappa"])
+    assert actor.training and actor.network.training
+    assert not flat["kappa"].requires_grad
+
+
+def test_a_field_at_rest_is_flagged():
+    with pytest.warns(UserWarning, match="5 of 5 paths do not move"):
+        out = curvature(policy(lambda t, a, o: 0 * a), batch())
+    assert out["kappa"].isnan().all() and out["relative"].isnan().all()
+    assert (out["speed"] == 0).all()
+
+
+def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
+    """A little noise around zero velocity, on the first half of WP-Preview only."""
+    prior = PreviewPrior(H, sigma=0.1)
+    n = 40
+    target = torch.randn(n, 2 * H, D_A, generator=torch.Generator().manual_seed(0))
+    data = batch(n, length=2 * H)
+    data["prior", "loc"] = torch.cat([target[:, :H], torch.zeros(n, H, D_A)], 1)
+    data["prior", "warm"] = torch.arange(2 * H).view(1, -1, 1).expand(n, -1, 1) < H
+    data["vla_action", "chunk"] = target
+
+    def lazy(t, a, o):  # first half nearly still, second half pulled to the mean of the data
+        return torch.cat([0.01 * torch.sin(9 * t) + 0 * a[:, :H], -a[:, H:]], 1)
+
+    with pytest.warns(UserWarning, match="on the executed positions"):
+        out = curvature(policy(lazy, prior), data)
+    assert out["kappa_executed"].isnan().all() and out["relative_executed"].isnan().all()
+    assert torch.isfinite(out["kappa"]).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert torch.isfinite(
+            curvature(policy(lazy, prior), data.exclude("vla_action"))["kappa"]
+        ).all()
+
+
+def test_comparison_is_relative_to_the_first():
+    fields = {"a": policy(lambda t, a, o: -a), "b": policy(lambda t, a, o: -2 * a)}
+    data = batch(2000)
+    out = compare_curvature(fields, {"a": data, "b": data})
+    steps = torch.arange(100, dtype=torch.float64)
+    kappas = [(rate * (1 - rate / 100) ** steps).var(correction=0) for rate in (1.0, 2.0)]
+    assert out["a"]["ratio"] == 1.0
+    assert out["b"]["ratio"] == pytest.approx(float(kappas[1] / kappas[0]), rel=0.1)
+
+
+def test_comparison_refuses_other_chunks_and_other_observations():
+    data = batch()
+    fields = {"a": policy(lambda t, a, o: -a), "b": policy(lambda t, a, o: -a, PastPrior(H + 1))}
+    with pytest.raises(ValueError, match="one chunk length"):
+        compare_curvature(fields, {"a": data, "b": batch(length=H + 1)})
+    fields["b"] = fields["a"]
+    other = data.clone()
+    other["observation"] += 1
+    with pytest.raises(ValueError, match="same observations"):
+        compare_curvature(fields, {"a": data, "b": other})
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (lambda d: d.exclude("observation"), KeyError, "observation"),
+        (lambda d: d.exclude(("prior", "warm")), KeyError, "warm"),
+        (lambda d: d[:0], ValueError, "no observation"),
+        (lambda d: d.update({"observation": d["observation"] * torch.nan}), ValueError, "NaN"),
+        (lambda d: batch(length=H + 1), ValueError, "positions"),
+    ],
+)
+def test_bad_batches_are_named(change, error, message):
+    with pytest.raises(error, match=message):
+        curvature(policy(lambda t, a, o: -a), change(batch()))
+
+
+def test_bad_options_and_policies_are_named():
+    field = policy(lambda t, a, o: -a)
+    with pytest.raises(ValueError, match="n_steps >= 2"):
+        curvature(field, batch(), 1)
+    with pytest.raises(ValueError, match="executed"):
+        curvature(field, batch(), executed=H + 1)
+    with pytest.raises(ValueError, match="no path of 100 steps"):
+        curvature(policy(lambda t, a, o: -a, RegressionPrior(H)), batch())
+
+    def explodes(t, a, o):
+        return torch.where((torch.arange(len(a)) == 2).view(-1, 1, 1), a * torch.inf, -a)
+
+    with pytest.raises(FloatingPointError, match="1 of 5 paths.*observation 2"):
+        curvature(policy(explodes), batch())

@@ -1,0 +1,55 @@
+from __future__ import annotations
+
+import pytest
+import torch
+
+from tests.diagnostics.fields import D_A, H, batch, policy
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior.diagnostics import flow_paths, forecast_mean
+
+
+def test_paths_start_at_the_source_and_follow_euler():
+    generator = torch.Generator().manual_seed(4)
+    field = policy(lambda t, a, o: o[..., :D_A] - a)
+    data = batch(6).reshape(2, 3)
+    path = flow_paths(field, data, 10, generator=generator)
+    assert path.shape == (2, 3, 11, H, D_A)
+    a0 = torch.randn(6, H, D_A, generator=torch.Generator().manual_seed(4)).view(2, 3, H, D_A)
+    assert torch.equal(path[:, :, 0], a0)
+    goal = data["observation"][..., :D_A]
+    expected = [goal + (a0 - goal) * 0.9**k for k in range(11)]
+    torch.testing.assert_close(path, torch.stack(expected, 2))
+
+
+@pytest.mark.parametrize("executed", [1, H])
+def test_forecast_is_the_previous_prediction(executed):
+    """A field that carries every source to the positions 0, 1, 2, ... predicts exactly these."""
+    prior = PreviewPrior(H, sigma=0.1)
+
+    def field(t, a, o):
+        goal = torch.arange(2.0 * H).view(1, -1, 1)
+        return (goal - a) / (1 - t).clamp_min(1e-6)
+
+    out = forecast_mean(policy(field, prior), batch(length=2 * H), executed=executed)
+    expected = torch.arange(executed, executed + H).float()
+    torch.testing.assert_close(out["prior", "loc"][:, :H, 0], expected.expand(5, -1))
+    assert out["prior", "warm"][:, :H].all() and not out["prior", "warm"][:, H:].any()
+
+
+def test_forecast_of_the_past_needs_a_full_history():
+    actor = policy(lambda t, a, o: -a, PastPrior(H))
+    data = batch()
+    assert forecast_mean(actor, data)["prior", "warm"].all()
+    assert not forecast_mean(actor, data, executed=1)["prior", "warm"].any()
+    data["prior", "warm"] = torch.ones_like(data["prior", "warm"])
+    assert forecast_mean(actor, data, executed=1)["prior", "warm"].all()
+
+
+def test_bad_input_is_named():
+    actor = policy(lambda t, a, o: -a, PreviewPrior(H))
+    with pytest.raises(KeyError, match="loc"):
+        forecast_mean(actor, batch(length=2 * H).exclude(("prior", "loc")))
+    with pytest.raises(ValueError, match="at most H"):
+        forecast_mean(actor, batch(length=2 * H), executed=H + 1)
+    with pytest.raises(ValueError, match="at least 1 step"):
+        flow_paths(policy(lambda t, a, o: -a, GaussianPrior(H)), batch(), 0)

@@ -1,0 +1,142 @@
+"""Smoothness of rollouts against plain loops over the executed actions."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.envs import GymEnv, StepCounter, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from warmprior import ChunkStep, HistoryPrior, PastPrior, VelocityMLP, WarmPriorActor
+from warmprior.diagnostics import HistoryShift, compare_smoothness, executed_actions, smoothness
+
+
+def rollout_of(chunks, steps, done=None):
+    steps = torch.as_tensor(steps).unsqueeze(-1)
+    data = {"vla_action": {"chunk": chunks}, "next": {"executed_steps": steps}}
+    if done is not None:
+        data["next"]["done"] = torch.as_tensor(done).unsqueeze(-1)
+    return TensorDict(data, steps.shape[:-1])
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    rows=st.integers(1, 3),
+    decisions=st.integers(2, 6),
+    horizon=st.integers(1, 4),
+    seed=st.integers(0, 10**6),
+)
+def test_against_loops(rows, decisions, horizon, seed):
+    rng = random.Random(seed)
+    generator = torch.Generator().manual_seed(seed)
+    chunks = torch.randn(rows, decisions, horizon + 1, 2, generator=generator)
+    steps = [[rng.randint(0, horizon) for _ in range(decisions)] for _ in range(rows)]
+    steps[0][:2] = [horizon, 1]
+    done = [[rng.random() < 0.3 for _ in range(decisions)] for _ in range(rows)]
+    done[0][0] = False
+    boundary, inner, jerk, switches = [], [], [], []
+    for b in range(rows):
+        episodes = [[]]
+        for j in range(decisions):
+            episodes[-1] += [(j, chunks[b, j, i].tolist()) for i in range(steps[b][j])]
+            if done[b][j]:
+                episodes.append([])
+        for episode in episodes:
+            for (j, x), (k, y) in zip(episode, episode[1:], strict=False):
+                (boundary if j != k else inner).append(math.dist(x, y))
+                if j != k:
+                    switches.append((x[1] > 0) != (y[1] > 0))
+            actions = [action for _, action in episode]
+            for p, q, r, s in zip(actions, actions[1:], actions[2:], actions[3:], strict=False):
+                third = [d - 3 * c + 3 * b - a for a, b, c, d in zip(p, q, r, s, strict=True)]
+                jerk.append(math.hypot(*third))
+    result = smoothness(rollout_of(chunks, steps, done), mode=1)
+
+    def mean(values):
+        return sum(values) / len(values) if values else math.nan
+
+    assert result.boundaries == len(boundary)
+    assert result.boundary_jump == pytest.approx(mean(boundary), rel=1e-4)
+    assert result.inner_jump == pytest.approx(mean(inner), rel=1e-4, nan_ok=True)
+    assert result.jerk == pytest.approx(mean(jerk), rel=1e-3, nan_ok=True)
+    assert result.switch_rate == pytest.approx(mean(switches))
+
+
+def test_actions_without_a_mode_do_not_switch():
+    chunks = torch.tensor([[[0.01]], [[1.0]], [[-1.0]], [[0.0]]])
+    rollout = rollout_of(chunks, [1, 1, 1, 1])
+    assert smoothness(rollout, mode=0).switch_rate == pytest.approx(0.5)
+
+    def clear(actions):
+        height = actions[..., 0]
+        return torch.where(height.abs() > 0.1, height, 0.0)
+
+    assert smoothness(rollout, mode=clear).switch_rate == 1.0
+    assert math.isnan(smoothness(rollout_of(0 * chunks, [1] * 4), mode=0).switch_rate)
+    assert math.isnan(smoothness(rollout).switch_rate)
+
+
+def test_rollout_of_an_environment_that_ends_inside_a_chunk():
+    env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(StepCounter(max_steps=10), ChunkStep(4)))
+    env.set_seed(0)
+    rollout = env.rollout(5)
+    actions, decision, episode = executed_actions(rollout)
+    chunk = rollout["vla_action", "chunk"]
+    assert torch.equal(actions, torch.cat([chunk[0], chunk[1], chunk[2, :2]]))
+    assert decision.tolist() == [0] * 4 + [1] * 4 + [2] * 2 and not episode.any()
+    assert smoothness(rollout).boundaries == 2
+
+
+def test_bad_rollouts_are_named():
+    chunks = torch.zeros(3, 2, 1)
+    with pytest.raises(KeyError, match="ChunkStep"):
+        smoothness(TensorDict({"vla_action": {"chunk": chunks}}, [3]))
+    with pytest.raises(ValueError, match="no chunk boundary"):
+        smoothness(rollout_of(chunks[:1], [2]))
+    with pytest.raises(ValueError, match="no chunk boundary"):
+        smoothness(rollout_of(chunks[:2], [2, 2], [True, True]))
+    with pytest.raises(ValueError, match="NaN"):
+        smoothness(rollout_of(chunks * math.nan, [2, 2, 2]))
+    with pytest.raises(ValueError, match="decisions"):
+        executed_actions(rollout_of(chunks[:0], torch.zeros(0, dtype=torch.int64)))
+    with pytest.raises(ValueError, match="executed actions only"):
+        compare_smoothness({"a": rollout_of(chunks, [2] * 3), "b": rollout_of(chunks, [1] * 3)})
+
+
+def test_what_is_not_executed_may_be_anything():
+    chunks = torch.tensor([[[1.0], [math.nan]], [[2.0], [math.nan]]])
+    assert smoothness(rollout_of(chunks, [1, 1])).boundary_jump == 1.0
+
+
+@pytest.mark.parametrize("prior_class", [PastPrior, HistoryPrior])
+def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(prior_class):
+    prior = prior_class(2)
+    network = VelocityMLP(1, 3 + prior.context_dim(1), 2, 1, hidden_dim=8)
+    actor = WarmPriorActor(network, prior, generator=torch.Generator().manual_seed(0))
+    data = TensorDict(
+        {
+            "observation": torch.zeros(4, 1, 3),
+            "prior": {
+                "loc": torch.ones(4, 2, 1),
+                "warm": torch.tensor([1, 1, 0, 0]).bool()[:, None, None].expand(4, 2, 1),
+            },
+        },
+        [4],
+    )
+    expected = data.clone()
+    noise = torch.randn(4, 2, 1, generator=torch.Generator().manual_seed(5))
+    expected["prior", "loc"][:2] += 0.3 * noise[:2]
+    chunk = actor(expected)["vla_action", "chunk"]
+    actor.sampler.generator.manual_seed(0)
+    shifted = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(5))
+    out = shifted(data)
+    torch.testing.assert_close(out["vla_action", "chunk"], chunk)
+    assert (out["prior", "loc"] == 1).all()
+    with pytest.raises(ValueError, match="std"):
+        HistoryShift(actor, -1.0)

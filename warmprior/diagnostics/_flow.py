@@ -1,0 +1,129 @@
+"""What the diagnostics of a policy's flow share: checked windows, sources and the field itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from warmprior import keys
+from warmprior.modules.actor import WarmPriorActor
+
+Field = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass
+class Windows:
+    """A batch of windows, flattened to ``N``, on the policy's device.
+
+    Attributes:
+        shape: the batch's own shape.
+        observation: what the network sees, ``[N, To, d_o + context]``.
+        loc: ``[N, P, d_a]``.
+        warm: bool ``[N, P, 1]``.
+        counted: positions inside the episode, bool ``[N, P, 1]``.
+        target: ``[N, P, d_a]``, if there is one.
+    """
+
+    shape: torch.Size
+    observation: Tensor
+    loc: Tensor
+    warm: Tensor
+    counted: Tensor
+    target: Tensor | None
+
+    def __len__(self) -> int:
+        return len(self.loc)
+
+    def repeat(self, draws: int) -> Windows:
+        """The windows ``draws`` times in a row, for as many samples of the source each."""
+        parts = (self.observation, self.loc, self.warm, self.counted, self.target)
+        repeated = [None if p is None else p.repeat(draws, *[1] * (p.ndim - 1)) for p in parts]
+        return Windows(self.shape, *repeated)  # type: ignore[arg-type]
+
+
+def flat_windows(
+    policy: WarmPriorActor, batch: TensorDictBase, *, target_needed: bool = False
+) -> Windows:
+    """Check a batch and bring it into shape.
+
+    Raises:
+        KeyError: if a needed key is missing.
+        ValueError: if the batch is empty, holds NaN or Inf, or belongs to another prediction length.
+    """
+    observation_key, loc_key, warm_key = policy.in_keys
+    needed = [observation_key, loc_key, warm_key] + ([keys.CHUNK] if target_needed else [])
+    missing = [key for key in needed if batch.get(key, None) is None]
+    if missing:
+        raise KeyError(
+            f"the batch lacks {missing}; sample windows from window_replay_buffer, or take a rollout"
+        )
+    if batch.numel() == 0:
+        raise ValueError("the batch holds no observation")
+    device = next(policy.parameters()).device
+    prior, ndim = policy.prior, batch.ndim
+
+    def flat(key: object) -> Tensor | None:
+        value = batch.get(key, None)
+        return None if value is None else value.reshape(-1, *value.shape[ndim:]).to(device)
+
+    observation, loc, warm = flat(observation_key), flat(loc_key), flat(warm_key)
+    target, pad = flat(keys.CHUNK), flat(keys.IS_PAD)
+    assert observation is not None and loc is not None and warm is not None
+    for key, value in ((observation_key, observation), (loc_key, loc), (keys.CHUNK, target)):
+        if value is None:
+            continue
+        if key != observation_key and value.shape[-2] != prior.prediction_length:
+            raise ValueError(
+                f"{key} has {value.shape[-2]} positions, but {prior} predicts "
+                f"{prior.prediction_length}: sample the windows with the policy's own prior"
+            )
+        if not torch.isfinite(value).all():
+            raise ValueError(f"{key} holds NaN or Inf")
+    counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
+    return Windows(
+        batch.batch_size,
+        prior.extend_observation(observation, loc, warm),
+        loc,
+        warm,
+        counted,
+        target,
+    )
+
+
+def check_flow(policy: WarmPriorActor, steps: int) -> None:
+    """Refuse policies whose field means nothing along a whole path.
+
+    Raises:
+        ValueError: if the prior allows fewer than ``steps`` network evaluations, or ``steps < 1``.
+    """
+    if steps < 1:
+        raise ValueError(f"a path needs at least 1 step, got {steps}")
+    limit = policy.prior.max_nfe
+    if limit is not None and limit < steps:
+        raise ValueError(
+            f"{policy.prior} trains its field for at most {limit} network evaluation(s): it has no "
+            f"path of {steps} steps"
+        )
+
+
+def field_of(policy: WarmPriorActor, observation: Tensor) -> Field:
+    """The velocity ``(t [n], a_t [n, P, d_a]) -> [n, P, d_a]`` at given observations."""
+    return lambda t, a: policy.network(t, a, observation)
+
+
+@contextmanager
+def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
+    """No dropout and no gradients, and every module's mode as before afterwards."""
+    modes = [(module, module.training) for module in policy.modules()]
+    policy.eval()
+    try:
+        with torch.no_grad():
+            yield
+    finally:
+        for module, mode in modes:
+            module.training = mode

@@ -1,0 +1,177 @@
+"""Branching cost: how much of the flow-matching loss no network could remove, and what bounds it."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from warmprior import keys
+from warmprior.diagnostics._flow import check_flow, evaluation_mode, field_of, flat_windows
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.interpolant import Interpolant, LinearInterpolant
+from warmprior.modules.prior import Prior
+
+__all__ = ["branching_bound", "branching_cost"]
+
+
+def branching_cost(
+    policy: WarmPriorActor,
+    batch: TensorDictBase,
+    *,
+    draws: int = 8,
+    executed: int | None = None,
+    interpolant: Interpolant | None = None,
+    split: int = 4096,
+    generator: torch.Generator | None = None,
+) -> TensorDict:
+    r"""Velocity error of a policy on data, which is the branching cost if its field is optimal.
+
+    The branching cost (Theorem B.1) is the smallest possible flow-matching loss,
+
+    .. math::
+        B(o) = \int_0^1 E\left[\|A_1 - A_0 - E[A_1 - A_0 \mid A_t, o]\|^2 \mid o\right] dt,
+
+    here with the policy's :math:`v(t, A_t, o)` in place of the conditional expectation: an estimate from
+    above, on average over the data. (The form with :math:`(1-t)^{-2}` is equal and blows up
+    numerically.) Sums run over coordinates inside the episode, in squared normalised action units.
+
+    Args:
+        policy: the policy.
+        batch: windows ``[*B]`` of its own prior with a target, see
+            :func:`~warmprior.window_replay_buffer`.
+
+    Keyword Args:
+        draws: samples of source and time per window; the times are stratified.
+        executed: how many positions ``"..._executed"`` counts; ``H`` by default.
+        interpolant: the path of the training; linear by default.
+        split: network batch size, for bounded memory; it changes nothing else.
+        generator: source of randomness on the policy's device; the policy's own by default.
+
+    Returns:
+        TensorDict ``[*B]`` with ``"cost"`` (all coordinates), ``"cost_warm"``, ``"cost_executed"``, and
+        ``"still"``, ``"still_executed"``: the same for a field that is 0 everywhere.
+
+    Raises:
+        KeyError: if the batch lacks a key.
+        ValueError: for bad batches or options, or a policy that is no flow.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, window_replay_buffer
+        >>> data = TensorDict({"observation": torch.zeros(50, 3), "action": torch.zeros(50, 2),
+        ...                    "episode": torch.arange(50) // 25}, [50])
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8))
+        >>> batch = window_replay_buffer(data, actor.prior, batch_size=16).sample()
+        >>> branching_cost(actor, batch)["cost"].shape
+        torch.Size([16])
+    """
+    check_flow(policy, 2)
+    if draws < 1 or split < 1:
+        raise ValueError(f"draws and split must be at least 1, got {draws} and {split}")
+    windows = flat_windows(policy, batch, target_needed=True)
+    n, steps = len(windows), executed_positions(policy.prior, executed)
+    rows = windows.repeat(draws)
+    path = LinearInterpolant() if interpolant is None else interpolant
+    generator = policy.sampler.generator if generator is None else generator
+    assert rows.target is not None
+    with evaluation_mode(policy):
+        a0 = policy.prior.sample(rows.loc, rows.warm, generator)
+        within = torch.rand(n, generator=generator, dtype=a0.dtype, device=a0.device)
+        stratum = torch.arange(draws, dtype=a0.dtype, device=a0.device).repeat_interleave(n)
+        t = (stratum + within.repeat(draws)) / draws
+        a_t, velocity = path(a0, rows.target, t)
+        slices = [slice(i, i + split) for i in range(0, n * draws, split)]
+        predicted = torch.cat([field_of(policy, rows.observation[s])(t[s], a_t[s]) for s in slices])
+    error = (predicted - velocity).square() * rows.counted
+    still = velocity.square() * rows.counted
+
+    def total(x: Tensor) -> Tensor:
+        return x.sum((-1, -2)).view(draws, *windows.shape).mean(0)
+
+    return TensorDict(
+        {
+            "cost": total(error),
+            "cost_warm": total(error * rows.warm),
+            "cost_executed": total(error[:, :steps]),
+            "still": total(still),
+            "still_executed": total(still[:, :steps]),
+        },
+        batch_size=windows.shape,
+    )
+
+
+def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
+    r"""Upper bound of the branching cost from data alone (Proposition B.2).
+
+    .. math::
+        B_W \le E\|P_W(A_1 - \mu)\|^2 + \sigma^2 d_W
+
+    on the warm coordinates inside the episode. The same argument on all coordinates treats a cold one
+    as ``mu = 0``, ``sigma = 1``; that is ``"total"``, the one to compare priors by. It orders bounds: the
+    branching cost itself may be far below.
+
+    Args:
+        batch: windows ``[*B]`` of the prior, see :func:`~warmprior.window_replay_buffer`.
+        prior: the source distribution.
+
+    Returns:
+        TensorDict ``[*B]`` with ``"mismatch"`` (first term), ``"noise"`` (second term), ``"warm"`` (their
+        sum) and ``"total"``, in squared normalised action units.
+
+    Raises:
+        KeyError: if the batch lacks a key.
+        ValueError: if the batch is empty or the prior's source is not that of Eq. 1.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, window_replay_buffer
+        >>> data = TensorDict({"observation": torch.zeros(9, 1), "action": torch.arange(9.0)[:, None],
+        ...                    "episode": torch.zeros(9, dtype=torch.int64)}, [9])
+        >>> prior = PastPrior(2, sigma=0.5)
+        >>> window = window_replay_buffer(data, prior, batch_size=1).transform[0]
+        >>> bound = branching_bound(window(TensorDict({"frame": torch.tensor([4])}, [1])), prior)
+        >>> float(bound["mismatch"]), float(bound["noise"])  # both actions are 2 ahead of the mean
+        (8.0, 0.5)
+    """
+    if type(prior).sample is not Prior.sample:
+        raise ValueError(f"the bound is that of the Gaussian source of Eq. 1, which {prior} is not")
+    needed = (keys.CHUNK, keys.LOC, keys.WARM)
+    missing = [key for key in needed if batch.get(key, None) is None]
+    if missing:
+        raise KeyError(f"branching_bound needs the keys {list(needed)}; missing: {missing}")
+    if batch.numel() == 0:
+        raise ValueError("the batch holds no window")
+    target, loc, warm = (batch.get(key) for key in needed)
+    pad = batch.get(keys.IS_PAD, None)
+    counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
+    warm = (warm & counted).expand_as(target)
+    cold = counted.expand_as(target) & ~warm
+    mismatch = ((target - loc).square() * warm).sum((-1, -2))
+    noise = prior.sigma**2 * warm.sum((-1, -2)).to(target.dtype)
+    rest = ((target.square() + 1.0) * cold).sum((-1, -2))
+    return TensorDict(
+        {
+            "mismatch": mismatch,
+            "noise": noise,
+            "warm": mismatch + noise,
+            "total": mismatch + noise + rest,
+        },
+        batch_size=batch.batch_size,
+    )
+
+
+def executed_positions(prior: Prior, executed: int | None) -> int:
+    """How many positions of a prediction are executed: ``H`` unless told otherwise.
+
+    Raises:
+        ValueError: if not ``1 <= executed <= P``.
+    """
+    executed = prior.chunk_length if executed is None else executed
+    if not 1 <= executed <= prior.prediction_length:
+        raise ValueError(
+            f"executed must be between 1 and {prior.prediction_length} for {prior}, got {executed}"
+        )
+    return executed

@@ -1,0 +1,231 @@
+"""How straight a policy's flow is (Sec. 4.1, Table 2)."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from warmprior import keys
+from warmprior.diagnostics._flow import check_flow, evaluation_mode, field_of, flat_windows
+from warmprior.diagnostics.branching import branching_cost, executed_positions
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.interpolant import Interpolant
+from warmprior.modules.ode import integrate
+
+__all__ = ["compare_curvature", "curvature"]
+
+NO_MOTION = 0.95
+"""Share of a zero field's loss from which on a field counts as not having learnt to move."""
+
+
+class _Velocities:
+    """Running mean and squared deviations of a path's velocities, per coordinate (Welford)."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.mean: Tensor | float = 0.0
+        self.deviations: Tensor | float = 0.0
+
+    def add(self, velocity: Tensor) -> Tensor:
+        self.count += 1
+        difference = velocity - self.mean
+        self.mean = self.mean + difference / self.count
+        self.deviations = self.deviations + difference * (velocity - self.mean)
+        return velocity
+
+
+def curvature(
+    policy: WarmPriorActor,
+    batch: TensorDictBase,
+    n_steps: int = 100,
+    *,
+    draws: int = 1,
+    executed: int | None = None,
+    interpolant: Interpolant | None = None,
+    split: int = 4096,
+    generator: torch.Generator | None = None,
+) -> TensorDict:
+    r"""Pathwise curvature of the learned flow per observation,
+
+    .. math::
+        \kappa(o) = \int_0^1 \|\dot a_t - \bar v\|^2 dt, \qquad \bar v = \int_0^1 \dot a_t dt,
+
+    along the Euler sampler with ``n_steps`` steps, summed over coordinates. It shrinks with the length
+    of the transport, whatever the shape of the path, and a source nearer to the data has a shorter one:
+    read it beside ``"relative"``, which divides by :math:`\|\bar v\|^2`. The paper does not say whether a
+    prediction of ``2H`` counts whole; ``"..._executed"`` counts the executed positions alone.
+
+    Where the field predicts no motion, its tiny curvature is no sign of straightness: values are NaN,
+    with a warning, for observations whose mean velocity is below 1e-4 per coordinate, and for all if
+    the batch has targets and the field's loss on the counted coordinates is at least 0.95 of the loss
+    of a field that is 0 everywhere. Positions past an episode's end do not count.
+
+    Args:
+        policy: the policy; its ``nfe`` and solver play no role.
+        batch: ``[*B]`` with observation, ``loc`` and ``warm``: windows of the policy's own prior or a
+            rollout. In windows WP-Preview's mean is the target itself; see
+            :func:`~warmprior.diagnostics.forecast_mean` for the mean that deployment meets.
+        n_steps: Euler steps.
+
+    Keyword Args:
+        draws: source samples per observation, averaged.
+        executed: positions that ``"..._executed"`` counts; ``H`` by default.
+        interpolant: the path of the training, for the check with targets; linear by default.
+        split: network batch size, for bounded memory; it changes nothing else.
+        generator: source of randomness on the policy's device; the policy's own by default.
+
+    Returns:
+        TensorDict ``[*B]`` on the policy's device: ``"kappa"``, ``"speed"`` (:math:`\|\bar v\|^2`),
+        ``"relative"`` (their ratio), ``"one_step_error"`` (root mean square distance per coordinate
+        between one Euler step and the end of the path), and each with ``"_executed"``. Squared
+        normalised action units; the error in normalised action units.
+
+    Raises:
+        KeyError: if the batch lacks a key.
+        ValueError: for bad batches or options, or a policy that is no flow.
+        FloatingPointError: if a path becomes NaN or infinite.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), GaussianPrior(8))
+        >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3), "prior": {
+        ...     "loc": torch.zeros(5, 8, 2), "warm": torch.zeros(5, 8, 1, dtype=torch.bool)}}, [5])
+        >>> curvature(actor, batch)["kappa"].shape
+        torch.Size([5])
+    """
+    check_flow(policy, max(n_steps, 2))
+    if draws < 1 or split < 1 or n_steps < 2:
+        raise ValueError(
+            f"need n_steps >= 2, draws >= 1 and split >= 1, got {n_steps}, {draws} and {split}"
+        )
+    windows = flat_windows(policy, batch)
+    steps = executed_positions(policy.prior, executed)
+    rows = windows.repeat(draws)
+    parts = []
+    with evaluation_mode(policy):
+        # All sources are drawn at once: how the batch is split must not change them.
+        generator = policy.sampler.generator if generator is None else generator
+        a0 = policy.prior.sample(rows.loc, rows.warm, generator)
+        for i in range(0, len(rows), split):
+            s = slice(i, i + split)
+            parts.append(_measure(policy, a0[s], rows.observation[s], n_steps))
+    deviations, mean, gap = (torch.cat(part) for part in zip(*parts, strict=True))
+    bad = ~torch.isfinite(deviations).flatten(1).all(1)
+    if bad.any():
+        raise FloatingPointError(
+            f"{int(bad.sum())} of {len(rows)} paths became NaN or infinite, the first that of "
+            f"observation {int(bad.nonzero()[0]) % len(windows)}"
+        )
+    out = TensorDict({}, batch_size=windows.shape, device=a0.device)
+    for suffix, end in (("", policy.prior.prediction_length), ("_executed", steps)):
+        counted = rows.counted[:, :end].expand_as(mean[:, :end])
+
+        def total(x: Tensor, counted: Tensor = counted, end: int = end) -> Tensor:
+            return (x[:, :end] * counted).sum((-1, -2)).view(draws, *windows.shape).mean(0)
+
+        count = total(torch.ones_like(mean))
+        kappa, speed = total(deviations), total(mean.square())
+        still = speed <= 1e-8 * count
+        out["kappa" + suffix] = kappa.masked_fill(still, math.nan)
+        out["speed" + suffix] = speed
+        out["relative" + suffix] = (kappa / speed).masked_fill(still, math.nan)
+        out["one_step_error" + suffix] = (total(gap.square()) / count).sqrt()
+    _flag_no_motion(out, policy, batch, {"executed": steps, "interpolant": interpolant})
+    return out
+
+
+def _measure(
+    policy: WarmPriorActor, a0: Tensor, observation: Tensor, n_steps: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean squared deviation and mean of the velocity, and the one-step error, each ``[n, P, d_a]``."""
+    field, track = field_of(policy, observation), _Velocities()
+    end = integrate(lambda t, a: track.add(field(t, a)), a0, nfe=n_steps)
+    one = a0 + field(torch.zeros_like(a0[:, 0, 0]), a0)
+    assert isinstance(track.deviations, Tensor) and isinstance(track.mean, Tensor)
+    return track.deviations / track.count, track.mean, one - end
+
+
+def _flag_no_motion(
+    out: TensorDict, policy: WarmPriorActor, batch: TensorDictBase, options: dict[str, Any]
+) -> None:
+    scopes = [suffix for suffix in ("", "_executed") if out["kappa" + suffix].isnan().any()]
+    if scopes:
+        warnings.warn(
+            f"{int(out['kappa' + scopes[0]].isnan().sum())} of {out.numel()} paths do not move: their "
+            "curvature is NaN",
+            stacklevel=3,
+        )
+    if batch.get(keys.CHUNK, None) is None:
+        return
+    # A generator of its own, so that the check leaves the caller's stream of random numbers alone.
+    generator = torch.Generator(out.device).manual_seed(0)
+    cost = branching_cost(policy, batch, generator=generator, **options)
+    for suffix in ("", "_executed"):
+        share = float(cost["cost" + suffix].sum() / cost["still" + suffix].sum())
+        if share >= NO_MOTION:
+            where = "the executed positions" if suffix else "the prediction"
+            warnings.warn(
+                f"on {where} the field's loss is {share:.2f} of that of a field that is 0 everywhere: "
+                "it predicts no motion, and its curvature is NaN",
+                stacklevel=3,
+            )
+            for name in ("kappa", "relative"):
+                out[name + suffix] = torch.full_like(out[name + suffix], math.nan)
+
+
+def compare_curvature(
+    policies: Mapping[str, WarmPriorActor],
+    batches: Mapping[str, TensorDictBase],
+    n_steps: int = 100,
+    **options: Any,
+) -> dict[str, dict[str, float]]:
+    """Mean curvatures of several policies on the same observations (Table 2).
+
+    Args:
+        policies: by name, the baseline first.
+        batches: the observations, with each policy's own mean.
+        n_steps: Euler steps.
+        options: see :func:`curvature`.
+
+    Returns:
+        For each policy the means of :func:`curvature`'s entries over observations, and
+        ``"ratio"``, ``"ratio_executed"`` and ``"ratio_relative"`` (of ``"relative_executed"``) to the
+        baseline.
+
+    Raises:
+        ValueError: if chunk lengths or observations differ between policies.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), GaussianPrior(8))
+        >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3), "prior": {
+        ...     "loc": torch.zeros(5, 8, 2), "warm": torch.zeros(5, 8, 1, dtype=torch.bool)}}, [5])
+        >>> compare_curvature({"base": actor}, {"base": batch})["base"]["ratio"]
+        1.0
+    """
+    lengths = {name: policy.prior.chunk_length for name, policy in policies.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"curvatures compare at one chunk length only, got {lengths}")
+    observations = [batches[name].get(policy.in_keys[0]) for name, policy in policies.items()]
+    if any(not torch.equal(observations[0], other) for other in observations[1:]):
+        raise ValueError("curvatures compare on the same observations only; these batches differ")
+    results: dict[str, dict[str, float]] = {}
+    for name, policy in policies.items():
+        values = curvature(policy, batches[name], n_steps, **options)
+        mean = {key: float(value.mean()) for key, value in values.items()}
+        base = next(iter(results.values()), mean)
+        mean["ratio"] = mean["kappa"] / base["kappa"]
+        mean["ratio_executed"] = mean["kappa_executed"] / base["kappa_executed"]
+        mean["ratio_relative"] = mean["relative_executed"] / base["relative_executed"]
+        results[name] = mean
+    return results

@@ -1,0 +1,55 @@
+"""Inference-time history shift: what a policy does when its memory is slightly wrong."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from warmprior.modules.actor import WarmPriorActor
+
+__all__ = ["HistoryShift"]
+
+
+class HistoryShift(TensorDictModuleBase):
+    """A policy whose remembered mean is disturbed at every decision: inference-time history shift.
+
+    Adds normal noise to the warm positions of ``loc`` before the policy sees it. What the environment
+    remembers stays undisturbed.
+
+    Args:
+        policy: the policy.
+        std: standard deviation of the noise, normalised action units.
+
+    Keyword Args:
+        generator: source of randomness; PyTorch's global one by default.
+
+    Raises:
+        ValueError: if ``std < 0``.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+        >>> actor = WarmPriorActor(VelocityMLP(1, 3, 4), PastPrior(4))
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(actor.prior))
+        >>> env.rollout(3, HistoryShift(actor, 0.1)).shape
+        torch.Size([3])
+    """
+
+    def __init__(
+        self, policy: WarmPriorActor, std: float, *, generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__()
+        if not std >= 0:
+            raise ValueError(f"std must be >= 0, got {std}")
+        self.policy, self.std, self.generator = policy, std, generator
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Disturb the mean and act."""
+        _, loc_key, warm_key = self.in_keys
+        loc, warm = tensordict.get(loc_key), tensordict.get(warm_key)
+        noise = torch.randn(loc.shape, generator=self.generator, dtype=loc.dtype, device=loc.device)
+        seen = tensordict.select(*self.in_keys).set(loc_key, loc + self.std * noise * warm)
+        out = self.policy(seen)
+        return tensordict.update(out.select(*self.out_keys))

@@ -1,0 +1,192 @@
+"""How smoothly executed actions continue across chunk boundaries, on rollouts of any policy."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from warmprior import keys
+
+__all__ = ["Smoothness", "compare_smoothness", "executed_actions", "smoothness"]
+
+Mode = int | Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Smoothness:
+    """Smoothness of the executed actions; NaN where nothing was there to measure.
+
+    Attributes:
+        boundary_jump: mean distance between the last action of a chunk and the first of the next.
+        inner_jump: mean distance between consecutive actions inside chunks.
+        jerk: mean norm of the third difference of the executed actions, per step cubed.
+        switch_rate: share of boundaries at which the mode changes sign, among those with a mode on
+            both sides.
+        boundaries: number of boundaries.
+        executed: largest number of actions executed per decision.
+    """
+
+    boundary_jump: float
+    inner_jump: float
+    jerk: float
+    switch_rate: float
+    boundaries: int
+    executed: int
+
+    @property
+    def jump_ratio(self) -> float:
+        """Boundary jump over inner jump; 1 for actions that do not know where chunks end."""
+        return self.boundary_jump / self.inner_jump if self.inner_jump else math.nan
+
+
+def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
+    """The actions that were executed, in order, from the chunks of a rollout.
+
+    Args:
+        rollout: ``[*B, D]`` decisions, time last, with ``("vla_action", "chunk")`` ``[*B, D, P, d_a]``,
+            ``("next", "executed_steps")`` ``[*B, D, 1]`` and, if episodes end inside,
+            ``("next", "done")``.
+
+    Returns:
+        The actions ``[*B, T, d_a]``, filled up with NaN where a row executed fewer than the longest;
+        the index of their decision, int64 ``[*B, T]``, -1 where filled up; and the index of their
+        episode in the row, likewise.
+
+    Raises:
+        KeyError: if a key is missing.
+        ValueError: if there is no time dimension, or an executed action is NaN or infinite.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> rollout = TensorDict({"vla_action": {"chunk": torch.arange(6.0).view(2, 3, 1)},
+        ...                       "next": {"executed_steps": torch.tensor([[2], [3]])}}, [2])
+        >>> actions, decision, _ = executed_actions(rollout)
+        >>> actions.flatten().tolist(), decision.tolist()
+        ([0.0, 1.0, 3.0, 4.0, 5.0], [0, 0, 1, 1, 1])
+    """
+    chunk = rollout.get(keys.CHUNK, None)
+    steps = rollout.get(("next", keys.EXECUTED), None)
+    if chunk is None or steps is None:
+        raise KeyError(
+            f"the rollout lacks {keys.CHUNK} or ('next', '{keys.EXECUTED}'): roll out a chunk policy in "
+            "an environment with ChunkStep"
+        )
+    if rollout.ndim < 1 or rollout.numel() == 0:
+        raise ValueError(f"a rollout is [*B, D] with D > 0 decisions, got {tuple(rollout.shape)}")
+    done = rollout.get(("next", "done"), None)
+    if done is None:
+        done = torch.zeros_like(steps, dtype=torch.bool)
+    longest = int(steps.max())
+    chunk = chunk[..., :longest, :]
+    kept = torch.arange(longest, device=chunk.device) < steps  # [*B, D, K]
+    decision = torch.arange(rollout.shape[-1], device=chunk.device)[:, None].expand_as(kept)
+    ended = done.squeeze(-1).long()
+    episode = (ended.cumsum(-1) - ended).unsqueeze(-1).expand_as(kept)
+    kept = kept.flatten(-2)
+    # Stable sorting brings the executed actions of every row to its front, in order.
+    order = (~kept).long().argsort(dim=-1, stable=True)[..., : int(kept.sum(-1).max())]
+    valid = kept.gather(-1, order)
+    flat = chunk.flatten(-3, -2)
+    actions = flat.gather(-2, order.unsqueeze(-1).expand(*order.shape, flat.shape[-1]))
+    if not torch.isfinite(actions[valid]).all():
+        raise ValueError("the rollout holds executed actions that are NaN or infinite")
+    return (
+        actions.masked_fill(~valid.unsqueeze(-1), math.nan),
+        decision.flatten(-2).gather(-1, order).masked_fill(~valid, -1),
+        episode.flatten(-2).gather(-1, order).masked_fill(~valid, -1),
+    )
+
+
+def smoothness(rollout: TensorDictBase, *, mode: Mode | None = None) -> Smoothness:
+    """Jumps at and inside chunk boundaries, jerk, and the rate of mode switches.
+
+    Args:
+        rollout: see :func:`executed_actions`.
+
+    Keyword Args:
+        mode: whose sign is the mode of an action: the index of a coordinate, or a function of actions
+            ``[..., d_a]`` that returns ``[...]``. Where it is 0 an action has no mode.
+
+    Returns:
+        Means over all boundaries, steps and rows, in normalised action units.
+
+    Raises:
+        KeyError: if a key is missing.
+        ValueError: if the rollout has no chunk boundary, or actions are NaN or infinite.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> rollout = TensorDict({
+        ...     "vla_action": {"chunk": torch.tensor([[[1.0], [1.5]], [[-1.0], [-1.5]]])},
+        ...     "next": {"executed_steps": torch.tensor([[2], [2]])}}, [2])
+        >>> result = smoothness(rollout, mode=0)
+        >>> result.boundary_jump, result.inner_jump, result.switch_rate
+        (2.5, 0.5, 1.0)
+    """
+    actions, decision, episode = executed_actions(rollout)
+    together = (episode[..., 1:] == episode[..., :-1]) & (episode[..., 1:] >= 0)
+    boundary = together & (decision[..., 1:] != decision[..., :-1])
+    if not boundary.any():
+        raise ValueError("the rollout has no chunk boundary: it needs two decisions of one episode")
+    jump = torch.linalg.vector_norm(actions.diff(dim=-2), dim=-1)
+    switch_rate = math.nan
+    if mode is not None:
+        value = actions[..., mode] if isinstance(mode, int) else mode(actions)
+        side = value.nan_to_num().sign()
+        decided = boundary & (side[..., 1:] != 0) & (side[..., :-1] != 0)
+        switch_rate = _mean((side[..., 1:] != side[..., :-1]).float(), decided)
+    jerk = math.nan
+    if actions.shape[-2] > 3:
+        third = torch.linalg.vector_norm(actions.diff(n=3, dim=-2), dim=-1)
+        jerk = _mean(third, together[..., 2:] & together[..., 1:-1] & together[..., :-2])
+    return Smoothness(
+        boundary_jump=_mean(jump, boundary),
+        inner_jump=_mean(jump, together & ~boundary),
+        jerk=jerk,
+        switch_rate=switch_rate,
+        boundaries=int(boundary.sum()),
+        executed=int(rollout["next", keys.EXECUTED].max()),
+    )
+
+
+def _mean(values: Tensor, mask: Tensor) -> float:
+    return float(values[mask].mean()) if mask.any() else math.nan
+
+
+def compare_smoothness(
+    rollouts: Mapping[str, TensorDictBase], *, mode: Mode | None = None
+) -> dict[str, Smoothness]:
+    """Smoothness of several policies that decide equally often.
+
+    Args:
+        rollouts: by name, see :func:`executed_actions`.
+
+    Keyword Args:
+        mode: see :func:`smoothness`.
+
+    Raises:
+        ValueError: if the policies execute different numbers of actions per decision: their boundaries
+            are not comparable then.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> rollout = TensorDict({"vla_action": {"chunk": torch.zeros(3, 2, 1)},
+        ...                       "next": {"executed_steps": torch.full((3, 1), 2)}}, [3])
+        >>> compare_smoothness({"a": rollout, "b": rollout})["b"].boundaries
+        2
+    """
+    results = {name: smoothness(rollout, mode=mode) for name, rollout in rollouts.items()}
+    executed = {name: result.executed for name, result in results.items()}
+    if len(set(executed.values())) > 1:
+        raise ValueError(
+            f"chunk boundaries compare at one number of executed actions only, got {executed}"
+        )
+    return results
