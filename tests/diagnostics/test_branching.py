@@ -112,7 +112,7 @@ def test_bad_input_is_named():
     data = windows(torch.zeros(5, H, 2), torch.zeros(5, H, 2))
     with pytest.raises(ValueError, match="no window"):
         branching_bound(data[:0], GaussianPrior(H))
-    with pytest.raises(ValueError, match="Eq. 1"):
+    with pytest.raises(ValueError, match=r"Eq\. 1"):
         branching_bound(data, HistoryPrior(H))
     with pytest.raises(ValueError, match="at most 1"):
         branching_cost(policy(lambda t, a, o: -a, RegressionPrior(H)), data)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from itertools import pairwise
 
 import pytest
 import torch
@@ -48,7 +49,7 @@ def test_against_loops(rows, decisions, horizon, seed):
             if done[b][j]:
                 episodes.append([])
         for episode in episodes:
-            for (j, x), (k, y) in zip(episode, episode[1:], strict=False):
+            for (j, x), (k, y) in pairwise(episode):
                 (boundary if j != k else inner).append(math.dist(x, y))
                 if j != k:
                     switches.append((x[1] > 0) != (y[1] > 0))

@@ -62,7 +62,7 @@ def flat_windows(
         raise KeyError(
             f"the batch lacks {missing}; sample windows from window_replay_buffer, or take a rollout"
         )
-    if batch.numel() == 0:
+    if batch.batch_size.numel() == 0:
         raise ValueError("the batch holds no observation")
     device = next(policy.parameters()).device
     prior, ndim = policy.prior, batch.ndim

@@ -142,7 +142,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
     missing = [key for key in needed if batch.get(key, None) is None]
     if missing:
         raise KeyError(f"branching_bound needs the keys {list(needed)}; missing: {missing}")
-    if batch.numel() == 0:
+    if batch.batch_size.numel() == 0:
         raise ValueError("the batch holds no window")
     target, loc, warm = (batch.get(key) for key in needed)
     pad = batch.get(keys.IS_PAD, None)

@@ -77,7 +77,7 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
             f"the rollout lacks {keys.CHUNK} or ('next', '{keys.EXECUTED}'): roll out a chunk policy in "
             "an environment with ChunkStep"
         )
-    if rollout.ndim < 1 or rollout.numel() == 0:
+    if rollout.ndim < 1 or rollout.batch_size.numel() == 0:
         raise ValueError(f"a rollout is [*B, D] with D > 0 decisions, got {tuple(rollout.shape)}")
     done = rollout.get(("next", "done"), None)
     if done is None:
