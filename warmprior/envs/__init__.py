@@ -2,7 +2,27 @@
 
 from __future__ import annotations
 
+from warmprior.envs.navigation1d import (
+    NavigationEnv,
+    NavigationMetrics,
+    navigation_collides,
+    navigation_demonstrations,
+    navigation_heights,
+    navigation_metrics,
+    navigation_positions,
+)
 from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.robosuite import RobosuiteEnv, RobosuiteWrapper
 
-__all__ = ["RobosuiteEnv", "RobosuiteWrapper", "rendering_backend"]
+__all__ = [
+    "NavigationEnv",
+    "NavigationMetrics",
+    "RobosuiteEnv",
+    "RobosuiteWrapper",
+    "navigation_collides",
+    "navigation_demonstrations",
+    "navigation_heights",
+    "navigation_metrics",
+    "navigation_positions",
+    "rendering_backend",
+]

@@ -1,0 +1,303 @@
+"""The one-dimensional navigation toy: two obstacles, six demonstrations, two modes everywhere (Sec. 4.2)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from warmprior import keys
+
+__all__ = [
+    "NavigationEnv",
+    "NavigationMetrics",
+    "navigation_collides",
+    "navigation_demonstrations",
+    "navigation_heights",
+    "navigation_metrics",
+    "navigation_positions",
+]
+
+STEPS = 64
+OBSTACLES = (-0.45, 0.45)
+HALF_WIDTH, HALF_HEIGHT = 0.12, 0.45
+SCALES = (0.85, 1.0, 1.15)
+OCTAVES = 4
+FEATURES = 1 + 2 * OCTAVES
+UNDECIDED = 0.05
+"""Heights nearer to the axis than this belong to neither side (no demonstration comes below 0.17)."""
+
+
+def navigation_positions() -> Tensor:
+    """Horizontal positions of the 64 steps, ``[64]``, from -1 to 1."""
+    return torch.linspace(-1.0, 1.0, STEPS)
+
+
+def navigation_heights() -> Tensor:
+    """Heights of the six demonstrations, ``[6, 64]``: three above both obstacles, three below.
+
+    A demonstration is a scaled profile with a bump over each obstacle; the two sides come closest (0.35
+    apart) at the start, between the obstacles, and at the end.
+
+    Examples:
+        >>> heights = navigation_heights()
+        >>> bool((heights[:3] == -heights[3:]).all()), round(float(2 * heights[0].min()), 2)
+        (True, 0.35)
+    """
+    x = navigation_positions()
+    bumps = sum(torch.exp(-(((x - c) / 0.25) ** 2)) for c in OBSTACLES)
+    profile = 0.2 + 0.6 * torch.as_tensor(bumps)
+    return torch.stack([s * side * profile for side in (1.0, -1.0) for s in SCALES])
+
+
+def _features(x: Tensor) -> Tensor:
+    # Raw positions underfit at small budgets: sines and cosines of four octaves stand beside them.
+    angle = x.unsqueeze(-1) * math.pi * 2.0 ** torch.arange(-1, OCTAVES - 1, device=x.device)
+    return torch.cat([x.unsqueeze(-1), angle.sin(), angle.cos()], dim=-1)
+
+
+def navigation_demonstrations() -> TensorDict:
+    """The six demonstrations as contiguous steps ``[384]``, ready for :class:`~warmprior.ActionWindow`.
+
+    Heights lie in [-1, 1] and need no normalisation.
+
+    Returns:
+        TensorDict with ``"observation"`` ``[384, 9]`` (the position, and its sines and cosines),
+        ``"action"`` ``[384, 1]`` (the height) and ``"episode"`` ``[384]``.
+
+    Examples:
+        >>> navigation_demonstrations()["observation"].shape
+        torch.Size([384, 9])
+    """
+    heights = navigation_heights()
+    count = len(heights)
+    return TensorDict(
+        {
+            keys.OBSERVATION: _features(navigation_positions()).repeat(count, 1),
+            keys.ACTION: heights.reshape(-1, 1),
+            keys.EPISODE: torch.arange(count).repeat_interleave(STEPS),
+        },
+        batch_size=[count * STEPS],
+    )
+
+
+def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
+    """Whether the straight segments between consecutive points enter an obstacle.
+
+    Args:
+        x: positions ``[*B, T]``, increasing.
+        y: heights ``[*B, T]``.
+
+    Returns:
+        bool ``[*B, T - 1]``.
+
+    Examples:
+        >>> x = torch.tensor([-0.6, -0.3, 0.0])
+        >>> navigation_collides(x, torch.tensor([0.0, 0.0, 0.0])).tolist()
+        [True, False]
+        >>> navigation_collides(x, torch.tensor([0.5, 0.5, 0.0])).tolist()
+        [False, False]
+    """
+    x0, x1, y0, y1 = x[..., :-1], x[..., 1:], y[..., :-1], y[..., 1:]
+    hit = torch.zeros_like(y0, dtype=torch.bool)
+    for c in OBSTACLES:
+        # The part of the segment above the obstacle's width, as shares of its length.
+        enter = ((c - HALF_WIDTH - x0) / (x1 - x0)).clamp(0, 1)
+        leave = ((c + HALF_WIDTH - x0) / (x1 - x0)).clamp(0, 1)
+        low, high = y0 + enter * (y1 - y0), y0 + leave * (y1 - y0)
+        inside = (low.abs() < HALF_HEIGHT) | (high.abs() < HALF_HEIGHT) | (low * high < 0)
+        hit |= (leave > enter) & inside
+    return hit
+
+
+class NavigationEnv(EnvBase):
+    """An agent that moves from left to right at constant speed and chooses its height at every step.
+
+    There are no dynamics: the action *is* the height, the position advances by itself, and an episode
+    lasts 64 steps. Inconsistent choices are therefore the policy's own. The environment holds no
+    state: what it needs arrives in the tensordict.
+
+    =================  ==================  ===============================================
+    key                shape               meaning
+    =================  ==================  ===============================================
+    ``"observation"``  ``[*B, 9]`` float   position in [-1, 1], its sines and cosines
+    ``"action"``       ``[*B, 1]`` float   height, in units of the normalised action space
+    ``"reward"``       ``[*B, 1]`` float   1 at the end of an episode without collision
+    ``"step_index"``   ``[*B, 1]`` int64   steps done, 0 to 64
+    ``"height"``       ``[*B, 1]`` float   the last action
+    ``"collided"``     ``[*B, 1]`` bool    whether the path entered an obstacle
+    ``"success"``      ``[*B, 1]`` bool    whether the episode ended without collision
+    =================  ==================  ===============================================
+
+    Keyword Args:
+        batch_size: ``*B``, independent agents.
+        device: of all tensors.
+
+    Examples:
+        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor, policy_transforms
+        >>> from torchrl.envs import TransformedEnv
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), GaussianPrior(4))
+        >>> transforms = policy_transforms(actor.prior, observation_steps=1)
+        >>> env = TransformedEnv(NavigationEnv(batch_size=[32]), transforms)
+        >>> rollout = env.rollout(100, actor)  # 64 steps are 16 decisions
+        >>> rollout.shape, bool(rollout["next", "done"][:, -1].all())
+        (torch.Size([32, 16]), True)
+    """
+
+    def __init__(
+        self,
+        *,
+        batch_size: tuple[int, ...] | list[int] | torch.Size = (),
+        device: torch.device | str = "cpu",
+    ) -> None:
+        super().__init__(device=device, batch_size=torch.Size(batch_size))
+        shape = (*self.batch_size, 1)
+
+        def flag() -> Categorical:
+            return Categorical(2, shape=shape, dtype=torch.bool, device=device)
+
+        def carried() -> dict[str, Unbounded | Categorical]:
+            return {
+                "step_index": Unbounded(shape, dtype=torch.int64, device=device),
+                "height": Unbounded(shape, device=device),
+                "collided": flag(),
+            }
+
+        self.observation_spec = Composite(
+            {
+                keys.OBSERVATION: Bounded(-1, 1, (*self.batch_size, FEATURES), device=device),
+                "success": flag(),
+                **carried(),
+            },
+            shape=self.batch_size,
+        )
+        self.state_spec = Composite(carried(), shape=self.batch_size)
+        # Policies may leave the corridor of the demonstrations: that is a result, not an error.
+        self.action_spec = Unbounded(shape, device=device)
+        self.reward_spec = Unbounded(shape, device=device)
+
+    def _at(self, step: Tensor) -> Tensor:
+        """Position of a step; the last one stays."""
+        return -1.0 + 2.0 / (STEPS - 1) * step.clamp(max=STEPS - 1)
+
+    def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDictBase:
+        zero = torch.zeros(*self.batch_size, 1, device=self.device)
+        step = zero.long()
+        return TensorDict(
+            {
+                keys.OBSERVATION: _features(self._at(step).squeeze(-1)),
+                "success": zero.bool(),
+                "step_index": step,
+                "height": zero,
+                "collided": zero.bool(),
+                "done": zero.bool(),
+                "terminated": zero.bool(),
+            },
+            batch_size=self.batch_size,
+            device=self.device,
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        step, height = tensordict["step_index"], tensordict[keys.ACTION]
+        here = self._at(step)
+        # Before the first action there is no segment; the start is far from the obstacles.
+        before = torch.where(step > 0, tensordict["height"], height)
+        x = torch.cat([here - 2.0 / (STEPS - 1), here], dim=-1)
+        hit = navigation_collides(x, torch.cat([before, height], dim=-1))
+        collided = tensordict["collided"] | hit
+        step = step + 1
+        done = step >= STEPS
+        success = done & ~collided
+        return TensorDict(
+            {
+                keys.OBSERVATION: _features(self._at(step).squeeze(-1)),
+                "success": success,
+                "step_index": step,
+                "height": height.clone(),
+                "collided": collided,
+                "reward": success.to(height.dtype),
+                "done": done,
+                "terminated": done.clone(),
+            },
+            batch_size=tensordict.batch_size,
+            device=self.device,
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Nothing in the environment is random."""
+
+
+@dataclass(frozen=True)
+class NavigationMetrics:
+    """What became of a set of rollouts.
+
+    Attributes:
+        switch_rate: share of chunk boundaries at which the side changes, among those with a side
+            before and after; NaN if there is none.
+        commit_rate: share of rollouts that never change sides.
+        collision_rate: share of rollouts that enter an obstacle.
+        route_entropy: entropy in bits of the four routes (above or below each obstacle): 1 if only
+            the two demonstrated ones occur equally often, 2 if all four do.
+        recombination_rate: share of rollouts on the two routes that were not demonstrated.
+        distance: mean distance to the nearest demonstration's height.
+        jump: mean change of height at chunk boundaries.
+    """
+
+    switch_rate: float
+    commit_rate: float
+    collision_rate: float
+    route_entropy: float
+    recombination_rate: float
+    distance: float
+    jump: float
+
+
+def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
+    """Judge executed heights.
+
+    Args:
+        heights: ``[n, 64]``.
+        chunk_length: ``H``, how many of them each decision executed.
+
+    Raises:
+        ValueError: if the heights have another shape, are not finite, or a chunk is the whole episode.
+
+    Examples:
+        >>> metrics = navigation_metrics(navigation_heights(), chunk_length=4)
+        >>> metrics.switch_rate, metrics.collision_rate, metrics.route_entropy, metrics.distance
+        (0.0, 0.0, 1.0, 0.0)
+    """
+    if heights.ndim != 2 or heights.shape[1] != STEPS or not len(heights):
+        raise ValueError(f"heights must be [n, {STEPS}] with n > 0, got {tuple(heights.shape)}")
+    if not torch.isfinite(heights).all():
+        raise ValueError("the heights hold NaN or Inf")
+    if not 1 <= chunk_length < STEPS:
+        raise ValueError(f"chunk_length must be between 1 and {STEPS - 1}, got {chunk_length}")
+    x, demonstrations = navigation_positions().to(heights.device), navigation_heights()
+    side = torch.where(heights.abs() > UNDECIDED, heights.sign(), 0.0)
+    changes = side[:, 1:] * side[:, :-1] < 0
+    known = side[:, 1:] * side[:, :-1] != 0
+    boundary = torch.arange(chunk_length - 1, STEPS - 1, chunk_length)
+    at_boundary = known[:, boundary]
+    nearest = [int((x - c).abs().argmin()) for c in OBSTACLES]
+    above = (heights[:, nearest] > 0).long()
+    routes = torch.bincount(2 * above[:, 0] + above[:, 1], minlength=4).double() / len(heights)
+    taken = routes[routes > 0]
+    hit = navigation_collides(x.expand_as(heights), heights).any(1)
+    gap = (heights[:, None] - demonstrations.to(heights.device)).abs().amin(1)
+    return NavigationMetrics(
+        switch_rate=float(changes[:, boundary].sum() / at_boundary.sum())
+        if at_boundary.any()
+        else math.nan,
+        commit_rate=float((~changes.any(1)).double().mean()),
+        collision_rate=float(hit.double().mean()),
+        route_entropy=abs(float((taken * taken.log2()).sum())),
+        recombination_rate=float(routes[1] + routes[2]),
+        distance=float(gap.mean()),
+        jump=float(heights.diff(dim=1)[:, boundary].abs().mean()),
+    )
