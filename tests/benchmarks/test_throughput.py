@@ -1,0 +1,77 @@
+"""The throughput script: its keys, its options, and the clock that its ratios rest on."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("robosuite")
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "throughput.py"
+KEYS = {
+    "windows_per_second",
+    "windows_over_lerobot",
+    "train_step_over_network",
+    "actor_over_network",
+    "actor_over_network_compiled",
+    "env_over_robosuite",
+    "chunk_step_overhead",
+    "load_memory_over_data",
+    "meta",
+}
+
+
+@pytest.fixture(scope="module")
+def throughput():
+    spec = importlib.util.spec_from_file_location("benchmark_throughput", SCRIPT)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+class Bar:
+    def set_postfix(self, **kwargs): ...
+
+
+def test_writes_every_key(throughput, tmp_path):
+    throughput.main(["--only", "windows_per_second", "--repeats", "1", "--out", str(tmp_path)])
+    results = json.loads((tmp_path / "throughput.json").read_text())
+    assert results.keys() == KEYS
+    assert results["windows_per_second"] > 0
+    assert results["env_over_robosuite"] is None
+    assert {"versions", "cpu", "threads", "date"} <= results["meta"].keys()
+
+
+def test_ratio_of_known_times(throughput):
+    clock = throughput.Clock(5, Bar())
+    ratio = clock.ratio(lambda: time.sleep(0.03), lambda: time.sleep(0.01))
+    assert ratio == pytest.approx(3, rel=0.4)
+
+
+def test_rounds_are_interleaved_and_the_first_is_dropped(throughput):
+    order = []
+    times = throughput.Clock(3, Bar()).times(
+        lambda: order.append("a"), lambda: order.append("b"), before=lambda: order.append("|")
+    )
+    assert "".join(order) == "|ba|ab|ba|ab"
+    assert [len(rounds) for rounds in times] == [3, 3]
+
+
+@pytest.mark.parametrize("arguments", [["--only", "nothing"], ["--repeats", "0"]])
+def test_bad_options(throughput, arguments, capsys):
+    with pytest.raises(SystemExit):
+        throughput.main(arguments)
+    assert "usage" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_every_figure_can_be_measured(throughput, tmp_path):
+    throughput.main(["--repeats", "1", "--out", str(tmp_path)])
+    results = json.loads((tmp_path / "throughput.json").read_text())
+    missing = {name for name, value in results.items() if value is None}
+    assert missing <= {"windows_over_lerobot"}
+    assert results["actor_over_network"].keys() == {"1", "3", "9"}
