@@ -195,10 +195,10 @@ def test_the_loss_trains_the_actor_itself():
         p.data_ptr() for p in actor.network.parameters()
     }
     optimizer = torch.optim.SGD(loss.parameters(), 0.1)
-    before = actor.network.net[0].weight.clone()
+    before = actor.network.embed_chunk.weight.clone()
     loss(sample(prior, 8))["loss_flow_matching"].backward()
     optimizer.step()
-    assert not torch.equal(before, actor.network.net[0].weight)
+    assert not torch.equal(before, actor.network.embed_chunk.weight)
 
 
 def test_generator_repeats_and_defaults_to_the_actor_s():

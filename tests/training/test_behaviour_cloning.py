@@ -427,6 +427,6 @@ def test_average_starts_at_the_first_update(tmp_path):
     network = mlp()
     average = ema_of(network)
     with torch.no_grad():
-        network.net[0].weight.add_(1.0)
+        network.embed_chunk.weight.add_(1.0)
     average.update_parameters(network)
-    assert torch.equal(average.module.net[0].weight, network.net[0].weight)
+    assert torch.equal(average.module.embed_chunk.weight, network.embed_chunk.weight)

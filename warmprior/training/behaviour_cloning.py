@@ -19,6 +19,7 @@ from warmprior.training.checkpoint import (
     module_tensors,
     named,
     restore_optimizer,
+    restore_rng,
     rng_tensors,
     save_state,
     select,
@@ -294,9 +295,7 @@ class BehaviourCloning:
         ):
             group["lr"] = rate
         self._running = list(tensors["running"])
-        rng = select("rng", tensors)
-        self.generator.set_state(rng["generator"])
-        torch.set_rng_state(rng["global"])
+        restore_rng(self.generator, select("rng", tensors))
 
 
 def _network_identity(network: nn.Module) -> Any:

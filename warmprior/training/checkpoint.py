@@ -77,5 +77,16 @@ def module_tensors(module: nn.Module) -> dict[str, Tensor]:
 
 
 def rng_tensors(generator: torch.Generator) -> dict[str, Tensor]:
-    """State of a generator and of PyTorch's global CPU generator (dropout draws from it)."""
-    return {"generator": generator.get_state(), "global": torch.get_rng_state()}
+    """State of a generator and of PyTorch's global ones (dropout draws from them)."""
+    states = {"generator": generator.get_state(), "global": torch.get_rng_state()}
+    if generator.device.type == "cuda":
+        states["cuda"] = torch.cuda.get_rng_state(generator.device)
+    return states
+
+
+def restore_rng(generator: torch.Generator, states: Mapping[str, Tensor]) -> None:
+    """Load what :func:`rng_tensors` gave."""
+    generator.set_state(states["generator"])
+    torch.set_rng_state(states["global"])
+    if generator.device.type == "cuda":
+        torch.cuda.set_rng_state(states["cuda"], generator.device)

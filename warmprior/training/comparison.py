@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import os
@@ -153,9 +154,11 @@ class Comparison:
             self.data["observation"].shape[-1] + prior.context_dim(action_dim),
             prior.prediction_length,
         )
+        # A copy: the policy moves to the device, the environments' normaliser stays on the CPU.
+        normalizer = copy.deepcopy(self.normalizer)
         # The normalised demonstrations span [-1, 1]: what leaves it is executed, and remembered, at
         # the bound.
-        return WarmPriorActor(network, prior, normalizer=self.normalizer, clip=1.0).to(self.device)
+        return WarmPriorActor(network, prior, normalizer=normalizer, clip=1.0).to(self.device)
 
     def train(self, prior: Prior, seed: int) -> BehaviourCloning:
         """Train one policy, or continue or reuse the stored one of the same options."""

@@ -162,6 +162,9 @@ def evaluate(
     actor.eval()
     device = next(actor.parameters()).device
     generator = torch.Generator(device).manual_seed(policy_seed)
+    # The simulators need the cores; a policy's call is small, and its idle threads would spin.
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     previous, actor.sampler.generator = actor.sampler.generator, generator
     played = [0] * num_envs
     outcomes: list[Episode] = []
@@ -191,6 +194,7 @@ def evaluate(
                 if done.any() and len(outcomes) < episodes:
                     data = env.reset(data.set("_reset", done.unsqueeze(-1)))
     finally:
+        torch.set_num_threads(threads)
         actor.sampler.generator = previous
     return sorted(outcomes, key=lambda outcome: outcome.seed)
 

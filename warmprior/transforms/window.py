@@ -201,7 +201,8 @@ def window_replay_buffer(
     window = ActionWindow(data, prior, observation_steps=observation_steps, generator=generator)
     frames = torch.arange(len(data), device=window.start.device)
     return TensorDictReplayBuffer(
-        storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)])),
+        # The sampler draws on the storage's device, where the generator has to be too.
+        storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
         sampler=RandomSampler() if sampler is None else sampler,
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,

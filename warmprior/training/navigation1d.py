@@ -1,0 +1,259 @@
+"""Trains and judges policies on the one-dimensional navigation toy (the paper's Fig. 5)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.envs import TransformedEnv
+
+from warmprior import keys
+from warmprior.diagnostics.branching import branching_bound
+from warmprior.diagnostics.curvature import compare_curvature
+from warmprior.diagnostics.history_shift import HistoryShift
+from warmprior.diagnostics.paths import forecast_mean
+from warmprior.diagnostics.smoothness import executed_actions, smoothness
+from warmprior.envs.navigation1d import (
+    NavigationEnv,
+    navigation_demonstrations,
+    navigation_metrics,
+)
+from warmprior.modules import (
+    GaussianPrior,
+    HistoryPrior,
+    PastPrior,
+    PreviewPrior,
+    Prior,
+    RegressionPrior,
+    VelocityMLP,
+    WarmPriorActor,
+)
+from warmprior.training.behaviour_cloning import BehaviourCloning, TrainingConfig
+from warmprior.transforms import ActionWindow, policy_transforms
+
+__all__ = ["NAVIGATION_PRESETS", "NavigationPreset", "NavigationStudy", "navigation_priors"]
+
+SHIFT = 0.15
+"""Standard deviation of the history shift, a third of the gap between the sides at its narrowest."""
+
+
+@dataclass(frozen=True)
+class NavigationPreset:
+    """One budget.
+
+    Attributes:
+        summary: one line for ``--help``.
+        training: the recipe.
+        hidden_dim: width of the network, a :class:`~warmprior.VelocityMLP` of four hidden layers.
+    """
+
+    summary: str
+    training: TrainingConfig
+    hidden_dim: int
+
+
+NAVIGATION_PRESETS: dict[str, NavigationPreset] = {
+    "quick": NavigationPreset(
+        summary="128-d network, 3,000 iterations: all policies in a few minutes on two cores",
+        training=TrainingConfig(
+            iterations=3_000,
+            batch_size=256,
+            learning_rate=2e-3,
+            warmup_ratio=0.0,
+            checkpoints=1,
+            save_every=3_000,
+        ),
+        hidden_dim=128,
+    ),
+    "wide": NavigationPreset(
+        summary="the paper's 1024-d network and 50,000 iterations: hours on a CPU",
+        training=TrainingConfig(iterations=50_000, batch_size=256, checkpoints=1),
+        hidden_dim=1024,
+    ),
+}
+
+
+def navigation_priors(chunk_length: int, cold_probability: float = 0.1) -> dict[str, Prior]:
+    """The policies of the comparison, the baseline first.
+
+    Args:
+        chunk_length: ``H``.
+        cold_probability: share of the training samples of the warm rows whose mean is withheld. The
+            paper's Algorithm 1 withholds none; see :class:`~warmprior.PreviewPrior` for why small
+            ``sigma`` needs it.
+
+    Examples:
+        >>> list(navigation_priors(4))[:4]
+        ['base', 'regression', 'history', 'past 0.1']
+    """
+    priors: dict[str, Prior] = {
+        "base": GaussianPrior(chunk_length),
+        "regression": RegressionPrior(chunk_length),
+        "history": HistoryPrior(chunk_length, cold_probability=cold_probability),
+    }
+    for prior_class in (PastPrior, PreviewPrior):
+        for sigma in (0.1, 0.5):
+            priors[f"{prior_class.name} {sigma}"] = prior_class(
+                chunk_length, sigma=sigma, cold_probability=cold_probability
+            )
+    return priors
+
+
+@dataclass
+class NavigationStudy:
+    """Policies that differ in their source alone, on the toy.
+
+    Attributes:
+        preset: the budget.
+        priors: by policy name, the baseline first.
+        directory: where the trained policies go.
+        nfe: network evaluations per chunk; fewer where a prior allows only fewer.
+        rollouts: how many to play per policy.
+    """
+
+    preset: NavigationPreset
+    priors: Mapping[str, Prior]
+    directory: Path
+    nfe: int = 9
+    rollouts: int = 256
+
+    def __post_init__(self) -> None:
+        self.data = navigation_demonstrations()
+
+    def train(self, name: str, seed: int) -> WarmPriorActor:
+        """Train one policy, or load it if the folder holds it with the same recipe.
+
+        Args:
+            name: of the policy.
+            seed: of initial weights, sampling, source and times.
+
+        Returns:
+            The policy of averaged weights, in evaluation mode.
+        """
+        prior = self.priors[name]
+        torch.manual_seed(seed)
+        width = self.data[keys.OBSERVATION].shape[-1] + prior.context_dim(1)
+        network = VelocityMLP(
+            1, width, prior.prediction_length, 1, hidden_dim=self.preset.hidden_dim
+        )
+        nfe = self.nfe if prior.max_nfe is None else min(self.nfe, prior.max_nfe)
+        training = BehaviourCloning(
+            WarmPriorActor(network, prior, nfe=nfe),
+            self.data,
+            replace(self.preset.training, seed=seed),
+            self.directory / f"{name.replace(' ', '-')}-h{prior.chunk_length}-seed{seed}",
+            observation_steps=1,
+        )
+        training.run(f"train {name}, seed {seed}")
+        final = self.preset.training.iterations
+        return WarmPriorActor.from_pretrained(training.policy_path(final), prior=prior)
+
+    def play(
+        self, actor: WarmPriorActor, seed: int, *, shift: float = 0.0, nfe: int | None = None
+    ) -> TensorDictBase:
+        """Roll a policy out.
+
+        Args:
+            actor: the policy.
+            seed: of the source samples and the history shift.
+
+        Keyword Args:
+            shift: standard deviation of the noise on the remembered mean.
+            nfe: network evaluations per chunk; the actor's own by default.
+
+        Returns:
+            The rollout, ``[rollouts, decisions]``.
+        """
+        generator = torch.Generator().manual_seed(seed)
+        previous = actor.sampler.generator, actor.ode.nfe
+        actor.sampler.generator, actor.ode.nfe = generator, nfe or actor.ode.nfe
+        transforms = policy_transforms(actor.prior, observation_steps=1)
+        env = TransformedEnv(NavigationEnv(batch_size=[self.rollouts]), transforms)
+        policy = HistoryShift(actor, shift, generator=generator) if shift else actor
+        try:
+            with torch.no_grad():
+                return env.rollout(1_000, policy)
+        finally:
+            actor.sampler.generator, actor.ode.nfe = previous
+
+    def windows(self, prior: Prior, offset: int = 0) -> TensorDictBase:
+        """Windows of all demonstrated steps from ``H`` on, with nothing withheld.
+
+        Args:
+            prior: whose mean to make.
+            offset: how many steps earlier to cut them.
+        """
+        whole = Prior.from_config(prior.config() | {"cold_probability": 0.0})
+        episode = self.data[keys.EPISODE]
+        first = torch.arange(len(episode)) - prior.chunk_length
+        frames = (first.clamp_min(0).eq(first) & (episode[first] == episode)).nonzero().flatten()
+        window = ActionWindow(self.data, whole, observation_steps=1)
+        return window(TensorDict({keys.FRAME: frames - offset}, [len(frames)]))
+
+    def judge(self, actor: WarmPriorActor, seed: int) -> dict[str, Any]:
+        """Play a policy and measure what it did.
+
+        Args:
+            actor: the policy.
+            seed: see :meth:`play`.
+
+        Returns:
+            Metrics of the rollouts (:class:`~warmprior.envs.NavigationMetrics`), ``jump_ratio`` and
+            ``jerk`` (:class:`~warmprior.diagnostics.Smoothness`), some metrics under history shift
+            (``"shifted_..."``) and at one network evaluation (``"one_step_..."``).
+        """
+        horizon = actor.prior.chunk_length
+        rollout = self.play(actor, seed)
+        heights = executed_actions(rollout)[0].squeeze(-1)
+        smooth = smoothness(rollout)
+        row: dict[str, Any] = asdict(navigation_metrics(heights, horizon))
+        row |= {"jump_ratio": smooth.jump_ratio, "jerk": smooth.jerk}
+        for prefix, options in (("shifted", {"shift": SHIFT}), ("one_step", {"nfe": 1})):
+            try:
+                played = executed_actions(self.play(actor, seed, **options))[0].squeeze(-1)  # type: ignore[arg-type]
+            except ValueError:  # diverged
+                other = dict.fromkeys(row, float("nan")) | {"collision_rate": 1.0}
+            else:
+                other = asdict(navigation_metrics(played, horizon))
+            for name in ("switch_rate", "collision_rate", "distance"):
+                row[f"{prefix}_{name}"] = other[name]
+        return row
+
+    def straightness(
+        self, actors: Mapping[str, WarmPriorActor], seed: int, n_steps: int = 100
+    ) -> dict[str, dict[str, float]]:
+        """Curvatures of the policies that are flows, on the demonstrated steps.
+
+        Args:
+            actors: by name, the baseline first; policies without a flow are left out.
+            seed: of the source samples.
+            n_steps: Euler steps.
+
+        Returns:
+            By name the entries of :func:`~warmprior.diagnostics.compare_curvature`;
+            ``"kappa_forecast"``, the executed curvature at the mean that deployment meets; and
+            ``"bound"``, the mean of :func:`~warmprior.diagnostics.branching_bound` where it applies.
+        """
+        flows = {name: a for name, a in actors.items() if a.prior.max_nfe is None}
+        windows = {name: self.windows(a.prior) for name, a in flows.items()}
+
+        def options() -> dict[str, Any]:
+            return {"draws": 4, "generator": torch.Generator().manual_seed(seed)}
+
+        results = compare_curvature(flows, windows, n_steps, **options())
+        for name, actor in flows.items():
+            prior = actor.prior
+            earlier = self.windows(prior, offset=prior.chunk_length)
+            generator = torch.Generator().manual_seed(seed)
+            met = windows[name].clone().update(forecast_mean(actor, earlier, generator=generator))
+            forecast = compare_curvature({name: actor}, {name: met}, n_steps, **options())[name]
+            results[name]["kappa_forecast"] = forecast["kappa_executed"]
+            if not prior.conditions_network:
+                results[name]["bound"] = float(
+                    branching_bound(windows[name], prior)["total"].mean()
+                )
+        return results
