@@ -264,8 +264,7 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
 
 
 def main(argv: list[str] | None = None) -> None:
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     add("--only", nargs="+", choices=FIGURES, metavar="NAME", help=f"of {', '.join(FIGURES)}")
     add("--out", type=Path, default=Path("runs/throughput"), help="folder of throughput.json")

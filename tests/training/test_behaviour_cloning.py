@@ -212,7 +212,7 @@ def start_process(folder, iterations):
 
 @pytest.mark.parametrize(
     ("iterations", "moments"),
-    [(500, (0.4,)), pytest.param(2000, (0.0, 0.31, 1.13, 2.2), marks=pytest.mark.slow)],
+    [(250, (0.2,)), pytest.param(2000, (0.0, 0.31, 1.13, 2.2), marks=pytest.mark.slow)],
 )
 def test_killed_and_resumed_is_bitwise_the_same(tmp_path, iterations, moments):
     """SIGKILL that long after the first save; saves are so frequent that many hit one."""
