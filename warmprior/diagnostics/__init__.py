@@ -3,6 +3,7 @@
 from warmprior.diagnostics.branching import branching_bound, branching_cost
 from warmprior.diagnostics.curvature import compare_curvature, curvature
 from warmprior.diagnostics.history_shift import HistoryShift
+from warmprior.diagnostics.navigation_plots import plot_flow_paths, plot_navigation
 from warmprior.diagnostics.paper import PAPER_SUCCESS, paper_success
 from warmprior.diagnostics.paths import flow_paths, forecast_mean
 from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
@@ -40,7 +41,9 @@ __all__ = [
     "forecast_mean",
     "paper_success",
     "plot_filmstrip",
+    "plot_flow_paths",
     "plot_learning_curves",
+    "plot_navigation",
     "plot_success",
     "probability_better",
     "smoothness",

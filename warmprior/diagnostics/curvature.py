@@ -174,7 +174,7 @@ def _flag_no_motion(
             where = "the executed positions" if suffix else "the prediction"
             warnings.warn(
                 f"on {where} the field's loss is {share:.2f} of that of a field that is 0 everywhere: "
-                "it predicts no motion, and its curvature is NaN",
+                "it has not learnt to move, and its curvature is NaN",
                 stacklevel=3,
             )
             for name in ("kappa", "relative"):

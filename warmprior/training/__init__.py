@@ -7,19 +7,29 @@
 from warmprior.training.behaviour_cloning import BehaviourCloning, TrainingConfig
 from warmprior.training.evaluation import Episode, evaluate, parallel_env
 from warmprior.training.filmstrip import Filmstrip, record_filmstrip
+from warmprior.training.navigation1d import (
+    NAVIGATION_PRESETS,
+    NavigationPreset,
+    NavigationStudy,
+    navigation_priors,
+)
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.presets import PRESETS, Preset
 
 __all__ = [
+    "NAVIGATION_PRESETS",
     "PRESETS",
     "BehaviourCloning",
     "Episode",
     "Filmstrip",
+    "NavigationPreset",
+    "NavigationStudy",
     "Preset",
     "TrainingConfig",
     "ema_of",
     "evaluate",
     "make_optimizer",
+    "navigation_priors",
     "parallel_env",
     "record_filmstrip",
     "warmup_cosine",
