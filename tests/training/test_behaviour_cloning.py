@@ -58,7 +58,9 @@ def actor_for(prior=None, network=None):
 
 def training(folder, config=CONFIG, **options):
     actor = options.pop("actor", None) or actor_for()
-    return BehaviourCloning(actor, dataset(), config, folder, **options)
+    data = options.pop("data", None)
+    data = dataset() if data is None else data
+    return BehaviourCloning(actor, data, config, folder, **options)
 
 
 def weights(cloning):
@@ -259,6 +261,7 @@ def _iteration(folder):
         ("prior", {"actor": lambda: actor_for(PastPrior(4, sigma=0.1))}),
         ("prior", {"actor": lambda: actor_for(PreviewPrior(4))}),
         ("network", {"actor": lambda: actor_for(PastPrior(4, cold_probability=0.25), mlp())}),
+        ("data", {"data": lambda: dataset().set("action", torch.zeros(120, 2))}),
     ],
 )
 def test_a_state_of_another_run(tmp_path, part, change):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from torch import nn
 from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
+from warmprior.keys import ACTION, EPISODE
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
@@ -105,7 +107,7 @@ class BehaviourCloning:
         compile: compile the velocity network with :func:`torch.compile`.
 
     Raises:
-        ValueError: if the folder's state belongs to another recipe, prior or network.
+        ValueError: if the folder's state belongs to another recipe, prior, network or dataset.
     """
 
     def __init__(
@@ -150,6 +152,7 @@ class BehaviourCloning:
             "config": asdict(config) | {"betas": list(config.betas)},
             "prior": actor.prior.config(),
             "network": _network_identity(actor.network),
+            "data": _data_digest(data),
         }
         torch.manual_seed(config.seed)
         if resume and self.state_path.exists():
@@ -303,3 +306,11 @@ def _network_identity(network: nn.Module) -> Any:
     if callable(config):
         return config()
     return {name: list(value.shape) for name, value in network.state_dict().items()}
+
+
+def _data_digest(data: TensorDictBase) -> str:
+    """Tells datasets apart by their actions and episodes."""
+    digest = hashlib.sha256()
+    for key in (ACTION, EPISODE):
+        digest.update(data[key].cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:16]
