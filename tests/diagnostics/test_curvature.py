@@ -133,6 +133,8 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
     assert torch.isfinite(out["kappa"]).all()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        prediction = data.clone().set(("prior", "noise"), target)  # as in a rollout: no target
+        assert torch.isfinite(curvature(policy(lazy, prior), prediction)["kappa_executed"]).all()
         assert torch.isfinite(
             curvature(policy(lazy, prior), data.exclude("vla_action"))["kappa"]
         ).all()

@@ -62,9 +62,10 @@ def curvature(
     prediction of ``2H`` counts whole; ``"..._executed"`` counts the executed positions alone.
 
     Where the field predicts no motion, its tiny curvature is no sign of straightness: values are NaN,
-    with a warning, for observations whose mean velocity is below 1e-4 per coordinate, and for all if
-    the batch has targets and the field's loss on the counted coordinates is at least 0.95 of the loss
-    of a field that is 0 everywhere. Positions past an episode's end do not count.
+    with a warning, for observations whose mean velocity is below 1e-4 per coordinate; and for all, if
+    the batch has targets (windows do, rollouts do not) and the field's loss on the counted coordinates
+    is at least 0.95 of that of a field that is 0 everywhere. Positions past an episode's end do not
+    count.
 
     Args:
         policy: the policy; its ``nfe`` and solver play no role.
@@ -163,7 +164,8 @@ def _flag_no_motion(
             "curvature is NaN",
             stacklevel=3,
         )
-    if batch.get(keys.CHUNK, None) is None:
+    # In a rollout the chunk is the policy's own prediction, beside the source it came from.
+    if batch.get(keys.CHUNK, None) is None or batch.get(keys.NOISE, None) is not None:
         return
     # A generator of its own, so that the check leaves the caller's stream of random numbers alone.
     generator = torch.Generator(out.device).manual_seed(0)
