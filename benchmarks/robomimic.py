@@ -150,7 +150,7 @@ def draw(comparison: Comparison) -> None:
     results, out = comparison.results, comparison.directory
     priors = [prior.name for prior in comparison.priors]
     first = results.rows[0]
-    title = f"{first.task} {first.data} ({results.meta['data']['source']} data), H = {first.chunk}"
+    title = f"{first.task} {first.data} ({results.meta['data_source']} data), H = {first.chunk}"
     plot_success(
         results.rows, out / "success.png", priors=priors, nfes=comparison.nfes, title=title
     )

@@ -60,7 +60,7 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
     assert set(fields.split()) <= set(row)
     assert row["success_rate"] == row["successes"] / row["episodes"]
     meta = stored["meta"]
-    assert meta["data"]["source"] == "file"
+    assert meta["data_source"] == "file"
     assert {"versions", "options", "hardware", "wall_time_s"} <= set(meta)
     table = (out / "table.md").read_text()
     assert "WP-Past" in table and table in capsys.readouterr().out

@@ -8,7 +8,7 @@ import pytest
 from warmprior.diagnostics import Results, Row, paper_success, success_table, summarize
 from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
 
-META = {"data": {"source": "scripted"}}
+META = {"data_source": "scripted"}
 ROW = Row("square", "ph", "gaussian", 1.0, 8, 1, 0, 100, 10, 5, 200.0)
 
 

@@ -185,7 +185,7 @@ def success_table(
     """The layout of the paper's Table 1 in Markdown, with the paper's own numbers in a row of their own.
 
     Args:
-        results: rows of one task, data and chunk length; ``meta["data"]["source"]`` says where the
+        results: rows of one task, data and chunk length; ``meta["data_source"]`` says where the
             demonstrations come from.
 
     Keyword Args:
@@ -204,7 +204,7 @@ def success_table(
         best = summary is not None and summary.mean == max(s.mean for s in group)
         measured.append(_cell(summary, base, best))
     name = f"{first.task.replace('_', '-').title()}-{first.data.upper()}"
-    source = meta["data"]["source"]
+    source = meta["data_source"]
     lines = [
         "| " + " | ".join(head) + " |",
         "|" + "---|" * len(head),
@@ -242,7 +242,7 @@ def _notes(results: Results, summaries: dict[Any, SeedSummary], top_k: int) -> l
             "meets its own imperfect one; at small budgets it copies that instead of correcting it "
             "(docs/benchmarks.md, 'WP-Preview at small budgets')."
         )
-    if results.meta["data"]["source"] != "official":
+    if results.meta["data_source"] != "official":
         notes.append(
             "- The measured row is from other demonstrations, another network and another budget than "
             "the paper's row, which was obtained on the official human data: compare gains within a "

@@ -119,8 +119,8 @@ class Comparison:
                 "torch_threads": torch.get_num_threads(),
                 "device": torch.cuda.get_device_name() if "cuda" in self.device else "cpu",
             },
+            "data_source": self.demonstrations.source,
             "data": {
-                "source": self.demonstrations.source,
                 "file": self.demonstrations.path.name,
                 "sha256": self.demonstrations.sha256,
                 "demonstrations": dataset.num_episodes,
