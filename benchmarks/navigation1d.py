@@ -89,17 +89,17 @@ def make_study(args: argparse.Namespace) -> NavigationStudy:
     preset: NavigationPreset = NAVIGATION_PRESETS[args.preset]
     if args.iterations is not None:
         preset = replace(preset, training=replace(preset.training, iterations=args.iterations))
-    for option in ("seeds", "nfe", "rollouts"):
-        if getattr(args, option) < 1:
-            raise ValueError(f"--{option} must be at least 1, got {getattr(args, option)}")
+    if args.seeds < 1:
+        raise ValueError(f"--seeds must be at least 1, got {args.seeds}")
     if not 1 <= args.chunk <= 32:
         raise ValueError(f"--chunk must be between 1 and 32, got {args.chunk}")
     out = args.out or Path("runs") / f"navigation1d-{args.preset}-h{args.chunk}"
     if (out / "results.json").exists() and not args.resume:
         raise ValueError(f"{out} holds results: add --resume, or choose another --out")
-    check_writable(out)
     priors = navigation_priors(args.chunk, args.cold_probability)
-    return NavigationStudy(preset, priors, out, nfe=args.nfe, rollouts=args.rollouts)
+    study = NavigationStudy(preset, priors, out, nfe=args.nfe, rollouts=args.rollouts)
+    check_writable(out)
+    return study
 
 
 def run_seed(study: NavigationStudy, seed: int) -> tuple[list[dict[str, Any]], dict[str, Any]]:

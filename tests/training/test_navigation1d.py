@@ -89,6 +89,14 @@ def test_straightness_covers_the_flows(tiny):
     assert "bound" not in result["history"]
 
 
+def test_a_study_is_fair_or_refused(tmp_path):
+    mixed = {"base": navigation_priors(4)["base"], "past 0.1": navigation_priors(8)["past 0.1"]}
+    with pytest.raises(ValueError, match="one chunk length"):
+        NavigationStudy(NAVIGATION_PRESETS["quick"], mixed, tmp_path)
+    with pytest.raises(ValueError, match="rollouts"):
+        study_in(tmp_path, rollouts=0)
+
+
 def test_warm_sources_stop_mode_switching(tmp_path):
     """A third of the benchmark's budget, one seed: the contrast is far larger than what that costs."""
     study = study_in(tmp_path, iterations=1_000)

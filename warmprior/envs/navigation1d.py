@@ -34,7 +34,12 @@ UNDECIDED = 0.05
 
 
 def navigation_positions() -> Tensor:
-    """Horizontal positions of the 64 steps, ``[64]``, from -1 to 1."""
+    """Horizontal positions of the 64 steps, ``[64]``, from -1 to 1.
+
+    Examples:
+        >>> navigation_positions()[[0, -1]].tolist()
+        [-1.0, 1.0]
+    """
     return torch.linspace(-1.0, 1.0, STEPS)
 
 

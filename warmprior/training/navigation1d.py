@@ -113,6 +113,20 @@ class NavigationStudy:
         directory: where the trained policies go.
         nfe: network evaluations per chunk; fewer where a prior allows only fewer.
         rollouts: how many to play per policy.
+
+    Raises:
+        ValueError: if ``nfe`` or ``rollouts`` is below 1, or the priors differ in chunk length.
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> from tempfile import TemporaryDirectory
+        >>> quick = NAVIGATION_PRESETS["quick"]
+        >>> short = replace(quick, training=replace(quick.training, iterations=2))
+        >>> with TemporaryDirectory() as folder:
+        ...     study = NavigationStudy(short, navigation_priors(16), Path(folder), rollouts=8)
+        ...     row = study.judge(study.train("past 0.1", seed=0), seed=0)
+        >>> 0.0 <= row["collision_rate"] <= 1.0
+        True
     """
 
     preset: NavigationPreset
@@ -122,6 +136,12 @@ class NavigationStudy:
     rollouts: int = 256
 
     def __post_init__(self) -> None:
+        for name in ("nfe", "rollouts"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        lengths = {name: prior.chunk_length for name, prior in self.priors.items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"policies compare at one chunk length only, got {lengths}")
         self.data = navigation_demonstrations()
 
     def train(self, name: str, seed: int) -> WarmPriorActor:
