@@ -6,10 +6,35 @@ import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from safetensors import SafetensorError
+from torch import Tensor
 
-__all__ = ["check_writable", "write_atomic"]
+__all__ = ["check_writable", "load_file", "save_file", "write_atomic"]
+
+
+def save_file(
+    tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | None = None
+) -> None:
+    """Write a safetensors file. (Imported here: ``import warmprior`` does not need the package.)
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import save_file as save
+
+    try:
+        save(tensors, path, metadata)
+    except SafetensorError as error:
+        raise OSError(str(error)) from error
+
+
+def load_file(path: Path) -> dict[str, Any]:
+    """Read the tensors of a safetensors file."""
+    from safetensors.torch import load_file as load
+
+    return load(path)
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
@@ -31,7 +56,7 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except (OSError, SafetensorError) as error:
+    except OSError as error:
         raise OSError(
             f"cannot write {path}: {error}. Free some space or choose another output folder."
         ) from error

@@ -93,6 +93,9 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
         ({"chunk": 0}, "chunk_length"),
         ({"device": "cuda:99"}, "CUDA device|device"),
         ({"task": "can"}, "holds demonstrations of lift"),
+        ({"demonstrations": 5}, "leave out"),
+        ({"prior": "gaussian", "sigma": 0.5}, "--sigma"),
+        ({"prior": "regression", "nfe": 9}, "regression"),
         ({"dataset": "missing.hdf5"}, "missing.hdf5"),
     ],
 )
@@ -100,7 +103,24 @@ def test_bad_options_stop_before_any_work(benchmark, dataset, tmp_path, capsys, 
     assert benchmark.main(options(dataset, tmp_path / "out", **extra)) == 2
     error = capsys.readouterr().err
     assert any(word in error for word in message.split("|")), error
-    assert not (tmp_path / "policies").exists()
+    assert not list(tmp_path.glob("policies/*"))
+
+
+def test_resuming_takes_the_stored_options_and_refuses_others(benchmark, dataset, tmp_path):
+    args = benchmark.parse(options(dataset, tmp_path, chunk=4, sigma=0.3))
+    benchmark.store_options(args)
+    again = benchmark.parse(["--resume", "--out", str(tmp_path)])
+    assert {**vars(again), "resume": False} == {**vars(args), "dataset": dataset.resolve()}
+    with pytest.raises(ValueError, match=r"started with --sigma 0\.3"):
+        benchmark.parse(["--resume", "--out", str(tmp_path), "--sigma", "0.5"])
+
+
+def test_default_folders_are_numbered_past_the_latest(benchmark, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert str(benchmark.parse([]).out) == "runs/square-ph-quick"
+    (tmp_path / "runs" / "square-ph-quick-2").mkdir(parents=True)
+    assert str(benchmark.parse([]).out) == "runs/square-ph-quick-3"
+    assert str(benchmark.parse(["--resume"]).out) == "runs/square-ph-quick-2"
 
 
 def test_task_without_expert_names_the_official_data(benchmark, tmp_path, capsys):

@@ -17,12 +17,14 @@ PAPER_SUCCESS: dict[tuple[str, str], dict[int, tuple[float, float, float]]] = {
 }
 
 
-def paper_success(task: str, data: str, prior: str, nfe: int) -> float | None:
+def paper_success(task: str, data: str, prior: str, nfe: int, chunk: int = 8) -> float | None:
     """The paper's success rate in percent, or ``None`` where it reports none.
 
     Examples:
         >>> paper_success("square", "mh", "preview", 1)
         77.8
     """
+    if chunk != 8:
+        return None
     row = PAPER_SUCCESS.get((task, data), {}).get(nfe)
     return row[PAPER_PRIORS.index(prior)] if row and prior in PAPER_PRIORS else None

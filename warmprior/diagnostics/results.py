@@ -172,8 +172,10 @@ def _cell(summary: SeedSummary | None, base: SeedSummary | None, best: bool) -> 
     return f"{text} ({100 * (summary.mean - base.mean):+.1f}{mark})"
 
 
-def _paper_cell(task: str, data: str, prior: str, nfe: int) -> str:
-    value, base = paper_success(task, data, prior, nfe), paper_success(task, data, "gaussian", nfe)
+def _paper_cell(row: Row, prior: str, nfe: int) -> str:
+    value, base = (
+        paper_success(row.task, row.data, p, nfe, row.chunk) for p in (prior, "gaussian")
+    )
     if value is None or base is None:
         return "-"
     return f"{value:.1f}" if prior == "gaussian" else f"{value:.1f} ({value - base:+.1f})"
@@ -210,8 +212,8 @@ def success_table(
         "|" + "---|" * len(head),
         f"| {name}, measured ({source} data) | " + " | ".join(measured) + " |",
     ]
-    if source != "official" or any(paper_success(first.task, first.data, p, n) for n, p in columns):
-        reported = [_paper_cell(first.task, first.data, prior, nfe) for nfe, prior in columns]
+    reported = [_paper_cell(first, prior, nfe) for nfe, prior in columns]
+    if any(cell != "-" for cell in reported):
         lines.append(f"| {name}, paper (official data) | " + " | ".join(reported) + " |")
     return "\n".join([*lines, "", *_notes(results, summaries, top_k)]) + "\n"
 
@@ -230,7 +232,7 @@ def _notes(results: Results, summaries: dict[Any, SeedSummary], top_k: int) -> l
         "per seed. In parentheses the gain over the first column of each group, in bold the best.",
         "- `*` marks gains above the sum of both seed standard deviations (one-sigma rule)."
         if seeds > 1
-        else "- One seed has no spread: no gain is marked. The intervals below come from the episodes.",
+        else "- One seed has no spread: no gain is marked. success.png shows the episodes' posterior.",
     ]
     bases, previews = (
         {nfe: summary.mean for (prior, nfe), summary in summaries.items() if prior == name}
@@ -244,8 +246,9 @@ def _notes(results: Results, summaries: dict[Any, SeedSummary], top_k: int) -> l
         )
     if results.meta["data_source"] != "official":
         notes.append(
-            "- The measured row is from other demonstrations, another network and another budget than "
-            "the paper's row, which was obtained on the official human data: compare gains within a "
-            "row, not numbers across rows."
+            "- The measured row is from other demonstrations than the paper's, which are the official "
+            "human ones: compare gains within a row, not numbers across rows."
         )
+    if results.meta.get("options", {}).get("preset") != "paper":
+        notes.append("- Network and training budget are smaller than the paper's.")
     return notes

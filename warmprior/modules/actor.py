@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from safetensors.torch import load_file, save_file
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import nn
 
 from warmprior import keys
-from warmprior._files import write_atomic
+from warmprior._files import load_file, save_file, write_atomic
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.ode import ODEActor, Solver
 from warmprior.modules.prior import Prior
@@ -186,17 +185,22 @@ class WarmPriorActor(TensorDictModuleBase):
                 f"the policy at {directory} was trained with {Prior.from_config(config['prior'])}, not "
                 f"with {prior}"
             )
-        options: dict[str, Any] = dict(config["actor"])
-        key = options.pop("observation_key")
-        normalizer = config["normalizer"]
-        actor = cls(
-            VelocityNetwork.from_config(config["network"]),
-            Prior.from_config(config["prior"]),
-            normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
-            generator=generator,
-            observation_key=key if isinstance(key, str) else tuple(key),
-            **options,
-        )
+        try:
+            options: dict[str, Any] = dict(config["actor"])
+            key = options.pop("observation_key")
+            normalizer = config["normalizer"]
+            actor = cls(
+                VelocityNetwork.from_config(config["network"]),
+                Prior.from_config(config["prior"]),
+                normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
+                generator=generator,
+                observation_key=key if isinstance(key, str) else tuple(key),
+                **options,
+            )
+        except (AttributeError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"{directory / 'config.json'} is damaged or of another version: {error!r}"
+            ) from error
         weights = directory / "model.safetensors"
         if not weights.exists():
             raise FileNotFoundError(f"no policy weights at {weights}")

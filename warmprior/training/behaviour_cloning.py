@@ -13,7 +13,7 @@ from torch import nn
 from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
-from warmprior.keys import ACTION, EPISODE
+from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
@@ -31,6 +31,10 @@ from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.transforms.window import window_replay_buffer
 
 __all__ = ["BehaviourCloning", "TrainingConfig"]
+
+
+STATE_FORMAT = 1
+"""Part of every state's identity; raised whenever the same options give other weights."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +157,8 @@ class BehaviourCloning:
             "prior": actor.prior.config(),
             "network": _network_identity(actor.network),
             "data": _data_digest(data),
+            "policy": {"observation_steps": observation_steps, "clip": actor.ode.clip},
+            "format": STATE_FORMAT,
         }
         torch.manual_seed(config.seed)
         if resume and self.state_path.exists():
@@ -280,14 +286,20 @@ class BehaviourCloning:
     def _restore(self) -> None:
         tensors, facts = load_state(self.state_path)
         for part, mine in self.identity.items():
-            theirs = facts["identity"][part]
+            theirs = facts["identity"].get(part)
             if theirs != mine:
                 raise ValueError(
                     f"{self.state_path} belongs to another {part}: it has {theirs}, this run has "
                     f"{mine}. Use the same options, another output folder, or do not resume."
                 )
-        self.actor.network.load_state_dict(select("network", tensors))
-        self.ema.load_state_dict(select("ema", tensors))
+        try:
+            self.actor.network.load_state_dict(select("network", tensors))
+            self.ema.load_state_dict(select("ema", tensors))
+        except RuntimeError as error:
+            raise ValueError(
+                f"{self.state_path} does not fit the network; its code has changed since: {error}. "
+                "Remove the folder to train again."
+            ) from error
         restore_optimizer(self.optimizer, select("optimizer", tensors))
         self.iteration = facts["iteration"]
         self.losses = [(int(i), float(loss)) for i, loss in facts["losses"]]
@@ -297,7 +309,7 @@ class BehaviourCloning:
             self.optimizer.param_groups, self.schedule.get_last_lr(), strict=True
         ):
             group["lr"] = rate
-        self._running = list(tensors["running"])
+        self._running = list(tensors["running"].to(self.generator.device))
         restore_rng(self.generator, select("rng", tensors))
 
 
@@ -309,8 +321,7 @@ def _network_identity(network: nn.Module) -> Any:
 
 
 def _data_digest(data: TensorDictBase) -> str:
-    """Tells datasets apart by their actions and episodes."""
     digest = hashlib.sha256()
-    for key in (ACTION, EPISODE):
+    for key in (OBSERVATION, ACTION, EPISODE):
         digest.update(data[key].cpu().contiguous().numpy().tobytes())
     return digest.hexdigest()[:16]

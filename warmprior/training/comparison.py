@@ -25,7 +25,7 @@ from warmprior.diagnostics.results import Results, Row
 from warmprior.envs import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
-from warmprior.training.behaviour_cloning import BehaviourCloning
+from warmprior.training.behaviour_cloning import STATE_FORMAT, BehaviourCloning
 from warmprior.training.evaluation import evaluate, parallel_env
 from warmprior.training.presets import Preset
 from warmprior.transforms import Normalizer, policy_transforms
@@ -70,7 +70,7 @@ class Comparison:
         directory: output folder.
         seeds: training seeds.
         device: of networks and data.
-        compile: compile the velocity network.
+        compile: compile the velocity network in training.
         logger: TorchRL logger: ``"csv"``, ``"tensorboard"``, ``"wandb"`` or ``"none"``.
         resume: keep the evaluations that the output folder holds.
         options: recorded in ``results.json``.
@@ -89,7 +89,14 @@ class Comparison:
     options: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        for prior in self.priors:
+            if prior.max_nfe is not None and prior.max_nfe < min(self.nfes):
+                raise ValueError(
+                    f"{prior.name} is evaluated with at most {prior.max_nfe} network evaluation(s): add "
+                    f"--nfe {prior.max_nfe}, or leave it out"
+                )
         check_writable(self.directory)
+        check_writable(self.policies)
         dataset = RobomimicExperienceReplay(self.demonstrations.path)
         task = dataset.task
         self.task = dataset.env_args["env_name"].lower() if task is None else task.name
@@ -104,9 +111,20 @@ class Comparison:
             self.directory / "results.json",
             self._meta(dataset),
             resume=self.resume,
-            identity=("data", "training", "network"),
+            identity=("data", "training", "network", "priors", "evaluation"),
         )
         self._earlier = self.results.meta.get("wall_time_s", 0.0)
+
+    @property
+    def policies(self) -> Path:
+        """Folder of the trained policies, beside the output folder."""
+        return self.directory.parent / "policies"
+
+    @property
+    def num_envs(self) -> int:
+        """Parallel environments: the preset's, or one per core that this process may use."""
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        return min(self.preset.envs or cores or 1, self.preset.episodes)
 
     def _meta(self, dataset: RobomimicExperienceReplay) -> dict[str, Any]:
         packages = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "numpy")
@@ -130,6 +148,14 @@ class Comparison:
             "training": asdict(self.preset.training),
             "network": {"name": self.preset.network, **self.preset.network_options},
             "priors": [prior.config() for prior in self.priors],
+            # The number of environments is part of it: it decides which noise an episode meets.
+            "evaluation": {
+                "episodes": self.preset.episodes,
+                "envs": self.num_envs,
+                "nfes": list(self.nfes),
+                "seeds": list(self.seeds),
+                "device": self.device,
+            },
         }
 
     def run(self) -> Results:
@@ -138,6 +164,7 @@ class Comparison:
         Returns:
             The results, also in ``results.json``.
         """
+        self._save_time()
         for prior in self.priors:
             for seed in self.seeds:
                 self.train(prior, seed)
@@ -173,7 +200,11 @@ class Comparison:
                 self.preset.network_options,
                 self.preset.observation_steps,
                 self.device,
+                self.compile,
+                torch.get_num_threads(),
+                version("torch"),
                 version("warmprior"),
+                STATE_FORMAT,
             ]
         )
         digest = hashlib.sha256(identity.encode()).hexdigest()[:10]
@@ -182,7 +213,7 @@ class Comparison:
             actor,
             self.data,
             config,
-            self.directory.parent / "policies" / name,
+            self.policies / name,
             observation_steps=self.preset.observation_steps,
             logger=self._logger(f"{prior.name}-seed{seed}"),
             compile=self.compile,
@@ -227,8 +258,7 @@ class Comparison:
         ]
         if not todo:
             return
-        num_envs = min(preset.envs or os.cpu_count() or 1, preset.episodes)
-        env = parallel_env(self.make_env, self.transforms(prior), num_envs)
+        env = parallel_env(self.make_env, self.transforms(prior), self.num_envs)
         try:
             for seed, checkpoint, nfe in todo:
                 episodes = evaluate(

@@ -150,7 +150,8 @@ def evaluate(
         description: of the progress bar; no bar if ``None``.
 
     Returns:
-        The episodes in order of their seeds. The same arguments give the same result.
+        The episodes in order of their seeds. The same arguments and number of environments give the same
+        result.
 
     Raises:
         ValueError: if ``episodes < 1``.

@@ -17,8 +17,10 @@ __all__ = ["Normalizer"]
 class Normalizer(nn.Module):
     """Maps every dimension of every key to ``[-1, 1]`` by the data's minimum and maximum (Table 4).
 
-    Dimensions that never vary map to 0 and back to their constant. The statistics are buffers: they
-    travel with :meth:`WarmPriorActor.save_pretrained` and to devices.
+    Dimensions that vary by no more than the float noise of a resting body (half a range of 1e-5, relative
+    above 1) count as constant and are only shifted: blown up to [-1, 1], the noise would drown the
+    rest. The statistics are buffers: they travel with :meth:`WarmPriorActor.save_pretrained` and to
+    devices.
 
     Args:
         low: minimum per key, each ``[d]``, raw units.
@@ -51,9 +53,10 @@ class Normalizer(nn.Module):
                 )
             if not (torch.isfinite(low[key]).all() and torch.isfinite(high[key]).all()):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
-            half = (high[key] - low[key]) / 2
-            self.register_buffer(f"{key}_loc", (high[key] + low[key]) / 2)
-            self.register_buffer(f"{key}_scale", torch.where(half > 0, half, 1.0))
+            loc, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
+            constant = half <= 1e-5 * loc.abs().clamp_min(1.0)
+            self.register_buffer(f"{key}_loc", loc)
+            self.register_buffer(f"{key}_scale", torch.where(constant, 1.0, half))
 
     @classmethod
     def fit(
