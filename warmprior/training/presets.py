@@ -62,7 +62,7 @@ PRESETS: dict[str, Preset] = {
         summary="one seed, small network: a first table within 15 minutes on two cores",
         demonstrations={"ph": 150, "mh": 150},
         training=TrainingConfig(
-            iterations=6_000,
+            iterations=5_000,
             batch_size=256,
             learning_rate=1e-3,
             warmup_ratio=0.1,
@@ -71,7 +71,7 @@ PRESETS: dict[str, Preset] = {
         network="mlp",
         network_options={"hidden_dim": 384},
         seeds=1,
-        episodes=30,
+        episodes=25,
         top_k=1,
     ),
     "cpu": Preset(
