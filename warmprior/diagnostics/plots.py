@@ -137,6 +137,7 @@ def plot_learning_curves(
             capsize=2,
             color=_color(prior),
         )
+    right.set_xlim(left.get_xlim())
     right.set_ylim(-0.02, 1.02)
     right.set_ylabel(f"success rate (NFE {nfe})")
     for axis in (left, right):
