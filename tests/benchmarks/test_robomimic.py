@@ -108,7 +108,7 @@ def test_bad_options_stop_before_any_work(benchmark, dataset, tmp_path, capsys, 
 
 def test_resuming_takes_the_stored_options_and_refuses_others(benchmark, dataset, tmp_path):
     args = benchmark.parse(options(dataset, tmp_path, chunk=4, sigma=0.3))
-    benchmark.store_options(args)
+    benchmark.experiment.store_options(args)
     again = benchmark.parse(["--resume", "--out", str(tmp_path)])
     assert {**vars(again), "resume": False} == {**vars(args), "dataset": dataset.resolve()}
     with pytest.raises(ValueError, match=r"started with --sigma 0\.3"):

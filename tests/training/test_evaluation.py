@@ -62,7 +62,8 @@ def length_of(seed):
 
 def expected(first_seed, episodes):
     seeds = range(first_seed, first_seed + episodes)
-    return [Episode(seed, seed % 3 == 0, length_of(seed)) for seed in seeds]
+    nothing = TensorDict({}, [0])  # decisions take no part in comparisons
+    return [Episode(seed, seed % 3 == 0, length_of(seed), nothing) for seed in seeds]
 
 
 class Recorder(nn.Module):
@@ -240,3 +241,20 @@ def test_the_fake_simulator_itself():
         data["action"] = torch.zeros(ACTION_DIM)
         assert isinstance(env.step(data)["next"], TensorDict)
     assert seeds == [11, 14, 17]
+
+
+def test_decisions_hold_what_was_executed():
+    env = environments(2)
+    try:
+        episodes = evaluate(actor_for(), env, episodes=5, first_seed=10)
+    finally:
+        env.close(raise_if_closed=False)
+    for episode in episodes:
+        executed = episode.decisions["next", "executed_steps"].flatten().tolist()
+        full, rest = divmod(episode.steps, H)
+        assert executed == [H] * full + [rest] * (rest > 0)
+        assert episode.decisions["vla_action", "chunk"].shape == (len(executed), H, ACTION_DIM)
+        done = episode.decisions["next", "done"].flatten()
+        assert done[-1] and not done[:-1].any()
+        # Different decisions saw different observations and drew different noise.
+        assert len(episode.decisions["vla_action", "chunk"].unique(dim=0)) == len(executed)

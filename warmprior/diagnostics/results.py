@@ -44,6 +44,9 @@ class Row:
         episodes: how many were played.
         successes: how many succeeded.
         mean_steps: mean number of control steps of an episode.
+        boundary_jump: mean distance between the last action of a chunk and the first of the next, in
+            normalised action units; ``None`` if no episode has two chunks.
+        inner_jump: mean distance between consecutive actions inside chunks; ``None`` at ``H = 1``.
     """
 
     task: str
@@ -57,6 +60,8 @@ class Row:
     episodes: int
     successes: int
     mean_steps: float
+    boundary_jump: float | None = None
+    inner_jump: float | None = None
 
     @property
     def success_rate(self) -> float:

@@ -12,7 +12,8 @@ from warmprior.modules.interpolant import (
 from warmprior.modules.mlp import VelocityMLP
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 from warmprior.modules.ode import ODEActor, integrate
-from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior.modules.prior import Prior
+from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.modules.sampler import PriorSampler
 
 __all__ = [

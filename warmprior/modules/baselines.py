@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from warmprior.modules.prior import GaussianPrior, PastPrior
+from warmprior.modules.priors import GaussianPrior, PastPrior
 
 __all__ = ["HistoryPrior", "RegressionPrior"]
 

@@ -1,7 +1,7 @@
 """Behaviour cloning, evaluation and comparisons of priors.
 
-:class:`~warmprior.training.comparison.Comparison` is imported from its module: it needs
-``warmprior[sim]``.
+:class:`~warmprior.training.comparison.Comparison` and what it is made of are imported from their
+modules: they need ``warmprior[sim]``.
 """
 
 from warmprior.training.behaviour_cloning import BehaviourCloning, TrainingConfig

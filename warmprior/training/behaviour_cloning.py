@@ -173,7 +173,7 @@ class BehaviourCloning:
 
     def policy_path(self, iteration: int) -> Path:
         """Where the policy kept after ``iteration`` lies."""
-        return self.directory / f"policy_{iteration:06d}"
+        return policy_path(self.directory, iteration)
 
     def step(self) -> torch.Tensor:
         """One gradient step: sample, loss, backward, optimiser, schedule, averaging.
@@ -311,6 +311,11 @@ class BehaviourCloning:
             group["lr"] = rate
         self._running = list(tensors["running"].to(self.generator.device))
         restore_rng(self.generator, select("rng", tensors))
+
+
+def policy_path(directory: Path, iteration: int) -> Path:
+    """Where a training in ``directory`` keeps the policy of one iteration."""
+    return directory / f"policy_{iteration:06d}"
 
 
 def _network_identity(network: nn.Module) -> Any:

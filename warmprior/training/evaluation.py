@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 from tqdm import tqdm
@@ -28,11 +29,15 @@ class Episode:
         seed: simulator seed of the reset.
         success: whether the task was solved.
         steps: control steps executed.
+        decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, and under ``"next"``
+            ``"executed_steps"`` and ``"done"``. Episodes concatenated along ``D`` are a rollout for
+            :func:`~warmprior.diagnostics.smoothness`.
     """
 
     seed: int
     success: bool
     steps: int
+    decisions: TensorDictBase = field(compare=False, repr=False)
 
 
 def _transformed(
@@ -169,6 +174,8 @@ def evaluate(
     previous, actor.sampler.generator = actor.sampler.generator, generator
     played = [0] * num_envs
     outcomes: list[Episode] = []
+    chunks: list[list[Tensor]] = [[] for _ in played]
+    executed: list[list[Tensor]] = [[] for _ in played]
     bar = tqdm(total=episodes, desc=description, unit="ep", disable=description is None)
     try:
         with bar, _watched(env):
@@ -183,10 +190,15 @@ def evaluate(
                     data.set("_step", active)
                 data = env.step(actor(data.to(device), nfe=nfe).to("cpu"))
                 done = data["next", "done"].flatten() & active
+                chunk, steps = data[keys.CHUNK], data["next", keys.EXECUTED]
+                for i in active.nonzero().flatten().tolist():
+                    chunks[i].append(chunk[i])
+                    executed[i].append(steps[i])
                 for i in done.nonzero().flatten().tolist():
-                    outcomes.append(
-                        _outcome(data["next"][i], first_seed + i + num_envs * played[i])
-                    )
+                    seed = first_seed + i + num_envs * played[i]
+                    decisions = _decisions(chunks[i], executed[i])
+                    outcomes.append(_outcome(data["next"][i], seed, decisions))
+                    chunks[i], executed[i] = [], []
                     played[i] += 1
                     bar.update()
                     wins = sum(outcome.success for outcome in outcomes)
@@ -200,5 +212,17 @@ def evaluate(
     return sorted(outcomes, key=lambda outcome: outcome.seed)
 
 
-def _outcome(data: TensorDictBase, seed: int) -> Episode:
-    return Episode(seed, bool(data["success"]), int(data[keys.ELAPSED]))
+def _decisions(chunks: list[Tensor], executed: list[Tensor]) -> TensorDict:
+    done = torch.zeros(len(chunks), 1, dtype=torch.bool)
+    done[-1] = True
+    return TensorDict(
+        {
+            keys.CHUNK: torch.stack(chunks),
+            "next": {keys.EXECUTED: torch.stack(executed), "done": done},
+        },
+        batch_size=[len(chunks)],
+    )
+
+
+def _outcome(data: TensorDictBase, seed: int, decisions: TensorDictBase) -> Episode:
+    return Episode(seed, bool(data["success"]), int(data[keys.ELAPSED]), decisions)

@@ -1,0 +1,163 @@
+"""Trained policies on disk, found again by everything that determines them."""
+
+from __future__ import annotations
+
+import copy
+import hashlib
+import json
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.record.loggers import get_logger
+
+from warmprior._files import check_writable
+from warmprior.data import RobomimicExperienceReplay
+from warmprior.envs import RobosuiteEnv
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.prior import Prior
+from warmprior.training.behaviour_cloning import STATE_FORMAT, BehaviourCloning, policy_path
+from warmprior.training.demonstrations import Demonstrations
+from warmprior.training.presets import Preset
+from warmprior.transforms import Normalizer, policy_transforms
+
+__all__ = ["Policies"]
+
+
+@dataclass
+class Policies:
+    """Policies that differ in their source alone, trained alike on one set of demonstrations.
+
+    Each lies in a folder named by a digest of everything that determines it (data, recipe, prior,
+    network): whoever asks for the same options shares it, and an interrupted training continues from
+    its last state.
+
+    Attributes:
+        demonstrations: the data.
+        preset: the budget.
+        directory: where the policies lie.
+        logs: folder of the training logs.
+        device: of networks and data.
+        compile: compile the velocity network in training.
+        logger: TorchRL logger: ``"csv"``, ``"tensorboard"``, ``"wandb"`` or ``"none"``.
+
+    Raises:
+        OSError: if ``directory`` cannot be written to.
+        DatasetError: if the demonstrations cannot be read.
+    """
+
+    demonstrations: Demonstrations
+    preset: Preset
+    directory: Path
+    logs: Path
+    device: str = "cpu"
+    compile: bool = False
+    logger: str = "csv"
+    _losses: dict[Path, list[tuple[int, float]]] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        check_writable(self.directory)
+        dataset = RobomimicExperienceReplay(self.demonstrations.path)
+        task = dataset.task
+        self.task: str = dataset.env_args["env_name"].lower() if task is None else task.name
+        self.num_episodes, self.num_steps = dataset.num_episodes, len(dataset.data)
+        self.normalizer = Normalizer.fit(dataset.data)
+        self.data = self.normalizer.normalize(dataset.data.exclude("next")).to(self.device)
+        self.make_env = partial(
+            RobosuiteEnv, env_args=dataset.env_args, style=self.demonstrations.style
+        )
+
+    def new_actor(self, prior: Prior, seed: int) -> WarmPriorActor:
+        """An untrained policy; its initial weights depend on the seed alone."""
+        torch.manual_seed(seed)
+        action_dim = self.data["action"].shape[-1]
+        network = self.preset.make_network(
+            action_dim,
+            self.data["observation"].shape[-1] + prior.context_dim(action_dim),
+            prior.prediction_length,
+        )
+        # A copy: the policy moves to the device, the environments' normaliser stays on the CPU.
+        normalizer = copy.deepcopy(self.normalizer)
+        # The normalised demonstrations span [-1, 1]: what leaves it is executed, and remembered, at
+        # the bound.
+        return WarmPriorActor(network, prior, normalizer=normalizer, clip=1.0).to(self.device)
+
+    def folder(self, prior: Prior, seed: int) -> Path:
+        """Where a policy lies, or will lie."""
+        identity = json.dumps(
+            [
+                self.demonstrations.sha256,
+                asdict(replace(self.preset.training, seed=seed)),
+                prior.config(),
+                self.preset.network,
+                self.preset.network_options,
+                self.preset.observation_steps,
+                self.device,
+                self.compile,
+                torch.get_num_threads(),
+                version("torch"),
+                version("warmprior"),
+                STATE_FORMAT,
+            ]
+        )
+        digest = hashlib.sha256(identity.encode()).hexdigest()[:10]
+        name = f"{self.task}-{self.demonstrations.style}-{prior.name}-seed{seed}-{digest}"
+        return self.directory / name
+
+    def train(self, prior: Prior, seed: int) -> list[tuple[int, float]]:
+        """Train a policy; continue or reuse the stored one of the same options.
+
+        Args:
+            prior: its source distribution.
+            seed: its training seed.
+
+        Returns:
+            The training curve, ``[(iteration, loss), ...]``.
+
+        Raises:
+            FloatingPointError: if the loss becomes NaN or infinite.
+        """
+        folder = self.folder(prior, seed)
+        if folder not in self._losses:
+            training = BehaviourCloning(
+                self.new_actor(prior, seed),
+                self.data,
+                replace(self.preset.training, seed=seed),
+                folder,
+                observation_steps=self.preset.observation_steps,
+                logger=self._logger(folder.name),
+                compile=self.compile,
+            )
+            training.run(f"train {prior.describe()}, seed {seed}")
+            self._losses[folder] = training.losses
+        return self._losses[folder]
+
+    def policy(self, prior: Prior, seed: int, checkpoint: int | None = None) -> WarmPriorActor:
+        """A trained policy of averaged weights, from disk.
+
+        Args:
+            prior: its source distribution.
+            seed: its training seed.
+            checkpoint: iteration; the last by default.
+        """
+        checkpoint = self.preset.training.iterations if checkpoint is None else checkpoint
+        self.train(prior, seed)
+        path = policy_path(self.folder(prior, seed), checkpoint)
+        return WarmPriorActor.from_pretrained(path, prior=prior, device=self.device)
+
+    def transforms(self, prior: Prior) -> partial[Any]:
+        """Builder of the environment transforms that these policies need."""
+        return partial(
+            policy_transforms,
+            prior,
+            normalizer=self.normalizer,
+            observation_steps=self.preset.observation_steps,
+        )
+
+    def _logger(self, name: str) -> Any:
+        if self.logger == "none":
+            return None
+        return get_logger(self.logger, logger_name=str(self.logs), experiment_name=name)
