@@ -13,15 +13,23 @@ constant                key                                    shape and dtype
 :data:`ACTION`          ``"action"``                           ``[*B, d_a]`` float
 :data:`LOC`             ``("prior", "loc")``                   ``[*B, P, d_a]`` float
 :data:`WARM`            ``("prior", "warm")``                  ``[*B, P, 1]`` bool
+:data:`ANCHOR`          ``("prior", "anchor")``                ``[*B, P, d_a]`` float
 :data:`NOISE`           ``("prior", "noise")``, the source a0  ``[*B, P, d_a]`` float
 :data:`DELTA`           ``("prior", "delta")``                 ``[*B, P, d_a]`` float
 :data:`ELAPSED`         ``("prior", "elapsed")``               ``[*B, 1]`` int64
 :data:`CHUNK`           ``("vla_action", "chunk")``            ``[*B, P, d_a]`` float
+:data:`DECODED_NOISE`   ``("decoded", "noise")``               ``[*B, P, d_a]`` float
+:data:`DECODED_CHUNK`   ``("decoded", "chunk")``               ``[*B, P, d_a]`` float
 :data:`IS_PAD`          ``"action_is_pad"``                    ``[*B, P]`` bool
 :data:`EXECUTED`        ``"executed_steps"``                   ``[*B, 1]`` int64
 :data:`EPISODE`         ``"episode"``                          ``[N]`` int64, data only
 :data:`FRAME`           ``"frame"``                            ``[N]`` int64, data only
 ======================  =====================================  ==================================
+
+In prior-space reinforcement learning :data:`ANCHOR` is the centre of the agent's box and :data:`DELTA` its
+action, so that the source is always ``noise = anchor + delta``. An environment that decodes by itself tells
+what it made of a step's action under ``("next", "decoded", "noise")`` and ``("next", "decoded", "chunk")``;
+without ``"next"`` they are those of the step before.
 """
 
 from __future__ import annotations
@@ -32,10 +40,13 @@ OBSERVATION = OBSERVATION_KEY
 ACTION = ACTION_KEY
 LOC = ("prior", "loc")
 WARM = ("prior", "warm")
+ANCHOR = ("prior", "anchor")
 NOISE = ("prior", "noise")
 DELTA = ("prior", "delta")
 ELAPSED = ("prior", "elapsed")
 CHUNK = ACTION_CHUNK_KEY
+DECODED_NOISE = ("decoded", "noise")
+DECODED_CHUNK = ("decoded", "chunk")
 IS_PAD = ACTION_IS_PAD_KEY
 EXECUTED = "executed_steps"
 EPISODE = "episode"

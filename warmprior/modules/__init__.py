@@ -3,6 +3,7 @@
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.baselines import HistoryPrior, RegressionPrior
 from warmprior.modules.chi_transformer import ChiTransformer
+from warmprior.modules.decoder import PriorDecoder
 from warmprior.modules.interpolant import (
     Interpolant,
     LinearInterpolant,
@@ -13,7 +14,9 @@ from warmprior.modules.mlp import VelocityMLP
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 from warmprior.modules.ode import ODEActor, integrate
 from warmprior.modules.prior import Prior
+from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
 from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
+from warmprior.modules.residual import ResidualSampler
 from warmprior.modules.sampler import PriorSampler
 
 __all__ = [
@@ -27,12 +30,16 @@ __all__ = [
     "PolynomialInterpolant",
     "PreviewPrior",
     "Prior",
+    "PriorDecoder",
     "PriorSampler",
     "RegressionPrior",
+    "ResidualSampler",
     "TimestepEmbedding",
     "TrigonometricInterpolant",
     "VelocityMLP",
     "VelocityNetwork",
     "WarmPriorActor",
     "integrate",
+    "make_prior_space_actor",
+    "make_prior_space_critic",
 ]

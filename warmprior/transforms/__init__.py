@@ -1,9 +1,11 @@
 """Transforms of replay buffers and environments."""
 
+from warmprior.transforms.anchor import PriorAnchor
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.normalize import Normalizer
 from warmprior.transforms.policy import policy_transforms
+from warmprior.transforms.prior_space import PriorSpace
 from warmprior.transforms.stack import ObservationStack
 from warmprior.transforms.window import ActionWindow, window_replay_buffer
 
@@ -13,6 +15,8 @@ __all__ = [
     "ChunkStep",
     "Normalizer",
     "ObservationStack",
+    "PriorAnchor",
+    "PriorSpace",
     "policy_transforms",
     "window_replay_buffer",
 ]

@@ -1,0 +1,217 @@
+"""From the agent's residual to the executed chunk, through a frozen policy."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor, nn
+from torchrl.envs import EnvBase, TransformedEnv
+
+from warmprior import keys
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.baselines import RegressionPrior
+from warmprior.modules.ode import _steps
+from warmprior.modules.prior import Prior
+from warmprior.modules.priors import GaussianPrior
+
+__all__ = ["PriorDecoder", "moves_source"]
+
+
+def moves_source(prior: Prior) -> bool:
+    """Whether the prior's mean is the centre of its source, so that an agent can search around it.
+
+    It is not if nothing is ever warm, or if the mean conditions the network instead.
+    """
+    return not isinstance(prior, GaussianPrior) and not prior.conditions_network
+
+
+class PriorDecoder(TensorDictModuleBase):
+    r"""The frozen policy as a decoder: ``(observation, anchor, delta) -> (noise, chunk)``.
+
+    An agent acts in the policy's source space by a bounded residual around an anchor,
+
+    .. math::
+        a_0 = \mu + \Delta, \qquad \Delta \in [-\delta, \delta]^{P \times d_a},
+
+    and the policy's own ODE carries :math:`a_0` to the chunk, deterministically. The anchor comes from
+    :class:`~warmprior.PriorAnchor`: the prior's mean where it is warm. With zero anchors this is
+    `DSRL <https://arxiv.org/abs/2506.15799>`_.
+
+    Place it behind the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
+    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` on a copy of the policy's network whose
+    parameters have become buffers. So it is never in ``parameters()`` of whatever contains it, cannot be
+    switched to training mode, unfrozen or re-initialised, and does not change when the policy does.
+
+    Args:
+        actor: the policy; copied.
+
+    Keyword Args:
+        delta: half the side of the agent's box, in units of the normalised action space. The paper uses
+            0.5 around a warm mean and 1.5 around zero.
+        nfe: network evaluations per chunk; the actor's own by default.
+        unscaled_box: ignore ``delta`` and use the box [-1, 1], as the official implementation of
+            DSRL-NA does by mistake (its ``action_magnitude`` reaches the SAC variant only).
+        differentiable: let gradients flow from the chunk to the residual. The network stays frozen.
+        anchor_key: centre of the box, ``[*B, P, d_a]``.
+        delta_key: the residual, ``[*B, P, d_a]``.
+        noise_key: where the source goes, ``[*B, P, d_a]``.
+
+    Raises:
+        ValueError: if ``delta`` is not a finite number > 0, the policy regresses (its field is defined at
+            a single source point) or ``nfe`` does not suit it.
+        KeyError: (when called) if an input key is missing.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, PriorDecoder, VelocityMLP, WarmPriorActor
+        >>> prior = PastPrior(4)
+        >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), prior, nfe=1), delta=0.5)
+        >>> data = TensorDict({"observation": torch.zeros(5, 2, 3),
+        ...     "prior": {"anchor": torch.zeros(5, 4, 2), "delta": torch.full((5, 4, 2), 0.5)}}, [5])
+        >>> decoder(data)["vla_action", "chunk"].shape
+        torch.Size([5, 4, 2])
+        >>> float(data["prior", "noise"].mean()), list(decoder.parameters())
+        (0.5, [])
+    """
+
+    def __init__(
+        self,
+        actor: WarmPriorActor,
+        *,
+        delta: float,
+        nfe: int | None = None,
+        unscaled_box: bool = False,
+        differentiable: bool = False,
+        anchor_key: NestedKey = keys.ANCHOR,
+        delta_key: NestedKey = keys.DELTA,
+        noise_key: NestedKey = keys.NOISE,
+    ) -> None:
+        super().__init__()
+        if not (delta > 0 and math.isfinite(delta)):
+            raise ValueError(f"delta must be a finite number > 0, got {delta}")
+        if isinstance(actor.prior, RegressionPrior):
+            raise ValueError(
+                f"{actor.prior} starts at a single point and its field means nothing elsewhere: there is "
+                "no source space to act in"
+            )
+        self.delta = 1.0 if unscaled_box else float(delta)
+        self.differentiable = differentiable
+        self.ode = copy.deepcopy(actor.ode)
+        self.nfe = self.ode.nfe if nfe is None else nfe
+        self.ode._check_nfe(self.nfe)
+        _steps(self.nfe, self.ode.solver)
+        self.normalizer = copy.deepcopy(actor.normalizer)
+        self.prior = actor.prior
+        _turn_parameters_into_buffers(self)
+        self.train(False)
+        self.anchor_key = unravel_key(anchor_key)
+        self.delta_key = unravel_key(delta_key)
+        self.noise_key = unravel_key(noise_key)
+        self._ode_noise_key, self.observation_key, *mean = self.ode.in_keys
+        self.chunk_key = unravel_key(self.ode.out_keys[0])
+        self.in_keys = [self.observation_key, self.anchor_key, self.delta_key, *mean]
+        self.out_keys = [self.noise_key, self.chunk_key]
+
+    @property
+    def prediction_length(self) -> int:
+        """``P``."""
+        return self.prior.prediction_length
+
+    @property
+    def action_dim(self) -> int | None:
+        """``d_a``, or ``None`` if the network does not tell."""
+        return getattr(self.ode.network, "action_dim", None)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the source and the chunk."""
+        missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
+        if missing:
+            raise KeyError(
+                f"PriorDecoder needs the keys {self.in_keys}; missing: {missing}. PriorAnchor writes the "
+                "anchor in an environment and the agent the residual"
+            )
+        anchor, delta = tensordict.get(self.anchor_key), tensordict.get(self.delta_key)
+        self._check_shape(anchor, self.anchor_key)
+        if delta.shape != anchor.shape:
+            raise ValueError(
+                f"{self.delta_key} has shape {tuple(delta.shape)}, but {self.anchor_key} has "
+                f"{tuple(anchor.shape)}"
+            )
+        with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
+            noise = anchor + delta
+            inputs = tensordict.select(*self.in_keys).set(self._ode_noise_key, noise)
+            chunk = self.ode(inputs, nfe=self.nfe).get(self.chunk_key)
+        tensordict.set(self.noise_key, noise)
+        return tensordict.set(self.chunk_key, chunk)
+
+    def _check_shape(self, anchor: Tensor, name: Any) -> None:
+        action_dim = self.action_dim or anchor.shape[-1]
+        if tuple(anchor.shape[-2:]) != (self.prediction_length, action_dim):
+            raise ValueError(
+                f"{name} has shape {tuple(anchor.shape)}, but the policy predicts chunks "
+                f"[*B, P, d_a] with (P, d_a) = {(self.prediction_length, action_dim)}"
+            )
+
+    def check_env(self, env: EnvBase) -> None:
+        """Compare the policy with an environment: chunk length, action width and prior.
+
+        Priors are compared where the environment's transforms can be seen, outside of workers.
+
+        Args:
+            env: an environment whose action is the chunk.
+
+        Raises:
+            KeyError: if the environment takes no chunk.
+            ValueError: naming what differs.
+        """
+        actions = env.full_action_spec
+        if self.chunk_key not in actions.keys(True, True):
+            raise KeyError(
+                f"the environment takes {list(actions.keys(True, True))}, not {self.chunk_key}: append "
+                "ChunkStep first"
+            )
+        shape = actions[self.chunk_key].shape
+        expected = (self.prediction_length, self.action_dim or shape[-1])
+        if tuple(shape[-2:]) != expected:
+            raise ValueError(
+                f"the environment takes chunks of (P, d_a) = {tuple(shape[-2:])}, but the policy "
+                f"predicts {expected}"
+            )
+        for transform, prior in _visible_priors(env):
+            if prior.config() != self.prior.config():
+                raise ValueError(
+                    f"the policy was trained with {self.prior}, but {transform} carries {prior}"
+                )
+
+    def train(self, mode: bool = True) -> PriorDecoder:
+        """Stays in evaluation mode."""
+        return super().train(False)
+
+    def reset_parameters_recursive(self, parameters: TensorDictBase | None = None) -> None:
+        """Keeps the weights, unlike other modules: TorchRL's losses call it on all they hold."""
+
+
+def _turn_parameters_into_buffers(module: nn.Module) -> None:
+    """Replace every parameter below ``module``; tied ones stay tied."""
+    frozen: dict[int, Tensor] = {}
+    for child in module.modules():
+        for name, parameter in list(child.named_parameters(recurse=False)):
+            buffer = frozen.setdefault(id(parameter), parameter.detach())
+            delattr(child, name)
+            child.register_buffer(name, buffer)
+
+
+def _visible_priors(env: EnvBase) -> Iterator[tuple[str, Prior]]:
+    while isinstance(env, TransformedEnv):
+        for transform in env.transform.modules():
+            if isinstance(getattr(transform, "prior", None), Prior):
+                yield type(transform).__name__, transform.prior
+        env = env.base_env

@@ -1,0 +1,234 @@
+"""Networks of an agent that acts in source space: its actor and its critics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from tensordict.nn import TensorDictModule
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor, nn
+from torchrl.data import Bounded, Composite
+from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
+
+from warmprior import keys
+
+__all__ = ["make_prior_space_actor", "make_prior_space_critic"]
+
+LOG_STD_RANGE = (-20.0, 2.0)
+
+
+class _Trunk(nn.Module):
+    """Linear, LayerNorm and Tanh ``num_layers`` times, then linear; on flattened, concatenated inputs."""
+
+    def __init__(
+        self,
+        event_dims: Sequence[int],
+        scales: Sequence[float],
+        in_features: int,
+        out_features: int,
+        hidden_dim: int,
+        num_layers: int,
+    ) -> None:
+        super().__init__()
+        self.event_dims = tuple(event_dims)
+        self.scales = tuple(scales)
+        self.in_features = in_features
+        layers: list[nn.Module] = []
+        for i in range(num_layers):
+            width = in_features if i == 0 else hidden_dim
+            layers += [nn.Linear(width, hidden_dim), nn.LayerNorm(hidden_dim), nn.Tanh()]
+        self.net = nn.Sequential(*layers, nn.Linear(hidden_dim, out_features))
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        x = torch.cat(
+            [
+                x.flatten(-n) * scale
+                for x, n, scale in zip(inputs, self.event_dims, self.scales, strict=True)
+            ],
+            dim=-1,
+        )
+        if x.shape[-1] != self.in_features:
+            raise ValueError(
+                f"the network was built for {self.in_features} inputs, got the shapes "
+                f"{[tuple(x.shape) for x in inputs]}"
+            )
+        return self.net(x)
+
+
+class _ActorHead(nn.Module):
+    """Location and scale of the residual before the squashing, each ``[*B, P, d_a]``."""
+
+    def __init__(self, trunk: _Trunk, shape: tuple[int, int]) -> None:
+        super().__init__()
+        self.trunk = trunk
+        self.shape = shape
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        loc, log_std = self.trunk(*inputs).chunk(2, dim=-1)
+        scale = log_std.clamp(*LOG_STD_RANGE).exp()
+        return loc.unflatten(-1, self.shape), scale.unflatten(-1, self.shape)
+
+
+def _make_trunk(
+    in_keys: Sequence[NestedKey],
+    chunk: tuple[int, int],
+    observation: tuple[int, int],
+    out_features: int,
+    hidden_dim: int,
+    num_layers: int,
+    scales: dict[NestedKey, float],
+) -> _Trunk:
+    sizes = {
+        "prediction_length": chunk[0],
+        "action_dim": chunk[1],
+        "observation_steps": observation[0],
+        "observation_dim": observation[1],
+        "hidden_dim": hidden_dim,
+        "num_layers": num_layers,
+        "out_features": out_features,
+    }
+    for name, size in sizes.items():
+        if size < 1:
+            raise ValueError(f"{name} must be at least 1, got {size}")
+    if not in_keys:
+        raise ValueError("in_keys is empty: the first is the observation")
+    width = math.prod(observation) + (len(in_keys) - 1) * math.prod(chunk)
+    return _Trunk(
+        [2] * len(in_keys),
+        [scales.get(unravel_key(key), 1.0) for key in in_keys],
+        width,
+        out_features,
+        hidden_dim,
+        num_layers,
+    )
+
+
+def make_prior_space_actor(
+    action_dim: int,
+    observation_dim: int,
+    prediction_length: int,
+    observation_steps: int = 2,
+    *,
+    delta: float,
+    hidden_dim: int = 256,
+    num_layers: int = 3,
+    in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR),
+    delta_key: NestedKey = keys.DELTA,
+) -> ProbabilisticActor:
+    r"""A squashed Gaussian over residuals, :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`, for SAC.
+
+    DSRL's network: per layer ``Linear -> LayerNorm -> Tanh``, then location and log standard deviation
+    (clipped to [-20, 2]). The official sizes are 3 layers of 2048 on Square and 128 on Transport.
+
+    Args:
+        action_dim: ``d_a``.
+        observation_dim: ``d_o``.
+        prediction_length: ``P``.
+        observation_steps: ``To``.
+
+    Keyword Args:
+        delta: half the side of the box; :attr:`PriorDecoder.delta`.
+        hidden_dim: width of the layers.
+        num_layers: number of layers.
+        in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``. Leave the anchor
+            out where it is always zero.
+        delta_key: where the residual is written; its log-probability is summed over the chunk.
+
+    Raises:
+        ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> actor = make_prior_space_actor(2, 3, 4, delta=0.5)
+        >>> data = actor(TensorDict({"observation": torch.zeros(5, 2, 3),
+        ...                          "prior": {"anchor": torch.zeros(5, 4, 2)}}, [5]))
+        >>> data["prior", "delta"].shape, data["prior", "delta_log_prob"].shape
+        (torch.Size([5, 4, 2]), torch.Size([5]))
+    """
+    _check_delta(delta)
+    chunk = (prediction_length, action_dim)
+    trunk = _make_trunk(
+        in_keys,
+        chunk,
+        (observation_steps, observation_dim),
+        2 * math.prod(chunk),
+        hidden_dim,
+        num_layers,
+        {},
+    )
+    parameters = ["delta_loc", "delta_scale"]
+    return ProbabilisticActor(
+        TensorDictModule(_ActorHead(trunk, chunk), in_keys=list(in_keys), out_keys=parameters),
+        in_keys=dict(zip(("loc", "scale"), parameters, strict=True)),
+        out_keys=[delta_key],
+        spec=Composite({delta_key: Bounded(-delta, delta, chunk)}),
+        distribution_class=TanhNormal,
+        # Two event dimensions: one log-probability per chunk and not per action.
+        distribution_kwargs={"low": -delta, "high": delta, "event_dims": 2},
+        return_log_prob=True,
+    )
+
+
+def make_prior_space_critic(
+    action_dim: int,
+    observation_dim: int,
+    prediction_length: int,
+    observation_steps: int = 2,
+    *,
+    delta: float = 1.0,
+    hidden_dim: int = 256,
+    num_layers: int = 3,
+    in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR, keys.DELTA),
+    out_features: int = 1,
+) -> ValueOperator:
+    """A critic of residuals or of chunks, with the trunk of :func:`make_prior_space_actor`.
+
+    The default judges residuals: a stock loss's critic, and the noise critic of
+    :class:`~warmprior.DSRLNALoss`. ``in_keys=(keys.OBSERVATION, keys.CHUNK)`` judges all ``P`` actions of
+    a chunk, which for WP-Past and WP-Preview alike determine the next mean: that is the latter's action
+    critic.
+
+    Args:
+        action_dim: ``d_a``.
+        observation_dim: ``d_o``.
+        prediction_length: ``P``.
+        observation_steps: ``To``.
+
+    Keyword Args:
+        delta: residuals are divided by it, so that the critic sees [-1, 1].
+        hidden_dim: width of the layers.
+        num_layers: number of layers.
+        in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``.
+        out_features: values per input, more than one for quantile critics.
+
+    Raises:
+        ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> critic = make_prior_space_critic(2, 3, 4, in_keys=["observation", ("vla_action", "chunk")])
+        >>> critic(TensorDict({"observation": torch.zeros(5, 2, 3),
+        ...     "vla_action": {"chunk": torch.zeros(5, 4, 2)}}, [5]))["state_action_value"].shape
+        torch.Size([5, 1])
+    """
+    _check_delta(delta)
+    trunk = _make_trunk(
+        in_keys,
+        (prediction_length, action_dim),
+        (observation_steps, observation_dim),
+        out_features,
+        hidden_dim,
+        num_layers,
+        {keys.DELTA: 1.0 / delta},
+    )
+    # TorchRL would call it "state_value" for any action that is not named "action".
+    return ValueOperator(trunk, in_keys=list(in_keys), out_keys=["state_action_value"])
+
+
+def _check_delta(delta: float) -> None:
+    if not (delta > 0 and math.isfinite(delta)):
+        raise ValueError(f"delta must be a finite number > 0, got {delta}")

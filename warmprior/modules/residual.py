@@ -1,0 +1,97 @@
+"""Residuals in source space without an agent."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from warmprior.modules.decoder import PriorDecoder, moves_source
+
+__all__ = ["ResidualSampler"]
+
+ResidualDistribution = Literal["normal", "clipped", "uniform"]
+
+
+class ResidualSampler(TensorDictModuleBase):
+    r"""Draws residuals without an agent: to fill the buffer at first, and to distil the noise critic.
+
+    With :math:`\sigma` the prior's (1 if nothing is ever warm) and :math:`\delta` the decoder's:
+
+    ===============  =============================================================================
+    distribution     residual
+    ===============  =============================================================================
+    ``"normal"``     :math:`\sigma \varepsilon`, the training prior; may leave the agent's box
+    ``"clipped"``    the same, clipped to :math:`[-\delta, \delta]`
+    ``"uniform"``    :math:`U[-\delta, \delta]`
+    ===============  =============================================================================
+
+    ``TensorDictSequential(ResidualSampler(decoder), decoder)`` is a policy for the first steps of a collector
+    (the environment's own random actions would be random *chunks* there).
+
+    Args:
+        decoder: the frozen policy.
+
+    Keyword Args:
+        distribution: see above. By default ``"clipped"`` around a mean and ``"normal"`` around zero, as
+            in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
+        sigma: the prior's own by default.
+        generator: source of randomness on the data's device; PyTorch's global one by default.
+
+    Raises:
+        ValueError: for an unknown distribution or a ``sigma`` that is not a finite number > 0.
+        KeyError: (when called) if the anchor is missing.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, PriorDecoder, ResidualSampler, VelocityMLP, WarmPriorActor
+        >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), delta=0.5)
+        >>> data = TensorDict({"prior": {"anchor": torch.zeros(100, 4, 2)}}, [100])
+        >>> float(ResidualSampler(decoder)(data)["prior", "delta"].abs().max())
+        0.5
+    """
+
+    def __init__(
+        self,
+        decoder: PriorDecoder,
+        *,
+        distribution: ResidualDistribution | None = None,
+        sigma: float | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        if distribution is None:
+            distribution = "clipped" if moves_source(decoder.prior) else "normal"
+        if distribution not in ("normal", "clipped", "uniform"):
+            raise ValueError(
+                f"the distribution must be 'normal', 'clipped' or 'uniform', got {distribution!r}"
+            )
+        if sigma is None:
+            # At sigma 0 there is no noise to draw from: the whole box is what the agent may ask for.
+            sigma = decoder.prior.sigma if moves_source(decoder.prior) else 1.0
+        if not (sigma > 0 and math.isfinite(sigma)):
+            raise ValueError(f"sigma must be a finite number > 0, got {sigma}")
+        self.distribution = distribution
+        self.sigma = sigma
+        self.delta = decoder.delta
+        self.generator = generator
+        self.in_keys = [decoder.anchor_key]
+        self.out_keys = [decoder.delta_key]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the residual."""
+        anchor = tensordict.get(self.in_keys[0], None)
+        if anchor is None:
+            raise KeyError(f"ResidualSampler needs {self.in_keys[0]}: PriorAnchor writes it")
+        like = {"dtype": anchor.dtype, "device": anchor.device, "generator": self.generator}
+        if self.distribution == "uniform":
+            delta = (2.0 * torch.rand(anchor.shape, **like) - 1.0) * self.delta
+        else:
+            delta = self.sigma * torch.randn(anchor.shape, **like)
+        if self.distribution == "clipped":
+            delta = delta.clamp(-self.delta, self.delta)
+        return tensordict.set(self.out_keys[0], delta)

@@ -1,0 +1,173 @@
+"""The environment's side of prior-space reinforcement learning: the centre of the agent's box."""
+
+from __future__ import annotations
+
+import random
+import weakref
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.data import TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Compose, Transform
+
+from warmprior import keys
+from warmprior.modules.decoder import moves_source
+from warmprior.modules.prior import Prior
+
+__all__ = ["PriorAnchor"]
+
+
+class PriorAnchor(Transform):
+    r"""Writes the anchor around which an agent acts in source space: the mean, and noise where it is cold.
+
+    .. math::
+        c_\tau = \mu_\tau \;\; (\tau \in W), \qquad
+        c_\tau = \varepsilon_\tau \text{ or } 0 \;\; (\tau \in C), \qquad a_0 = c + \Delta.
+
+    The first chunk of an episode has no mean, nor has the second half of a preview. A small box around
+    zero would confine these positions to a corner of the source the policy was trained on; around a
+    draw of that source it does not. The draw is made *here*, before the agent acts, and written next to
+    the observation: the agent sees which noise will be used, the decision process stays Markov and the
+    decoder deterministic. ``("prior", "loc")`` is left alone, :class:`ActionHistory` carries it on.
+
+    Append it after :class:`ActionHistory`, inside or outside of batched environments.
+
+    .. note::
+        ``env.set_seed`` seeds the noise too. Workers of a batched environment that all get the same seed
+        (``static_seed=True``) need different ``seed_offset``; outside of the workers one
+        transform draws for all of them.
+
+    Args:
+        prior: the policy's source distribution.
+
+    Keyword Args:
+        cold: ``"noise"`` draws the prior's own cold source, N(0, I); ``"zero"`` puts zero. By default
+            noise for priors with a mean and zero for the others (:class:`~warmprior.GaussianPrior`,
+            :class:`~warmprior.HistoryPrior`), which gives vanilla DSRL: :math:`a_0 = \Delta`.
+        seed: of the noise until ``env.set_seed`` is called.
+        seed_offset: mixed with the seed.
+        loc_key: the mean, ``[*B, P, d_a]``.
+        warm_key: its mask, bool ``[*B, P, 1]``.
+        anchor_key: where the anchor is written, ``[*B, P, d_a]``.
+
+    Raises:
+        ValueError: for an unknown ``cold``, or if the environment carries another prior's means.
+        KeyError: if :class:`ActionHistory` does not come before.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv, Compose
+        >>> from warmprior import ActionHistory, ChunkStep, PastPrior, PriorAnchor
+        >>> prior = PastPrior(4)
+        >>> env = TransformedEnv(
+        ...     GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(prior), PriorAnchor(prior)))
+        >>> rollout = env.rollout(2)
+        >>> anchor = rollout["prior", "anchor"]
+        >>> bool(anchor[0].any()), bool((anchor[1] == rollout["prior", "loc"][1]).all())
+        (True, True)
+    """
+
+    def __init__(
+        self,
+        prior: Prior,
+        *,
+        cold: Literal["noise", "zero"] | None = None,
+        seed: int = 0,
+        seed_offset: int = 0,
+        loc_key: NestedKey = keys.LOC,
+        warm_key: NestedKey = keys.WARM,
+        anchor_key: NestedKey = keys.ANCHOR,
+    ) -> None:
+        super().__init__(in_keys=[loc_key, warm_key], out_keys=[anchor_key])
+        if cold not in (None, "noise", "zero"):
+            raise ValueError(f"cold must be 'noise' or 'zero', got {cold!r}")
+        self.prior = prior
+        self.follows_mean = moves_source(prior)
+        self.cold = cold or ("noise" if self.follows_mean else "zero")
+        self.seed_offset = seed_offset
+        self.loc_key, self.warm_key = unravel_key(loc_key), unravel_key(warm_key)
+        self.anchor_key = unravel_key(anchor_key)
+        self.generator = torch.Generator()
+        self.set_seed(seed)
+
+    def set_seed(self, seed: int) -> None:
+        """Start the noise again from a seed; ``env.set_seed`` calls it.
+
+        Args:
+            seed: any integer; mixed with ``seed_offset``.
+        """
+        self.generator.manual_seed(random.Random(f"{seed}/{self.seed_offset}").getrandbits(62))
+
+    def set_container(self, container: Any) -> None:
+        """Attach the transform, and have it told the seeds that its environment is given."""
+        super().set_container(container)
+        while isinstance(container, Compose):
+            reference = container.__dict__.get("_container")
+            container = None if reference is None else reference()
+        if isinstance(container, EnvBase):
+            # TorchRL hands seeds to the base environment alone.
+            container.__dict__["set_seed"] = _SetSeed(container)
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        loc = next_tensordict.get(self.loc_key, None)
+        warm = next_tensordict.get(self.warm_key, None)
+        if loc is None or warm is None:
+            raise KeyError(
+                f"PriorAnchor found no {self.loc_key} and {self.warm_key}: append it after ActionHistory"
+            )
+        if loc.shape[-2] != self.prior.prediction_length:
+            raise ValueError(
+                f"{self.loc_key} has shape {tuple(loc.shape)}, but {self.prior} predicts "
+                f"{self.prior.prediction_length} actions: ActionHistory must carry the same prior"
+            )
+        if self.cold == "noise":
+            # Drawn on the CPU: one seed gives one noise on every device.
+            zero = torch.zeros(loc.shape, dtype=loc.dtype)
+            nothing = torch.zeros(warm.shape, dtype=torch.bool)
+            cold = self.prior.sample(zero, nothing, self.generator).to(loc.device)
+        else:
+            cold = torch.zeros_like(loc)
+        anchor = torch.where(warm, loc, cold) if self.follows_mean else cold
+        return next_tensordict.set(self.anchor_key, anchor)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # For all sub-environments: TorchRL keeps the rows of those that were reset.
+        return self._call(tensordict_reset)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Outside environments the transform does nothing: the key is already in the data."""
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the anchor."""
+        if self.loc_key not in observation_spec.keys(True, True):
+            raise KeyError(f"PriorAnchor found no {self.loc_key}: append it after ActionHistory")
+        shape = observation_spec[self.loc_key].shape
+        observation_spec[self.anchor_key] = Unbounded(shape, device=observation_spec.device)
+        return observation_spec
+
+
+class _SetSeed:
+    """Stands for ``env.set_seed``: also seeds the anchors among the environment's transforms."""
+
+    def __init__(self, env: EnvBase) -> None:
+        self._env = weakref.ref(env)
+
+    def __call__(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        env: Any = self._env()
+        following = type(env).set_seed(env, seed, static_seed=static_seed)
+        for transform in env.transform.modules():
+            if isinstance(transform, PriorAnchor) and seed is not None:
+                transform.set_seed(seed)
+        return following
+
+    def __getstate__(self) -> EnvBase | None:
+        # Copies of the environment must seed themselves, and not the original.
+        return self._env()
+
+    def __setstate__(self, env: EnvBase) -> None:
+        self._env = weakref.ref(env)

@@ -1,0 +1,126 @@
+"""An environment whose action is a residual in the source space of a frozen policy."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torchrl.data import Bounded, Composite
+from torchrl.envs.transforms import Transform
+
+from warmprior import keys
+from warmprior.modules.decoder import PriorDecoder
+
+__all__ = ["PriorSpace"]
+
+
+class PriorSpace(Transform):
+    r"""Makes the residual the environment's action: :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`.
+
+    The other wiring of :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
+    environment with a bounded action. The chunk is decoded on the way in and the transitions are those
+    of ``TensorDictSequential(agent, decoder)``, except for where the source and the chunk are found:
+
+    =======================================  =====================================================
+    ``TensorDictSequential(agent, decoder)``  ``PriorSpace(decoder)``
+    =======================================  =====================================================
+    ``("prior", "noise")``                   ``("next", "decoded", "noise")``
+    ``("vla_action", "chunk")``              ``("next", "decoded", "chunk")``
+    =======================================  =====================================================
+
+    (TorchRL keeps nothing that an inverse transform writes, so they leave with the next state. Under their
+    usual names the data would hold, at the root, those of the step before.)
+
+    Append it last, after :class:`~warmprior.PriorAnchor`, and outside of batched environments: inside, every
+    worker holds a copy of the network.
+
+    Args:
+        decoder: the frozen policy.
+
+    Keyword Args:
+        noise_key: where the source is written, ``[*B, P, d_a]``.
+        chunk_key: where the chunk is written, ``[*B, P, d_a]``.
+
+    Raises:
+        KeyError: if :class:`~warmprior.ChunkStep` or :class:`~warmprior.PriorAnchor` does not come before.
+        ValueError: if the environment's chunks or prior are not the policy's, see
+            :meth:`PriorDecoder.check_env`.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from warmprior import PastPrior, PriorAnchor, PriorDecoder, PriorSpace, VelocityMLP
+        >>> from warmprior import WarmPriorActor, policy_transforms
+        >>> from warmprior.envs import NavigationEnv
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4), nfe=1)
+        >>> transforms = policy_transforms(actor.prior, observation_steps=1)
+        >>> transforms.append(PriorAnchor(actor.prior))
+        >>> transforms.append(PriorSpace(PriorDecoder(actor, delta=0.5)))
+        >>> env = TransformedEnv(NavigationEnv(batch_size=[3]), transforms)
+        >>> env.action_keys, env.full_action_spec["prior", "delta"].shape
+        ([('prior', 'delta')], torch.Size([3, 4, 1]))
+        >>> env.rollout(2)["next", "decoded", "chunk"].shape
+        torch.Size([3, 2, 4, 1])
+    """
+
+    def __init__(
+        self,
+        decoder: PriorDecoder,
+        *,
+        noise_key: NestedKey = keys.DECODED_NOISE,
+        chunk_key: NestedKey = keys.DECODED_CHUNK,
+    ) -> None:
+        super().__init__(
+            out_keys=[noise_key, chunk_key],
+            in_keys_inv=[decoder.chunk_key],
+            out_keys_inv=[decoder.delta_key],
+        )
+        self.decoder = decoder
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.decoder(tensordict)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for key, out_key in zip(self.decoder.out_keys, self.out_keys, strict=True):
+            next_tensordict.set(out_key, tensordict.get(key))
+        return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        for key in self.out_keys:
+            anchor = tensordict_reset.get(self.decoder.anchor_key)
+            tensordict_reset.set(key, torch.zeros_like(anchor))
+        return tensordict_reset
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Outside environments the transform does nothing."""
+        return tensordict
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Replace the chunk by the bounded residual."""
+        self.decoder.check_env(self.parent)
+        actions = input_spec["full_action_spec"]
+        key: NestedKey = self.decoder.chunk_key
+        leaf, delta = actions[key], self.decoder.delta
+        actions[self.decoder.delta_key] = Bounded(
+            -delta, delta, leaf.shape, dtype=leaf.dtype, device=leaf.device
+        )
+        del actions[key]
+        while isinstance(key, tuple) and len(key) > 1:
+            # An empty branch would count as an action.
+            key = key[:-1]
+            if len(actions[key].keys()):
+                break
+            del actions[key]
+        return input_spec
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the source and the chunk."""
+        key = self.decoder.anchor_key
+        if key not in observation_spec.keys(True, True):
+            raise KeyError(
+                f"PriorSpace found no {key} among the observations: append it after PriorAnchor"
+            )
+        for out_key in self.out_keys:
+            observation_spec[out_key] = observation_spec[key].clone()
+        return observation_spec
