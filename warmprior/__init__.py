@@ -31,7 +31,7 @@ from warmprior.modules import (
     make_prior_space_actor,
     make_prior_space_critic,
 )
-from warmprior.objectives import FlowMatchingLoss
+from warmprior.objectives import DSRLNALoss, FlowMatchingLoss
 from warmprior.transforms import (
     ActionHistory,
     ActionWindow,
@@ -51,6 +51,7 @@ __all__ = [
     "ActionWindow",
     "ChiTransformer",
     "ChunkStep",
+    "DSRLNALoss",
     "FlowMatchingLoss",
     "GaussianPrior",
     "HistoryPrior",

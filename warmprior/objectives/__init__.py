@@ -1,5 +1,6 @@
 """Losses."""
 
+from warmprior.objectives.dsrl import DSRLNALoss
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 
-__all__ = ["FlowMatchingLoss"]
+__all__ = ["DSRLNALoss", "FlowMatchingLoss"]
