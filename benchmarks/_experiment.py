@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 import argparse
+import copy
 import importlib.util
 import json
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 # Before torch: on a busy machine, threads that spin while they wait slow small networks thirtyfold.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import torch
 
-from warmprior import Prior
+from warmprior import Prior, WarmPriorActor
 from warmprior._files import check_writable, write_atomic
-from warmprior.data import TASKS, download_robomimic, generate_demonstrations, get_task
+from warmprior.data import (
+    TASKS,
+    RobomimicExperienceReplay,
+    download_robomimic,
+    generate_demonstrations,
+    get_task,
+)
+from warmprior.diagnostics import SharedObservations
 from warmprior.training import PRESETS, Preset
 from warmprior.training.comparison import Comparison
 from warmprior.training.demonstrations import Demonstrations
@@ -62,6 +71,24 @@ def add_options(parser: argparse.ArgumentParser) -> Callable[..., argparse.Actio
         help="TorchRL logger of the training curves (%(default)s)",
     )
     return add
+
+
+def add_curvature_options(parser: argparse.ArgumentParser, *, observations: int) -> None:
+    """Add the options of measurements on held-out observations."""
+    add = parser.add_argument
+    add(
+        "--validation",
+        type=Path,
+        help="robomimic HDF5 file of held-out demonstrations (default: newly generated ones)",
+    )
+    add(
+        "--observations",
+        type=int,
+        default=observations,
+        help="observations to measure curvature on (%(default)s; the paper: 2000)",
+    )
+    add("--steps", type=int, default=100, help="Euler steps (%(default)s, the paper's)")
+    add("--draws", type=int, default=1, help="source samples per observation (%(default)s)")
 
 
 def parse(
@@ -223,4 +250,37 @@ def start_comparison(
         seeds=range(preset.seeds),
         resume=args.resume,
         options=options,
+    )
+
+
+def held_out(args: argparse.Namespace, meta: dict[str, Any]) -> tuple[Demonstrations, str]:
+    """The demonstrations to measure on, and what they are in words."""
+    if args.validation is not None:
+        found = Demonstrations(args.validation, "file", meta["style"])
+        if found.sha256 == meta["data"]["sha256"]:
+            return found, "the TRAINING demonstrations (not held out)"
+        return found, f"{args.validation.name}"
+    if meta["data_source"] != "scripted":
+        raise ValueError(
+            "these policies were trained on all demonstrations of "
+            f"{meta['data']['file']}: add --validation FILE with others (or with the same file, to "
+            "measure on the training data)"
+        )
+    # About a hundred steps each; enough for any --observations in reason.
+    n = max(20, -(-args.observations // 50))
+    found = Demonstrations.held_out(meta["task"], meta["style"], n)
+    return found, f"{n} newly generated demonstrations"
+
+
+def observe(args: argparse.Namespace, path: Path, actor: WarmPriorActor) -> SharedObservations:
+    """Draw the observations, normalised as the policies were trained."""
+    data = RobomimicExperienceReplay(path).data.exclude("next")
+    # A copy: the data are normalised on the CPU, the policy may live elsewhere.
+    normalizer = copy.deepcopy(actor.normalizer).to("cpu")
+    return SharedObservations(
+        normalizer.normalize(data).to(args.device),
+        actor.prior.chunk_length,
+        observation_steps=actor.network.observation_steps,
+        count=args.observations,
+        generator=torch.Generator().manual_seed(0),
     )

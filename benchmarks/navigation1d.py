@@ -9,7 +9,6 @@ python benchmarks/navigation1d.py --preset wide        # the paper's network and
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import os
 import platform
@@ -23,13 +22,14 @@ from typing import Any
 
 import torch
 
-from warmprior._files import check_writable, write_atomic
+from warmprior._files import check_writable
 from warmprior.diagnostics import (
     executed_actions,
     flow_paths,
     plot_flow_paths,
     plot_navigation,
     summarize_seeds,
+    write_results,
 )
 from warmprior.training import (
     NAVIGATION_PRESETS,
@@ -114,16 +114,6 @@ def run_seed(study: NavigationStudy, seed: int) -> tuple[list[dict[str, Any]], d
     return rows, actors
 
 
-def save(path: Path, meta: dict[str, Any], rows: list[dict[str, Any]]) -> None:
-    # JSON has no NaN.
-    clean = [
-        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
-        for row in rows
-    ]
-    text = json.dumps({"meta": meta, "rows": clean}, indent=1) + "\n"
-    write_atomic(path, lambda temporary: temporary.write_text(text))
-
-
 def table(rows: list[dict[str, Any]], names: Sequence[str]) -> str:
     lines = ["| policy | " + " | ".join(COLUMNS) + " |", "|" + "---|" * (len(COLUMNS) + 1)]
     for name in names:
@@ -168,7 +158,7 @@ def draw(study: NavigationStudy, actors: dict[str, Any], rows: list[dict[str, An
     # One window of a demonstration, above the first obstacle, from many source samples.
     paths = {}
     for name in FLOWS:
-        window = study.windows(actors[name].prior)
+        window = study.observations.windows(actors[name].prior)
         index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
         batch = window[index : index + 1].expand(48).contiguous()
         generator = torch.Generator().manual_seed(seed)
@@ -204,7 +194,7 @@ def main(argv: list[str] | None = None) -> int:
             new, actors = run_seed(study, seed)
             rows += new
             meta["wall_time_s"] = time.monotonic() - started
-            save(study.directory / "results.json", meta, rows)
+            write_results(study.directory / "results.json", meta, rows)
             if seed == 0:
                 draw(study, actors, rows)
     except (ValueError, OSError) as error:

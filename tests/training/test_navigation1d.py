@@ -47,7 +47,7 @@ def test_priors_differ_in_the_source_alone():
 
 def test_windows_are_the_demonstrated_steps_with_a_full_history(tiny):
     for prior in tiny.priors.values():
-        now, before = tiny.windows(prior), tiny.windows(prior, offset=4)
+        now, before = tiny.observations.windows(prior), tiny.observations.windows(prior, offset=4)
         assert len(now) == 6 * 60
         assert now["prior", "warm"].any(1).all() == (prior.name not in ("gaussian", "regression"))
         chunk, earlier = now["vla_action", "chunk"], before["vla_action", "chunk"]

@@ -2,12 +2,26 @@
 
 from warmprior.diagnostics.branching import branching_bound, branching_cost
 from warmprior.diagnostics.curvature import compare_curvature, curvature
+from warmprior.diagnostics.held_out import SharedObservations
 from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.navigation_plots import plot_flow_paths, plot_navigation
-from warmprior.diagnostics.paper import PAPER_SUCCESS, paper_success
+from warmprior.diagnostics.paper import (
+    PAPER_CURVATURE,
+    PAPER_SIGMA,
+    PAPER_SUCCESS,
+    paper_success,
+)
 from warmprior.diagnostics.paths import flow_paths, forecast_mean
 from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
-from warmprior.diagnostics.results import Results, Row, success_table, summarize
+from warmprior.diagnostics.results import (
+    PRIOR_LABELS,
+    Results,
+    Row,
+    success_table,
+    summarize,
+    summarize_cell,
+    write_results,
+)
 from warmprior.diagnostics.smoothness import (
     Smoothness,
     compare_smoothness,
@@ -16,40 +30,59 @@ from warmprior.diagnostics.smoothness import (
 )
 from warmprior.diagnostics.statistics import (
     SeedSummary,
+    bootstrap_ratio,
     exceeds_one_sigma,
     probability_better,
     success_posterior,
     summarize_seeds,
     top_k_mean,
 )
+from warmprior.diagnostics.straightness import curvature_table, straightness
+from warmprior.diagnostics.study_plots import (
+    plot_chunk_lengths,
+    plot_sigma,
+    plot_success_bars,
+)
 
 __all__ = [
+    "PAPER_CURVATURE",
+    "PAPER_SIGMA",
     "PAPER_SUCCESS",
+    "PRIOR_LABELS",
     "HistoryShift",
     "Results",
     "Row",
     "SeedSummary",
+    "SharedObservations",
     "Smoothness",
+    "bootstrap_ratio",
     "branching_bound",
     "branching_cost",
     "compare_curvature",
     "compare_smoothness",
     "curvature",
+    "curvature_table",
     "exceeds_one_sigma",
     "executed_actions",
     "flow_paths",
     "forecast_mean",
     "paper_success",
+    "plot_chunk_lengths",
     "plot_filmstrip",
     "plot_flow_paths",
     "plot_learning_curves",
     "plot_navigation",
+    "plot_sigma",
     "plot_success",
+    "plot_success_bars",
     "probability_better",
     "smoothness",
+    "straightness",
     "success_posterior",
     "success_table",
     "summarize",
+    "summarize_cell",
     "summarize_seeds",
     "top_k_mean",
+    "write_results",
 ]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from warmprior._extras import require
+from warmprior.diagnostics._figure import new_figure
 from warmprior.envs.navigation1d import (
     HALF_HEIGHT,
     HALF_WIDTH,
@@ -21,18 +21,6 @@ from warmprior.envs.navigation1d import (
 __all__ = ["plot_flow_paths", "plot_navigation"]
 
 _ABOVE, _BELOW, _INK = "#1f77b4", "#d95f02", "#202020"
-
-
-def _figure(width: float, height: float, rows: int, columns: int) -> tuple[Any, list[Any]]:
-    # The Agg canvas needs no display, and no pyplot state is left behind.
-    require("matplotlib", "sim")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
-    return figure, list(axes.flat)
 
 
 def plot_navigation(
@@ -58,7 +46,7 @@ def plot_navigation(
         shown: how many rollouts to draw.
     """
     rows = -(-(len(panels) + 1) // 3)
-    figure, axes = _figure(11.0, 0.7 + 3.0 * rows, rows, 3)
+    figure, axes = new_figure(11.0, 0.7 + 3.0 * rows, rows, 3, share=True)
     x, demonstrations = navigation_positions().numpy(), navigation_heights().numpy()
     for axis in axes[len(panels) + 1 :]:
         axis.set_visible(False)
@@ -114,7 +102,7 @@ def plot_flow_paths(paths: Mapping[str, Tensor], path: str | Path, *, title: str
     Keyword Args:
         title: of the figure.
     """
-    figure, axes = _figure(2.5 * len(paths) + 0.5, 3.4, 1, len(paths))
+    figure, axes = new_figure(2.5 * len(paths) + 0.5, 3.4, 1, len(paths), share=True)
     for axis, (name, lines) in zip(axes, paths.items(), strict=True):
         values = lines.numpy()
         t = np.linspace(0.0, 1.0, values.shape[1])

@@ -4,39 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from warmprior._extras import require
+from warmprior.diagnostics._figure import COLORS, new_figure
 from warmprior.diagnostics.results import PRIOR_LABELS, Row, summarize
 from warmprior.diagnostics.statistics import success_posterior
 
 __all__ = ["plot_filmstrip", "plot_learning_curves", "plot_success"]
-
-_COLORS = {
-    "gaussian": "#7f7f7f",
-    "past": "#1f77b4",
-    "preview": "#d95f02",
-    "regression": "#b8860b",
-    "history": "#6a51a3",
-}
-
-
-def _figure(width: float, height: float, columns: int = 1) -> tuple[Any, list[Any]]:
-    # The Agg canvas needs no display, and no pyplot state is left behind.
-    require("matplotlib", "sim")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, columns, squeeze=False)[0]
-    return figure, list(axes)
-
-
-def _color(prior: str) -> str | None:
-    return _COLORS.get(prior)
 
 
 def plot_success(
@@ -58,7 +33,7 @@ def plot_success(
     """
     rows = list(rows)
     last = max(row.checkpoint for row in rows)
-    figure, (axis,) = _figure(2.2 + 1.6 * len(nfes), 4.2)
+    figure, (axis,) = new_figure(2.2 + 1.6 * len(nfes), 4.2)
     grid = np.linspace(0.0, 1.0, 801)
     ticks: list[tuple[float, str]] = []
     for g, nfe in enumerate(nfes):
@@ -75,7 +50,7 @@ def plot_success(
                 grid,
                 x - half,
                 x + half,
-                color=_color(prior),
+                color=COLORS.get(prior),
                 alpha=0.75,
                 lw=0,
                 label=PRIOR_LABELS.get(prior, prior) if g == 0 else None,
@@ -113,11 +88,11 @@ def plot_learning_curves(
         title: of the figure.
     """
     rows = [row for row in rows if row.nfe == nfe]
-    figure, (left, right) = _figure(9.0, 3.6, columns=2)
+    figure, (left, right) = new_figure(9.0, 3.6, columns=2)
     for prior, seeds in losses.items():
         for i, curve in enumerate(seeds):
             label = PRIOR_LABELS.get(prior, prior) if i == 0 else None
-            left.plot(*zip(*curve, strict=True), color=_color(prior), lw=1.0, label=label)
+            left.plot(*zip(*curve, strict=True), color=COLORS.get(prior), lw=1.0, label=label)
     left.set_yscale("log")
     left.set_ylabel("flow-matching loss (own source)")
     for prior in losses:
@@ -135,7 +110,7 @@ def plot_learning_curves(
             ms=4,
             lw=1.0,
             capsize=2,
-            color=_color(prior),
+            color=COLORS.get(prior),
         )
     right.set_xlim(left.get_xlim())
     right.set_ylim(-0.02, 1.02)
@@ -165,7 +140,7 @@ def plot_filmstrip(
     Keyword Args:
         title: of the figure.
     """
-    figure, axes = _figure(1.5 * len(frames), 2.0, columns=len(frames))
+    figure, axes = new_figure(1.5 * len(frames), 2.0, columns=len(frames))
     for axis, frame, label in zip(axes, frames, labels, strict=True):
         axis.imshow(frame)
         axis.set_axis_off()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -17,7 +18,15 @@ from warmprior.diagnostics.statistics import (
     top_k_mean,
 )
 
-__all__ = ["PRIOR_LABELS", "Results", "Row", "success_table", "summarize"]
+__all__ = [
+    "PRIOR_LABELS",
+    "Results",
+    "Row",
+    "success_table",
+    "summarize",
+    "summarize_cell",
+    "write_results",
+]
 
 PRIOR_LABELS = {
     "gaussian": "Base",
@@ -108,6 +117,8 @@ class Results:
         self.path = Path(path)
         self.meta = meta
         self.rows: list[Row] = []
+        #: Further lists of rows to save beside these, by name.
+        self.extra: dict[str, list[dict[str, Any]]] = {}
         if resume and self.path.exists():
             try:
                 stored = json.loads(self.path.read_text())
@@ -141,8 +152,36 @@ class Results:
     def save(self) -> None:
         """Write the file atomically."""
         rows = [asdict(row) | {"success_rate": row.success_rate} for row in self.rows]
-        text = json.dumps({"meta": self.meta, "rows": rows}, indent=1) + "\n"
-        write_atomic(self.path, lambda temporary: temporary.write_text(text))
+        write_results(self.path, self.meta, rows, **self.extra)
+
+
+def write_results(
+    path: str | Path,
+    meta: dict[str, Any],
+    rows: Iterable[dict[str, Any]],
+    **extra: Iterable[dict[str, Any]],
+) -> None:
+    """Write a results file atomically; what is NaN or infinite becomes ``null``, as JSON demands.
+
+    Args:
+        path: of the file.
+        meta: facts about the run.
+        rows: one per measurement.
+        extra: further lists of rows.
+    """
+
+    def clean(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+        return [
+            {
+                k: None if isinstance(v, float) and not math.isfinite(v) else v
+                for k, v in row.items()
+            }
+            for row in rows
+        ]
+
+    lists = {name: clean(part) for name, part in {"rows": rows, **extra}.items()}
+    text = json.dumps({"meta": meta, **lists}, indent=1) + "\n"
+    write_atomic(Path(path), lambda temporary: temporary.write_text(text))
 
 
 def summarize(rows: Iterable[Row], top_k: int) -> dict[tuple[str, int], SeedSummary]:
@@ -155,15 +194,26 @@ def summarize(rows: Iterable[Row], top_k: int) -> dict[tuple[str, int], SeedSumm
     Returns:
         ``{(prior, nfe): summary of success rates}``.
     """
-    by_seed: dict[tuple[str, int], dict[int, list[float]]] = {}
+    cells: dict[tuple[str, int], list[Row]] = {}
     for row in rows:
-        by_seed.setdefault((row.prior, row.nfe), {}).setdefault(row.seed, []).append(
-            row.success_rate
-        )
-    return {
-        cell: summarize_seeds([top_k_mean(rates, top_k) for rates in seeds.values()])
-        for cell, seeds in by_seed.items()
-    }
+        cells.setdefault((row.prior, row.nfe), []).append(row)
+    return {cell: summarize_cell(members, top_k) for cell, members in cells.items()}
+
+
+def summarize_cell(rows: Sequence[Row], top_k: int) -> SeedSummary:
+    """Average the best ``top_k`` checkpoints per seed, then summarise over seeds, of one cell.
+
+    Args:
+        rows: of one prior, sigma, chunk length and NFE.
+        top_k: how many checkpoints to average.
+
+    Raises:
+        ValueError: if there is no row.
+    """
+    by_seed: dict[int, list[float]] = {}
+    for row in rows:
+        by_seed.setdefault(row.seed, []).append(row.success_rate)
+    return summarize_seeds([top_k_mean(rates, top_k) for rates in by_seed.values()])
 
 
 def _cell(summary: SeedSummary | None, base: SeedSummary | None, best: bool) -> str:

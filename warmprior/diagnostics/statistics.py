@@ -7,10 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+from torch import Tensor
+
 from warmprior._extras import require
 
 __all__ = [
     "SeedSummary",
+    "bootstrap_ratio",
     "exceeds_one_sigma",
     "probability_better",
     "success_posterior",
@@ -158,3 +162,67 @@ def exceeds_one_sigma(method: SeedSummary, base: SeedSummary) -> bool:
         True
     """
     return method.mean - base.mean > method.std + base.std
+
+
+def bootstrap_ratio(
+    numerator: Tensor,
+    denominator: Tensor,
+    groups: Tensor,
+    *,
+    resamples: int = 2_000,
+    level: float = 0.95,
+    generator: torch.Generator | None = None,
+) -> tuple[float, float, float]:
+    """Ratio of two means over the same observations, with a percentile bootstrap interval.
+
+    Whole groups are drawn with replacement: neighbouring steps of an episode are much alike, and
+    intervals from single steps would be far too narrow. Observations where either value is NaN do
+    not count.
+
+    Args:
+        numerator: ``[n]``.
+        denominator: ``[n]``, of the same observations.
+        groups: the group of each, int64 ``[n]``; its episode, usually.
+
+    Keyword Args:
+        resamples: bootstrap samples.
+        level: of the interval.
+        generator: source of randomness on the CPU; PyTorch's global one by default.
+
+    Returns:
+        The ratio, the lower and the upper end of its interval; NaN if nothing counts, and a NaN
+        interval for a single group.
+
+    Raises:
+        ValueError: if the shapes differ, or an option is out of range.
+
+    Examples:
+        >>> import torch
+        >>> episode = torch.arange(100) // 10
+        >>> x = 1.0 + episode.double()
+        >>> bootstrap_ratio(2 * x, x, episode)
+        (2.0, 2.0, 2.0)
+    """
+    if numerator.ndim != 1 or not numerator.shape == denominator.shape == groups.shape:
+        shapes = [tuple(x.shape) for x in (numerator, denominator, groups)]
+        raise ValueError(f"need three tensors [n], got {shapes}")
+    if resamples < 1 or not 0.0 < level < 1.0:
+        raise ValueError(f"need resamples >= 1 and 0 < level < 1, got {resamples} and {level}")
+    both = torch.stack([numerator, denominator], -1).double().cpu()
+    counted = ~both.isnan().any(-1)
+    if not counted.any():
+        return math.nan, math.nan, math.nan
+    _, index = groups.cpu()[counted].unique(return_inverse=True)
+    sums = torch.zeros(int(index.max()) + 1, 2, dtype=torch.float64)
+    sums.index_add_(0, index, both[counted])
+    total = sums.sum(0)
+    ratio = float(total[0] / total[1])
+    if len(sums) == 1:
+        return ratio, math.nan, math.nan
+    drawn = torch.randint(len(sums), (resamples, len(sums)), generator=generator)
+    resampled = sums[drawn].sum(1)
+    tail = (1.0 - level) / 2
+    ends = torch.quantile(
+        resampled[:, 0] / resampled[:, 1], torch.tensor([tail, 1 - tail]).double()
+    )
+    return ratio, float(ends[0]), float(ends[1])

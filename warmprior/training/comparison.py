@@ -99,6 +99,8 @@ class Comparison:
                 "torch_threads": torch.get_num_threads(),
                 "device": torch.cuda.get_device_name() if cuda else "cpu",
             },
+            "task": policies.task,
+            "style": demonstrations.style,
             "data_source": demonstrations.source,
             "data": {
                 "file": demonstrations.path.name,

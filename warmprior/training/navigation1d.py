@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
 from warmprior import keys
 from warmprior.diagnostics.branching import branching_bound
 from warmprior.diagnostics.curvature import compare_curvature
+from warmprior.diagnostics.held_out import SharedObservations
 from warmprior.diagnostics.history_shift import HistoryShift
-from warmprior.diagnostics.paths import forecast_mean
 from warmprior.diagnostics.smoothness import executed_actions, smoothness
 from warmprior.envs.navigation1d import (
     NavigationEnv,
@@ -33,7 +33,7 @@ from warmprior.modules import (
     WarmPriorActor,
 )
 from warmprior.training.behaviour_cloning import BehaviourCloning, TrainingConfig
-from warmprior.transforms import ActionWindow, policy_transforms
+from warmprior.transforms import policy_transforms
 
 __all__ = ["NAVIGATION_PRESETS", "NavigationPreset", "NavigationStudy", "navigation_priors"]
 
@@ -143,6 +143,9 @@ class NavigationStudy:
         if len(set(lengths.values())) > 1:
             raise ValueError(f"policies compare at one chunk length only, got {lengths}")
         self.data = navigation_demonstrations()
+        horizon = next(iter(lengths.values()))
+        #: All demonstrated steps from ``H`` on.
+        self.observations = SharedObservations(self.data, horizon)
 
     def train(self, name: str, seed: int) -> WarmPriorActor:
         """Train one policy, or load it if the folder holds it with the same recipe.
@@ -200,20 +203,6 @@ class NavigationStudy:
         finally:
             actor.sampler.generator, actor.ode.nfe = previous
 
-    def windows(self, prior: Prior, offset: int = 0) -> TensorDictBase:
-        """Windows of all demonstrated steps from ``H`` on, with nothing withheld.
-
-        Args:
-            prior: whose mean to make.
-            offset: how many steps earlier to cut them.
-        """
-        whole = Prior.from_config(prior.config() | {"cold_probability": 0.0})
-        episode = self.data[keys.EPISODE]
-        first = torch.arange(len(episode)) - prior.chunk_length
-        frames = (first.clamp_min(0).eq(first) & (episode[first] == episode)).nonzero().flatten()
-        window = ActionWindow(self.data, whole, observation_steps=1)
-        return window(TensorDict({keys.FRAME: frames - offset}, [len(frames)]))
-
     def judge(self, actor: WarmPriorActor, seed: int) -> dict[str, Any]:
         """Play a policy and measure what it did.
 
@@ -259,7 +248,7 @@ class NavigationStudy:
             ``"bound"``, the mean of :func:`~warmprior.diagnostics.branching_bound` where it applies.
         """
         flows = {name: a for name, a in actors.items() if a.prior.max_nfe is None}
-        windows = {name: self.windows(a.prior) for name, a in flows.items()}
+        windows = {name: self.observations.windows(a.prior) for name, a in flows.items()}
 
         def options() -> dict[str, Any]:
             return {"draws": 4, "generator": torch.Generator().manual_seed(seed)}
@@ -267,9 +256,7 @@ class NavigationStudy:
         results = compare_curvature(flows, windows, n_steps, **options())
         for name, actor in flows.items():
             prior = actor.prior
-            earlier = self.windows(prior, offset=prior.chunk_length)
-            generator = torch.Generator().manual_seed(seed)
-            met = windows[name].clone().update(forecast_mean(actor, earlier, generator=generator))
+            met = self.observations.deployed(actor, generator=torch.Generator().manual_seed(seed))
             forecast = compare_curvature({name: actor}, {name: met}, n_steps, **options())[name]
             results[name]["kappa_forecast"] = forecast["kappa_executed"]
             if not prior.conditions_network:

@@ -1,0 +1,132 @@
+"""The paper's sigma ablation: success, curvature and the branching bound against the residual noise.
+
+python benchmarks/sigma.py                                # square ph, one seed, under an hour on two cores
+python benchmarks/sigma.py --data mh --preset cpu         # the paper's task, three seeds
+python benchmarks/sigma.py --resume                       # after an interruption
+
+The policies of robomimic.py with the same options are used, not trained again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import _experiment as experiment
+
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior._files import write_atomic
+from warmprior.diagnostics import PRIOR_LABELS, Row, plot_sigma, straightness, summarize_cell
+from warmprior.training.comparison import Comparison
+
+SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
+VARIANTS: dict[str, type[Prior]] = {prior.name: prior for prior in (PastPrior, PreviewPrior)}
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = experiment.add_options(parser)
+    add("--sigmas", nargs="+", type=float, default=list(SIGMAS), help="default: the paper's seven")
+    add("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS, help="default: both")
+    add("--nfe", type=int, default=1, help="evaluations per chunk (%(default)s, the paper's)")
+    add("--chunk", type=int, default=8, help="chunk length H (%(default)s)")
+    experiment.add_curvature_options(parser, observations=500)
+    return parser
+
+
+def make_priors(args: argparse.Namespace) -> list[Prior]:
+    priors: list[Prior] = [GaussianPrior(args.chunk, cold_probability=args.cold_probability)]
+    for variant in dict.fromkeys(args.variants):
+        for sigma in sorted(set(args.sigmas), reverse=True):
+            options = {"sigma": sigma, "cold_probability": args.cold_probability}
+            priors.append(VARIANTS[variant](args.chunk, **options))
+    return priors
+
+
+def measure(args: argparse.Namespace, comparison: Comparison) -> list[dict[str, Any]]:
+    """Curvature and bound of all policies on the same held-out observations."""
+    policies = comparison.policies
+    actors = {
+        prior.describe(): [policies.policy(prior, seed) for seed in comparison.seeds]
+        for prior in comparison.priors
+    }
+    demonstrations, source = experiment.held_out(args, comparison.results.meta)
+    first = next(iter(actors.values()))[0]
+    observations = experiment.observe(args, demonstrations.path, first)
+    comparison.results.meta["curvature_observations"] = source
+    return straightness(
+        actors, observations, n_steps=args.steps, draws=args.draws, description="curvature"
+    )
+
+
+def make_table(
+    rows: Sequence[Row], curvatures: Sequence[dict[str, Any]], priors: Sequence[Prior], top_k: int
+) -> str:
+    seeds = {row["seed"] for row in curvatures}
+    pooled = None if None in seeds else 0
+    lines = [
+        "| source | sigma | success (%) | curvature, training mean | deployed mean "
+        "| per squared mean velocity | bound |",
+        "|" + "---|" * 7,
+    ]
+    for prior in priors:
+        cell = [row for row in rows if (row.prior, row.sigma) == (prior.name, prior.sigma)]
+        summary = summarize_cell(cell, top_k)
+        spread = f" ± {100 * summary.std:.1f}" if summary.seeds > 1 else ""
+        mine = {
+            row["mean"]: row
+            for row in curvatures
+            if (row["policy"], row["seed"]) == (prior.describe(), pooled)
+        }
+        trained, deployed = mine["training"], mine.get("deployed", mine["training"])
+        values = [
+            f"{100 * summary.mean:.1f}{spread}",
+            f"{trained['ratio_executed']:.3f}",
+            f"{deployed['ratio_executed']:.3f}",
+            f"{trained['ratio_relative']:.3f}",
+            f"{trained['bound']:.2f}",
+        ]
+        name = PRIOR_LABELS[prior.name]
+        lines.append(f"| {name} | {prior.sigma:g} | " + " | ".join(values) + " |")
+    lines += [
+        "",
+        "- Curvatures are relative to the Gaussian source, on the executed positions; the bound is in "
+        "squared normalised action units over the whole prediction. nan: the policy predicts no motion.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def main(argv: list[str] | None = None) -> int:
+    try:
+        args = experiment.parse(make_parser, argv, "sigma-")
+        preset, priors = experiment.make_preset(args), make_priors(args)
+        comparison = experiment.start_comparison(args, preset, priors, [args.nfe])
+        results = comparison.run()
+        curvatures = measure(args, comparison)
+        results.extra["curvature"] = curvatures
+        results.save()
+        table = make_table(results.rows, curvatures, priors, preset.top_k)
+        write_atomic(args.out / "table.md", lambda path: path.write_text(table))
+        task, data = results.meta["task"], results.meta["style"]
+        plot_sigma(
+            results.rows,
+            curvatures,
+            args.out / "sigma.png",
+            top_k=preset.top_k,
+            title=f"{task} {data} ({results.meta['data_source']} data), H = {args.chunk}, NFE {args.nfe}, "
+            f"{preset.seeds} seed(s)",
+            paper=(task, data, args.chunk, args.nfe) == ("square", "mh", 8, 1),
+        )
+    except experiment.ERRORS as error:
+        print(f"sigma.py: error: {error}", file=sys.stderr)
+        return 2
+    print(f"\n{table}\nResults, table and picture: {args.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,124 @@
+"""The same observations for every policy, with each policy's own mean."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from warmprior import keys
+from warmprior.diagnostics.paths import forecast_mean
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.prior import Prior
+from warmprior.transforms.window import ActionWindow
+
+__all__ = ["SharedObservations"]
+
+
+class SharedObservations:
+    """Observations from which policies of any prior (of one chunk length) get their windows.
+
+    Only steps with ``H`` earlier ones in their episode are used, so that every history is complete,
+    and nothing is withheld, whatever the prior's ``cold_probability``.
+
+    Args:
+        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`. For a fair curvature,
+            ones that no policy was trained on.
+        chunk_length: ``H``.
+
+    Keyword Args:
+        observation_steps: ``To``.
+        count: how many to draw, without replacement; all by default.
+        generator: source of the draw, on the CPU; PyTorch's global one by default.
+
+    Raises:
+        KeyError: if the data lack a key.
+        ValueError: if there are fewer observations than asked for.
+
+    Examples:
+        >>> from warmprior import PastPrior
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> shared = SharedObservations(navigation_demonstrations(), 4)  # 6 episodes of 64 steps
+        >>> len(shared), shared.windows(PastPrior(4))["prior", "loc"].shape
+        (360, torch.Size([360, 4, 1]))
+    """
+
+    def __init__(
+        self,
+        data: TensorDictBase,
+        chunk_length: int,
+        *,
+        observation_steps: int = 1,
+        count: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self.data, self.chunk_length = data, chunk_length
+        self.observation_steps = observation_steps
+        episode = data.get(keys.EPISODE, None)
+        if episode is None:
+            raise KeyError(f"the data lack {keys.EPISODE!r}, the number of each step's episode")
+        episode = episode.cpu()
+        first = torch.arange(len(episode)) - chunk_length
+        frames = ((first >= 0) & (episode[first] == episode)).nonzero().flatten()
+        if count is not None:
+            if not 1 <= count <= len(frames):
+                raise ValueError(
+                    f"{count} observations are asked for, but {len(frames)} of {len(episode)} steps "
+                    f"have {chunk_length} earlier ones in their episode: give more demonstrations, or "
+                    "ask for fewer observations"
+                )
+            frames = frames[torch.randperm(len(frames), generator=generator)[:count]].sort()[0]
+        self.frames = frames
+        self.episodes = episode[frames]
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def windows(self, prior: Prior, offset: int = 0) -> TensorDictBase:
+        """Windows with the mean of the training.
+
+        Args:
+            prior: whose mean to make.
+            offset: how many steps earlier to cut them, at most ``H``.
+
+        Returns:
+            Windows ``[n]``, see :class:`~warmprior.ActionWindow`.
+
+        Raises:
+            ValueError: if the prior has another chunk length.
+        """
+        if prior.chunk_length != self.chunk_length:
+            raise ValueError(
+                f"policies compare at one chunk length only: these observations have H = "
+                f"{self.chunk_length}, {prior} has {prior.chunk_length}"
+            )
+        whole = Prior.from_config(prior.config() | {"cold_probability": 0.0})
+        window = ActionWindow(self.data, whole, observation_steps=self.observation_steps)
+        frames = (self.frames - offset).to(self.data[keys.EPISODE].device)
+        return window(TensorDict({keys.FRAME: frames}, [len(frames)]))
+
+    def deployed(
+        self, policy: WarmPriorActor, *, generator: torch.Generator | None = None
+    ) -> TensorDictBase:
+        """Windows with the mean that deployment meets: from the policy's own earlier prediction.
+
+        Args:
+            policy: the policy.
+
+        Keyword Args:
+            generator: see :func:`forecast_mean`.
+        """
+        earlier = self.windows(policy.prior, offset=self.chunk_length)
+        met = forecast_mean(policy, earlier, generator=generator)
+        return self.windows(policy.prior).to(met.device).update(met)
+
+    def subset(self, index: Tensor) -> SharedObservations:
+        """Some of the observations.
+
+        Args:
+            index: which, int64 ``[m]``.
+        """
+        part = object.__new__(SharedObservations)
+        part.__dict__.update(self.__dict__)
+        part.frames, part.episodes = self.frames[index], self.episodes[index]
+        return part

@@ -1,0 +1,206 @@
+"""Curvature of several policies on the same observations, and the paper's Table 2 made from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+from tqdm import tqdm
+
+from warmprior.diagnostics.branching import branching_bound
+from warmprior.diagnostics.curvature import curvature
+from warmprior.diagnostics.held_out import SharedObservations
+from warmprior.diagnostics.paper import PAPER_CURVATURE, PAPER_PRIORS
+from warmprior.diagnostics.results import PRIOR_LABELS
+from warmprior.diagnostics.statistics import bootstrap_ratio
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.prior import Prior
+
+__all__ = ["curvature_table", "straightness"]
+
+RATIOS = {
+    "ratio": "kappa",
+    "ratio_executed": "kappa_executed",
+    "ratio_relative": "relative_executed",
+    "ratio_one_step": "one_step_error_executed",
+}
+"""Ratios to the baseline, and the entry of :func:`curvature` that each compares."""
+
+
+def straightness(
+    policies: Mapping[str, Sequence[WarmPriorActor]],
+    observations: SharedObservations,
+    *,
+    n_steps: int = 100,
+    draws: int = 1,
+    seed: int = 0,
+    description: str | None = None,
+) -> list[dict[str, Any]]:
+    """Curvatures relative to the first policy's, with bootstrap intervals over episodes.
+
+    Every policy is measured at the mean of its training and, if anything of its source is warm, at the
+    mean that deployment meets, made from its own prediction one decision earlier.
+
+    Args:
+        policies: by name the policies of one prior, one per training seed; the baseline first.
+        observations: the observations of all of them.
+
+    Keyword Args:
+        n_steps: Euler steps.
+        draws: source samples per observation.
+        seed: of the source samples and of the bootstrap.
+        description: of the progress bar; no bar if ``None``.
+
+    Returns:
+        One row per policy, training seed and mean, and one with ``"seed": None`` for the average over
+        several seeds: ``"policy"``, ``"prior"``, ``"sigma"``, ``"chunk"``, ``"seed"``, ``"mean"``
+        (``"training"`` or ``"deployed"``), ``"observations"``; the means of :func:`curvature`'s
+        entries; ``"bound"`` (:func:`branching_bound`, where it applies); and per ratio of
+        :data:`RATIOS` its value and 95% interval (``"ratio"``, ``"ratio_low"``, ``"ratio_high"``, and
+        so on). NaN, with a warning, where a policy predicts no motion.
+
+    Raises:
+        ValueError: if the numbers of training seeds or the chunk lengths differ, or a policy is no flow.
+    """
+    counts = {name: len(actors) for name, actors in policies.items()}
+    if len(set(counts.values())) != 1 or not next(iter(counts.values())):
+        raise ValueError(f"every policy needs the same number of training seeds, got {counts}")
+    measured: dict[tuple[str, str], list[TensorDict]] = {}
+    jobs = [(name, actor) for name, actors in policies.items() for actor in actors]
+    for name, actor in tqdm(jobs, desc=description, disable=description is None):
+        generator = torch.Generator(next(actor.parameters()).device)
+        batches = {"training": observations.windows(actor.prior)}
+        if batches["training"]["prior", "warm"].any():
+            batches["deployed"] = observations.deployed(
+                actor, generator=generator.manual_seed(seed)
+            )
+        for mean, batch in batches.items():
+            # The same source noise for every policy and mean.
+            generator.manual_seed(seed)
+            values = curvature(actor, batch, n_steps, draws=draws, generator=generator).cpu()
+            measured.setdefault((name, mean), []).append(values)
+    base = next(iter(policies))
+    rows = []
+    for (name, mean), per_seed in measured.items():
+        prior = policies[name][0].prior
+        bound = _bound(prior, observations)
+        parts: list[tuple[int | None, TensorDict, TensorDict]] = [
+            (s, values, measured[base, "training"][s]) for s, values in enumerate(per_seed)
+        ]
+        if len(per_seed) > 1:
+            bases = measured[base, "training"]
+            parts.append((None, _average(per_seed), _average(bases)))
+        for s, values, baseline in parts:
+            row: dict[str, Any] = {
+                "policy": name,
+                "prior": prior.name,
+                "sigma": prior.sigma,
+                "chunk": prior.chunk_length,
+                "seed": s,
+                "mean": mean,
+                "observations": len(observations),
+                **{key: _mean(value) for key, value in values.items()},
+                "bound": bound,
+            }
+            rows.append(row | _ratios(values, baseline, observations.episodes, seed))
+    return rows
+
+
+def _mean(values: Tensor) -> float:
+    return float(values.nanmean())
+
+
+def _average(per_seed: Sequence[TensorDict]) -> TensorDict:
+    mean = {
+        key: torch.stack([values[key] for values in per_seed]).nanmean(0)
+        for key, _ in per_seed[0].items()
+    }
+    return TensorDict(mean, batch_size=per_seed[0].shape)
+
+
+def _bound(prior: Prior, observations: SharedObservations) -> float:
+    if type(prior).sample is not Prior.sample or prior.conditions_network:
+        return math.nan
+    return _mean(branching_bound(observations.windows(prior), prior)["total"])
+
+
+def _ratios(
+    values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int
+) -> dict[str, float]:
+    out: dict[str, float] = {}
+    for name, key in RATIOS.items():
+        generator = torch.Generator().manual_seed(seed)
+        ends = bootstrap_ratio(values[key], baseline[key], episodes, generator=generator)
+        out.update(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
+    return out
+
+
+def curvature_table(rows: Sequence[dict[str, Any]], *, task: str, data: str, source: str) -> str:
+    """The layout of the paper's Table 2 in Markdown, with the paper's own numbers in a row of their own.
+
+    Args:
+        rows: of :func:`straightness`.
+
+    Keyword Args:
+        task: short task name.
+        data: ``"ph"`` or ``"mh"``.
+        source: what the observations are, in words.
+    """
+    seeds = {row["seed"] for row in rows}
+    chosen = [row for row in rows if row["seed"] == (None if None in seeds else min(seeds))]
+    names = list(dict.fromkeys(row["policy"] for row in chosen))
+    labels = [PRIOR_LABELS.get(row["policy"], row["policy"]) for row in map(_first(chosen), names)]
+    title = f"{task.replace('_', '-').title()}-{data.upper()}"
+    lines = [
+        "| curvature relative to the first column | " + " | ".join(labels) + " |",
+        "|" + "---|" * (len(names) + 1),
+    ]
+    told = {
+        "ratio": "whole prediction",
+        "ratio_executed": "executed H",
+        "ratio_relative": "executed H, per squared mean velocity",
+        "ratio_one_step": "error of one Euler step, executed H",
+    }
+    for ratio, what in told.items():
+        for mean in ("training", "deployed"):
+            if not any(row["mean"] == mean for row in chosen):
+                continue
+            cells = [_cell(chosen, name, mean, ratio) for name in names]
+            lines.append(f"| {title}, {what}, {mean} mean | " + " | ".join(cells) + " |")
+    paper = PAPER_CURVATURE.get((task, data))
+    if paper is not None:
+        values = dict(zip(PAPER_PRIORS, (1.0, *paper), strict=True))
+        cells = [f"{values[name]:.3f}" if name in values else "-" for name in names]
+        lines.append(f"| {title}, paper (official data) | " + " | ".join(cells) + " |")
+    count = chosen[0]["observations"]
+    several = f", averaged over {len(seeds) - 1} training seeds" if None in seeds else ", one seed"
+    lines += [
+        "",
+        f"- {count} observations of {source}{several}; in brackets 95% bootstrap intervals over episodes.",
+        "- Deployed mean: made from the policy's own prediction one decision earlier. The paper does not "
+        "say which mean it uses, nor whether it counts a prediction of 2H whole.",
+        "- Curvature shrinks with the length of the transport; divided by the squared mean velocity it "
+        "does not.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _first(rows: Sequence[dict[str, Any]]) -> Any:
+    return lambda name: next(row for row in rows if row["policy"] == name)
+
+
+def _cell(rows: Sequence[dict[str, Any]], name: str, mean: str, ratio: str) -> str:
+    # A policy without a mean is the same at both.
+    of_policy = [row for row in rows if row["policy"] == name]
+    row = next((row for row in of_policy if row["mean"] == mean), of_policy[0])
+    value, low, high = row[ratio], row[f"{ratio}_low"], row[f"{ratio}_high"]
+    if math.isnan(value):
+        return "no motion"
+    if name == rows[0]["policy"]:
+        return f"{value:.3f}"
+    interval = "" if math.isnan(low) else f" [{low:.3f}, {high:.3f}]"
+    return f"{value:.3f}{interval}"
