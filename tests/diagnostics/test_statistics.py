@@ -4,11 +4,13 @@ import math
 import statistics
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from warmprior.diagnostics import (
     SeedSummary,
+    bootstrap_ratio,
     exceeds_one_sigma,
     probability_better,
     success_posterior,
@@ -94,3 +96,45 @@ def test_probability_better_agrees_with_sampling_and_stays_a_probability():
         assert 0 <= p <= 1 and p + q == pytest.approx(1.0)
     with pytest.raises(ValueError, match="successes"):
         probability_better(3, 2, 0, 0)
+
+
+def test_bootstrap_agrees_with_the_delta_method():
+    """Independent groups of one: the interval is the ratio plus and minus 1.96 standard errors."""
+    generator = torch.Generator().manual_seed(0)
+    x = 2.0 + 0.3 * torch.randn(4_000, generator=generator).double()
+    y = 3.0 + 0.5 * torch.randn(4_000, generator=generator).double() + 0.2 * x
+    ratio, low, high = bootstrap_ratio(x, y, torch.arange(4_000), generator=generator)
+    expected = float(x.mean() / y.mean())
+    error = float((x - expected * y).std() / y.mean()) / math.sqrt(4_000)
+    assert ratio == pytest.approx(expected)
+    assert high - low == pytest.approx(2 * 1.96 * error, rel=0.1)
+    assert (high + low) / 2 == pytest.approx(expected, abs=0.3 * error)
+
+
+def test_bootstrap_draws_whole_groups():
+    """Repeating every observation inside its group tells nothing new; fresh groups would."""
+    generator = torch.Generator().manual_seed(1)
+    x, y = torch.rand(2, 30, generator=generator).double() + 0.5
+    groups = torch.arange(30)
+
+    def width(*args):
+        _, low, high = bootstrap_ratio(*args, generator=torch.Generator().manual_seed(2))
+        return high - low
+
+    once = width(x, y, groups)
+    repeated = width(x.repeat(9), y.repeat(9), groups.repeat(9))
+    assert repeated == pytest.approx(once)
+    assert width(x.repeat(9), y.repeat(9), torch.arange(270)) < 0.5 * once
+
+
+def test_bootstrap_leaves_nan_out_and_names_bad_input():
+    x, y = torch.tensor([1.0, math.nan, 3.0]), torch.tensor([2.0, 5.0, 2.0])
+    ratio, low, high = bootstrap_ratio(x, y, torch.arange(3))
+    assert ratio == 1.0 and low >= 0.5 and high <= 1.5
+    assert math.isnan(bootstrap_ratio(x[1:2], y[1:2], torch.zeros(1))[0])
+    single = bootstrap_ratio(x[:1], y[:1], torch.zeros(1))
+    assert single[0] == 0.5 and math.isnan(single[1])
+    with pytest.raises(ValueError, match=r"three tensors \[n\]"):
+        bootstrap_ratio(x, y[:2], torch.arange(3))
+    with pytest.raises(ValueError, match="level"):
+        bootstrap_ratio(x, y, torch.arange(3), level=1.0)

@@ -59,7 +59,7 @@ class SharedObservations:
             raise KeyError(f"the data lack {keys.EPISODE!r}, the number of each step's episode")
         episode = episode.cpu()
         first = torch.arange(len(episode)) - chunk_length
-        frames = ((first >= 0) & (episode[first] == episode)).nonzero().flatten()
+        frames = ((first >= 0) & (episode[first.clamp_min(0)] == episode)).nonzero().flatten()
         if count is not None:
             if not 1 <= count <= len(frames):
                 raise ValueError(
