@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import os
 import signal
@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from tests.data.synthetic import write_robomimic_file
+from tests.benchmarks.conftest import options
 
 pytest.importorskip("robosuite")
 
@@ -23,31 +23,7 @@ SCRIPT = Path(__file__).parents[2] / "benchmarks" / "robomimic.py"
 
 @pytest.fixture(scope="module")
 def benchmark():
-    spec = importlib.util.spec_from_file_location("benchmark_robomimic", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "lift.hdf5"
-    write_robomimic_file(path, lengths=(30, 5, 40), task="lift")
-    return path
-
-
-def options(path, out, **extra):
-    values = {
-        "dataset": path,
-        "task": "lift",
-        "out": out,
-        "iterations": 30,
-        "episodes": 1,
-        "envs": 1,
-        "nfe": 1,
-        "logger": "none",
-    } | extra
-    return [word for key, value in values.items() for word in (f"--{key}", str(value))]
+    return importlib.import_module("robomimic")
 
 
 def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, capsys, monkeypatch):
