@@ -110,8 +110,7 @@ class PriorDecoder(TensorDictModuleBase):
         _steps(self.nfe, self.ode.solver)
         self.normalizer = copy.deepcopy(actor.normalizer)
         self.prior = actor.prior
-        _turn_parameters_into_buffers(self)
-        self.train(False)
+        _freeze(self)
         self.anchor_key = unravel_key(anchor_key)
         self.delta_key = unravel_key(delta_key)
         self.noise_key = unravel_key(noise_key)
@@ -195,18 +194,23 @@ class PriorDecoder(TensorDictModuleBase):
         """Stays in evaluation mode."""
         return super().train(False)
 
-    def reset_parameters_recursive(self, parameters: TensorDictBase | None = None) -> None:
-        """Keeps the weights, unlike other modules: TorchRL's losses call it on all they hold."""
 
-
-def _turn_parameters_into_buffers(module: nn.Module) -> None:
-    """Replace every parameter below ``module``; tied ones stay tied."""
+def _freeze(module: nn.Module) -> None:
+    """Make every parameter below ``module`` a buffer (tied ones stay tied), in evaluation mode."""
     frozen: dict[int, Tensor] = {}
     for child in module.modules():
         for name, parameter in list(child.named_parameters(recurse=False)):
             buffer = frozen.setdefault(id(parameter), parameter.detach())
             delattr(child, name)
             child.register_buffer(name, buffer)
+        # TorchRL's losses and modules draw new weights for all they reach.
+        if hasattr(child, "reset_parameters"):
+            child.__dict__["reset_parameters"] = _keep_weights
+    module.train(False)
+
+
+def _keep_weights() -> None:
+    """Stands for ``reset_parameters``."""
 
 
 def _visible_priors(env: EnvBase) -> Iterator[tuple[str, Prior]]:

@@ -71,10 +71,11 @@ class ResidualSampler(TensorDictModuleBase):
                 f"the distribution must be 'normal', 'clipped' or 'uniform', got {distribution!r}"
             )
         if sigma is None:
-            # At sigma 0 there is no noise to draw from: the whole box is what the agent may ask for.
             sigma = decoder.prior.sigma if moves_source(decoder.prior) else 1.0
-        if not (sigma > 0 and math.isfinite(sigma)):
-            raise ValueError(f"sigma must be a finite number > 0, got {sigma}")
+        if distribution != "uniform" and not (sigma > 0 and math.isfinite(sigma)):
+            raise ValueError(
+                f"sigma must be a finite number > 0, got {sigma}; a prior without noise leaves 'uniform'"
+            )
         self.distribution = distribution
         self.sigma = sigma
         self.delta = decoder.delta

@@ -208,6 +208,9 @@ class DSRLNALoss(PriorSpaceLoss):
     def _distillation_keys(self) -> list[NestedKey]:
         return self._states(self.decoder, self.qvalue_network, self.noise_qvalue_network)
 
+    def _needed_keys(self) -> list[NestedKey]:
+        return [*self._reinforcement_keys(), *self._distillation_keys()]
+
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """All four losses on one batch.
 

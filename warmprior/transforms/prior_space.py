@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -87,10 +89,18 @@ class PriorSpace(Transform):
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
+        anchor = self._anchor_of(tensordict_reset)
         for key in self.out_keys:
-            anchor = tensordict_reset.get(self.decoder.anchor_key)
             tensordict_reset.set(key, torch.zeros_like(anchor))
         return tensordict_reset
+
+    def _anchor_of(self, observations: Any) -> Any:
+        key = self.decoder.anchor_key
+        if key not in observations.keys(True, True):
+            raise KeyError(
+                f"PriorSpace found no {key} among the observations: append it after PriorAnchor"
+            )
+        return observations[key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Outside environments the transform does nothing."""
@@ -116,11 +126,7 @@ class PriorSpace(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the source and the chunk."""
-        key = self.decoder.anchor_key
-        if key not in observation_spec.keys(True, True):
-            raise KeyError(
-                f"PriorSpace found no {key} among the observations: append it after PriorAnchor"
-            )
-        for out_key in self.out_keys:
-            observation_spec[out_key] = observation_spec[key].clone()
+        anchor = self._anchor_of(observation_spec)
+        for key in self.out_keys:
+            observation_spec[key] = anchor.clone()
         return observation_spec

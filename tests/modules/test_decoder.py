@@ -1,0 +1,262 @@
+"""PriorDecoder: the actor's own ODE from anchor + delta, frozen against everything."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torch import nn
+from torchrl.envs import Compose, TransformedEnv
+
+from tests.toy_env import ACTION_DIM, CountingEnv
+from warmprior import (
+    ActionHistory,
+    ChiTransformer,
+    ChunkStep,
+    GaussianPrior,
+    HistoryPrior,
+    Normalizer,
+    PastPrior,
+    PreviewPrior,
+    PriorAnchor,
+    PriorDecoder,
+    RegressionPrior,
+    VelocityMLP,
+    WarmPriorActor,
+    make_prior_space_actor,
+)
+
+H, D_A, D_O, TO = 3, ACTION_DIM, 5, 2
+
+
+def make_actor(prior, **options):
+    torch.manual_seed(1)
+    network = VelocityMLP(
+        D_A, D_O + prior.context_dim(D_A), prior.prediction_length, TO, hidden_dim=16
+    )
+    return WarmPriorActor(network, prior, **options)
+
+
+def batch(prior, *shape):
+    chunk = (*shape, prior.prediction_length, D_A)
+    return TensorDict(
+        {
+            "observation": torch.randn(*shape, TO, D_O),
+            "prior": {
+                "anchor": torch.randn(chunk),
+                "delta": torch.rand(chunk) - 0.5,
+                "loc": torch.randn(chunk),
+                "warm": torch.rand(*chunk[:-1], 1) < 0.5,
+            },
+        },
+        shape,
+    )
+
+
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
+@pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
+def test_euler_from_anchor_plus_delta(prior_class, shape):
+    prior = prior_class(H)
+    actor = make_actor(prior, nfe=3, clip=0.2)
+    decoder = PriorDecoder(actor, delta=0.5)
+    data = batch(prior, *shape)
+    a = (data["prior", "anchor"] + data["prior", "delta"]).reshape(-1, prior.prediction_length, D_A)
+    o = data["observation"].reshape(-1, TO, D_O)
+    expected_noise = a.reshape(*shape, *a.shape[1:])
+    with torch.no_grad():
+        for i in range(3):
+            a = a + actor.network(torch.full(a.shape[:1], i / 3), a, o) / 3
+    out = decoder(data)
+    assert torch.equal(out["prior", "noise"], expected_noise)
+    expected = a.clamp(-0.2, 0.2).reshape(expected_noise.shape)
+    torch.testing.assert_close(out["vla_action", "chunk"], expected)
+    assert (a.abs() > 0.2).any() and (a.abs() < 0.2).any()  # the clip matters
+
+
+def test_another_number_of_evaluations():
+    prior = PastPrior(H)
+    actor = make_actor(prior, nfe=3)
+    data = batch(prior, 4)
+    one = PriorDecoder(actor, delta=0.5, nfe=1)(data.clone())
+    a0, o = one["prior", "noise"], data["observation"]
+    with torch.no_grad():
+        expected = a0 + actor.network(torch.zeros(4), a0, o)
+    torch.testing.assert_close(one["vla_action", "chunk"], expected)
+    with pytest.raises(ValueError, match="positive multiple of 2 for the heun"):
+        PriorDecoder(make_actor(prior, nfe=4, solver="heun"), delta=0.5, nfe=3)
+
+
+def test_history_conditioned_policy_sees_its_mean():
+    prior = HistoryPrior(H)
+    actor = make_actor(prior, nfe=2)
+    data = batch(prior, 4)
+    data["prior", "anchor"] = torch.zeros_like(data["prior", "anchor"])
+    decoder = PriorDecoder(actor, delta=1.5)
+    assert {("prior", "loc"), ("prior", "warm")} <= set(decoder.in_keys)
+    out = decoder(data.clone())
+    with torch.no_grad():
+        reference = actor.ode(data.set(("prior", "noise"), data["prior", "delta"]))
+    assert torch.equal(out["vla_action", "chunk"], reference["vla_action", "chunk"])
+
+
+def fingerprint(module):
+    return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def unchanged(module, before):
+    after = module.state_dict()
+    return before.keys() == after.keys() and all(torch.equal(before[k], after[k]) for k in before)
+
+
+@pytest.mark.parametrize("network", ["mlp", "transformer"])
+def test_nothing_can_change_the_decoder(network):
+    prior = PastPrior(H)
+    data = TensorDict({"observation": torch.randn(9, D_O), "action": torch.randn(9, D_A)}, [9])
+    actor = make_actor(prior, nfe=1, normalizer=Normalizer.fit(data))
+    if network == "transformer":
+        net = ChiTransformer(
+            D_A, D_O, H, TO, embedding_dim=12, num_layers=1, num_heads=2, dropout=0.5
+        )
+        actor = WarmPriorActor(net, prior, nfe=1, normalizer=actor.normalizer)
+    decoder = PriorDecoder(actor, delta=0.5)
+    policy = TensorDictSequential(make_prior_space_actor(D_A, D_O, H, delta=0.5), decoder)
+    before = fingerprint(decoder)
+    assert len(before) == len(actor.state_dict())
+
+    policy.train().requires_grad_(True)
+    assert not any(module.training for module in decoder.modules())
+    assert not list(decoder.parameters()) and not any(b.requires_grad for b in decoder.buffers())
+    policy.reset_parameters_recursive()
+    optimizer = torch.optim.SGD(policy.parameters(), lr=1.0)
+    chunk = policy(batch(prior, 4))["vla_action", "chunk"]
+    assert not chunk.requires_grad
+    data = policy(batch(prior, 4))
+    data["prior", "delta_log_prob"].sum().backward()
+    optimizer.step()
+    with torch.no_grad():
+        for parameter in actor.parameters():  # the policy it was copied from goes on training
+            parameter.add_(1.0)
+    assert unchanged(decoder, before)
+    fixed = batch(prior, 4)
+    first = decoder(fixed.clone())["vla_action", "chunk"]
+    assert torch.equal(first, decoder(fixed.clone())["vla_action", "chunk"])
+
+
+def test_the_policy_is_left_alone():
+    actor = make_actor(PastPrior(H)).train()
+    names = [name for name, _ in actor.named_parameters()]
+    PriorDecoder(actor, delta=0.5)
+    assert actor.training and [name for name, _ in actor.named_parameters()] == names
+    assert all(parameter.requires_grad for parameter in actor.parameters())
+
+
+def test_tied_parameters_stay_tied():
+    class Tied(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.a = nn.Linear(D_A, D_A)
+            self.b = nn.Linear(D_A, D_A)
+            self.b.weight = self.a.weight
+
+        def forward(self, t, a, observation):
+            return self.b(self.a(a))
+
+    decoder = PriorDecoder(WarmPriorActor(Tied(), PastPrior(H)), delta=0.5)
+    network = decoder.ode.network
+    assert network.a.weight is network.b.weight
+    network.to(torch.float64)
+    assert network.a.weight.dtype == network.b.weight.dtype == torch.float64
+
+
+def test_copies_and_devices():
+    decoder = PriorDecoder(make_actor(PastPrior(H), nfe=1), delta=0.5)
+    data = batch(PastPrior(H), 4)
+    again = copy.deepcopy(decoder)
+    assert torch.equal(
+        decoder(data.clone())["vla_action", "chunk"], again(data.clone())["vla_action", "chunk"]
+    )
+    assert all(value.device.type == "meta" for value in again.to("meta").state_dict().values())
+
+
+def test_gradient_of_the_residual_by_finite_differences():
+    prior = PastPrior(H)
+    decoder = PriorDecoder(make_actor(prior, nfe=2), delta=0.5, differentiable=True).double()
+    data = batch(prior, 1).double()
+    data["prior", "warm"] = data["prior", "warm"].bool()
+
+    def decode(delta):
+        return decoder(data.clone().set(("prior", "delta"), delta))["vla_action", "chunk"]
+
+    delta = data["prior", "delta"].clone().requires_grad_()
+    assert torch.autograd.gradcheck(decode, delta)
+    with torch.no_grad():
+        assert not decode(delta).requires_grad
+
+
+@pytest.mark.parametrize("delta", [0.0, -0.5, float("nan"), float("inf")])
+def test_no_box(delta):
+    with pytest.raises(ValueError, match="delta must be a finite number > 0"):
+        PriorDecoder(make_actor(PastPrior(H)), delta=delta)
+
+
+def test_the_official_box():
+    assert PriorDecoder(make_actor(GaussianPrior(H)), delta=1.5, unscaled_box=True).delta == 1.0
+    assert PriorDecoder(make_actor(GaussianPrior(H)), delta=1.5).delta == 1.5
+
+
+def test_regression_has_no_source_space():
+    with pytest.raises(ValueError, match=r"RegressionPrior.* starts at a single point"):
+        PriorDecoder(make_actor(RegressionPrior(H)), delta=0.5)
+
+
+@pytest.mark.parametrize("missing", ["observation", ("prior", "anchor"), ("prior", "delta")])
+def test_missing_key(missing):
+    prior = PastPrior(H)
+    data = batch(prior, 4)
+    del data[missing]
+    with pytest.raises(KeyError, match=missing[-1] if isinstance(missing, tuple) else missing):
+        PriorDecoder(make_actor(prior), delta=0.5)(data)
+
+
+def test_shapes_of_another_policy():
+    decoder = PriorDecoder(make_actor(PastPrior(H)), delta=0.5)
+    with pytest.raises(ValueError, match=r"anchor.*\(4, 6, 2\).*\(P, d_a\) = \(3, 2\)"):
+        decoder(batch(PreviewPrior(H), 4))
+    data = batch(PastPrior(H), 4)
+    data["prior", "delta"] = data["prior", "delta"].flatten(-2)
+    with pytest.raises(ValueError, match=r"delta.* has shape \(4, 6\)"):
+        decoder(data)
+
+
+def env_for(prior, length=None):
+    length = prior.prediction_length if length is None else length
+    chunk = ChunkStep(prior.chunk_length, prediction_length=length)
+    return TransformedEnv(
+        CountingEnv(7), Compose(chunk, ActionHistory(prior), PriorAnchor(prior, cold="zero"))
+    )
+
+
+def test_check_env():
+    decoder = PriorDecoder(make_actor(PastPrior(H)), delta=0.5)
+    decoder.check_env(env_for(PastPrior(H)))
+    decoder.check_env(TransformedEnv(env_for(PastPrior(H)), auto_unwrap=False))
+    with pytest.raises(
+        ValueError, match=r"takes chunks of \(P, d_a\) = \(6, 2\), .* predicts \(3, 2\)"
+    ):
+        decoder.check_env(env_for(PreviewPrior(H)))
+    with pytest.raises(
+        ValueError, match=r"trained with PastPrior.*0.5.*ActionHistory carries.*0.3"
+    ):
+        decoder.check_env(env_for(PastPrior(H, sigma=0.3)))
+    with pytest.raises(ValueError, match=r"ActionHistory carries PastPrior"):
+        nested = TransformedEnv(env_for(PastPrior(H, sigma=0.3)), auto_unwrap=False)
+        decoder.check_env(nested)
+    with pytest.raises(KeyError, match="append ChunkStep first"):
+        decoder.check_env(CountingEnv(7))
+    wide = make_actor(PastPrior(H))
+    wide.network.action_dim = 5
+    with pytest.raises(ValueError, match=r"\(3, 2\), but the policy predicts \(3, 5\)"):
+        PriorDecoder(wide, delta=0.5).check_env(env_for(PastPrior(H)))

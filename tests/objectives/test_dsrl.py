@@ -1,0 +1,249 @@
+"""DSRL-NA against equations written by hand."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
+from torch import nn
+
+from tests.objectives.dsrl_parts import GAMMA, H, N, batch, build, make_decoder
+from warmprior import (
+    GaussianPrior,
+    PastPrior,
+    PreviewPrior,
+    PriorDecoder,
+    ResidualSampler,
+    WarmPriorActor,
+    keys,
+)
+
+
+def networks(loss):
+    """Plain copies of the loss's networks: actor, critics, target critics, noise critics."""
+
+    def of(name, params):
+        out = []
+        for i in range(2):
+            net = loss.get_stateful_net(name)
+            params[i].to_module(net)
+            out.append(net)
+        return out
+
+    return (
+        loss.get_stateful_net("actor_network"),
+        of("qvalue_network", loss.qvalue_network_params.data),
+        of("qvalue_network", loss.target_qvalue_network_params.data),
+        of("noise_qvalue_network", loss.noise_qvalue_network_params.data),
+    )
+
+
+def value(critic, **inputs):
+    data = TensorDict({}, [N])
+    for key, tensor in inputs.items():
+        data.set(getattr(keys, key), tensor)
+    return critic(data)["state_action_value"].squeeze(-1)
+
+
+def decode(loss, observation, noise):
+    a = noise
+    for i in range(2):
+        t = torch.full(a.shape[:1], i / 2)
+        a = a + loss.decoder.ode.network(t, a, observation) / 2
+    return a
+
+
+def squashed(actor, state, delta):
+    """Draw tanh(loc + scale * eps) * delta; its log-probability before the scaling."""
+    out = actor.get_dist_params(state)
+    loc, scale = out["delta_loc"], out["delta_scale"]
+    u = torch.distributions.Normal(loc, scale).rsample()
+    log_prob = torch.distributions.Normal(loc, scale).log_prob(u)
+    log_prob = log_prob - 2 * (math.log(2) - u - nn.functional.softplus(-2 * u))
+    return delta * u.tanh(), log_prob.sum((-1, -2))
+
+
+@pytest.mark.parametrize("prior_class", [PastPrior, PreviewPrior])
+@pytest.mark.parametrize(
+    ("options", "delta"),
+    [
+        ({}, 0.5),
+        ({}, 1.5),
+        ({"backup": "mean"}, 0.5),
+        ({"backup_entropy": False}, 0.5),
+        ({"bootstrap_timeouts": True}, 0.5),
+        ({"discount": "decision"}, 0.5),
+        ({"alpha_init": 0.3, "target_entropy": -2.0}, 0.5),
+        ({"deactivate_vmap": True}, 0.5),
+    ],
+)
+def test_losses_by_hand(prior_class, options, delta):
+    prior = prior_class(H)
+    loss = build(prior, delta, **options)
+    with torch.no_grad():  # targets that differ from the critics, as in training
+        for parameter in loss.target_qvalue_network_params.values(True, True):
+            parameter.mul_(0.7)
+    data = batch(prior)
+    actor, q, q_target, q_noise = networks(loss)
+    alpha, entropy = options.get("alpha_init", 1.0), options.get("target_entropy", 0.0)
+    combine = torch.mean if options.get("backup") == "mean" else torch.amin
+
+    torch.manual_seed(5)
+    after = data["next"]
+    with torch.no_grad():
+        residual, log_prob = squashed(actor, after, delta)
+        chunk = decode(loss, after["observation"], after["prior", "anchor"] + residual)
+        v = combine(
+            torch.stack(
+                [value(c, OBSERVATION=after["observation"], CHUNK=chunk) for c in q_target]
+            ),
+            0,
+        )
+        if options.get("backup_entropy", True):
+            v = v - alpha * log_prob
+        k = after["executed_steps"][:, 0] if options.get("discount") != "decision" else 1
+        end = after["terminated" if options.get("bootstrap_timeouts") else "done"][:, 0]
+        y = after["reward"][:, 0] + GAMMA**k * ~end * v
+        errors = [
+            value(c, OBSERVATION=data["observation"], CHUNK=data["vla_action", "chunk"]) - y
+            for c in q
+        ]
+        loss_q = sum(0.5 * e.square().mean() for e in errors)
+        residual, log_prob = squashed(actor, data, delta)
+        inputs = {"OBSERVATION": data["observation"], "ANCHOR": data["prior", "anchor"]}
+        v = combine(torch.stack([value(c, **inputs, DELTA=residual) for c in q_noise]), 0)
+        loss_actor = (alpha * log_prob - v).mean()
+        loss_alpha = (-math.log(alpha) * (log_prob + entropy)).mean()
+
+    torch.manual_seed(5)
+    original = data.clone()
+    out = loss.reinforcement_loss(data)
+    torch.testing.assert_close(out["loss_qvalue"], loss_q, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(out["loss_actor"], loss_actor, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(out["loss_alpha"], loss_alpha, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(out["entropy"], -log_prob.mean(), rtol=1e-4, atol=1e-4)
+    td_error = torch.stack(errors).abs().amax(0)
+    torch.testing.assert_close(data["td_error"], td_error, rtol=1e-4, atol=1e-4)
+    assert (data.exclude("td_error") == original).all()
+    assert not out["entropy"].requires_grad and not out["td_error"].requires_grad
+
+
+@pytest.mark.parametrize("distribution", ["normal", "clipped", "uniform"])
+def test_distillation_by_hand(distribution):
+    """Head by head, online action critics at decoded draws; the gradient is the noise critics' alone."""
+    generator = torch.Generator().manual_seed(2)
+    loss = build(distillation=distribution, generator=generator)
+    data = batch()
+    _, q, _, q_noise = networks(loss)
+    sampler = ResidualSampler(
+        loss.decoder, distribution=distribution, generator=torch.Generator().manual_seed(2)
+    )
+    delta = sampler(data.clone())["prior", "delta"]
+    chunk = decode(loss, data["observation"], data["prior", "anchor"] + delta)
+    inputs = {"OBSERVATION": data["observation"], "ANCHOR": data["prior", "anchor"]}
+    parameters = [list(c.parameters()) for c in q_noise]
+    for group in parameters:
+        for p in group:
+            p.requires_grad_(True)
+    expected = torch.zeros(())
+    for critic, noise_critic in zip(q, q_noise, strict=True):
+        with torch.no_grad():
+            target = value(critic, OBSERVATION=data["observation"], CHUNK=chunk)
+        expected = (
+            expected + 0.5 * (value(noise_critic, **inputs, DELTA=delta) - target).square().mean()
+        )
+    expected.backward()
+    original = data.clone()
+    out = loss.distillation_loss(data)
+    assert (data == original).all() and set(data.keys(True)) == set(original.keys(True))
+    torch.testing.assert_close(out["loss_qvalue_noise"], expected.detach(), rtol=1e-4, atol=1e-5)
+    out["loss_qvalue_noise"].backward()
+    named = dict(loss.named_parameters())
+    moved = {name for name, p in named.items() if p.grad is not None}
+    assert moved == {name for name in named if name.startswith("noise_qvalue_network")}
+    stateful = dict(q_noise[0].named_parameters())
+    for i, critic in enumerate(q_noise):
+        for name, p in critic.named_parameters():
+            ours = named["noise_qvalue_network_params." + name].grad[i]
+            torch.testing.assert_close(ours, p.grad, rtol=1e-3, atol=1e-5)
+    assert len(stateful) == len(moved)
+
+
+@pytest.mark.parametrize(
+    ("name", "reached"),
+    [
+        ("loss_actor", "actor_network"),
+        ("loss_qvalue", "qvalue_network"),
+        ("loss_alpha", "log_alpha"),
+        ("loss_qvalue_noise", "noise_qvalue_network"),
+    ],
+)
+def test_each_loss_trains_its_own_network(name, reached):
+    loss = build()
+    loss(batch())[name].backward()
+    with_gradient = {n for n, p in loss.named_parameters() if p.grad is not None}
+    assert with_gradient == {n for n, _ in loss.named_parameters() if n.startswith(reached)}
+    assert with_gradient
+
+
+@pytest.mark.slow
+def test_training_reaches_a_known_optimum():
+    """The policy stands still, so the best residual is known: the agent must come near it."""
+
+    class Still(nn.Module):
+        def forward(self, t, a, observation):
+            return torch.zeros_like(a)
+
+    decoder = PriorDecoder(WarmPriorActor(Still(), PastPrior(H), nfe=1), delta=0.5)
+    loss = build(
+        decoder=decoder,
+        hidden_dim=64,
+        fixed_alpha=True,
+        alpha_init=0.3,
+        distillation="uniform",
+        generator=torch.Generator().manual_seed(0),
+    )
+    states = batch()[:1].expand(256).clone()
+    states["next", "done"] = torch.ones(256, 1, dtype=torch.bool)
+    best = torch.tensor([[0.3, -0.2], [0.0, 0.4]])
+    goal = states["prior", "anchor"] + best
+    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-3)
+    sampler = TensorDictSequential(ResidualSampler(decoder, distribution="uniform"), decoder)
+    torch.manual_seed(0)
+    for _ in range(300):
+        data = sampler(states.clone())
+        error = (data["vla_action", "chunk"] - goal).square().sum((-1, -2))
+        data["next", "reward"] = -10 * error.unsqueeze(-1)
+        losses = loss(data)
+        optimizer.zero_grad()
+        sum(v for k, v in losses.items() if k.startswith("loss_")).backward()
+        optimizer.step()
+    with torch.no_grad():
+        parameters = loss.get_stateful_net("actor_network").get_dist_params(states[:1])
+    found = 0.5 * parameters["delta_loc"][0].tanh()
+    assert float((found - best).abs().max()) < 0.2
+    assert float((found - best).abs().mean()) < 0.12 < 0.22 < float(best.abs().mean())
+
+
+def test_schedule():
+    loss = build(noise_critic_steps=3)
+    names = [compute.__name__ for compute in loss.schedule(updates=2)]
+    assert names == ["reinforcement_loss"] * 2 + ["distillation_loss"] * 3
+    assert [c.__name__ for c in build().schedule(20)].count("distillation_loss") == 10
+    with pytest.raises(ValueError, match="updates must be at least 1"):
+        loss.schedule(0)
+
+
+def test_official_defaults():
+    loss = build(GaussianPrior(H), delta=1.5)
+    assert (loss.backup, loss.bootstrap_timeouts, loss.noise_critic_steps) == ("min", False, 10)
+    assert loss.distillation.distribution == "normal" and loss.distillation.sigma == 1.0
+    assert float(loss.log_alpha) == 0.0 and float(loss.target_entropy) == 0.0
+    assert len(loss.qvalue_network_params["module", "net", "0", "weight"]) == 2
+    unscaled = make_decoder(GaussianPrior(H), delta=1.5, unscaled_box=True)
+    actor = build(GaussianPrior(H), decoder=unscaled).get_stateful_net("actor_network")
+    assert float(actor.spec[keys.DELTA].high.max()) == 1.0
+    assert build(PastPrior(H)).distillation.distribution == "clipped"

@@ -1,0 +1,172 @@
+"""TorchRL's own losses, unmodified, through the decoder: gradients, discounts of short chunks, frozenness."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict.nn import TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.envs import RenameTransform, SerialEnv, TransformedEnv
+from torchrl.objectives import (
+    CrossQLoss,
+    REDQLoss,
+    SACLoss,
+    SoftUpdate,
+    TQCLoss,
+    ValueEstimators,
+)
+
+from tests.toy_env import ACTION_DIM, CountingEnv
+from warmprior import (
+    PreviewPrior,
+    PriorAnchor,
+    PriorDecoder,
+    PriorSpace,
+    VelocityMLP,
+    WarmPriorActor,
+    keys,
+    make_prior_space_actor,
+    make_prior_space_critic,
+    policy_transforms,
+)
+
+H, TO, D_O, DELTA, GAMMA = 3, 2, 2 + ACTION_DIM, 0.5, 0.9
+LENGTHS = (7, 4)
+PRIOR = PreviewPrior(H)
+SIZES = (ACTION_DIM, D_O, PRIOR.prediction_length, TO)
+LOG_PROB = ("prior", "delta_log_prob")
+LOSSES = [SACLoss, REDQLoss, CrossQLoss, TQCLoss]
+
+
+def make_decoder():
+    torch.manual_seed(0)
+    network = VelocityMLP(*SIZES, hidden_dim=8)
+    return PriorDecoder(WarmPriorActor(network, PRIOR, nfe=2, clip=1.0), delta=DELTA)
+
+
+def make_env(decoder=None, truncate=False):
+    transforms = policy_transforms(PRIOR, observation_steps=TO, gamma=GAMMA)
+    transforms.append(PriorAnchor(PRIOR))
+    if decoder is not None:
+        transforms.append(PriorSpace(decoder))
+    base = SerialEnv(2, [partial(CountingEnv, n, truncate=truncate) for n in LENGTHS])
+    return TransformedEnv(base, transforms)
+
+
+def make_loss(loss_class):
+    torch.manual_seed(0)
+    actor = make_prior_space_actor(*SIZES, delta=DELTA, hidden_dim=8)
+    quantiles = {"out_features": 5} if loss_class is TQCLoss else {}
+    critic = make_prior_space_critic(*SIZES, delta=DELTA, hidden_dim=8, **quantiles)
+    loss = loss_class(actor, critic, target_entropy=0.0)
+    if loss_class is REDQLoss:
+        loss.set_keys(action=keys.DELTA, sample_log_prob=LOG_PROB)
+    if loss_class is CrossQLoss:
+        loss.set_keys(action=keys.DELTA, log_prob=LOG_PROB)
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    if loss_class is REDQLoss:
+        loss.value_estimator.set_keys(steps_to_next_obs=("next", keys.EXECUTED))
+    return actor, loss
+
+
+def make_buffer():
+    """A transition's own count of steps where the losses look for it."""
+    steps = RenameTransform([("next", keys.EXECUTED)], ["steps_to_next_obs"], create_copy=True)
+    return TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=16, transform=steps)
+
+
+@pytest.mark.parametrize("wiring", ["policy", "environment"])
+@pytest.mark.parametrize("loss_class", LOSSES)
+def test_training_loop(loss_class, wiring):
+    decoder = make_decoder()
+    before = {name: tensor.clone() for name, tensor in decoder.state_dict().items()}
+    actor, loss = make_loss(loss_class)
+    if wiring == "policy":
+        env, policy = make_env(), TensorDictSequential(actor, decoder)
+    else:
+        env, policy = make_env(decoder), actor
+    collector = Collector(env, policy, frames_per_batch=16, total_frames=48)
+    collector.set_seed(0)
+    buffer = make_buffer()
+    updater = None if loss_class is CrossQLoss else SoftUpdate(loss, tau=0.1)
+    parameters = dict(loss.named_parameters())
+    optimizer = torch.optim.Adam(parameters.values(), lr=1e-2)
+    start = {name: p.detach().clone() for name, p in parameters.items()}
+    for data in collector:
+        buffer.extend(data.reshape(-1))
+        losses = loss(buffer.sample())
+        optimizer.zero_grad()
+        sum(v for k, v in losses.items() if k.startswith("loss_")).backward()
+        assert all(p.grad is not None for p in parameters.values())
+        optimizer.step()
+        if updater is not None:
+            updater.step()
+    collector.shutdown()
+    assert all(torch.isfinite(p).all() for p in parameters.values())
+    moved = {name for name, p in parameters.items() if not torch.equal(p, start[name])}
+    assert {name.split(".")[0] for name in moved} == {name.split(".")[0] for name in parameters}
+    after = decoder.state_dict()
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    frozen = {tensor.data_ptr() for tensor in after.values()}
+    assert not frozen & {p.data_ptr() for p in policy.parameters()}
+
+
+@pytest.mark.parametrize("loss_class", LOSSES)
+def test_discount_of_short_chunks(loss_class, monkeypatch):
+    """What each loss bootstraps from, compared with reward + gamma^k * value written by hand.
+
+    The toy truncates inside chunks, so values after one, two and three executed steps all count.
+    """
+    decoder = make_decoder()
+    actor, loss = make_loss(loss_class)
+    if loss_class is not CrossQLoss:
+        SoftUpdate(loss, tau=0.1)
+    env = make_env(truncate=True)
+    env.set_seed(0)
+    data = env.rollout(12, TensorDictSequential(actor, decoder), break_when_any_done=False)
+    buffer = make_buffer()
+    buffer.extend(data.reshape(-1))
+    sample = buffer.sample(200)
+    k = sample["next", "executed_steps"]
+    assert set(k.flatten().tolist()) == {1, 3} and not sample["next", "terminated"].any()
+    assert not torch.equal(k, sample["executed_steps"])  # at the root: the step before
+
+    seen = []
+    original = type(loss.value_estimator).value_estimate
+
+    def spy(self, tensordict, *args, next_value=None, **kwargs):
+        out = original(self, tensordict, *args, next_value=next_value, **kwargs)
+        value = next_value
+        if value is None:
+            value = tensordict["next", self.tensor_keys.value]
+        seen.append((tensordict["next", "reward"], value, out))
+        return out
+
+    monkeypatch.setattr(type(loss.value_estimator), "value_estimate", spy)
+    loss(sample)
+    assert len(seen) == 1
+    reward, value, target = seen[0]
+    power = GAMMA ** k.float()
+    while power.ndim < target.ndim:
+        power, reward = power.unsqueeze(0), reward.unsqueeze(0)
+    torch.testing.assert_close(target, reward + power * value, rtol=1e-5, atol=1e-5)
+    # The reward is the chunk's own discounted sum: the toy pays t at control step t.
+    time = sample["observation"][:, -1, :1]
+    paid = sum(GAMMA**i * (time + i + 1) * (i < k) for i in range(H))
+    torch.testing.assert_close(sample["next", "reward"], paid)
+
+
+def test_warm_up_in_the_environment_is_uniform_in_the_box():
+    decoder = make_decoder()
+    actor, _ = make_loss(SACLoss)
+    collector = Collector(
+        make_env(decoder), actor, frames_per_batch=64, total_frames=128, init_random_frames=64
+    )
+    batches = list(collector)
+    collector.shutdown()
+    delta = batches[0]["prior", "delta"]
+    assert float(delta.abs().max()) <= DELTA
+    assert float(delta.std()) == pytest.approx(DELTA / 3**0.5, rel=0.05)

@@ -1,0 +1,216 @@
+"""PriorAnchor: the mean where it is warm, observed noise where it is cold, one seed one result."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import pickle
+from functools import partial
+
+import pytest
+import torch
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.toy_env import ACTION_DIM, CountingEnv
+from warmprior import (
+    ActionHistory,
+    ChunkStep,
+    GaussianPrior,
+    HistoryPrior,
+    PastPrior,
+    PreviewPrior,
+    PriorAnchor,
+)
+
+H = 3
+LENGTHS = (7, 4)
+PLACES = ("single", "serial-outside", "serial-inside", "parallel-outside", "parallel-inside")
+PRIORS = [GaussianPrior, PastPrior, PreviewPrior, HistoryPrior]
+
+
+def history(prior, execute=None):
+    chunk = ChunkStep(
+        prior.chunk_length, execute=execute, prediction_length=prior.prediction_length
+    )
+    return [chunk, ActionHistory(prior)]
+
+
+def anchored(env, prior, execute=None, **options):
+    return TransformedEnv(env, Compose(*history(prior, execute), PriorAnchor(prior, **options)))
+
+
+def single(prior, length, **options):
+    return anchored(CountingEnv(length), prior, **options)
+
+
+def build(place, prior, **options):
+    if place == "single":
+        return single(prior, LENGTHS[0], **options)
+    batched = SerialEnv if "serial" in place else partial(ParallelEnv, mp_start_method="fork")
+    if place.endswith("outside"):
+        return anchored(batched(2, [partial(CountingEnv, n) for n in LENGTHS]), prior, **options)
+    workers = [partial(single, prior, n, seed_offset=i, **options) for i, n in enumerate(LENGTHS)]
+    return batched(2, workers)
+
+
+@pytest.mark.parametrize(
+    ("place", "prior_class", "execute"),
+    [
+        *itertools.product(PLACES[:3], PRIORS, [H, 2]),
+        *itertools.product(PLACES[3:], [PastPrior, PreviewPrior], [2]),
+    ],
+)
+def test_everywhere(place, prior_class, execute):
+    """Specs hold, warm positions are the mean, the rest is fresh noise, and seeds repeat."""
+    prior = prior_class(H)
+    env = build(place, prior, cold="noise", execute=execute)
+    again = build(place, prior, cold="noise", execute=execute)
+    try:
+        check_env_specs(env)
+        rollouts = []
+        for e in (env, again):  # one has been used by the check, the other not
+            e.set_seed(5)
+            torch.manual_seed(0)
+            rollouts.append(e.rollout(9, break_when_any_done=False))
+        data, other = rollouts
+        assert torch.equal(data["prior", "anchor"], other["prior", "anchor"])
+        env.set_seed(6)
+        torch.manual_seed(0)
+        new = env.rollout(9, break_when_any_done=False)
+        assert not torch.equal(new["prior", "anchor"], data["prior", "anchor"])
+        for part in (data, data["next"]):
+            anchor, loc, warm = (part["prior", k] for k in ("anchor", "loc", "warm"))
+            centred = warm & (prior_class in (PastPrior, PreviewPrior))
+            assert torch.equal(anchor[centred.expand_as(anchor)], loc[centred.expand_as(loc)])
+            noise = anchor[~centred.expand_as(anchor)]
+            assert len(noise) == len(noise.unique())
+            assert len(noise) or (part is not data and prior_class is PastPrior and execute == H)
+        # What the agent saw after a step is what it acts around at the next, unless there was a reset.
+        alive = ~data["next", "done"][..., :-1, 0]
+        after, root = data["next", "prior", "anchor"][..., :-1, :, :], data["prior", "anchor"]
+        assert torch.equal(after[alive], root[..., 1:, :, :][alive]) and alive.any()
+    finally:
+        env.close(raise_if_closed=False)
+        again.close(raise_if_closed=False)
+
+
+def test_noise_is_standard_normal():
+    prior = PreviewPrior(50)
+    env = build("serial-outside", prior)
+    torch.manual_seed(0)
+    noise = torch.cat([env.reset()["prior", "anchor"].flatten() for _ in range(100)])
+    assert abs(float(noise.mean())) < 0.03 and abs(float(noise.std()) - 1) < 0.03
+
+
+@pytest.mark.parametrize("prior_class", [GaussianPrior, HistoryPrior])
+def test_vanilla_dsrl_is_the_default_without_a_mean(prior_class):
+    data = build("single", prior_class(H)).rollout(3)
+    assert not data["prior", "anchor"].any() and not data["next", "prior", "anchor"].any()
+
+
+def test_zero_on_request():
+    data = build("single", PreviewPrior(H), cold="zero").rollout(2)["prior", "anchor"]
+    assert not data[0].any() and data[1, :H].all() and not data[1, H:].any()
+
+
+def test_a_partly_collected_history_is_not_an_anchor():
+    """Past collects its mean before it is warm: what is there must not leak into the box's centre."""
+    data = build("single", PastPrior(H), execute=2, cold="zero").rollout(2)
+    assert data["prior", "loc"][1].any() and not data["prior", "warm"][1].any()
+    assert not data["prior", "anchor"][1].any()
+
+
+def test_one_environment_may_reset_alone():
+    env = build("serial-outside", PastPrior(H))
+    data = env.step_mdp(env.rand_step(env.reset()))
+    kept = data["prior", "anchor"].clone()
+    data = env.reset(data.set("_reset", torch.tensor([[True], [False]])))
+    assert torch.equal(data["prior", "anchor"][1], kept[1])
+    assert not torch.equal(data["prior", "anchor"][0], kept[0])
+
+
+def test_workers_with_one_seed_differ_by_offset():
+    env = build("serial-inside", PastPrior(H))
+    env.set_seed(3, static_seed=True)
+    first, second = env.reset()["prior", "anchor"]
+    assert not torch.equal(first, second)
+
+
+def test_global_generator_is_not_used():
+    env = build("single", PastPrior(H))
+    torch.manual_seed(0)
+    state = torch.get_rng_state()
+    env.reset()
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_set_seed_still_returns_the_next_seed():
+    env = build("serial-outside", PastPrior(H))
+    base = SerialEnv(2, [partial(CountingEnv, n) for n in LENGTHS])
+    assert env.set_seed(3) == base.set_seed(3)
+    assert env.set_seed(3, static_seed=True) == 3
+
+
+def test_nested_and_extended_environments_are_seeded():
+    anchors = []
+    for wrap in (False, True):
+        env = build("serial-outside", PastPrior(H))
+        if wrap:
+            env = TransformedEnv(env, Compose(), auto_unwrap=False)
+        env.set_seed(8)
+        anchors.append(env.reset()["prior", "anchor"])
+    late = TransformedEnv(SerialEnv(2, [partial(CountingEnv, n) for n in LENGTHS]))
+    for transform in (*history(PastPrior(H)), PriorAnchor(PastPrior(H))):
+        late.append_transform(transform)
+    late.set_seed(8)
+    anchors.append(late.reset()["prior", "anchor"])
+    assert torch.equal(anchors[0], anchors[1]) and torch.equal(anchors[0], anchors[2])
+
+
+@pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_is_seeded_by_itself(copy_of):
+    env = build("single", PastPrior(H))
+    twin = copy_of(env)
+    twin.set_seed(4)
+    state = env.transform[-1].generator.get_state()
+    expected = twin.reset()["prior", "anchor"]
+    assert torch.equal(env.transform[-1].generator.get_state(), state)
+    env.set_seed(4)
+    assert torch.equal(env.reset()["prior", "anchor"], expected)
+
+
+def test_in_a_collector():
+    collector = Collector(
+        build("serial-outside", PreviewPrior(H)), None, frames_per_batch=12, total_frames=24
+    )
+    collector.set_seed(1)
+    for batch in collector:
+        warm = batch["prior", "warm"].expand_as(batch["prior", "loc"])
+        assert torch.equal(batch["prior", "anchor"][warm], batch["prior", "loc"][warm])
+    collector.shutdown()
+
+
+def test_wrong_places_and_options():
+    with pytest.raises(ValueError, match="cold must be 'noise' or 'zero'"):
+        PriorAnchor(PastPrior(H), cold="warm")
+    with pytest.raises(KeyError, match="append it after ActionHistory"):
+        TransformedEnv(CountingEnv(5), Compose(ChunkStep(H), PriorAnchor(PastPrior(H)))).reset()
+    with pytest.raises(KeyError, match="append it after ActionHistory"):
+        env = TransformedEnv(CountingEnv(5), Compose(ChunkStep(H), PriorAnchor(PastPrior(H))))
+        env.observation_spec  # noqa: B018
+    with pytest.raises(ValueError, match=r"PreviewPrior.* predicts 6 .*must carry the same prior"):
+        chain = Compose(*history(PastPrior(H)), PriorAnchor(PreviewPrior(H)))
+        TransformedEnv(CountingEnv(5), chain).reset()
+
+
+def test_renamed_keys():
+    prior = PastPrior(H)
+    anchor = PriorAnchor(prior, loc_key="mean", warm_key="is_warm", anchor_key="centre")
+    chain = Compose(ChunkStep(H), ActionHistory(prior, loc_key="mean", warm_key="is_warm"), anchor)
+    env = TransformedEnv(CountingEnv(7), chain)
+    check_env_specs(env)
+    data = env.rollout(2)
+    assert data["centre"].shape == (2, H, ACTION_DIM)
+    assert torch.equal(data["centre"][1], data["mean"][1])

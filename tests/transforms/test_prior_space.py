@@ -1,0 +1,153 @@
+"""PriorSpace: the other wiring of the decoder, with the same transitions."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict.nn import TensorDictSequential
+from torchrl.collectors import Collector
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.toy_env import ACTION_DIM, CountingEnv
+from warmprior import (
+    ActionHistory,
+    ChunkStep,
+    GaussianPrior,
+    PastPrior,
+    PreviewPrior,
+    PriorAnchor,
+    PriorDecoder,
+    PriorSpace,
+    VelocityMLP,
+    WarmPriorActor,
+    make_prior_space_actor,
+    policy_transforms,
+)
+
+H, TO, D_O, DELTA = 3, 2, 2 + ACTION_DIM, 0.5
+LENGTHS = (7, 4)
+WHERE = {
+    ("prior", "noise"): ("next", "decoded", "noise"),
+    ("vla_action", "chunk"): ("next", "decoded", "chunk"),
+}
+
+
+def make_decoder(prior, delta=DELTA):
+    torch.manual_seed(0)
+    network = VelocityMLP(ACTION_DIM, D_O, prior.prediction_length, TO, hidden_dim=8)
+    return PriorDecoder(WarmPriorActor(network, prior, nfe=2, clip=1.0), delta=delta)
+
+
+def make_env(prior, decoder=None, batched=SerialEnv):
+    transforms = policy_transforms(prior, observation_steps=TO)
+    transforms.append(PriorAnchor(prior))
+    if decoder is not None:
+        transforms.append(PriorSpace(decoder))
+    base = batched(2, [partial(CountingEnv, n) for n in LENGTHS])
+    return TransformedEnv(base, transforms)
+
+
+@pytest.mark.parametrize("collect", [False, True])
+@pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
+def test_both_wirings_give_bit_identical_transitions(prior_class, collect):
+    prior = prior_class(H)
+    decoder = make_decoder(prior)
+    agent = make_prior_space_actor(
+        ACTION_DIM, D_O, prior.prediction_length, TO, delta=DELTA, hidden_dim=8
+    )
+    results = []
+    for inside in (False, True):
+        env = make_env(prior, decoder if inside else None)
+        policy = agent if inside else TensorDictSequential(agent, decoder)
+        env.set_seed(3)
+        torch.manual_seed(1)
+        if collect:
+            collector = Collector(env, policy, frames_per_batch=16, total_frames=48)
+            results.append(torch.cat(list(collector), 1))
+            collector.shutdown()
+        else:
+            results.append(env.rollout(9, policy, break_when_any_done=False))
+    outside, inside = results
+    keys = [key for key in outside.keys(True, True) if "collector" not in key]
+    assert {"observation", *WHERE, ("next", "prior", "anchor")} <= set(keys)
+    for key in keys:
+        assert torch.equal(outside[key], inside[WHERE.get(key, key)]), key
+    assert outside["next", "done"].sum() >= 3
+
+
+@pytest.mark.parametrize("batched", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
+def test_specs_and_random_actions(batched):
+    prior = PreviewPrior(H)
+    env = make_env(prior, make_decoder(prior), batched)
+    try:
+        check_env_specs(env)
+        assert env.action_keys == [("prior", "delta")]
+        spec = env.full_action_spec["prior", "delta"]
+        assert spec.shape == (2, 2 * H, ACTION_DIM)
+        assert torch.equal(spec.high, torch.full_like(spec.high, DELTA))
+        assert torch.equal(spec.low, torch.full_like(spec.low, -DELTA))
+        data = env.rollout(20, break_when_any_done=False)
+        delta = data["prior", "delta"]
+        assert delta.abs().max() <= DELTA and delta.std() == pytest.approx(DELTA / 3**0.5, rel=0.1)
+        # The decoded chunk is the one that was executed: the toy's observation holds the last action.
+        chunk, k = data["next", "decoded", "chunk"], data["next", "executed_steps"]
+        last = chunk.gather(-2, (k - 1).unsqueeze(-1).expand(*k.shape[:-1], 1, ACTION_DIM))
+        assert torch.equal(data["next", "observation"][..., -1, 2:], last.squeeze(-2))
+        noise = data["next", "decoded", "noise"]
+        assert torch.equal(noise, data["prior", "anchor"] + delta)
+    finally:
+        env.close(raise_if_closed=False)
+
+
+def test_inside_of_workers():
+    prior = PastPrior(H)
+    decoder = make_decoder(prior)
+
+    def one(length):
+        transforms = policy_transforms(prior, observation_steps=TO)
+        return TransformedEnv(
+            CountingEnv(length), Compose(*transforms, PriorAnchor(prior), PriorSpace(decoder))
+        )
+
+    check_env_specs(SerialEnv(2, [partial(one, n) for n in LENGTHS]))
+
+
+def test_a_bare_step_holds_what_was_decoded():
+    prior = PastPrior(H)
+    env = make_env(prior, make_decoder(prior))
+    data = env.rand_step(env.reset())
+    assert data["next", "decoded", "chunk"].any()
+    assert ("vla_action", "chunk") not in data.keys(True, True)
+    assert not data["decoded", "chunk"].any()
+
+
+def test_chunks_of_another_length():
+    chain = Compose(ChunkStep(H), ActionHistory(PastPrior(H)), PriorAnchor(PastPrior(H)))
+    env = TransformedEnv(CountingEnv(7), chain)
+    decoder = make_decoder(PreviewPrior(H))
+    with pytest.raises(ValueError, match=r"\(3, 2\), but the policy predicts \(6, 2\)"):
+        env.append_transform(PriorSpace(decoder)).rollout(1)
+
+
+@pytest.mark.parametrize("carries", ["ActionHistory", "PriorAnchor"])
+def test_another_prior(carries):
+    ours, other = PastPrior(H), PastPrior(H, sigma=0.3)
+    history = ActionHistory(other if carries == "ActionHistory" else ours)
+    anchor = PriorAnchor(other if carries == "PriorAnchor" else ours)
+    chain = Compose(ChunkStep(H), history, anchor, PriorSpace(make_decoder(ours)))
+    with pytest.raises(
+        ValueError, match=rf"trained with PastPrior.*0\.5.*{carries} carries .*0\.3"
+    ):
+        TransformedEnv(CountingEnv(7), chain).rollout(1)
+
+
+def test_without_anchor_or_chunks():
+    decoder = make_decoder(PastPrior(H))
+    chain = Compose(ChunkStep(H), ActionHistory(PastPrior(H)), PriorSpace(decoder))
+    with pytest.raises(KeyError, match="append it after PriorAnchor"):
+        TransformedEnv(CountingEnv(7), chain).rollout(1)
+    with pytest.raises(KeyError, match="append ChunkStep first"):
+        TransformedEnv(CountingEnv(7), PriorSpace(decoder)).full_action_spec  # noqa: B018
