@@ -114,19 +114,38 @@ def test_training_loop(loss_class, wiring):
     assert not frozen & {p.data_ptr() for p in policy.parameters()}
 
 
+def watched(loss, sample, monkeypatch):
+    """What the loss hands to its value estimator and gets back: reward, next value, target."""
+    seen = []
+    original = type(loss.value_estimator).value_estimate
+
+    def spy(self, tensordict, *args, next_value=None, **kwargs):
+        out = original(self, tensordict, *args, next_value=next_value, **kwargs)
+        if next_value is None:
+            next_value = tensordict["next", self.tensor_keys.value]
+        seen.append((tensordict["next", "reward"], next_value, out))
+        return out
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(loss.value_estimator), "value_estimate", spy)
+        loss(sample)
+    (result,) = seen
+    return result
+
+
 @pytest.mark.parametrize("loss_class", LOSSES)
 def test_discount_of_short_chunks(loss_class, monkeypatch):
     """What each loss bootstraps from, compared with reward + gamma^k * value written by hand.
 
-    The toy truncates inside chunks, so values after one, two and three executed steps all count.
+    The toy truncates inside chunks, so values after one and three executed steps both count.
     """
-    decoder = make_decoder()
     actor, loss = make_loss(loss_class)
     if loss_class is not CrossQLoss:
         SoftUpdate(loss, tau=0.1)
     env = make_env(truncate=True)
     env.set_seed(0)
-    data = env.rollout(12, TensorDictSequential(actor, decoder), break_when_any_done=False)
+    policy = TensorDictSequential(actor, make_decoder())
+    data = env.rollout(12, policy, break_when_any_done=False)
     buffer = make_buffer()
     buffer.extend(data.reshape(-1))
     sample = buffer.sample(200)
@@ -134,29 +153,21 @@ def test_discount_of_short_chunks(loss_class, monkeypatch):
     assert set(k.flatten().tolist()) == {1, 3} and not sample["next", "terminated"].any()
     assert not torch.equal(k, sample["executed_steps"])  # at the root: the step before
 
-    seen = []
-    original = type(loss.value_estimator).value_estimate
-
-    def spy(self, tensordict, *args, next_value=None, **kwargs):
-        out = original(self, tensordict, *args, next_value=next_value, **kwargs)
-        value = next_value
-        if value is None:
-            value = tensordict["next", self.tensor_keys.value]
-        seen.append((tensordict["next", "reward"], value, out))
-        return out
-
-    monkeypatch.setattr(type(loss.value_estimator), "value_estimate", spy)
-    loss(sample)
-    assert len(seen) == 1
-    reward, value, target = seen[0]
-    power = GAMMA ** k.float()
-    while power.ndim < target.ndim:
-        power, reward = power.unsqueeze(0), reward.unsqueeze(0)
-    torch.testing.assert_close(target, reward + power * value, rtol=1e-5, atol=1e-5)
+    reward, value, target = watched(loss, sample, monkeypatch)
+    torch.testing.assert_close(target, reward + GAMMA ** k.float() * value, rtol=1e-5, atol=1e-5)
+    assert (value != 0).all()
     # The reward is the chunk's own discounted sum: the toy pays t at control step t.
     time = sample["observation"][:, -1, :1]
     paid = sum(GAMMA**i * (time + i + 1) * (i < k) for i in range(H))
     torch.testing.assert_close(sample["next", "reward"], paid)
+
+    # Time-outs as terminations, the official reading.
+    loss.set_keys(terminated="done")
+    reward, value, target = watched(loss, sample, monkeypatch)
+    goes_on = ~sample["next", "done"]
+    assert goes_on.any() and not goes_on.all()
+    expected = reward + GAMMA ** k.float() * goes_on * value
+    torch.testing.assert_close(target, expected, rtol=1e-5, atol=1e-5)
 
 
 def test_warm_up_in_the_environment_is_uniform_in_the_box():
@@ -165,6 +176,7 @@ def test_warm_up_in_the_environment_is_uniform_in_the_box():
     collector = Collector(
         make_env(decoder), actor, frames_per_batch=64, total_frames=128, init_random_frames=64
     )
+    torch.manual_seed(0)
     batches = list(collector)
     collector.shutdown()
     delta = batches[0]["prior", "delta"]

@@ -183,6 +183,7 @@ def make_prior_space_critic(
     num_layers: int = 3,
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR, keys.DELTA),
     out_features: int = 1,
+    delta_key: NestedKey = keys.DELTA,
 ) -> ValueOperator:
     """A critic of residuals or of chunks, with the trunk of :func:`make_prior_space_actor`.
 
@@ -203,6 +204,7 @@ def make_prior_space_critic(
         num_layers: number of layers.
         in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``.
         out_features: values per input, more than one for quantile critics.
+        delta_key: where the residual is read.
 
     Raises:
         ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
@@ -223,7 +225,7 @@ def make_prior_space_critic(
         out_features,
         hidden_dim,
         num_layers,
-        {keys.DELTA: 1.0 / delta},
+        {unravel_key(delta_key): 1.0 / delta},
     )
     # TorchRL would call it "state_value" for any action that is not named "action".
     return ValueOperator(trunk, in_keys=list(in_keys), out_keys=["state_action_value"])

@@ -43,8 +43,8 @@ class DSRLNALoss(PriorSpaceLoss):
 
     with stopped gradients where SAC has them; batch means throughout. Log-probabilities count in units of the
     box, :math:`\Delta / \delta \in [-1, 1]`, as in the official implementation, so that entropies do not
-    depend on :math:`\delta`. The defaults are the official ones. The official *schedule* takes several
-    updates per step and then distils on batches of its own:
+    depend on :math:`\delta`. The defaults are the official ones but for the discount. The official schedule
+    takes several updates per step and then distils on batches of its own:
 
     .. code-block:: python
 
@@ -58,8 +58,8 @@ class DSRLNALoss(PriorSpaceLoss):
             if "loss_qvalue" in losses.keys():
                 updater.step()
 
-    One optimiser does for all: Adam passes over parameters without gradient. :meth:`forward` computes the
-    four losses on one batch, for trainers that know a single call.
+    One optimiser does for all: Adam passes over parameters without gradient. :meth:`forward` computes all
+    four losses on one batch.
 
     Args:
         actor_network: the policy over residuals, see :func:`~warmprior.make_prior_space_actor`.
@@ -199,9 +199,8 @@ class DSRLNALoss(PriorSpaceLoss):
 
     def _reinforcement_keys(self) -> list[NestedKey]:
         k = self.tensor_keys
-        after = [*self._states(self.actor_network, self.decoder, self.qvalue_network)]
-        after += [k.reward, k.done, k.terminated]
-        after += [k.executed] if self.discount == "step" else []
+        after = self._states(self.actor_network, self.decoder, self.qvalue_network)
+        after += [k.reward, k.done, k.terminated, *[k.executed] * (self.discount == "step")]
         before = self._states(self.actor_network, self.qvalue_network, self.noise_qvalue_network)
         return [*before, k.chunk, *(unravel_key(("next", key)) for key in after)]
 
@@ -221,8 +220,7 @@ class DSRLNALoss(PriorSpaceLoss):
             TensorDict of scalars: ``loss_actor``, ``loss_alpha``, ``loss_qvalue`` and
             ``loss_qvalue_noise``, and detached ``alpha``, ``entropy`` (units of the box) and ``td_error``.
         """
-        losses = self.reinforcement_loss(tensordict)
-        return losses.update(self.distillation_loss(tensordict))
+        return self.reinforcement_loss(tensordict).update(self.distillation_loss(tensordict))
 
     def schedule(self, updates: int) -> Iterator[Callable[[TensorDictBase], TensorDict]]:
         """The official order: ``updates`` times the first three losses, then the distillation.
@@ -256,9 +254,9 @@ class DSRLNALoss(PriorSpaceLoss):
 
         state = tensordict.select(*self._states(self.actor_network, self.noise_qvalue_network))
         delta, log_prob = self._act(state)
-        state.set(self.decoder.delta_key, delta)
         # Gradients reach the residual, not the critic.
-        value = self._vmap_noise_qvalue(state, self.noise_qvalue_network_params.detach())
+        frozen = self.noise_qvalue_network_params.detach()
+        value = self._vmap_noise_qvalue(state.set(self.decoder.delta_key, delta), frozen)
         loss_actor = alpha * log_prob - self._combine(value)
         loss_alpha = -self.log_alpha * (log_prob.detach() + self.target_entropy)
         losses = {"loss_actor": loss_actor, "loss_alpha": loss_alpha, "loss_qvalue": loss_qvalue}
@@ -270,7 +268,6 @@ class DSRLNALoss(PriorSpaceLoss):
         return self._finish(losses, tensordict, weights).update(diagnostics)
 
     def _qvalue_loss(self, tensordict: TensorDictBase, alpha: Tensor) -> tuple[Tensor, Tensor]:
-        k = self.tensor_keys
         with torch.no_grad():
             after = tensordict.get("next")
             state = after.select(
@@ -283,7 +280,7 @@ class DSRLNALoss(PriorSpaceLoss):
                 value = value - alpha * log_prob
             target = self._td_target(after, value)
         state = tensordict.select(*self._states(self.qvalue_network))
-        state.set(self.decoder.chunk_key, tensordict.get(k.chunk))
+        state.set(self.decoder.chunk_key, tensordict.get(self.tensor_keys.chunk))
         error = self._values(self._vmap_qvalue(state, self.qvalue_network_params)) - target
         return 0.5 * error.square().sum(0), error.detach().abs().amax(0)
 

@@ -23,12 +23,12 @@ class PriorSpace(Transform):
     environment with a bounded action. The chunk is decoded on the way in and the transitions are those
     of ``TensorDictSequential(agent, decoder)``, except for where the source and the chunk are found:
 
-    =======================================  =====================================================
+    ========================================  =====================================================
     ``TensorDictSequential(agent, decoder)``  ``PriorSpace(decoder)``
-    =======================================  =====================================================
-    ``("prior", "noise")``                   ``("next", "decoded", "noise")``
-    ``("vla_action", "chunk")``              ``("next", "decoded", "chunk")``
-    =======================================  =====================================================
+    ========================================  =====================================================
+    ``("prior", "noise")``                    ``("next", "decoded", "noise")``
+    ``("vla_action", "chunk")``               ``("next", "decoded", "chunk")``
+    ========================================  =====================================================
 
     (TorchRL keeps nothing that an inverse transform writes, so they leave with the next state. Under their
     usual names the data would hold, at the root, those of the step before.)
