@@ -11,10 +11,12 @@ from warmprior.envs.navigation1d import (
     navigation_metrics,
     navigation_positions,
 )
+from warmprior.envs.navigation_goal import GoalNavigationEnv
 from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.robosuite import RobosuiteEnv, RobosuiteWrapper
 
 __all__ = [
+    "GoalNavigationEnv",
     "NavigationEnv",
     "NavigationMetrics",
     "RobosuiteEnv",

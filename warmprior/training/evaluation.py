@@ -10,6 +10,7 @@ from functools import partial
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
@@ -83,9 +84,12 @@ def parallel_env(
 @contextmanager
 def _watched(env: EnvBase) -> Iterator[None]:
     """Turn the death of a worker into an error: TorchRL alone would wait for it for hours."""
-    if isinstance(env, ParallelEnv) and env.is_closed:
-        env.start()
-    workers = list(env._workers) if isinstance(env, ParallelEnv) else []
+    base = env
+    while isinstance(base, TransformedEnv):
+        base = base.base_env
+    if isinstance(base, ParallelEnv) and base.is_closed:
+        base.start()
+    workers = list(base._workers) if isinstance(base, ParallelEnv) else []
     finished = threading.Event()
     dead: list[str] = []
 
@@ -130,9 +134,25 @@ def _watched(env: EnvBase) -> Iterator[None]:
         watcher.join()
 
 
+@contextmanager
+def _drawing(policy: TensorDictModuleBase, seed: int, device: torch.device) -> Iterator[None]:
+    """Let a policy draw from a seed, and leave all other draws as they were."""
+    if isinstance(policy, WarmPriorActor):
+        previous = policy.sampler.generator
+        policy.sampler.generator = torch.Generator(device).manual_seed(seed)
+        try:
+            yield
+        finally:
+            policy.sampler.generator = previous
+        return
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        yield
+
+
 @torch.no_grad()
 def evaluate(
-    actor: WarmPriorActor,
+    policy: TensorDictModuleBase,
     env: EnvBase,
     *,
     episodes: int,
@@ -144,14 +164,15 @@ def evaluate(
     """Play episodes and report each one's outcome.
 
     Args:
-        actor: the policy; set to evaluation mode.
-        env: a batched environment ``[n]`` from :func:`parallel_env`.
+        policy: a :class:`~warmprior.WarmPriorActor`, or any module that writes chunks, such as an agent
+            followed by a :class:`~warmprior.PriorDecoder`; set to evaluation mode.
+        env: a batched environment ``[n]`` with the policy's transforms, such as :func:`parallel_env`.
 
     Keyword Args:
         episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
         first_seed: seed of the first episode; keep it away from the data's seeds.
-        nfe: network evaluations per chunk; the actor's own by default.
-        policy_seed: of the source samples.
+        nfe: network evaluations per chunk of a :class:`~warmprior.WarmPriorActor`; its own by default.
+        policy_seed: of the policy's random draws.
         description: of the progress bar; no bar if ``None``.
 
     Returns:
@@ -165,20 +186,19 @@ def evaluate(
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     num_envs = env.batch_size[0]
-    actor.eval()
-    device = next(actor.parameters()).device
-    generator = torch.Generator(device).manual_seed(policy_seed)
+    policy.eval()
+    device = next(policy.parameters()).device
+    options = {} if nfe is None else {"nfe": nfe}
     # The simulators need the cores; a policy's call is small, and its idle threads would spin.
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    previous, actor.sampler.generator = actor.sampler.generator, generator
     played = [0] * num_envs
     outcomes: list[Episode] = []
     chunks: list[list[Tensor]] = [[] for _ in played]
     executed: list[list[Tensor]] = [[] for _ in played]
     bar = tqdm(total=episodes, desc=description, unit="ep", disable=description is None)
     try:
-        with bar, _watched(env):
+        with bar, _watched(env), _drawing(policy, policy_seed, device):
             env.set_seed(first_seed, static_seed=True)
             data = env.reset()
             while len(outcomes) < episodes:
@@ -188,7 +208,7 @@ def evaluate(
                 )
                 if not active.all():
                     data.set("_step", active)
-                data = env.step(actor(data.to(device), nfe=nfe).to("cpu"))
+                data = env.step(policy(data.to(device), **options).to("cpu"))
                 done = data["next", "done"].flatten() & active
                 chunk, steps = data[keys.CHUNK], data["next", keys.EXECUTED]
                 for i in active.nonzero().flatten().tolist():
@@ -208,7 +228,6 @@ def evaluate(
                     data = env.reset(data.set("_reset", done.unsqueeze(-1)))
     finally:
         torch.set_num_threads(threads)
-        actor.sampler.generator = previous
     return sorted(outcomes, key=lambda outcome: outcome.seed)
 
 

@@ -1,0 +1,84 @@
+"""Transitions on disk, appended and never rewritten: a replay buffer that survives the process."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+
+from warmprior._files import load_file, save_file, write_atomic
+
+__all__ = ["ReplaySegments"]
+
+SEPARATOR = "."
+
+
+class ReplaySegments:
+    """A folder of safetensors files, one per save, with the transitions since the one before.
+
+    What is saved counts only once :meth:`committed` names it: a process that dies between writing a
+    segment and its training state leaves a segment that the next one replaces.
+
+    Args:
+        directory: the folder; created with the first segment.
+        segments: how many of its segments are to be kept.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     segments = ReplaySegments(Path(folder))
+        ...     for k in range(2):
+        ...         segments.append(TensorDict({"next": {"reward": torch.full((3, 1), float(k))}}, [3]))
+        ...         segments.write()
+        ...     ReplaySegments(Path(folder), segments.committed).load()["next", "reward"].flatten()
+        tensor([0., 0., 0., 1., 1., 1.])
+    """
+
+    def __init__(self, directory: Path, segments: int = 0) -> None:
+        self.directory = directory
+        self.committed = segments
+        self._pending: list[TensorDictBase] = []
+
+    def _path(self, index: int) -> Path:
+        return self.directory / f"{index:06d}.safetensors"
+
+    def append(self, transitions: TensorDictBase) -> None:
+        """Remember transitions ``[n]`` for the next :meth:`write`."""
+        self._pending.append(transitions)
+
+    def write(self) -> None:
+        """Write what was appended as one new segment, if anything was."""
+        if not self._pending:
+            return
+        data = torch.cat(self._pending)
+        tensors = {
+            SEPARATOR.join(key) if isinstance(key, tuple) else key: value.cpu().contiguous()
+            for key, value in data.items(True, True)
+        }
+        write_atomic(self._path(self.committed), lambda path: save_file(tensors, path))
+        self.committed += 1
+        self._pending.clear()
+
+    def load(self) -> TensorDict | None:
+        """All committed transitions ``[N]``, or ``None`` if there are none.
+
+        Raises:
+            ValueError: if a segment is missing or damaged.
+        """
+        parts = []
+        for index in range(self.committed):
+            path = self._path(index)
+            try:
+                tensors = load_file(path)
+            except Exception as error:
+                raise ValueError(
+                    f"{path}, a part of the replay buffer, is missing or damaged ({error}): restore it, "
+                    "or choose another output folder"
+                ) from error
+            size = len(next(iter(tensors.values())))
+            nested = {
+                tuple(k.split(SEPARATOR)) if SEPARATOR in k else k: v for k, v in tensors.items()
+            }
+            parts.append(TensorDict(nested, batch_size=[size]))
+        return torch.cat(parts) if parts else None
