@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import copy
 import importlib.util
 import json
 import os
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,14 +19,7 @@ import torch
 
 from warmprior import Prior, WarmPriorActor
 from warmprior._files import check_writable, write_atomic
-from warmprior.data import (
-    TASKS,
-    RobomimicExperienceReplay,
-    download_robomimic,
-    generate_demonstrations,
-    get_task,
-)
-from warmprior.diagnostics import SharedObservations
+from warmprior.data import TASKS, download_robomimic, generate_demonstrations, get_task
 from warmprior.training import PRESETS, Preset
 from warmprior.training.comparison import Comparison
 from warmprior.training.demonstrations import Demonstrations
@@ -73,36 +66,34 @@ def add_options(parser: argparse.ArgumentParser) -> Callable[..., argparse.Actio
     return add
 
 
-def add_curvature_options(parser: argparse.ArgumentParser, *, observations: int) -> None:
-    """Add the options of measurements on held-out observations."""
-    add = parser.add_argument
-    add(
-        "--validation",
-        type=Path,
-        help="robomimic HDF5 file of held-out demonstrations (default: newly generated ones)",
-    )
-    add(
-        "--observations",
-        type=int,
-        default=observations,
-        help="observations to measure curvature on (%(default)s; the paper: 2000)",
-    )
-    add("--steps", type=int, default=100, help="Euler steps (%(default)s, the paper's)")
-    add("--draws", type=int, default=1, help="source samples per observation (%(default)s)")
+def launch(main: Callable[[], int]) -> None:
+    """Run a script. Policies are shared between scripts, so all of them compute alike."""
+    torch.set_float32_matmul_precision("high")
+    sys.exit(main())
 
 
 def parse(
-    make_parser: Callable[[], argparse.ArgumentParser], argv: list[str] | None, prefix: str = ""
+    make_parser: Callable[[], argparse.ArgumentParser],
+    argv: list[str] | None,
+    prefix: str = "",
+    default_task: Callable[[argparse.Namespace], str] = lambda args: "square",
 ) -> argparse.Namespace:
     """The options; those of the run to continue, where --resume is given."""
     parser = make_parser()
+    study = prefix.rstrip("-") or "robomimic"
+    parser.set_defaults(study=study)
     args = parser.parse_args(argv)
-    if args.dataset is None and args.task is None:
-        args.task = None if args.resume else "square"
-    args.out = output_folder(args, prefix)
+    if args.dataset is None and args.task is None and not args.resume:
+        args.task = default_task(args)
+    args.out = output_folder(args, prefix, default_task(args))
     stored = args.out / "options.json"
     if args.resume and stored.exists():
         options = json.loads(stored.read_text())
+        if options.setdefault("study", study) != study:
+            raise ValueError(
+                f"{args.out} holds a run of another study ({options['study']}): continue it with that "
+                "script, or choose another --out"
+            )
         parser = make_parser()
         types = {action.dest: action.type for action in parser._actions}
         for key, value in options.items():  # JSON knows no paths
@@ -112,22 +103,24 @@ def parse(
         parser.set_defaults(**options)
         args = parser.parse_args(argv)
         args.out = out
-        changed = [key for key in options if getattr(args, key) != options[key]]
+        changed = [key for key in options if _plain(getattr(args, key)) != _plain(options[key])]
         if changed:
             told = ", ".join(f"--{key.replace('_', '-')} {options[key]}" for key in changed)
             raise ValueError(
                 f"{out} was started with {told}: leave these out, or choose another --out"
             )
-    args.task = args.task or (None if args.dataset else "square")
+    args.task = args.task or (None if args.dataset else default_task(args))
     return args
+
+
+def _plain(value: Any) -> Any:
+    return str(value.resolve()) if isinstance(value, Path) else value
 
 
 def store_options(args: argparse.Namespace) -> dict[str, object]:
     """Write the options to the output folder before any work, and return them."""
     options = {
-        key: str(value.resolve()) if isinstance(value, Path) else value
-        for key, value in vars(args).items()
-        if key not in ("out", "resume")
+        key: _plain(value) for key, value in vars(args).items() if key not in ("out", "resume")
     }
     text = json.dumps(options, indent=1) + "\n"
     write_atomic(args.out / "options.json", lambda path: path.write_text(text))
@@ -152,7 +145,7 @@ def make_preset(args: argparse.Namespace) -> Preset:
     return preset
 
 
-def output_folder(args: argparse.Namespace, prefix: str = "") -> Path:
+def output_folder(args: argparse.Namespace, prefix: str = "", default_task: str = "square") -> Path:
     """The folder to write to; never one that holds results, unless they are to be continued."""
     if args.out is not None:
         if (args.out / "results.json").exists() and not args.resume:
@@ -160,21 +153,24 @@ def output_folder(args: argparse.Namespace, prefix: str = "") -> Path:
                 f"{args.out} holds a run: add --resume to continue it, or choose another --out"
             )
         return args.out
-    task = args.task or (args.dataset.stem if args.dataset else "square")
+    task = args.task or (args.dataset.stem if args.dataset else default_task)
     name = f"{prefix}{task}-{args.data}-{args.preset}"
+    return numbered_folder(Path("runs"), name, latest=args.resume)
+
+
+def numbered_folder(parent: Path, name: str, *, latest: bool = False) -> Path:
+    """The first free one of ``name``, ``name-2``, ``name-3``, ...; or the latest one taken."""
 
     def number(folder: Path) -> int:
         return int(folder.name[len(name) + 1 :] or 1)
 
     taken = [
-        d
-        for d in Path("runs").glob(f"{name}*")
-        if d.name == name or d.name[len(name) + 1 :].isdigit()
+        d for d in parent.glob(f"{name}*") if d.name == name or d.name[len(name) + 1 :].isdigit()
     ]
     if not taken:
-        return Path("runs") / name
-    latest = max(taken, key=number)
-    return latest if args.resume else latest.with_name(f"{name}-{number(latest) + 1}")
+        return parent / name
+    last = max(taken, key=number)
+    return last if latest else parent / f"{name}-{number(last) + 1}"
 
 
 def check(args: argparse.Namespace) -> None:
@@ -253,34 +249,29 @@ def start_comparison(
     )
 
 
-def held_out(args: argparse.Namespace, meta: dict[str, Any]) -> tuple[Demonstrations, str]:
-    """The demonstrations to measure on, and what they are in words."""
-    if args.validation is not None:
-        found = Demonstrations(args.validation, "file", meta["style"])
-        if found.sha256 == meta["data"]["sha256"]:
-            return found, "the TRAINING demonstrations (not held out)"
-        return found, f"{args.validation.name}"
-    if meta["data_source"] != "scripted":
+def finished_run(run: Path, device: str) -> tuple[dict[str, Any], dict[str, list[WarmPriorActor]]]:
+    """The facts of a run of robomimic.py and its last policies, by prior one per seed."""
+    path = run / "results.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"--run {run}: it has no results.json; name a run of robomimic.py")
+    meta = json.loads(path.read_text())["meta"]
+    if not {"policies", "task"} <= meta.keys():
+        raise ValueError(f"{path} does not say where its policies lie: run robomimic.py again")
+    entries = [(Prior.from_config(entry["prior"]), entry["folder"]) for entry in meta["policies"]]
+    described = {prior.describe(): prior.name for prior, _ in entries}
+    if len(set(described.values())) < len(described):
         raise ValueError(
-            "these policies were trained on all demonstrations of "
-            f"{meta['data']['file']}: add --validation FILE with others (or with the same file, to "
-            "measure on the training data)"
+            f"--run {run} compares {'; '.join(described)}: name a run of robomimic.py, with one sigma "
+            "and one chunk length"
         )
-    # About a hundred steps each; enough for any --observations in reason.
-    n = max(20, -(-args.observations // 50))
-    found = Demonstrations.held_out(meta["task"], meta["style"], n)
-    return found, f"{n} newly generated demonstrations"
-
-
-def observe(args: argparse.Namespace, path: Path, actor: WarmPriorActor) -> SharedObservations:
-    """Draw the observations, normalised as the policies were trained."""
-    data = RobomimicExperienceReplay(path).data.exclude("next")
-    # A copy: the data are normalised on the CPU, the policy may live elsewhere.
-    normalizer = copy.deepcopy(actor.normalizer).to("cpu")
-    return SharedObservations(
-        normalizer.normalize(data).to(args.device),
-        actor.prior.chunk_length,
-        observation_steps=actor.network.observation_steps,
-        count=args.observations,
-        generator=torch.Generator().manual_seed(0),
-    )
+    last = meta["training"]["iterations"]
+    actors: dict[str, list[WarmPriorActor]] = {}
+    for prior, name in entries:
+        folder = run.resolve().parent / "policies" / name / f"policy_{last:06d}"
+        if not folder.is_dir():
+            raise FileNotFoundError(
+                f"{folder} is missing: finish the run with robomimic.py --resume --out {run}"
+            )
+        actor = WarmPriorActor.from_pretrained(folder, prior=prior, device=device)
+        actors.setdefault(prior.name, []).append(actor)
+    return meta, actors

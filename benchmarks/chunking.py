@@ -18,13 +18,13 @@ import _experiment as experiment
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
 from warmprior._files import write_atomic
 from warmprior.diagnostics import (
-    PRIOR_LABELS,
     Row,
     plot_chunk_lengths,
     plot_success,
     plot_success_bars,
     summarize_cell,
 )
+from warmprior.diagnostics.results import PRIOR_LABELS
 
 COMPARED = (GaussianPrior, PastPrior, PreviewPrior)
 
@@ -111,4 +111,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    experiment.launch(main)

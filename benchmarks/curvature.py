@@ -8,19 +8,19 @@ python benchmarks/curvature.py --run runs/paper --validation square_held_out.hdf
 from __future__ import annotations
 
 import argparse
-import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import _experiment as experiment
+import _measurement as measurement
 import robomimic
 import torch
 
 from warmprior import Prior, WarmPriorActor
 from warmprior._files import check_writable, write_atomic
 from warmprior.diagnostics import (
-    PRIOR_LABELS,
     SharedObservations,
     curvature_table,
     flow_paths,
@@ -28,8 +28,12 @@ from warmprior.diagnostics import (
     straightness,
     write_results,
 )
+from warmprior.diagnostics.results import PRIOR_LABELS
 
 SHOWN = 40
+
+Measured = tuple[dict[str, Any], dict[str, list[WarmPriorActor]], SharedObservations, str]
+"""Facts, policies by prior, the observations to measure on, and what these are in words."""
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -37,61 +41,75 @@ def make_parser() -> argparse.ArgumentParser:
     parser.description = __doc__
     add = parser.add_argument
     add(
-        "--run", type=Path, help="folder of a finished run of robomimic.py; no other options needed"
-    )
-    add(
-        "--validation",
+        "--run",
         type=Path,
-        help="robomimic HDF5 file of held-out demonstrations (default: newly generated ones)",
+        help="folder of a finished run of robomimic.py; only the options below and --out, --device "
+        "go with it",
     )
-    add(
-        "--observations",
-        type=int,
-        default=2_000,
-        help="how many (default: the paper's %(default)s)",
-    )
-    add("--steps", type=int, default=100, help="Euler steps (default: the paper's %(default)s)")
-    add("--draws", type=int, default=1, help="source samples per observation (%(default)s)")
+    measurement.add_options(parser, observations=2_000)
     add("--coordinate", type=int, default=0, help="of the action, in flow_paths.png (%(default)s)")
     return parser
 
 
-def finished_run(
-    args: argparse.Namespace,
-) -> tuple[dict[str, Any], dict[str, list[WarmPriorActor]]]:
-    """The facts of a run of robomimic.py and its last policies, by prior."""
-    path = args.run / "results.json"
-    if not path.is_file():
-        raise FileNotFoundError(
-            f"--run {args.run}: it has no results.json; name a run of robomimic.py"
-        )
-    meta = json.loads(path.read_text())["meta"]
-    if not {"policies", "task"} <= meta.keys():
-        raise ValueError(f"{path} does not say where its policies lie: run robomimic.py again")
-    last = meta["training"]["iterations"]
-    actors: dict[str, list[WarmPriorActor]] = {}
-    for entry in meta["policies"]:
-        folder = args.run.parent / "policies" / entry["folder"] / f"policy_{last:06d}"
-        prior = Prior.from_config(entry["prior"])
-        actor = WarmPriorActor.from_pretrained(folder, prior=prior, device=args.device)
-        actors.setdefault(prior.name, []).append(actor)
-    return meta, actors
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    args = make_parser().parse_args(argv)
+    if args.run is None:
+        return experiment.parse(make_parser, argv, "curvature-")
+    allowed = {"run", "out", "device", "coordinate", "validation", "observations", "steps", "draws"}
+    defaults = vars(make_parser().parse_args([]))
+    ignored = [k for k, v in vars(args).items() if k not in allowed and v != defaults[k]]
+    if ignored:
+        told = ", ".join(f"--{key.replace('_', '-')}" for key in ignored)
+        raise ValueError(f"--run measures policies as they were trained: leave out {told}")
+    run = args.run = args.run.resolve()
+    default = experiment.numbered_folder(run.parent, f"curvature-{run.name}")
+    args.out = experiment.output_folder(args) if args.out is not None else default
+    return args
 
 
-def own_run(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, list[WarmPriorActor]]]:
+def flows_of(priors: Sequence[Prior]) -> list[Prior]:
+    """The priors that have a flow to measure; says which have none."""
+    for prior in priors:
+        if prior.max_nfe is not None:
+            print(f"{prior.name} has no flow and is left out.")
+    flows = [prior for prior in priors if prior.max_nfe is None]
+    if not flows:
+        raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
+    return flows
+
+
+def finished_run(args: argparse.Namespace) -> Measured:
+    """The last policies of a run of robomimic.py."""
+    meta, actors = experiment.finished_run(args.run, args.device)
+    flows = flows_of([group[0].prior for group in actors.values()])
+    actors = {prior.name: actors[prior.name] for prior in flows}
+    first = next(iter(actors.values()))[0]
+    observations, source = measurement.observe(
+        args,
+        meta,
+        first.normalizer,
+        chunk_length=first.prior.chunk_length,
+        observation_steps=first.network.observation_steps,
+    )
+    return meta, actors, observations, source
+
+
+def own_run(args: argparse.Namespace) -> Measured:
     """The policies of these options: those of earlier runs where they exist, or trained now."""
-    preset, priors = experiment.make_preset(args), robomimic.make_priors(args)
+    preset, priors = experiment.make_preset(args), flows_of(robomimic.make_priors(args))
     options = experiment.store_options(args)
     policies = experiment.find_policies(args, preset)
+    meta = policies.facts() | {"options": options}
+    # Before the training: what cannot be measured on is better known now.
+    observations, source = measurement.observe(
+        args,
+        meta,
+        policies.normalizer,
+        chunk_length=args.chunk,
+        observation_steps=preset.observation_steps,
+    )
     actors = {p.name: [policies.policy(p, seed) for seed in range(preset.seeds)] for p in priors}
-    demonstrations = policies.demonstrations
-    return {
-        "task": policies.task,
-        "style": demonstrations.style,
-        "data_source": demonstrations.source,
-        "data": {"file": demonstrations.path.name, "sha256": demonstrations.sha256},
-        "options": options,
-    }, actors
+    return meta, actors, observations, source
 
 
 def draw(
@@ -111,34 +129,27 @@ def draw(
 
 def main(argv: list[str] | None = None) -> int:
     try:
-        args = make_parser().parse_args(argv)
-        if args.run is not None and args.out is None:
-            args.out = args.run.parent / f"curvature-{args.run.name}"
-        elif args.run is None:
-            args = experiment.parse(make_parser, argv, "curvature-")
+        args = parse(argv)
         experiment.check(args)
+        measurement.check(args)
         check_writable(args.out)
         print(f"Output folder: {args.out}", flush=True)
-        meta, actors = own_run(args) if args.run is None else finished_run(args)
-        flows = {name: group for name, group in actors.items() if group[0].prior.max_nfe is None}
-        for name in actors.keys() - flows.keys():
-            print(f"{name} has no flow and is left out.")
-        demonstrations, source = experiment.held_out(args, meta)
-        first = next(iter(flows.values()))[0]
-        width = first.network.action_dim
+        meta, actors, observations, source = (
+            own_run(args) if args.run is None else finished_run(args)
+        )
+        width = observations.data["action"].shape[-1]
         if not 0 <= args.coordinate < width:
             raise ValueError(f"--coordinate must be in [0, {width}), got {args.coordinate}")
-        observations = experiment.observe(args, demonstrations.path, first)
         rows = straightness(
-            flows, observations, n_steps=args.steps, draws=args.draws, description="curvature"
+            actors, observations, n_steps=args.steps, draws=args.draws, description="curvature"
         )
         task, data = meta["task"], meta["style"]
         meta["curvature"] = {"observations": source, "steps": args.steps, "draws": args.draws}
         write_results(args.out / "results.json", meta, rows)
         table = curvature_table(rows, task=task, data=data, source=source)
         write_atomic(args.out / "table.md", lambda path: path.write_text(table))
-        title = f"{task} {data}: action coordinate {args.coordinate} along the flow, held-out observations"
-        draw(args, flows, observations, title)
+        title = f"{task} {data}: action coordinate {args.coordinate} along the flow, {source}"
+        draw(args, actors, observations, title)
     except experiment.ERRORS as error:
         print(f"curvature.py: error: {error}", file=sys.stderr)
         return 2
@@ -147,4 +158,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    experiment.launch(main)

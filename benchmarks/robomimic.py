@@ -12,7 +12,6 @@ import argparse
 import sys
 
 import _experiment as experiment
-import torch
 
 from warmprior import (
     GaussianPrior,
@@ -129,5 +128,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    torch.set_float32_matmul_precision("high")
-    sys.exit(main())
+    experiment.launch(main)

@@ -15,10 +15,18 @@ from collections.abc import Sequence
 from typing import Any
 
 import _experiment as experiment
+import _measurement as measurement
 
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
 from warmprior._files import write_atomic
-from warmprior.diagnostics import PRIOR_LABELS, Row, plot_sigma, straightness, summarize_cell
+from warmprior.diagnostics import (
+    Row,
+    SharedObservations,
+    plot_sigma,
+    straightness,
+    summarize_cell,
+)
+from warmprior.diagnostics.results import PRIOR_LABELS
 from warmprior.training.comparison import Comparison
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
@@ -34,7 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS, help="default: both")
     add("--nfe", type=int, default=1, help="evaluations per chunk (%(default)s, the paper's)")
     add("--chunk", type=int, default=8, help="chunk length H (%(default)s)")
-    experiment.add_curvature_options(parser, observations=500)
+    measurement.add_options(parser, observations=500)
     return parser
 
 
@@ -47,17 +55,27 @@ def make_priors(args: argparse.Namespace) -> list[Prior]:
     return priors
 
 
-def measure(args: argparse.Namespace, comparison: Comparison) -> list[dict[str, Any]]:
-    """Curvature and bound of all policies on the same held-out observations."""
+def observe(args: argparse.Namespace, comparison: Comparison) -> tuple[SharedObservations, str]:
+    """The held-out observations of all policies, and what they are in words."""
+    policies = comparison.policies
+    return measurement.observe(
+        args,
+        comparison.results.meta,
+        policies.normalizer,
+        chunk_length=args.chunk,
+        observation_steps=policies.preset.observation_steps,
+    )
+
+
+def measure(
+    args: argparse.Namespace, comparison: Comparison, observations: SharedObservations
+) -> list[dict[str, Any]]:
+    """Curvature and bound of all policies on the same observations."""
     policies = comparison.policies
     actors = {
         prior.describe(): [policies.policy(prior, seed) for seed in comparison.seeds]
         for prior in comparison.priors
     }
-    demonstrations, source = experiment.held_out(args, comparison.results.meta)
-    first = next(iter(actors.values()))[0]
-    observations = experiment.observe(args, demonstrations.path, first)
-    comparison.results.meta["curvature_observations"] = source
     return straightness(
         actors, observations, n_steps=args.steps, draws=args.draws, description="curvature"
     )
@@ -104,9 +122,13 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = experiment.parse(make_parser, argv, "sigma-")
         preset, priors = experiment.make_preset(args), make_priors(args)
+        measurement.check(args)
         comparison = experiment.start_comparison(args, preset, priors, [args.nfe])
+        # Before the hours of training: what cannot be measured on is better known now.
+        observations, source = observe(args, comparison)
+        comparison.results.meta["curvature_observations"] = source
         results = comparison.run()
-        curvatures = measure(args, comparison)
+        curvatures = measure(args, comparison, observations)
         results.extra["curvature"] = curvatures
         results.save()
         table = make_table(results.rows, curvatures, priors, preset.top_k)
@@ -129,4 +151,4 @@ def main(argv: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    experiment.launch(main)

@@ -9,6 +9,8 @@ import pytest
 
 from tests.benchmarks.conftest import options
 from tests.data.synthetic import write_robomimic_file
+from warmprior import PastPrior
+from warmprior.training.policies import Policies
 
 pytest.importorskip("robosuite")
 
@@ -149,10 +151,6 @@ def test_chunk_length_study(scripts, dataset, tmp_path):
         ("sigma", {"sigmas": [-1.0]}, "sigma"),
         ("sigma", {"nfe": 0}, "--nfe"),
         ("chunking", {"chunks": [0]}, "chunk_length"),
-        ("curvature", {"steps": 1}, "n_steps >= 2"),
-        ("curvature", {"observations": 5_000}, "5000 observations are asked for"),
-        ("curvature", {"validation": None}, "add --validation FILE"),
-        ("curvature", {"validation": "missing.hdf5"}, "missing.hdf5"),
         ("curvature", {"coordinate": 9}, "--coordinate must be in [0, 7)"),
     ],
 )
@@ -174,3 +172,106 @@ def test_a_folder_that_is_no_finished_run_is_named(scripts, tmp_path, capsys, co
         (run / "results.json").write_text(content)
     assert scripts["curvature"].main(["--run", str(run)]) == 2
     assert "robomimic.py" in capsys.readouterr().err
+
+
+@pytest.fixture
+def no_training(monkeypatch):
+    def train(*args):
+        pytest.fail("something was trained")
+
+    monkeypatch.setattr(Policies, "train", train)
+
+
+@pytest.mark.parametrize("script", ["sigma", "curvature"])
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        ({"validation": None}, "add --validation FILE"),
+        ({"validation": "missing.hdf5"}, "missing.hdf5"),
+        ({"validation": "square"}, "holds demonstrations of square"),
+        ({"observations": 5_000}, "5000 observations are asked for"),
+        ({"steps": 1}, "--steps must be at least 2"),
+        ({"draws": 0}, "--draws must be at least 1"),
+    ],
+)
+def test_what_cannot_be_measured_is_named_before_any_training(
+    scripts, dataset, validation, tmp_path, capsys, no_training, script, extra, message
+):
+    if extra.get("validation") == "square":
+        path = tmp_path / "other.hdf5"
+        write_robomimic_file(path, lengths=(25, 30), task="square", seed=1)
+        extra = {"validation": path}
+    argv = options(dataset, **measured(tmp_path / "out", validation) | extra)
+    assert scripts[script].main(argv) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_policies_without_a_flow_have_no_curvature(
+    scripts, dataset, validation, tmp_path, capsys, no_training
+):
+    argv = options(dataset, prior="regression", **measured(tmp_path / "out", validation))
+    assert scripts["curvature"].main(argv) == 2
+    assert "none of these policies has a flow" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--seeds", "3"], "leave out --seeds"),
+        (["--out", "{run}"], "holds a run"),
+        (["--resume"], "leave out --resume"),
+    ],
+)
+def test_a_measured_run_is_neither_overwritten_nor_given_other_options(
+    scripts, tmp_path, capsys, extra, message
+):
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / "results.json").write_text('{"meta": {}, "rows": []}')
+    argv = ["--run", str(run), *(word.format(run=run) for word in extra)]
+    assert scripts["curvature"].main(argv) == 2
+    assert message in capsys.readouterr().err
+    assert stored(run) == {"meta": {}, "rows": []}
+
+
+def test_measuring_a_run_twice_keeps_both_results(scripts, tmp_path):
+    parse = scripts["curvature"].parse
+    argv = ["--run", str(tmp_path / "main")]
+    assert parse(argv).out == tmp_path / "curvature-main"
+    (tmp_path / "curvature-main").mkdir()
+    assert parse(argv).out == tmp_path / "curvature-main-2"
+
+
+def test_only_the_same_study_continues_a_folder(scripts, dataset, tmp_path, capsys):
+    out = tmp_path / "out"
+    out.mkdir()
+    told = json.dumps({"study": "sigma", "nfe": 1})
+    (out / "options.json").write_text(told)
+    assert scripts["robomimic"].main(["--resume", "--out", str(out)]) == 2
+    assert "another study (sigma)" in capsys.readouterr().err
+    assert (out / "options.json").read_text() == told
+
+
+def test_a_relative_path_continues_the_run_of_the_same_file(
+    scripts, dataset, tmp_path, monkeypatch
+):
+    experiment = importlib.import_module("_experiment")
+    monkeypatch.chdir(dataset.parent)
+    argv = ["--dataset", dataset.name, "--out", str(tmp_path)]
+    make_parser = scripts["sigma"].make_parser
+    experiment.store_options(experiment.parse(make_parser, argv, "sigma-"))
+    again = experiment.parse(make_parser, [*argv, "--resume"], "sigma-")
+    assert again.dataset.resolve() == dataset
+
+
+def test_a_run_of_several_sigmas_is_not_taken_for_seeds(scripts, tmp_path, capsys):
+    run = tmp_path / "sigma"
+    run.mkdir()
+    policies = [
+        {"prior": PastPrior(8, sigma=sigma).config(), "seed": 0, "folder": f"past-{sigma}"}
+        for sigma in (0.5, 1.0)
+    ]
+    meta = {"policies": policies, "task": "lift", "training": {"iterations": 1}}
+    (run / "results.json").write_text(json.dumps({"meta": meta, "rows": []}))
+    assert scripts["curvature"].main(["--run", str(run)]) == 2
+    assert "one sigma and one chunk length" in capsys.readouterr().err

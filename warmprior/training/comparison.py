@@ -87,7 +87,7 @@ class Comparison:
 
     def _meta(self) -> dict[str, Any]:
         policies = self.policies
-        preset, demonstrations = policies.preset, policies.demonstrations
+        preset = policies.preset
         packages = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "numpy")
         cuda = "cuda" in policies.device
         return {
@@ -99,15 +99,7 @@ class Comparison:
                 "torch_threads": torch.get_num_threads(),
                 "device": torch.cuda.get_device_name() if cuda else "cpu",
             },
-            "task": policies.task,
-            "style": demonstrations.style,
-            "data_source": demonstrations.source,
-            "data": {
-                "file": demonstrations.path.name,
-                "sha256": demonstrations.sha256,
-                "demonstrations": policies.num_episodes,
-                "steps": policies.num_steps,
-            },
+            **policies.facts(),
             "options": self.options,
             "training": asdict(preset.training),
             "network": {"name": preset.network, **preset.network_options},

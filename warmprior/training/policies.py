@@ -61,14 +61,28 @@ class Policies:
     def __post_init__(self) -> None:
         check_writable(self.directory)
         dataset = RobomimicExperienceReplay(self.demonstrations.path)
-        task = dataset.task
-        self.task: str = dataset.env_args["env_name"].lower() if task is None else task.name
+        self.task = task_of(dataset)
         self.num_episodes, self.num_steps = dataset.num_episodes, len(dataset.data)
         self.normalizer = Normalizer.fit(dataset.data)
         self.data = self.normalizer.normalize(dataset.data.exclude("next")).to(self.device)
         self.make_env = partial(
             RobosuiteEnv, env_args=dataset.env_args, style=self.demonstrations.style
         )
+
+    def facts(self) -> dict[str, Any]:
+        """What ``results.json`` tells about the demonstrations."""
+        demonstrations = self.demonstrations
+        return {
+            "task": self.task,
+            "style": demonstrations.style,
+            "data_source": demonstrations.source,
+            "data": {
+                "file": demonstrations.path.name,
+                "sha256": demonstrations.sha256,
+                "demonstrations": self.num_episodes,
+                "steps": self.num_steps,
+            },
+        }
 
     def new_actor(self, prior: Prior, seed: int) -> WarmPriorActor:
         """An untrained policy; its initial weights depend on the seed alone."""
@@ -161,3 +175,9 @@ class Policies:
         if self.logger == "none":
             return None
         return get_logger(self.logger, logger_name=str(self.logs), experiment_name=name)
+
+
+def task_of(dataset: RobomimicExperienceReplay) -> str:
+    """Short name of a dataset's task, or the environment's where it is none of ours."""
+    task = dataset.task
+    return str(dataset.env_args["env_name"]).lower() if task is None else task.name
