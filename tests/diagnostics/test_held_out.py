@@ -60,6 +60,15 @@ def test_windows_hold_the_same_observations_and_each_priors_own_mean():
     assert torch.equal(part.episodes, data["episode"][frames[[1, 4]]])
 
 
+def test_episode_numbers_may_have_a_dimension_of_their_own():
+    data = steps([10, 3, 8])
+    flat = SharedObservations(data, H)
+    data["episode"] = data["episode"].unsqueeze(-1)
+    column = SharedObservations(data, H)
+    assert torch.equal(column.frames, flat.frames)
+    assert torch.equal(column.episodes, flat.episodes)
+
+
 def test_the_draw_depends_on_the_seed_alone():
     def drawn(seed):
         generator = torch.Generator().manual_seed(seed)
@@ -91,5 +100,8 @@ def test_bad_input_is_named():
         SharedObservations(data, H, count=100)
     with pytest.raises(ValueError, match="one chunk length only"):
         SharedObservations(data, H).windows(PastPrior(H + 1))
+    for offset in (-1, H + 1):
+        with pytest.raises(ValueError, match=f"offset must be between 0 and {H}"):
+            SharedObservations(data, H).windows(PastPrior(H), offset=offset)
     with pytest.raises(KeyError, match="episode"):
         SharedObservations(data.exclude("episode"), H)

@@ -63,12 +63,70 @@ def test_ratios_follow_from_the_fields(monkeypatch):
     assert all(r["ratio_low"] <= r["ratio"] + 1e-9 <= r["ratio_high"] + 2e-9 for r in rows.values())
     assert rows["gaussian", 0, "training"]["bound"] > rows["past", 0, "training"]["bound"]
 
-    text = curvature_table(list(rows.values()), task="square", data="mh", source="a test")
+    # The paper's numbers are for H = 8 and relative to the Gaussian source.
+    own = curvature_table(list(rows.values()), task="square", data="mh", source="a test")
+    assert "paper (official data)" not in own
+    eight = [row | {"chunk": 8} for row in rows.values()]
+    warm = [row for row in eight if row["prior"] != "gaussian"]
+    assert "paper (official" not in curvature_table(warm, task="square", data="mh", source="")
+    text = curvature_table(eight, task="square", data="mh", source="a test")
     assert "| Square-MH, executed H, training mean | 1.000 | 0.625" in text
     assert "| Square-MH, paper (official data) | 1.000 | 0.705 | 0.559 |" in text
     assert "20 observations of a test, averaged over 2 training seeds" in text
     unknown = curvature_table(list(rows.values()), task="lift", data="ph", source="a test")
     assert "paper (official data)" not in unknown
+
+
+def test_an_average_over_seeds_leaves_none_out(monkeypatch):
+    small_loss(monkeypatch)
+    policies = {
+        "gaussian": [policy(turning(2.0)), policy(turning(2.0))],
+        "past": [policy(turning(0.0), PastPrior(H)), policy(turning(1.0), PastPrior(H))],
+    }
+    with pytest.warns(UserWarning, match="do not move"):
+        rows = {(r["policy"], r["seed"], r["mean"]): r for r in straightness(policies, shared())}
+    assert rows["past", 1, "training"]["ratio_executed"] == pytest.approx(1 / 4, rel=1e-4)
+    for seed in (0, None):
+        row = rows["past", seed, "training"]
+        # Nor is an exact Euler step from nowhere to nowhere a merit.
+        assert math.isnan(row["ratio_executed"]) and math.isnan(row["ratio_one_step"])
+
+
+def test_the_noise_of_the_earlier_prediction_is_not_that_of_the_path(monkeypatch):
+    """A field of 0 predicts mean + noise; from the mean it makes, the next source starts."""
+    small_loss(monkeypatch)
+    starts = []
+
+    def field(t, a, o):
+        if bool((t == 0).all()):
+            starts.append(a.clone())
+        return torch.ones_like(a)
+
+    observations = shared(count=None)
+    demonstrated = observations.windows(PastPrior(H))["prior", "loc"]
+    straightness({"past": [policy(field, PastPrior(H, sigma=1.0))]}, observations, n_steps=2)
+    # At time 0: the earlier prediction, then path and one step at either mean.
+    earlier, at_training, at_deployed = starts[0], starts[1], starts[3]
+    noise = at_training - demonstrated
+    assert torch.equal(starts[1], starts[2]) and torch.equal(starts[3], starts[4])
+    mean = earlier + 1.0  # what the field makes of it
+    torch.testing.assert_close(at_deployed - mean, noise, atol=1e-5, rtol=0)
+    previous = earlier - observations.windows(PastPrior(H), offset=H)["prior", "loc"]
+    both = torch.stack([noise.flatten(), previous.flatten()])
+    assert abs(float(torch.corrcoef(both)[0, 1])) < 0.25
+
+
+def test_the_bound_is_that_of_the_mean_it_stands_beside(monkeypatch):
+    small_loss(monkeypatch)
+    far = {"past": [policy(lambda t, a, o: torch.full_like(a, 100.0), PastPrior(H))]}
+    bounds = {row["mean"]: row["bound"] for row in straightness(far, shared(), n_steps=4)}
+    assert bounds["deployed"] > 1_000 > bounds["training"]
+
+
+def test_a_path_that_diverges_names_its_policy():
+    policies = {"past": [policy(lambda t, a, o: a * math.inf, PastPrior(H))]}
+    with pytest.raises(FloatingPointError, match="past, training mean: 20 of 20 paths"):
+        straightness(policies, shared(), n_steps=4)
 
 
 def test_one_seed_one_result(monkeypatch):

@@ -57,7 +57,7 @@ class SharedObservations:
         episode = data.get(keys.EPISODE, None)
         if episode is None:
             raise KeyError(f"the data lack {keys.EPISODE!r}, the number of each step's episode")
-        episode = episode.cpu()
+        episode = episode.flatten().cpu()
         first = torch.arange(len(episode)) - chunk_length
         frames = ((first >= 0) & (episode[first.clamp_min(0)] == episode)).nonzero().flatten()
         if count is not None:
@@ -85,8 +85,10 @@ class SharedObservations:
             Windows ``[n]``, see :class:`~warmprior.ActionWindow`.
 
         Raises:
-            ValueError: if the prior has another chunk length.
+            ValueError: if the prior has another chunk length, or ``offset`` is out of range.
         """
+        if not 0 <= offset <= self.chunk_length:
+            raise ValueError(f"offset must be between 0 and {self.chunk_length}, got {offset}")
         if prior.chunk_length != self.chunk_length:
             raise ValueError(
                 f"policies compare at one chunk length only: these observations have H = "

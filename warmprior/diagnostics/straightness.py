@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
@@ -59,42 +59,48 @@ def straightness(
         One row per policy, training seed and mean, and one with ``"seed": None`` for the average over
         several seeds: ``"policy"``, ``"prior"``, ``"sigma"``, ``"chunk"``, ``"seed"``, ``"mean"``
         (``"training"`` or ``"deployed"``), ``"observations"``; the means of :func:`curvature`'s
-        entries; ``"bound"`` (:func:`branching_bound`, where it applies); and per ratio of
+        entries; ``"bound"`` (:func:`branching_bound` at this mean, where it applies); and per ratio of
         :data:`RATIOS` its value and 95% interval (``"ratio"``, ``"ratio_low"``, ``"ratio_high"``, and
-        so on). NaN, with a warning, where a policy predicts no motion.
+        so on). NaN, with a warning, where a policy predicts no motion; an average is, if any seed is.
 
     Raises:
         ValueError: if the numbers of training seeds or the chunk lengths differ, or a policy is no flow.
+        FloatingPointError: if a path becomes NaN or infinite.
     """
     counts = {name: len(actors) for name, actors in policies.items()}
     if len(set(counts.values())) != 1 or not next(iter(counts.values())):
         raise ValueError(f"every policy needs the same number of training seeds, got {counts}")
     measured: dict[tuple[str, str], list[TensorDict]] = {}
+    bounds: dict[tuple[str, str], list[float]] = {}
     jobs = [(name, actor) for name, actors in policies.items() for actor in actors]
     for name, actor in tqdm(jobs, desc=description, disable=description is None):
-        generator = torch.Generator(next(actor.parameters()).device)
+        device = next(actor.parameters()).device
+        # Of the earlier prediction: at deployment its noise and that of the next are independent.
+        earlier = torch.Generator(device).manual_seed(seed + 1)
         batches = {"training": observations.windows(actor.prior)}
         if batches["training"]["prior", "warm"].any():
-            batches["deployed"] = observations.deployed(
-                actor, generator=generator.manual_seed(seed)
-            )
+            batches["deployed"] = observations.deployed(actor, generator=earlier)
         for mean, batch in batches.items():
             # The same source noise for every policy and mean.
-            generator.manual_seed(seed)
-            values = curvature(actor, batch, n_steps, draws=draws, generator=generator).cpu()
+            generator = torch.Generator(device).manual_seed(seed)
+            try:
+                values = curvature(actor, batch, n_steps, draws=draws, generator=generator).cpu()
+            except FloatingPointError as error:
+                raise FloatingPointError(f"{name}, {mean} mean: {error}") from error
             measured.setdefault((name, mean), []).append(values)
+            bounds.setdefault((name, mean), []).append(_bound(actor.prior, batch))
     base = next(iter(policies))
     rows = []
     for (name, mean), per_seed in measured.items():
         prior = policies[name][0].prior
-        bound = _bound(prior, observations)
-        parts: list[tuple[int | None, TensorDict, TensorDict]] = [
-            (s, values, measured[base, "training"][s]) for s, values in enumerate(per_seed)
+        parts: list[tuple[int | None, TensorDict, TensorDict, float]] = [
+            (s, values, measured[base, "training"][s], bounds[name, mean][s])
+            for s, values in enumerate(per_seed)
         ]
         if len(per_seed) > 1:
-            bases = measured[base, "training"]
-            parts.append((None, _average(per_seed), _average(bases)))
-        for s, values, baseline in parts:
+            average, bases = _average(per_seed), _average(measured[base, "training"])
+            parts.append((None, average, bases, math.fsum(bounds[name, mean]) / len(per_seed)))
+        for s, values, baseline, bound in parts:
             row: dict[str, Any] = {
                 "policy": name,
                 "prior": prior.name,
@@ -115,32 +121,40 @@ def _mean(values: Tensor) -> float:
 
 
 def _average(per_seed: Sequence[TensorDict]) -> TensorDict:
+    # NaN where any seed predicts no motion: the others alone would be no average over the seeds.
     mean = {
-        key: torch.stack([values[key] for values in per_seed]).nanmean(0)
+        key: torch.stack([values[key] for values in per_seed]).mean(0)
         for key, _ in per_seed[0].items()
     }
     return TensorDict(mean, batch_size=per_seed[0].shape)
 
 
-def _bound(prior: Prior, observations: SharedObservations) -> float:
+def _bound(prior: Prior, batch: TensorDictBase) -> float:
     if type(prior).sample is not Prior.sample or prior.conditions_network:
         return math.nan
-    return _mean(branching_bound(observations.windows(prior), prior)["total"])
+    return _mean(branching_bound(batch, prior)["total"])
 
 
 def _ratios(
     values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int
 ) -> dict[str, float]:
     out: dict[str, float] = {}
+    # A field that predicts no motion has no error of one step either, and no merit in that.
+    still = values["kappa_executed"].isnan()
     for name, key in RATIOS.items():
         generator = torch.Generator().manual_seed(seed)
-        ends = bootstrap_ratio(values[key], baseline[key], episodes, generator=generator)
+        counted = values[key]
+        if name == "ratio_one_step":
+            counted = counted.masked_fill(still, math.nan)
+        ends = bootstrap_ratio(counted, baseline[key], episodes, generator=generator)
         out.update(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
     return out
 
 
 def curvature_table(rows: Sequence[dict[str, Any]], *, task: str, data: str, source: str) -> str:
     """The layout of the paper's Table 2 in Markdown, with the paper's own numbers in a row of their own.
+
+    The paper's are for ``H = 8`` and relative to the Gaussian source; otherwise they are left out.
 
     Args:
         rows: of :func:`straightness`.
@@ -172,9 +186,10 @@ def curvature_table(rows: Sequence[dict[str, Any]], *, task: str, data: str, sou
             cells = [_cell(chosen, name, mean, ratio) for name in names]
             lines.append(f"| {title}, {what}, {mean} mean | " + " | ".join(cells) + " |")
     paper = PAPER_CURVATURE.get((task, data))
-    if paper is not None:
+    if paper is not None and chosen[0]["prior"] == "gaussian" and chosen[0]["chunk"] == 8:
         values = dict(zip(PAPER_PRIORS, (1.0, *paper), strict=True))
-        cells = [f"{values[name]:.3f}" if name in values else "-" for name in names]
+        shown = [row["prior"] for row in map(_first(chosen), names)]
+        cells = [f"{values[prior]:.3f}" if prior in values else "-" for prior in shown]
         lines.append(f"| {title}, paper (official data) | " + " | ".join(cells) + " |")
     count = chosen[0]["observations"]
     several = f", averaged over {len(seeds) - 1} training seeds" if None in seeds else ", one seed"
