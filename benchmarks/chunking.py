@@ -53,6 +53,7 @@ def make_table(rows: Sequence[Row], chunks: Sequence[int], nfes: Sequence[int], 
         + " |",
         "|" + "---|" * (len(columns) + 1),
     ]
+    last = max(row.checkpoint for row in rows)
     jumps = [lines[0].replace("success (%)", "jump at boundaries"), lines[1]]
     for chunk in chunks:
         success, jump = [], []
@@ -61,12 +62,16 @@ def make_table(rows: Sequence[Row], chunks: Sequence[int], nfes: Sequence[int], 
             summary = summarize_cell(cell, top_k)
             spread = f" ± {100 * summary.std:.1f}" if summary.seeds > 1 else ""
             success.append(f"{100 * summary.mean:.1f}{spread}")
-            known = [row.boundary_jump for row in cell if row.boundary_jump is not None]
+            known = [row.boundary_jump for row in cell if row.checkpoint == last]
+            known = [value for value in known if value is not None]
             jump.append(f"{sum(known) / len(known):.3f}" if known else "-")
         lines.append(f"| H = {chunk} | " + " | ".join(success) + " |")
         jumps.append(f"| H = {chunk} | " + " | ".join(jump) + " |")
-    note = "Jump: mean distance between the last action of a chunk and the first of the next, in"
-    return "\n".join([*lines, "", *jumps, "", f"{note} normalised action units."]) + "\n"
+    note = (
+        "Jump: mean distance between the last action of a chunk and the first of the next, in "
+        "normalised action units, of the last checkpoints."
+    )
+    return "\n".join([*lines, "", *jumps, "", note]) + "\n"
 
 
 def main(argv: list[str] | None = None) -> int:

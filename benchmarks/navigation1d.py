@@ -22,7 +22,7 @@ from typing import Any
 
 import torch
 
-from warmprior._files import check_writable
+from warmprior._files import check_writable, write_atomic
 from warmprior.diagnostics import (
     executed_actions,
     flow_paths,
@@ -58,6 +58,9 @@ PANELS = {
     "past 0.1": "WP-Past, sigma = 0.1",
     "past 0.5": "WP-Past, sigma = 0.5",
 }
+ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError)
+"""What a user can mend: reported without a traceback."""
+
 FLOWS = ("base", "history", "past 0.1", "past 0.5", "preview 0.5")
 
 
@@ -174,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parse(argv)
     try:
         study = make_study(args)
-    except (ValueError, OSError) as error:
+    except ERRORS as error:
         print(f"navigation1d.py: error: {error}", file=sys.stderr)
         return 2
     if study.preset.hidden_dim < 512:
@@ -197,11 +200,11 @@ def main(argv: list[str] | None = None) -> int:
             write_results(study.directory / "results.json", meta, rows)
             if seed == 0:
                 draw(study, actors, rows)
-    except (ValueError, OSError) as error:
+        text = table(rows, list(study.priors))
+        write_atomic(study.directory / "table.md", lambda path: path.write_text(text))
+    except ERRORS as error:
         print(f"navigation1d.py: error: {error}", file=sys.stderr)
         return 2
-    text = table(rows, list(study.priors))
-    (study.directory / "table.md").write_text(text)
     print(f"\n{text}\nResults, table and pictures: {study.directory}")
     return 0
 

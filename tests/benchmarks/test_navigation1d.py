@@ -69,6 +69,17 @@ def test_bad_options_stop_before_any_work(benchmark, tmp_path, capsys, option, v
     assert "error" in capsys.readouterr().err and not (out / "results.json").exists()
 
 
+def test_a_training_that_diverges_ends_without_a_traceback(
+    benchmark, tmp_path, capsys, monkeypatch
+):
+    def diverge(study, seed):
+        raise FloatingPointError("the loss became nan")
+
+    monkeypatch.setattr(benchmark, "run_seed", diverge)
+    assert benchmark.main(["--out", str(tmp_path / "out")]) == 2
+    assert "error: the loss became nan" in capsys.readouterr().err
+
+
 def test_table_tells_what_is_missing(benchmark):
     rows = [
         {"policy": "a", "switch_rate": 0.25, "kappa_executed": math.nan},

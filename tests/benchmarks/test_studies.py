@@ -10,6 +10,7 @@ import pytest
 from tests.benchmarks.conftest import options
 from tests.data.synthetic import write_robomimic_file
 from warmprior import PastPrior
+from warmprior.diagnostics import Row
 from warmprior.training.policies import Policies
 
 pytest.importorskip("robosuite")
@@ -275,3 +276,12 @@ def test_a_run_of_several_sigmas_is_not_taken_for_seeds(scripts, tmp_path, capsy
     (run / "results.json").write_text(json.dumps({"meta": meta, "rows": []}))
     assert scripts["curvature"].main(["--run", str(run)]) == 2
     assert "one sigma and one chunk length" in capsys.readouterr().err
+
+
+def test_jumps_are_those_of_the_last_checkpoint_as_in_the_figure(scripts):
+    def row(prior, checkpoint, jump):
+        return Row("lift", "ph", prior, 1.0, 1, 1, 0, checkpoint, 10, 5, 9.0, jump)
+
+    rows = [row(p, *at) for p in ("gaussian", "past", "preview") for at in ((5, 9.0), (10, 0.25))]
+    table = scripts["chunking"].make_table(rows, [1], [1], 2)
+    assert table.splitlines()[6] == "| H = 1 | 0.250 | 0.250 | 0.250 |"
