@@ -90,6 +90,10 @@ def test_an_average_over_seeds_leaves_none_out(monkeypatch):
         row = rows["past", seed, "training"]
         # Nor is an exact Euler step from nowhere to nowhere a merit.
         assert math.isnan(row["ratio_executed"]) and math.isnan(row["ratio_one_step"])
+    with pytest.warns(UserWarning, match="do not move"):  # the baseline, now
+        rows = straightness(dict(reversed(policies.items())), shared())
+    base = [row for row in rows if (row["policy"], row["seed"]) == ("gaussian", 0)]
+    assert len(base) == 1 and math.isnan(base[0]["ratio_one_step"])
 
 
 def test_the_noise_of_the_earlier_prediction_is_not_that_of_the_path(monkeypatch):

@@ -140,7 +140,7 @@ def _ratios(
 ) -> dict[str, float]:
     out: dict[str, float] = {}
     # A field that predicts no motion has no error of one step either, and no merit in that.
-    still = values["kappa_executed"].isnan()
+    still = values["kappa_executed"].isnan() | baseline["kappa_executed"].isnan()
     for name, key in RATIOS.items():
         generator = torch.Generator().manual_seed(seed)
         counted = values[key]
