@@ -6,15 +6,12 @@ from warmprior.diagnostics.held_out import SharedObservations
 from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.navigation_plots import plot_flow_paths, plot_navigation
 from warmprior.diagnostics.paper import (
-    PAPER_CURVATURE,
-    PAPER_SIGMA,
-    PAPER_SUCCESS,
     paper_success,
 )
 from warmprior.diagnostics.paths import flow_paths, forecast_mean
 from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
+from warmprior.diagnostics.reinforcement_plots import plot_reinforcement
 from warmprior.diagnostics.results import (
-    PRIOR_LABELS,
     Results,
     Row,
     success_table,
@@ -45,10 +42,6 @@ from warmprior.diagnostics.study_plots import (
 )
 
 __all__ = [
-    "PAPER_CURVATURE",
-    "PAPER_SIGMA",
-    "PAPER_SUCCESS",
-    "PRIOR_LABELS",
     "HistoryShift",
     "Results",
     "Row",
@@ -72,6 +65,7 @@ __all__ = [
     "plot_flow_paths",
     "plot_learning_curves",
     "plot_navigation",
+    "plot_reinforcement",
     "plot_sigma",
     "plot_success",
     "plot_success_bars",

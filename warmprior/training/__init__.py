@@ -15,6 +15,9 @@ from warmprior.training.navigation1d import (
 )
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.presets import PRESETS, Preset
+from warmprior.training.prior_space import PriorSpaceTraining
+from warmprior.training.prior_space_config import PriorSpaceConfig
+from warmprior.training.replay_segments import ReplaySegments
 
 __all__ = [
     "NAVIGATION_PRESETS",
@@ -25,6 +28,9 @@ __all__ = [
     "NavigationPreset",
     "NavigationStudy",
     "Preset",
+    "PriorSpaceConfig",
+    "PriorSpaceTraining",
+    "ReplaySegments",
     "TrainingConfig",
     "ema_of",
     "evaluate",

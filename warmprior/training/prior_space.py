@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.decoder import PriorDecoder, moves_source
+from warmprior.modules.decoder import PriorDecoder
 from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
 from warmprior.modules.residual import ResidualSampler
 from warmprior.objectives import DSRLNALoss
@@ -37,79 +37,10 @@ from warmprior.training.checkpoint import (
     snapshot_optimizer,
 )
 from warmprior.training.evaluation import Episode, evaluate
+from warmprior.training.prior_space_config import PriorSpaceConfig
 from warmprior.training.replay_segments import ReplaySegments
 
-__all__ = ["PriorSpaceConfig", "PriorSpaceTraining"]
-
-
-@dataclass(frozen=True)
-class PriorSpaceConfig:
-    """The recipe; the defaults are DSRL's for Lift, Can and Square, around a WarmPrior mean.
-
-    Attributes:
-        algorithm: ``"dsrl-na"`` or ``"dsrl-sac"``.
-        environment_steps: control steps to collect, those of the warm-up included.
-        warmup_steps: control steps with residuals drawn from the prior, before the first update.
-        delta: half the side of the agent's box; ``None`` for 0.5 around a mean and 1.5 around zero.
-        nfe: network evaluations per decoded chunk.
-        updates: updates per vector step (one decision of every parallel environment).
-        noise_critic_steps: distillation updates per vector step, DSRL-NA only.
-        batch_size: transitions per update.
-        learning_rate: of actor, critics and temperature.
-        tau: of the target critics' averaging.
-        gamma: discount per decision.
-        hidden_dim: width of actor and critics.
-        num_layers: their number of hidden layers.
-        backup: ``"min"`` or ``"mean"`` over critics, DSRL-NA only.
-        target_entropy: in units of the box.
-        reward_offset: subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
-        bootstrap_timeouts: whether the value after a time-out counts; DSRL takes it for a termination.
-        evaluate_every: control steps between evaluations (and saves).
-        evaluation_episodes: episodes per evaluation, greedy and stochastic each.
-        seed: of everything random.
-    """
-
-    algorithm: Literal["dsrl-na", "dsrl-sac"] = "dsrl-na"
-    environment_steps: int = 1_000_000
-    warmup_steps: int = 24_000
-    delta: float | None = None
-    nfe: int = 1
-    updates: int = 20
-    noise_critic_steps: int = 10
-    batch_size: int = 256
-    learning_rate: float = 3e-4
-    tau: float = 0.005
-    gamma: float = 0.99
-    hidden_dim: int = 2048
-    num_layers: int = 3
-    backup: Literal["min", "mean"] = "min"
-    target_entropy: float = 0.0
-    reward_offset: float = 1.0
-    bootstrap_timeouts: bool = False
-    evaluate_every: int = 20_000
-    evaluation_episodes: int = 200
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.algorithm not in ("dsrl-na", "dsrl-sac"):
-            raise ValueError(f"algorithm must be dsrl-na or dsrl-sac, got {self.algorithm!r}")
-        if self.delta is not None and not (self.delta > 0 and math.isfinite(self.delta)):
-            raise ValueError(f"delta must be a finite number > 0, got {self.delta}")
-        counts = ("environment_steps", "warmup_steps", "nfe", "updates", "batch_size")
-        for name in (*counts, "evaluate_every", "evaluation_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.warmup_steps > self.environment_steps:
-            raise ValueError(
-                f"warmup_steps ({self.warmup_steps}) exceed environment_steps "
-                f"({self.environment_steps})"
-            )
-
-    def box(self, actor: WarmPriorActor) -> float:
-        """``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
-        if self.delta is not None:
-            return self.delta
-        return 0.5 if moves_source(actor.prior) else 1.5
+__all__ = ["PriorSpaceTraining"]
 
 
 class PriorSpaceTraining:
@@ -182,7 +113,7 @@ class PriorSpaceTraining:
         return self.directory / "state.safetensors"
 
     def _network(self, make: Callable[..., Any], **options: Any) -> Any:
-        network = self.actor.network
+        network: Any = self.actor.network
         return make(
             network.action_dim,
             network.observation_dim - self.actor.prior.context_dim(network.action_dim),
@@ -207,15 +138,16 @@ class PriorSpaceTraining:
                 discount="decision",
                 noise_critic_steps=config.noise_critic_steps,
                 bootstrap_timeouts=config.bootstrap_timeouts,
+                alpha_init=config.alpha_init,
                 target_entropy=config.target_entropy,
             )
-        size = (self.actor.prior.prediction_length, self.actor.network.action_dim)
+        size = (self.actor.prior.prediction_length, int(agent.spec[keys.DELTA].shape[-1]))
         box = Composite({keys.DELTA: Bounded(-delta, delta, size)})
         return SACLoss(
             agent,
             noise_critic,
             action_spec=box,
-            alpha_init=1.0,
+            alpha_init=config.alpha_init,
             # TorchRL's log-probabilities are those of the residual, not of units of the box.
             target_entropy=config.target_entropy + math.prod(size) * math.log(delta),
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -51,7 +52,7 @@ class ReplaySegments:
         """Write what was appended as one new segment, if anything was."""
         if not self._pending:
             return
-        data = torch.cat(self._pending)
+        data: Any = torch.cat(self._pending)  # type: ignore[arg-type]
         tensors = {
             SEPARATOR.join(key) if isinstance(key, tuple) else key: value.cpu().contiguous()
             for key, value in data.items(True, True)
