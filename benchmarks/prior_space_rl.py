@@ -98,13 +98,14 @@ BUDGETS = {
     "quick": Budget(
         summary="can from a weak policy, WP-Past against the base, two seeds: half an hour",
         config=PriorSpaceConfig(
-            environment_steps=30_000,
+            environment_steps=24_000,
             warmup_steps=4_000,
             nfe=1,
             updates=4,
             noise_critic_steps=2,
-            hidden_dim=256,
-            evaluate_every=10_000,
+            batch_size=128,
+            hidden_dim=128,
+            evaluate_every=8_000,
             evaluation_episodes=25,
         ),
         pretraining=replace(

@@ -24,6 +24,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import _prior_space_figures as prior_space
 import numpy as np
 import torch
 from tensordict import TensorDict
@@ -260,6 +261,8 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "env_over_robosuite": (env_over_robosuite, ">= 2"),
     "chunk_step_overhead": (chunk_step_overhead, "<= 0.15"),
     "load_memory_over_data": (load_memory_over_data, "<= 1.3"),
+    "prior_space_decoding": (prior_space.decoding, ""),
+    "prior_space_collection_over_env": (prior_space.collection_over_env, ""),
 }
 
 
@@ -282,7 +285,7 @@ def main(argv: list[str] | None = None) -> None:
             measure, target = FIGURES[name]
             results[name] = value = measure(Clock(options.repeats, bar))
             shown = f"{value:.4g}" if isinstance(value, float) else json.dumps(value)
-            tqdm.write(f"{name:30} {shown} {f'(target {target})' if target else ''}")
+            tqdm.write(f"{name:32} {shown} {f'(target {target})' if target else ''}")
     packages = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "lerobot")
     results["meta"] = {
         "versions": {name: version(name) for name in packages if importlib.util.find_spec(name)},

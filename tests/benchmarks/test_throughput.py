@@ -21,6 +21,8 @@ KEYS = {
     "env_over_robosuite",
     "chunk_step_overhead",
     "load_memory_over_data",
+    "prior_space_decoding",
+    "prior_space_collection_over_env",
     "meta",
 }
 
