@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -44,7 +48,26 @@ class Episode:
 def _transformed(
     make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]
 ) -> EnvBase:
+    _end_with_parent()
     return TransformedEnv(make_env(), make_transforms())
+
+
+def _end_with_parent() -> None:
+    """Let this process end when the one that started it dies, however abruptly.
+
+    A killed process cannot tell its workers to stop. They would wait on their pipes for hours: its end of
+    each pipe is also held by the workers that were forked later. The main process is left alone.
+    """
+    if multiprocessing.parent_process() is None:
+        return
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)  # nobody is left to be told, and the environment may be in the middle of a step
+
+    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 
 
 def parallel_env(
@@ -82,7 +105,7 @@ def parallel_env(
 
 
 @contextmanager
-def _watched(env: EnvBase) -> Iterator[None]:
+def watched(env: EnvBase) -> Iterator[None]:
     """Turn the death of a worker into an error: TorchRL alone would wait for it for hours."""
     base = env
     while isinstance(base, TransformedEnv):
@@ -172,7 +195,9 @@ def evaluate(
         episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
         first_seed: seed of the first episode; keep it away from the data's seeds.
         nfe: network evaluations per chunk of a :class:`~warmprior.WarmPriorActor`; its own by default.
-        policy_seed: of the policy's random draws.
+        policy_seed: of the policy's random draws: those of a :class:`~warmprior.WarmPriorActor`, or those
+            that another module takes from PyTorch's global generator. The latter goes on afterwards as if
+            nothing had been played.
         description: of the progress bar; no bar if ``None``.
 
     Returns:
@@ -187,7 +212,9 @@ def evaluate(
         raise ValueError(f"episodes must be at least 1, got {episodes}")
     num_envs = env.batch_size[0]
     policy.eval()
-    device = next(policy.parameters()).device
+    # Policies without an agent, such as residuals drawn for a decoder, have buffers alone, or nothing.
+    tensors = chain(policy.parameters(), policy.buffers())
+    device = next((tensor.device for tensor in tensors), torch.device("cpu"))
     options = {} if nfe is None else {"nfe": nfe}
     # The simulators need the cores; a policy's call is small, and its idle threads would spin.
     threads = torch.get_num_threads()
@@ -198,7 +225,7 @@ def evaluate(
     executed: list[list[Tensor]] = [[] for _ in played]
     bar = tqdm(total=episodes, desc=description, unit="ep", disable=description is None)
     try:
-        with bar, _watched(env), _drawing(policy, policy_seed, device):
+        with bar, watched(env), _drawing(policy, policy_seed, device):
             env.set_seed(first_seed, static_seed=True)
             data = env.reset()
             while len(outcomes) < episodes:

@@ -3,40 +3,26 @@
 from __future__ import annotations
 
 import hashlib
-import math
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, TensorDictSequential
-from tensordict.utils import unravel_key
-from torch import Tensor
-from torchrl.data import Bounded, Composite, LazyTensorStorage, ReplayBuffer
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, unravel_key
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.decoder import PriorDecoder
-from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
-from warmprior.modules.residual import ResidualSampler
-from warmprior.objectives import DSRLNALoss
-from warmprior.objectives._prior_space import check_finite
-from warmprior.training.checkpoint import (
-    load_state,
-    named,
-    restore_optimizer,
-    save_state,
-    select,
-    snapshot_optimizer,
-)
-from warmprior.training.evaluation import Episode, evaluate
+from warmprior.training.checkpoint import load_state, save_state
+from warmprior.training.evaluation import Episode, evaluate, watched
+from warmprior.training.prior_space_agent import PriorSpaceAgent
 from warmprior.training.prior_space_config import PriorSpaceConfig
 from warmprior.training.replay_segments import ReplaySegments
 
@@ -61,9 +47,14 @@ class PriorSpaceTraining:
         evaluation_seed: simulator seed of the first evaluation episode.
         description: of the progress bar; no bar if ``None``.
 
+    Attributes:
+        decoder: the frozen policy as a decoder.
+        steps: control steps so far, those of the warm-up included.
+        curve: the evaluations so far, see :meth:`run`.
+
     Raises:
-        ValueError: if the environment does not fit the policy, or the folder's state belongs to another
-            recipe or policy.
+        ValueError: if the recipe does not suit the policy, or the folder's state belongs to another
+            recipe or policy, or its replay buffer to another wiring.
     """
 
     def __init__(
@@ -80,17 +71,8 @@ class PriorSpaceTraining:
         self.directory = Path(directory)
         self.evaluation_seed, self.description = evaluation_seed, description
         torch.manual_seed(config.seed)
-        self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
-        self.warmup = TensorDictSequential(
-            ResidualSampler(self.decoder, distribution="clipped"), self.decoder
-        )
-        self.device = next(actor.parameters()).device
-        agent = self._network(make_prior_space_actor, delta=self.decoder.delta).to(self.device)
-        self.policy = TensorDictSequential(agent, self.decoder)
-        self.loss = self._make_loss(agent).to(self.device)
-        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
-        self.updater = SoftUpdate(self.loss, tau=config.tau)
-        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.learning_rate)
+        self.agent = PriorSpaceAgent(actor, config)
+        self.decoder, self.device = self.agent.decoder, self.agent.device
         # No transition is ever dropped: at least one control step each.
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(config.environment_steps, device=self.device),
@@ -112,46 +94,6 @@ class PriorSpaceTraining:
         """Where the training state lies."""
         return self.directory / "state.safetensors"
 
-    def _network(self, make: Callable[..., Any], **options: Any) -> Any:
-        network: Any = self.actor.network
-        return make(
-            network.action_dim,
-            network.observation_dim - self.actor.prior.context_dim(network.action_dim),
-            self.actor.prior.prediction_length,
-            network.observation_steps,
-            hidden_dim=self.config.hidden_dim,
-            num_layers=self.config.num_layers,
-            **options,
-        )
-
-    def _make_loss(self, agent: Any) -> Any:
-        config, delta = self.config, self.decoder.delta
-        noise_critic = self._network(make_prior_space_critic, delta=delta)
-        if config.algorithm == "dsrl-na":
-            chunk_keys = (keys.OBSERVATION, keys.CHUNK)
-            return DSRLNALoss(
-                agent,
-                self._network(make_prior_space_critic, in_keys=chunk_keys),
-                noise_critic,
-                self.decoder,
-                backup=config.backup,
-                discount="decision",
-                noise_critic_steps=config.noise_critic_steps,
-                bootstrap_timeouts=config.bootstrap_timeouts,
-                alpha_init=config.alpha_init,
-                target_entropy=config.target_entropy,
-            )
-        size = (self.actor.prior.prediction_length, int(agent.spec[keys.DELTA].shape[-1]))
-        box = Composite({keys.DELTA: Bounded(-delta, delta, size)})
-        return SACLoss(
-            agent,
-            noise_critic,
-            action_spec=box,
-            alpha_init=config.alpha_init,
-            # TorchRL's log-probabilities are those of the residual, not of units of the box.
-            target_entropy=config.target_entropy + math.prod(size) * math.log(delta),
-        )
-
     def run(self) -> list[dict[str, Any]]:
         """Collect, learn and evaluate to the end.
 
@@ -160,11 +102,14 @@ class PriorSpaceTraining:
             ``"greedy"``, ``"stochastic"``), ``episodes``, ``successes``, ``success_rate``.
 
         Raises:
-            FloatingPointError: if a loss becomes NaN or infinite; the last save stays.
+            ValueError: if the environment does not fit the policy, see :meth:`PriorDecoder.check_env`.
+            FloatingPointError: if a loss, a parameter or what the environment gives becomes NaN or
+                infinite; the last save stays.
+            RuntimeError: if a worker process of an environment dies.
         """
         config = self.config
-        evaluation_env = self.make_env(0)
-        env = self.make_env(self._training_seed())
+        if self.steps >= config.environment_steps:
+            return self.curve
         bar = tqdm(
             total=config.environment_steps,
             initial=self.steps,
@@ -172,7 +117,9 @@ class PriorSpaceTraining:
             unit="step",
             disable=self.description is None,
         )
-        try:
+        evaluating, training = _opened(self.make_env, 0), _opened(self.make_env, self._seed())
+        with bar, evaluating as evaluation_env, training as env:
+            self.decoder.check_env(env)
             if not self.curve:
                 self._evaluate(evaluation_env, {"base": self.actor})
                 self._save()
@@ -182,42 +129,46 @@ class PriorSpaceTraining:
                 before, self.steps = self.steps, self.steps + executed
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
-                    self._learn(bar)
+                    told = self.agent.learn(self.buffer)
+                    bar.set_postfix(told, refresh=False)
                 due = self.steps // config.evaluate_every > before // config.evaluate_every
                 if due or self.steps >= config.environment_steps:
-                    agents = {"greedy": self.policy, "stochastic": self.policy}
-                    self._evaluate(evaluation_env, agents)
+                    self.agent.state()  # Raises for an agent that is not worth an evaluation.
+                    policy = self.agent.policy
+                    self._evaluate(evaluation_env, {"greedy": policy, "stochastic": policy})
                     self._save()
-        finally:
-            bar.close()
-            for each in (env, evaluation_env):
-                if not each.is_closed:
-                    each.close()
         return self.curve
 
-    def _training_seed(self) -> int:
+    def _seed(self) -> int:
         # Away from evaluation and demonstrations; a continued training plays new episodes.
         return 6_000_000 + 100_000 * (self.config.seed % 10) + self.steps % 100_000
 
     @torch.no_grad()
     def _collect(self, env: EnvBase, data: TensorDictBase) -> tuple[TensorDictBase, int]:
-        policy = self.warmup if self.steps < self.config.warmup_steps else self.policy
+        warming = self.steps < self.config.warmup_steps
+        policy = self.agent.warmup if warming else self.agent.policy
         with set_exploration_type(ExplorationType.RANDOM):
             data = policy(data.to(self.device)).to("cpu")
+        # Before a simulator sees them.
+        _check_finite(data.select(keys.DELTA, keys.CHUNK))
         data, following = env.step_and_maybe_reset(data)
         transitions = self._transitions(data)
+        # Before they are saved: they would end every later training on them.
+        _check_finite(transitions)
         self.buffer.extend(transitions)
         self.segments.append(transitions)
         return following, int(data["next", keys.EXECUTED].sum())
 
-    def _transitions(self, data: TensorDictBase) -> TensorDictBase:
+    @property
+    def _keys(self) -> list[NestedKey]:
+        """What is kept of a transition."""
         states = [self.decoder.observation_key, keys.ANCHOR, *self.decoder.in_keys]
         states = [key for key in dict.fromkeys(states) if key != keys.DELTA]
         after = [*states, "reward", "done", "terminated", keys.EXECUTED]
-        transitions = data.select(
-            *states, keys.DELTA, keys.CHUNK, *(unravel_key(("next", key)) for key in after)
-        )
-        transitions = transitions.reshape(-1).contiguous().clone()
+        return [*states, keys.DELTA, keys.CHUNK, *(unravel_key(("next", key)) for key in after)]
+
+    def _transitions(self, data: TensorDictBase) -> TensorDictBase:
+        transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
         following = transitions["next"]
         following["reward"] = (
             following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
@@ -225,29 +176,6 @@ class PriorSpaceTraining:
         if not self.config.bootstrap_timeouts:
             following["terminated"] = following["done"].clone()
         return transitions
-
-    def _schedule(self) -> Iterator[Callable[[TensorDictBase], TensorDict]]:
-        if isinstance(self.loss, DSRLNALoss):
-            return self.loss.schedule(self.config.updates)
-        return iter([self.loss] * self.config.updates)
-
-    def _learn(self, bar: Any) -> None:
-        values: dict[str, Tensor] = {}
-        for compute in self._schedule():
-            result = compute(self.buffer.sample())
-            losses = {k: v for k, v in result.items() if k.startswith("loss_")}
-            check_finite(losses)
-            self.optimizer.zero_grad()
-            torch.stack(list(losses.values())).sum().backward()
-            self.optimizer.step()
-            if "loss_qvalue" in losses:
-                self.updater.step()
-            values |= {k: v.detach() for k, v in result.items()}
-        bar.set_postfix(
-            q=f"{float(values['loss_qvalue']):.3g}",
-            alpha=f"{float(values['alpha']):.2g}",
-            refresh=False,
-        )
 
     def _evaluate(self, env: EnvBase, policies: dict[str, TensorDictModuleBase]) -> None:
         for name, policy in policies.items():
@@ -262,7 +190,7 @@ class PriorSpaceTraining:
                     policy_seed=self.config.seed,
                 )
             self.curve.append(self._row(name, episodes))
-        self.policy.train()
+        self.agent.policy.train()
 
     def _row(self, name: str, episodes: list[Episode]) -> dict[str, Any]:
         successes = sum(episode.success for episode in episodes)
@@ -274,16 +202,11 @@ class PriorSpaceTraining:
             "success_rate": successes / len(episodes),
         }
 
-    def _parameters(self) -> dict[str, Tensor]:
-        return dict(chain(self.loss.named_parameters(), self.loss.named_buffers()))
-
     def _save(self) -> None:
+        tensors = {**self.agent.state(), "rng": torch.get_rng_state()}
+        if self.device.type == "cuda":
+            tensors["rng_cuda"] = torch.cuda.get_rng_state(self.device)
         self.segments.write()
-        tensors = {
-            **named("loss", self._parameters()),
-            **named("optimizer", snapshot_optimizer(self.optimizer)),
-            "rng": torch.get_rng_state(),
-        }
         facts = {
             "identity": self.identity,
             "steps": self.steps,
@@ -301,17 +224,56 @@ class PriorSpaceTraining:
                     f"{self.state_path} belongs to another {part}: it has {theirs}, this run has "
                     f"{mine}. Use the same options, or another output folder."
                 )
-        saved = select("loss", tensors)
-        with torch.no_grad():
-            for name, value in self._parameters().items():
-                value.copy_(saved[name])
-        restore_optimizer(self.optimizer, select("optimizer", tensors))
-        self.steps, self.curve = facts["steps"], facts["curve"]
         self.segments = ReplaySegments(self.directory / "buffer", facts["segments"])
         transitions = self.segments.load()
         if transitions is not None:
+            self._check_wiring(transitions)
             self.buffer.extend(transitions)
+        self.agent.load(tensors)
+        self.steps, self.curve = facts["steps"], facts["curve"]
         torch.set_rng_state(tensors["rng"])
+        if "rng_cuda" in tensors:
+            torch.cuda.set_rng_state(tensors["rng_cuda"], self.device)
+
+    def _check_wiring(self, transitions: TensorDictBase) -> None:
+        found = set(transitions.keys(True, True))
+        missing = [key for key in self._keys if key not in found]
+        if missing:
+            raise ValueError(
+                f"the replay buffer in {self.segments.directory} comes from another wiring: it lacks "
+                f"{missing} and holds {sorted(map(str, found))}. Choose another output folder."
+            )
+        length = self.decoder.prediction_length
+        for key in (keys.ANCHOR, keys.DELTA, keys.CHUNK):
+            shape = transitions[key].shape
+            if shape[1:] != (length, self.decoder.action_dim or shape[-1]):
+                raise ValueError(
+                    f"the replay buffer in {self.segments.directory} belongs to another policy: its "
+                    f"{key} is {tuple(shape)}, this policy predicts chunks of (P, d_a) = "
+                    f"{(length, self.decoder.action_dim)}. Choose another output folder."
+                )
+
+
+@contextmanager
+def _opened(make_env: Callable[[int], EnvBase], seed: int) -> Iterator[EnvBase]:
+    """An environment that is closed in the end, and whose workers' death is an error."""
+    env = make_env(seed)
+    with watched(env):
+        yield env
+    env.close(raise_if_closed=False)
+
+
+def _check_finite(data: TensorDictBase) -> None:
+    wrong = [
+        key
+        for key, value in data.items(True, True)
+        if value.is_floating_point() and not torch.isfinite(value).all()
+    ]
+    if wrong:
+        raise FloatingPointError(
+            f"a transition holds NaN or infinity at {wrong}: the policy or the training has diverged, or "
+            "the environment is at fault"
+        )
 
 
 def _digest(actor: WarmPriorActor) -> str:

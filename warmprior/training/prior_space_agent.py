@@ -1,0 +1,168 @@
+"""What learns in prior-space reinforcement learning: networks, loss and optimiser, but no environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from itertools import chain
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictSequential
+from torch import Tensor
+from torchrl.data import Bounded, Composite, ReplayBuffer
+from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
+
+from warmprior import keys
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.decoder import PriorDecoder
+from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
+from warmprior.modules.residual import ResidualSampler
+from warmprior.objectives import DSRLNALoss
+from warmprior.objectives._prior_space import check_finite
+from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
+from warmprior.training.prior_space_config import PriorSpaceConfig
+
+__all__ = ["PriorSpaceAgent"]
+
+
+class PriorSpaceAgent:
+    """An agent around a frozen policy, its critics, and one update of them.
+
+    Initial weights follow from PyTorch's global generator.
+
+    Args:
+        actor: the frozen policy; copied.
+        config: the recipe.
+
+    Attributes:
+        decoder: the frozen policy as a decoder.
+        policy: the agent followed by the decoder.
+        warmup: residuals from the prior, clipped to the agent's box, followed by the decoder.
+        loss: DSRL-NA's or TorchRL's SAC.
+
+    Raises:
+        ValueError: if the recipe does not suit the policy.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.training import PriorSpaceConfig
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4), nfe=1)
+        >>> agent = PriorSpaceAgent(actor, PriorSpaceConfig(hidden_dim=8))
+        >>> agent.decoder.delta, type(agent.loss).__name__
+        (0.5, 'DSRLNALoss')
+    """
+
+    def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
+        self.config, self._prior, self._network = config, actor.prior, actor.network
+        self.device = next(actor.parameters()).device
+        self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
+        self.warmup = TensorDictSequential(
+            ResidualSampler(self.decoder, distribution="clipped"), self.decoder
+        )
+        network = self._make(make_prior_space_actor, delta=self.decoder.delta).to(self.device)
+        self.policy = TensorDictSequential(network, self.decoder)
+        self.loss = self._make_loss(network).to(self.device)
+        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
+        self._updater = SoftUpdate(self.loss, tau=config.tau)
+        self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.learning_rate)
+
+    def _make(self, make: Callable[..., Any], **options: Any) -> Any:
+        network: Any = self._network
+        return make(
+            network.action_dim,
+            network.observation_dim - self._prior.context_dim(network.action_dim),
+            self._prior.prediction_length,
+            network.observation_steps,
+            hidden_dim=self.config.hidden_dim,
+            num_layers=self.config.num_layers,
+            **options,
+        )
+
+    def _make_loss(self, network: Any) -> Any:
+        config, delta = self.config, self.decoder.delta
+        noise_critic = self._make(make_prior_space_critic, delta=delta)
+        if config.algorithm == "dsrl-na":
+            return DSRLNALoss(
+                network,
+                self._make(make_prior_space_critic, in_keys=(keys.OBSERVATION, keys.CHUNK)),
+                noise_critic,
+                self.decoder,
+                backup=config.backup,
+                discount="decision",
+                noise_critic_steps=config.noise_critic_steps,
+                bootstrap_timeouts=config.bootstrap_timeouts,
+                alpha_init=config.alpha_init,
+                target_entropy=config.target_entropy,
+            )
+        size = (self._prior.prediction_length, int(network.spec[keys.DELTA].shape[-1]))
+        box = Composite({keys.DELTA: Bounded(-delta, delta, size)})
+        return SACLoss(
+            network,
+            noise_critic,
+            action_spec=box,
+            alpha_init=config.alpha_init,
+            # TorchRL's log-probabilities are those of the residual, not of units of the box.
+            target_entropy=config.target_entropy + math.prod(size) * math.log(delta),
+        )
+
+    def _schedule(self) -> Iterator[Callable[[TensorDictBase], TensorDict]]:
+        if isinstance(self.loss, DSRLNALoss):
+            return self.loss.schedule(self.config.updates)
+        return iter([self.loss] * self.config.updates)
+
+    def learn(self, buffer: ReplayBuffer) -> dict[str, float]:
+        """The updates that one vector step of the environment pays for, each on a batch of its own.
+
+        Args:
+            buffer: transitions on the agent's device.
+
+        Returns:
+            The critic's loss ``"q"`` and the temperature ``"alpha"`` of the last update.
+
+        Raises:
+            FloatingPointError: if a loss is NaN or infinite, naming it, before it changes anything.
+        """
+        values: dict[str, Tensor] = {}
+        for compute in self._schedule():
+            result = compute(buffer.sample())
+            losses = {k: v for k, v in result.items() if k.startswith("loss_")}
+            check_finite(losses)
+            self.optimizer.zero_grad()
+            torch.stack(list(losses.values())).sum().backward()
+            self.optimizer.step()
+            if "loss_qvalue" in losses:
+                self._updater.step()
+            values |= {k: v.detach() for k, v in result.items()}
+        return {"q": float(values["loss_qvalue"]), "alpha": float(values["alpha"])}
+
+    def _parameters(self) -> dict[str, Tensor]:
+        return dict(chain(self.loss.named_parameters(), self.loss.named_buffers()))
+
+    def state(self) -> dict[str, Tensor]:
+        """All that learning has changed, by name.
+
+        Raises:
+            FloatingPointError: if any of it is NaN or infinite: a finite loss may have an infinite
+                gradient, and what it leaves must not be saved.
+        """
+        tensors = {
+            **named("loss", self._parameters()),
+            **named("optimizer", snapshot_optimizer(self.optimizer)),
+        }
+        wrong = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
+        if wrong:
+            raise FloatingPointError(
+                f"{wrong[0]} and {len(wrong) - 1} more tensors of the agent are NaN or infinite: the "
+                "training has diverged; lower the learning rate or check the rewards"
+            )
+        return tensors
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Go back to what :meth:`state` gave."""
+        saved = select("loss", tensors)
+        with torch.no_grad():
+            for name, value in self._parameters().items():
+                value.copy_(saved[name])
+        restore_optimizer(self.optimizer, select("optimizer", tensors))
