@@ -222,12 +222,12 @@ class NavigationStudy:
         row: dict[str, Any] = asdict(navigation_metrics(heights, horizon))
         row |= {"jump_ratio": smooth.jump_ratio, "jerk": smooth.jerk}
         for prefix, options in (("shifted", {"shift": SHIFT}), ("one_step", {"nfe": 1})):
-            try:
-                played = executed_actions(self.play(actor, seed, **options))[0].squeeze(-1)  # type: ignore[arg-type]
-            except ValueError:  # diverged
+            played = self.play(actor, seed, **options)  # type: ignore[arg-type]
+            if _diverged(played):
                 other = dict.fromkeys(row, float("nan")) | {"collision_rate": 1.0}
             else:
-                other = asdict(navigation_metrics(played, horizon))
+                heights = executed_actions(played)[0].squeeze(-1)
+                other = asdict(navigation_metrics(heights, horizon))
             for name in ("switch_rate", "collision_rate", "distance"):
                 row[f"{prefix}_{name}"] = other[name]
         return row
@@ -256,7 +256,9 @@ class NavigationStudy:
         results = compare_curvature(flows, windows, n_steps, **options())
         for name, actor in flows.items():
             prior = actor.prior
-            met = self.observations.deployed(actor, generator=torch.Generator().manual_seed(seed))
+            # At deployment the noise of the earlier prediction and that of the next are independent.
+            earlier = torch.Generator().manual_seed(seed + 1)
+            met = self.observations.deployed(actor, generator=earlier)
             forecast = compare_curvature({name: actor}, {name: met}, n_steps, **options())[name]
             results[name]["kappa_forecast"] = forecast["kappa_executed"]
             if not prior.conditions_network:
@@ -264,3 +266,10 @@ class NavigationStudy:
                     branching_bound(windows[name], prior)["total"].mean()
                 )
         return results
+
+
+def _diverged(rollout: TensorDictBase) -> bool:
+    """Whether an executed action is NaN or infinite."""
+    chunk = rollout[keys.CHUNK]
+    executed = torch.arange(chunk.shape[-2]) < rollout["next", keys.EXECUTED]
+    return not bool(torch.isfinite(chunk[executed]).all())
