@@ -88,8 +88,8 @@ def make_table(
     pooled = None if None in seeds else 0
     lines = [
         "| source | sigma | success (%) | curvature, training mean | deployed mean "
-        "| per squared mean velocity | bound |",
-        "|" + "---|" * 7,
+        "| per squared mean velocity | bound, training mean | deployed mean |",
+        "|" + "---|" * 8,
     ]
     for prior in priors:
         cell = [row for row in rows if (row.prior, row.sigma) == (prior.name, prior.sigma)]
@@ -107,13 +107,14 @@ def make_table(
             f"{deployed['ratio_executed']:.3f}",
             f"{trained['ratio_relative']:.3f}",
             f"{trained['bound']:.2f}",
+            f"{deployed['bound']:.2f}",
         ]
         name = PRIOR_LABELS[prior.name]
         lines.append(f"| {name} | {prior.sigma:g} | " + " | ".join(values) + " |")
     lines += [
         "",
-        "- Curvatures are relative to the Gaussian source, on the executed positions; the bound is in "
-        "squared normalised action units over the whole prediction. nan: the policy predicts no motion.",
+        "- Curvature (relative to the Gaussian source) and bound (in squared normalised action units) are "
+        "those of the executed positions. nan: the policy predicts no motion.",
     ]
     return "\n".join(lines) + "\n"
 

@@ -90,6 +90,7 @@ def test_bound_counts_cold_and_padded_positions():
     assert bound["mismatch"].tolist() == [H * 4.0] * 2
     assert bound["noise"].tolist() == [H * 0.25] * 2
     assert bound["total"].tolist() == [H * 4.25 + H * 10.0] * 2
+    assert bound["total_executed"].tolist() == [H * 4.25] * 2
     data["action_is_pad"] = torch.arange(2 * H).expand(2, -1) >= 1
     assert branching_bound(data, prior)["total"].tolist() == [4.25] * 2
 

@@ -118,7 +118,8 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
 
     Returns:
         TensorDict ``[*B]`` with ``"mismatch"`` (first term), ``"noise"`` (second term), ``"warm"`` (their
-        sum) and ``"total"``, in squared normalised action units.
+        sum), ``"total"`` and ``"total_executed"`` (the first ``H`` positions alone, to compare priors of
+        different prediction lengths), in squared normalised action units.
 
     Raises:
         KeyError: if the batch lacks a key.
@@ -149,15 +150,19 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
     counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
     warm = (warm & counted).expand_as(target)
     cold = counted.expand_as(target) & ~warm
-    mismatch = ((target - loc).square() * warm).sum((-1, -2))
+    squared = (target - loc).square() * warm
+    unknown = (target.square() + 1.0) * cold
+    mismatch = squared.sum((-1, -2))
     noise = prior.sigma**2 * warm.sum((-1, -2)).to(target.dtype)
-    rest = ((target.square() + 1.0) * cold).sum((-1, -2))
+    rest = unknown.sum((-1, -2))
+    per_position = (squared + prior.sigma**2 * warm + unknown).sum(-1)
     return TensorDict(
         {
             "mismatch": mismatch,
             "noise": noise,
             "warm": mismatch + noise,
             "total": mismatch + noise + rest,
+            "total_executed": per_position[..., : prior.chunk_length].sum(-1),
         },
         batch_size=batch.batch_size,
     )

@@ -59,7 +59,8 @@ def straightness(
         One row per policy, training seed and mean, and one with ``"seed": None`` for the average over
         several seeds: ``"policy"``, ``"prior"``, ``"sigma"``, ``"chunk"``, ``"seed"``, ``"mean"``
         (``"training"`` or ``"deployed"``), ``"observations"``; the means of :func:`curvature`'s
-        entries; ``"bound"`` (:func:`branching_bound` at this mean, where it applies); and per ratio of
+        entries; ``"bound"`` (:func:`branching_bound` of the executed positions at this mean, where it
+        applies); and per ratio of
         :data:`RATIOS` its value and 95% interval (``"ratio"``, ``"ratio_low"``, ``"ratio_high"``, and
         so on). NaN, with a warning, where a policy predicts no motion; an average is, if any seed is.
 
@@ -132,7 +133,7 @@ def _average(per_seed: Sequence[TensorDict]) -> TensorDict:
 def _bound(prior: Prior, batch: TensorDictBase) -> float:
     if type(prior).sample is not Prior.sample or prior.conditions_network:
         return math.nan
-    return _mean(branching_bound(batch, prior)["total"])
+    return _mean(branching_bound(batch, prior)["total_executed"])
 
 
 def _ratios(
