@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import threading
@@ -12,11 +13,22 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.data import Categorical
+from torchrl.envs import TransformedEnv
 
 from tests.toy_env import ACTION_DIM, CountingEnv
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, WarmPriorActor, policy_transforms
+from warmprior import (
+    GaussianPrior,
+    PastPrior,
+    PreviewPrior,
+    PriorAnchor,
+    PriorDecoder,
+    ResidualSampler,
+    WarmPriorActor,
+    policy_transforms,
+)
 from warmprior.training import Episode, evaluate, parallel_env
 
 H = 3
@@ -213,9 +225,70 @@ def test_a_killed_worker_is_an_error_and_not_a_hang(moment):
     assert isinstance(error, RuntimeError)
     assert "worker 1 of 2 (exit code -9)" in str(error) and "memory" in str(error)
     time.sleep(0.5)
-    for pid in pids:
-        state = Path(f"/proc/{pid}/stat")
-        assert not state.exists() or state.read_text().split()[2] == "Z", "a worker still runs"
+    assert all(ended(pid) for pid in pids), "a worker still runs"
+
+
+def hold_environments(pipe):
+    """Start workers, and another child that inherits the parent's ends of their pipes; wait."""
+    env = environments(3, sleep=0.01)
+    env.reset()
+    other = multiprocessing.get_context("fork").Process(target=time.sleep, args=(60,))
+    other.start()
+    pipe.send([*(worker.pid for worker in env._workers), other.pid])
+    time.sleep(60)
+
+
+def ended(pid):
+    state = Path(f"/proc/{pid}/stat")
+    return not state.exists() or state.read_text().split()[2] == "Z"
+
+
+def test_workers_end_with_a_killed_parent():
+    """Their pipes stay open where the parent had other children: they would wait on them for hours."""
+    context = multiprocessing.get_context("fork")
+    ours, theirs = context.Pipe()
+    parent = context.Process(target=hold_environments, args=(theirs,))
+    parent.start()
+    assert ours.poll(60)
+    *pids, other = ours.recv()
+    assert len(pids) == 3 and not any(ended(pid) for pid in pids)
+    time.sleep(1.5)
+    assert not any(ended(pid) for pid in pids)  # nobody has died so far
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.join()
+    deadline = time.monotonic() + 20
+    while not all(ended(pid) for pid in pids) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    survivors = [pid for pid in pids if not ended(pid)]
+    for pid in [*survivors, other]:
+        os.kill(pid, signal.SIGKILL)
+    assert not survivors
+
+
+def test_any_policy_that_writes_chunks():
+    """An agent, or residuals alone: seeded, and without a trace in PyTorch's global generator."""
+    prior = PastPrior(H)
+    decoder = PriorDecoder(actor_for(prior), delta=0.5)
+    policy = TensorDictSequential(ResidualSampler(decoder), decoder)
+    assert not list(policy.parameters())
+    transforms = partial(policy_transforms, prior)
+    env = TransformedEnv(parallel_env(NoiseSuccess, transforms, 2), PriorAnchor(prior))
+    play = partial(evaluate, policy, env, episodes=6, first_seed=3)
+    try:
+        torch.manual_seed(0)
+        before = torch.get_rng_state()
+        one = play()
+        assert torch.equal(torch.get_rng_state(), before)
+        torch.rand(5)
+        again, other = play(), play(policy_seed=1)
+    finally:
+        env.close(raise_if_closed=False)
+
+    def chunks(episodes):
+        return torch.cat([episode.decisions["vla_action", "chunk"] for episode in episodes])
+
+    assert again == one and torch.equal(chunks(again), chunks(one))
+    assert not torch.isclose(chunks(other)[:3], chunks(one)[:3]).any()
 
 
 @pytest.mark.parametrize("episodes", [0, -1])

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
 
-from warmprior.diagnostics import executed_actions
+from warmprior.diagnostics import SharedObservations, compare_curvature, executed_actions
 from warmprior.envs import navigation_metrics
 from warmprior.training import (
     NAVIGATION_PRESETS,
@@ -89,6 +90,61 @@ def test_straightness_covers_the_flows(tiny):
     # Windows inside the data: WP-Past's bound is that of a slowly varying height.
     assert result["past 0.1"]["bound"] < result["past 0.5"]["bound"] < result["base"]["bound"]
     assert "bound" not in result["history"]
+
+
+def test_only_divergence_is_taken_for_divergence(tiny, monkeypatch):
+    actor = tiny.train("past 0.1", seed=1)
+    play = NavigationStudy.play
+
+    def spoiled(study, actor, seed, *, shift=0.0, nfe=None):
+        rollout = play(study, actor, seed, shift=shift, nfe=nfe)
+        if nfe == 1:
+            rollout["vla_action", "chunk"][0, -1, 0] = torch.inf
+        return rollout
+
+    fine = tiny.judge(actor, seed=1)
+    monkeypatch.setattr(NavigationStudy, "play", spoiled)
+    row = tiny.judge(actor, seed=1)
+    assert row["one_step_collision_rate"] == 1.0 and math.isnan(row["one_step_distance"])
+    assert {k: v for k, v in row.items() if "one_step" not in k} == pytest.approx(
+        {k: v for k, v in fine.items() if "one_step" not in k}, nan_ok=True
+    )
+
+    def broken(study, actor, seed, **options):
+        if "nfe" in options:
+            raise ValueError("something else")
+        return play(study, actor, seed, **options)
+
+    monkeypatch.setattr(NavigationStudy, "play", broken)
+    with pytest.raises(ValueError, match="something else"):
+        tiny.judge(actor, seed=1)
+
+
+def test_the_earlier_prediction_has_noise_of_its_own(tiny, monkeypatch):
+    """Otherwise both predictions of a deployed curvature would start from the same draw."""
+    drawn = {"curvature": [], "earlier": []}
+
+    def spy(name, function):
+        def wrapper(*args, generator):
+            copy = torch.Generator()
+            copy.set_state(generator.get_state())
+            drawn[name].append(torch.randn(5, generator=copy))
+            return function(*args, generator=generator)
+
+        return wrapper
+
+    measure = partial(compare_curvature, draws=4)
+    fixed = spy("curvature", measure)
+    monkeypatch.setattr(
+        "warmprior.training.navigation1d.compare_curvature",
+        lambda *args, draws, generator: fixed(*args, generator=generator),
+    )
+    monkeypatch.setattr(SharedObservations, "deployed", spy("earlier", SharedObservations.deployed))
+    tiny.straightness({"past 0.1": tiny.train("past 0.1", seed=1)}, seed=0, n_steps=5)
+    # The same noise at the training's and at the deployed mean, which was made from another.
+    at_training, at_deployed = drawn["curvature"]
+    assert torch.equal(at_training, at_deployed)
+    assert not torch.isclose(drawn["earlier"][0], at_training).any()
 
 
 def test_a_study_is_fair_or_refused(tmp_path):

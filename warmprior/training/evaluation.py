@@ -55,8 +55,8 @@ def _transformed(
 def _end_with_parent() -> None:
     """Let this process end when the one that started it dies, however abruptly.
 
-    A killed process cannot tell its workers to stop. They would wait on their pipes for hours: its end of
-    each pipe is also held by the workers that were forked later. The main process is left alone.
+    A killed process cannot tell its workers to stop, and they would wait for hours: its ends of their
+    pipes stay open in whatever else it forked later. The main process is left alone.
     """
     if multiprocessing.parent_process() is None:
         return
