@@ -110,15 +110,7 @@ class PriorSpaceTraining:
         config = self.config
         if self.steps >= config.environment_steps:
             return self.curve
-        bar = tqdm(
-            total=config.environment_steps,
-            initial=self.steps,
-            desc=self.description,
-            unit="step",
-            disable=self.description is None,
-        )
-        evaluating, training = _opened(self.make_env, 0), _opened(self.make_env, self._seed())
-        with bar, evaluating as evaluation_env, training as env:
+        with self._environments() as (evaluation_env, env), self._bar() as bar:
             self.decoder.check_env(env)
             if not self.curve:
                 self._evaluate(evaluation_env, {"base": self.actor})
@@ -138,6 +130,29 @@ class PriorSpaceTraining:
                     self._evaluate(evaluation_env, {"greedy": policy, "stochastic": policy})
                     self._save()
         return self.curve
+
+    @contextmanager
+    def _environments(self) -> Iterator[tuple[EnvBase, EnvBase]]:
+        """For evaluation and for training; closed in the end, and the death of a worker is an error."""
+        evaluation_env = self.make_env(0)
+        try:
+            env = self.make_env(self._seed())
+        except BaseException:
+            evaluation_env.close(raise_if_closed=False)
+            raise
+        with watched(evaluation_env), watched(env):
+            yield evaluation_env, env
+        for each in (evaluation_env, env):
+            each.close(raise_if_closed=False)
+
+    def _bar(self) -> Any:
+        return tqdm(
+            total=self.config.environment_steps,
+            initial=self.steps,
+            desc=self.description,
+            unit="step",
+            disable=self.description is None,
+        )
 
     def _seed(self) -> int:
         # Away from evaluation and demonstrations; a continued training plays new episodes.
@@ -252,15 +267,6 @@ class PriorSpaceTraining:
                     f"{key} is {tuple(shape)}, this policy predicts chunks of (P, d_a) = "
                     f"{(length, self.decoder.action_dim)}. Choose another output folder."
                 )
-
-
-@contextmanager
-def _opened(make_env: Callable[[int], EnvBase], seed: int) -> Iterator[EnvBase]:
-    """An environment that is closed in the end, and whose workers' death is an error."""
-    env = make_env(seed)
-    with watched(env):
-        yield env
-    env.close(raise_if_closed=False)
 
 
 def _check_finite(data: TensorDictBase) -> None:

@@ -138,7 +138,9 @@ class PriorSpaceAgent:
         return {"q": float(values["loss_qvalue"]), "alpha": float(values["alpha"])}
 
     def _parameters(self) -> dict[str, Tensor]:
-        return dict(chain(self.loss.named_parameters(), self.loss.named_buffers()))
+        # Of the buffers those of the target critics: the others are constants, some of them made late.
+        targets = (item for item in self.loss.named_buffers() if "_params." in item[0])
+        return dict(chain(self.loss.named_parameters(), targets))
 
     def state(self) -> dict[str, Tensor]:
         """All that learning has changed, by name.

@@ -19,7 +19,8 @@ class PriorSpaceConfig:
     Attributes:
         algorithm: ``"dsrl-na"`` or ``"dsrl-sac"``.
         environment_steps: control steps to collect, those of the warm-up included.
-        warmup_steps: control steps with residuals drawn from the prior, before the first update.
+        warmup_steps: control steps with residuals drawn from the prior and clipped to the box, before the
+            first update.
         delta: half the side of the agent's box; ``None`` for 0.5 around a mean and 1.5 around zero.
         nfe: network evaluations per decoded chunk.
         updates: updates per vector step (one decision of every parallel environment).
@@ -38,6 +39,9 @@ class PriorSpaceConfig:
         evaluate_every: control steps between evaluations (and saves).
         evaluation_episodes: episodes per evaluation, greedy and stochastic each.
         seed: of everything random.
+
+    Raises:
+        ValueError: for a number out of its range, naming it.
     """
 
     algorithm: Literal["dsrl-na", "dsrl-sac"] = "dsrl-na"
@@ -65,8 +69,13 @@ class PriorSpaceConfig:
     def __post_init__(self) -> None:
         if self.algorithm not in ("dsrl-na", "dsrl-sac"):
             raise ValueError(f"algorithm must be dsrl-na or dsrl-sac, got {self.algorithm!r}")
-        if self.delta is not None and not (self.delta > 0 and math.isfinite(self.delta)):
-            raise ValueError(f"delta must be a finite number > 0, got {self.delta}")
+        for name in ("delta", "learning_rate", "alpha_init"):
+            value = getattr(self, name)
+            if value is not None and not (value > 0 and math.isfinite(value)):
+                raise ValueError(f"{name} must be a finite number > 0, got {value}")
+        for name in ("gamma", "tau"):
+            if not 0 < getattr(self, name) <= 1:
+                raise ValueError(f"{name} must lie in (0, 1], got {getattr(self, name)}")
         counts = ("environment_steps", "warmup_steps", "nfe", "updates", "batch_size")
         for name in (*counts, "evaluate_every", "evaluation_episodes"):
             if getattr(self, name) < 1:

@@ -1,0 +1,80 @@
+"""A tiny training in source space, on an environment whose transitions are known in closed form."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import torch
+from torchrl.data import Categorical
+from torchrl.envs import SerialEnv, TransformedEnv
+
+from tests.toy_env import ACTION_DIM, CountingEnv
+from warmprior import PastPrior, PriorAnchor, VelocityMLP, WarmPriorActor, policy_transforms
+from warmprior.training import PriorSpaceConfig, PriorSpaceTraining
+
+H = 3
+LENGTHS = (5, 7)
+EVALUATION_SEED = 100
+
+
+class SolvableEnv(CountingEnv):
+    """:class:`CountingEnv` with a success at every other episode's end, and a hook before every step."""
+
+    before_step = None
+
+    def __init__(self, length, truncate=False):
+        super().__init__(length, truncate)
+        self.observation_spec["success"] = Categorical(2, dtype=torch.bool, shape=(1,))
+
+    def _reset(self, tensordict=None, **kwargs):
+        return super()._reset(tensordict).set("success", torch.zeros(1, dtype=torch.bool))
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        out.set("success", out["done"] & (self.episode % 2 == 0))
+        return out if self.before_step is None else self.before_step(out)
+
+
+def make_actor(prior=None, seed=0, action_dim=ACTION_DIM):
+    prior = PastPrior(H) if prior is None else prior
+    torch.manual_seed(seed)
+    network = VelocityMLP(action_dim, 2 + ACTION_DIM, prior.prediction_length, 1, hidden_dim=8)
+    return WarmPriorActor(network, prior, nfe=2, clip=1.0)
+
+
+def make_env(seed, prior=None, truncate=True, hook=None):
+    """Two environments; the hook gets what those of the training (and not of evaluations) return."""
+    prior = PastPrior(H) if prior is None else prior
+    bases = [SolvableEnv(length, truncate) for length in LENGTHS]
+    for base in bases:
+        base.before_step = None if seed == 0 else hook
+    transforms = policy_transforms(prior, observation_steps=1)
+    transforms.append(PriorAnchor(prior, seed=seed))
+    return TransformedEnv(SerialEnv(2, [lambda base=base: base for base in bases]), transforms)
+
+
+def make_config(**options):
+    values = {
+        "environment_steps": 90,
+        "warmup_steps": 30,
+        "nfe": 2,
+        "updates": 1,
+        "noise_critic_steps": 1,
+        "batch_size": 8,
+        "hidden_dim": 8,
+        "num_layers": 1,
+        "evaluate_every": 30,
+        "evaluation_episodes": 2,
+    }
+    return PriorSpaceConfig(**values | options)
+
+
+def make_training(directory, actor=None, env=None, training_class=PriorSpaceTraining, **options):
+    env = {} if env is None else env
+    return training_class(
+        make_actor() if actor is None else actor,
+        partial(make_env, **env),
+        make_config(**options),
+        directory,
+        evaluation_seed=EVALUATION_SEED,
+    )
