@@ -181,6 +181,19 @@ def test_a_copy_is_seeded_by_itself(copy_of):
     assert torch.equal(env.reset()["prior", "anchor"], expected)
 
 
+def test_a_clone_draws_by_itself():
+    """Transforms are cloned into evaluation environments: what these draw must not reach the training."""
+    env = build("single", PastPrior(H))
+    env.set_seed(4)
+    expected = env.reset()["prior", "anchor"]
+    env.set_seed(4)
+    twin = TransformedEnv(CountingEnv(LENGTHS[0]), env.transform.clone())
+    assert torch.equal(twin.reset()["prior", "anchor"], expected)  # it goes on from the same state
+    twin.set_seed(5)
+    assert not torch.equal(twin.reset()["prior", "anchor"], expected)
+    assert torch.equal(env.reset()["prior", "anchor"], expected)
+
+
 def test_in_a_collector():
     collector = Collector(
         build("serial-outside", PreviewPrior(H)), None, frames_per_batch=12, total_frames=24
@@ -201,7 +214,14 @@ def test_wrong_places_and_options():
         env = TransformedEnv(CountingEnv(5), Compose(ChunkStep(H), PriorAnchor(PastPrior(H))))
         env.observation_spec  # noqa: B018
     with pytest.raises(ValueError, match=r"PreviewPrior.* predicts 6 .*must carry the same prior"):
-        chain = Compose(*history(PastPrior(H)), PriorAnchor(PreviewPrior(H)))
+        inside = SerialEnv(
+            1, [lambda: TransformedEnv(CountingEnv(5), Compose(*history(PastPrior(H))))]
+        )
+        TransformedEnv(inside, PriorAnchor(PreviewPrior(H))).reset()
+    with pytest.raises(
+        ValueError, match=r"PriorAnchor.* Gaussian.*ActionHistory carries PastPrior"
+    ):
+        chain = Compose(*history(PastPrior(H)), PriorAnchor(GaussianPrior(H)))
         TransformedEnv(CountingEnv(5), chain).reset()
 
 

@@ -21,7 +21,13 @@ from warmprior.modules.ode import _steps
 from warmprior.modules.prior import Prior
 from warmprior.modules.priors import GaussianPrior
 
-__all__ = ["PriorDecoder", "moves_source"]
+__all__ = ["PriorDecoder", "check_delta", "moves_source", "visible_priors"]
+
+
+def check_delta(delta: float) -> None:
+    """Raise ValueError if there is no such box."""
+    if not (delta > 0 and math.isfinite(delta)):
+        raise ValueError(f"delta must be a finite number > 0, got {delta}")
 
 
 def moves_source(prior: Prior) -> bool:
@@ -95,8 +101,7 @@ class PriorDecoder(TensorDictModuleBase):
         noise_key: NestedKey = keys.NOISE,
     ) -> None:
         super().__init__()
-        if not (delta > 0 and math.isfinite(delta)):
-            raise ValueError(f"delta must be a finite number > 0, got {delta}")
+        check_delta(delta)
         if isinstance(actor.prior, RegressionPrior):
             raise ValueError(
                 f"{actor.prior} starts at a single point and its field means nothing elsewhere: there is "
@@ -184,7 +189,7 @@ class PriorDecoder(TensorDictModuleBase):
                 f"the environment takes chunks of (P, d_a) = {tuple(shape[-2:])}, but the policy "
                 f"predicts {expected}"
             )
-        for transform, prior in _visible_priors(env):
+        for transform, prior in visible_priors(env):
             if prior.config() != self.prior.config():
                 raise ValueError(
                     f"the policy was trained with {self.prior}, but {transform} carries {prior}"
@@ -213,7 +218,8 @@ def _keep_weights() -> None:
     """Stands for ``reset_parameters``."""
 
 
-def _visible_priors(env: EnvBase) -> Iterator[tuple[str, Prior]]:
+def visible_priors(env: EnvBase) -> Iterator[tuple[str, Prior]]:
+    """The priors that the transforms around ``env`` carry, with the transforms' names."""
     while isinstance(env, TransformedEnv):
         for transform in env.transform.modules():
             if isinstance(getattr(transform, "prior", None), Prior):

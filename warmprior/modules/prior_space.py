@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
+from warmprior.modules.decoder import check_delta
 
 __all__ = ["make_prior_space_actor", "make_prior_space_critic"]
 
@@ -133,7 +134,9 @@ def make_prior_space_actor(
         hidden_dim: width of the layers.
         num_layers: number of layers.
         in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``. Leave the anchor
-            out where it is always zero.
+            out where it is always zero. Add ``keys.LOC`` where the anchor does not tell what the decoder
+            or the next mean depends on: for :class:`~warmprior.HistoryPrior`, and for WP-Past with
+            ``execute < H``.
         delta_key: where the residual is written; its log-probability is summed over the chunk.
 
     Raises:
@@ -148,7 +151,7 @@ def make_prior_space_actor(
         >>> data["prior", "delta"].shape, data["prior", "delta_log_prob"].shape
         (torch.Size([5, 4, 2]), torch.Size([5]))
     """
-    _check_delta(delta)
+    check_delta(delta)
     chunk = (prediction_length, action_dim)
     trunk = _make_trunk(
         in_keys,
@@ -188,9 +191,10 @@ def make_prior_space_critic(
     """A critic of residuals or of chunks, with the trunk of :func:`make_prior_space_actor`.
 
     The default judges residuals: a stock loss's critic, and the noise critic of
-    :class:`~warmprior.DSRLNALoss`. ``in_keys=(keys.OBSERVATION, keys.CHUNK)`` judges all ``P`` actions of
-    a chunk, which for WP-Past and WP-Preview alike determine the next mean: that is the latter's action
-    critic.
+    :class:`~warmprior.DSRLNALoss`. ``in_keys=(keys.OBSERVATION, keys.CHUNK)`` is the latter's action critic.
+    It judges all ``P`` actions of a chunk, which determine the next mean for WP-Preview, and for WP-Past if
+    whole chunks are executed. If not (``execute < H``), earlier actions are part of the next mean: give
+    actor and critics ``keys.LOC`` as well.
 
     Args:
         action_dim: ``d_a``.
@@ -217,7 +221,7 @@ def make_prior_space_critic(
         ...     "vla_action": {"chunk": torch.zeros(5, 4, 2)}}, [5]))["state_action_value"].shape
         torch.Size([5, 1])
     """
-    _check_delta(delta)
+    check_delta(delta)
     trunk = _make_trunk(
         in_keys,
         (prediction_length, action_dim),
@@ -229,8 +233,3 @@ def make_prior_space_critic(
     )
     # TorchRL would call it "state_value" for any action that is not named "action".
     return ValueOperator(trunk, in_keys=list(in_keys), out_keys=["state_action_value"])
-
-
-def _check_delta(delta: float) -> None:
-    if not (delta > 0 and math.isfinite(delta)):
-        raise ValueError(f"delta must be a finite number > 0, got {delta}")

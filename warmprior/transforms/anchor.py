@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import random
 import weakref
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
-from torchrl.data import TensorSpec, Unbounded
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
-from warmprior.modules.decoder import moves_source
+from warmprior.modules.decoder import moves_source, visible_priors
 from warmprior.modules.prior import Prior
 
 __all__ = ["PriorAnchor"]
@@ -30,8 +30,9 @@ class PriorAnchor(Transform):
     The first chunk of an episode has no mean, nor has the second half of a preview. A small box around
     zero would confine these positions to a corner of the source the policy was trained on; around a
     draw of that source it does not. The draw is made *here*, before the agent acts, and written next to
-    the observation: the agent sees which noise will be used, the decision process stays Markov and the
-    decoder deterministic. ``("prior", "loc")`` is left alone, :class:`ActionHistory` carries it on.
+    the observation: the agent sees which noise will be used, the decision process stays Markov (for WP-Past
+    if whole chunks are executed, see :func:`~warmprior.make_prior_space_actor`) and the decoder
+    deterministic. ``("prior", "loc")`` is left alone, :class:`ActionHistory` carries it on.
 
     Append it after :class:`ActionHistory`, inside or outside of batched environments.
 
@@ -54,7 +55,8 @@ class PriorAnchor(Transform):
         anchor_key: where the anchor is written, ``[*B, P, d_a]``.
 
     Raises:
-        ValueError: for an unknown ``cold``, or if the environment carries another prior's means.
+        ValueError: for an unknown ``cold``, or if the environment's :class:`ActionHistory` carries another
+            prior (compared where it can be seen, outside of workers; the length everywhere).
         KeyError: if :class:`ActionHistory` does not come before.
 
     Examples:
@@ -99,6 +101,12 @@ class PriorAnchor(Transform):
             seed: any integer; mixed with ``seed_offset``.
         """
         self.generator.manual_seed(random.Random(f"{seed}/{self.seed_offset}").getrandbits(62))
+
+    def clone(self) -> Self:
+        """A copy without environment, whose noise continues by itself."""
+        twin = super().clone()
+        twin.generator = self.generator.clone_state()
+        return twin
 
     def set_container(self, container: Any) -> None:
         """Attach the transform, and have it told the seeds that its environment is given."""
@@ -146,8 +154,13 @@ class PriorAnchor(Transform):
         """Add the anchor."""
         if self.loc_key not in observation_spec.keys(True, True):
             raise KeyError(f"PriorAnchor found no {self.loc_key}: append it after ActionHistory")
-        shape = observation_spec[self.loc_key].shape
-        observation_spec[self.anchor_key] = Unbounded(shape, device=observation_spec.device)
+        for transform, prior in visible_priors(self.parent):
+            if prior.config() != self.prior.config():
+                raise ValueError(
+                    f"PriorAnchor was built for {self.prior}, but {transform} carries {prior}: all parts "
+                    "of an environment need the policy's own prior"
+                )
+        observation_spec[self.anchor_key] = observation_spec[self.loc_key].clone()
         return observation_spec
 
 
