@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import TransformedEnv
 from torchrl.objectives import HardUpdate, SoftUpdate, ValueEstimators
 
-from tests.objectives.dsrl_parts import D_A, D_O, TO, H, batch, build, make_decoder
+from tests.objectives.dsrl_parts import D_A, D_O, GAMMA, TO, H, batch, build, make_decoder
 from warmprior import (
     DSRLNALoss,
     GaussianPrior,
@@ -151,6 +151,62 @@ def test_buffer_of_another_wiring(missing):
     assert f"missing: [{missing!r}]" in error.value.args[0]
 
 
+def test_renamed_keys():
+    """Every key of the decoder, the networks and the loss under another name: the same losses."""
+    torch.manual_seed(7)
+    observation, prior = ("sensors", "state"), PastPrior(H)
+    actor = WarmPriorActor(
+        VelocityMLP(D_A, D_O, H, TO, hidden_dim=8), prior, nfe=2, observation_key=observation
+    )
+    names = {"anchor_key": "centre", "delta_key": "shift", "noise_key": "source"}
+    decoder = PriorDecoder(actor, delta=0.5, **names)
+    sizes, options = (D_A, D_O, H, TO), {"delta_key": "shift", "hidden_dim": 8}
+    torch.manual_seed(0)
+    agent = make_prior_space_actor(*sizes, delta=0.5, in_keys=[observation, "centre"], **options)
+    chunk_keys, noise_keys = [observation, keys.CHUNK], [observation, "centre", "shift"]
+    critics = [make_prior_space_critic(*sizes, in_keys=chunk_keys, **options) for _ in range(2)]
+    noise_critics = [
+        make_prior_space_critic(*sizes, delta=0.5, in_keys=noise_keys, **options) for _ in range(2)
+    ]
+    for critic in (*critics, *noise_critics):
+        critic.out_keys = ["worth"]
+    loss = DSRLNALoss(agent, critics, noise_critics, decoder)
+    loss.set_keys(
+        chunk="plan",
+        reward="gain",
+        done=("end", "any"),
+        terminated=("end", "true"),
+        executed="count",
+        priority="error",
+        state_action_value="worth",
+    )
+    loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
+    data, original = batch(), batch()
+    for part in (data, data["next"]):
+        part.rename_key_("observation", observation).rename_key_(("prior", "anchor"), "centre")
+    data.rename_key_(("vla_action", "chunk"), "plan")
+    after = data["next"].rename_key_("reward", "gain").rename_key_("done", ("end", "any"))
+    after.rename_key_("terminated", ("end", "true")).rename_key_("executed_steps", "count")
+    results = []
+    for module, transitions in ((loss, data.select(*loss.in_keys)), (build(), original)):
+        torch.manual_seed(1)
+        losses = module(transitions)
+        rows = transitions["error" if module is loss else "td_error"]
+        results.append(losses.update({"rows": rows}))
+    for key in results[1].keys():  # noqa: SIM118
+        assert torch.equal(results[0][key], results[1][key]), key
+
+
+def test_priority_weights():
+    """All weight on a row leaves that row's losses. Nothing random enters: it ended, nothing is distilled."""
+    data = batch().set("priority_weight", torch.tensor([2.0, 0, 0, 0, 0, 0]))
+    loss = build()
+    weighted = loss.reinforcement_loss(data)["loss_qvalue"]
+    alone = loss.reinforcement_loss(batch()[:1])["loss_qvalue"]
+    torch.testing.assert_close(weighted, alone)
+    assert not torch.isclose(weighted, loss.reinforcement_loss(batch())["loss_qvalue"])
+
+
 def test_decisions_need_no_count_of_steps():
     data = batch()
     del data["next", "executed_steps"]
@@ -191,6 +247,21 @@ def test_networks_that_do_not_fit():
     ):
         renamed = make_prior_space_actor(*sizes, delta=0.5, delta_key="shift")
         DSRLNALoss(renamed, chunk, noise, decoder)
+    with pytest.raises(TypeError, match=r"without a decoder behind it, got TensorDictSequential"):
+        DSRLNALoss(TensorDictSequential(actor, decoder), chunk, noise, decoder)
+
+
+def test_critics_with_several_values():
+    """As many quantiles as rows would broadcast in silence."""
+    decoder, data = make_decoder(PastPrior(H)), batch()
+    sizes, quantiles = (D_A, D_O, H, TO), {"out_features": len(batch())}
+    actor = make_prior_space_actor(*sizes, delta=0.5)
+    chunk = make_prior_space_critic(*sizes, in_keys=(keys.OBSERVATION, keys.CHUNK), **quantiles)
+    noise = make_prior_space_critic(*sizes, delta=0.5, **quantiles)
+    loss = DSRLNALoss(actor, chunk, noise, decoder)
+    for compute in (loss.distillation_loss, loss.reinforcement_loss):
+        with pytest.raises(ValueError, match=r"one value \[\*B, 1\].*found the shape \(2, 6, 6\)"):
+            compute(data)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +270,10 @@ def test_networks_that_do_not_fit():
         ({"backup": "max"}, "backup must be 'min' or 'mean'"),
         ({"discount": "none"}, "discount must be 'step' or 'decision'"),
         ({"noise_critic_steps": 0}, "noise_critic_steps must be at least 1"),
-        ({"alpha_init": 0.0}, "alpha_init must be > 0"),
+        ({"num_qvalue_nets": 0}, "num_qvalue_nets must be at least 1"),
+        ({"alpha_init": 0.0}, "alpha_init must be a finite number > 0"),
+        ({"alpha_init": float("inf")}, "alpha_init must be a finite number > 0"),
+        ({"target_entropy": float("nan")}, "target_entropy must be a finite number"),
         ({"distillation": "laplace"}, "distribution must be"),
     ],
 )

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.common import LossModule
@@ -19,7 +19,7 @@ from torchrl.objectives.utils import dispatch_value_estimator
 
 from warmprior.modules.decoder import PriorDecoder
 
-__all__ = ["PriorSpaceLoss", "check_finite", "check_networks"]
+__all__ = ["PriorSpaceLoss", "check_counts", "check_finite", "check_networks"]
 
 
 class PriorSpaceLoss(LossModule):
@@ -40,6 +40,8 @@ class PriorSpaceLoss(LossModule):
     actor_network: ProbabilisticTensorDictSequential
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
+    log_alpha: Tensor
+    target_entropy: Tensor
     _results: ClassVar[tuple[str, ...]]
     _diagnostics: ClassVar[tuple[str, ...]]
 
@@ -59,6 +61,21 @@ class PriorSpaceLoss(LossModule):
         self.bootstrap_timeouts = bootstrap_timeouts
         self.discount = discount
         self.reduction = "mean"
+
+    def _register_temperature(
+        self, alpha_init: float, fixed_alpha: bool, target_entropy: float
+    ) -> None:
+        if not (alpha_init > 0 and math.isfinite(alpha_init)):
+            raise ValueError(f"alpha_init must be a finite number > 0, got {alpha_init}")
+        if not math.isfinite(target_entropy):
+            raise ValueError(f"target_entropy must be a finite number, got {target_entropy}")
+        device = self._default_device
+        log_alpha = torch.tensor(math.log(alpha_init), device=device)
+        if fixed_alpha:
+            self.register_buffer("log_alpha", log_alpha)
+        else:
+            self.register_parameter("log_alpha", nn.Parameter(log_alpha))
+        self.register_buffer("target_entropy", torch.tensor(float(target_entropy), device=device))
 
     def _apply(self, fn: Callable[[Tensor], Tensor], *args: Any) -> PriorSpaceLoss:
         # Not a submodule, but it must be on the device of the rest.
@@ -156,7 +173,12 @@ class PriorSpaceLoss(LossModule):
         return delta, log_prob + delta.shape[-2:].numel() * math.log(self.decoder.delta)
 
     def _values(self, data: TensorDictBase) -> Tensor:
-        return data.get(self.tensor_keys.state_action_value).squeeze(-1)
+        key = self.tensor_keys.state_action_value
+        values = data.get(key, None)
+        if values is None or values.shape[-1:] != (1,):
+            found = "none" if values is None else f"the shape {tuple(values.shape)}"
+            raise ValueError(f"every critic must give one value [*B, 1] at {key!r}, found {found}")
+        return values.squeeze(-1)
 
     def _combine(self, data: TensorDictBase) -> Tensor:
         values = self._values(data)
@@ -182,8 +204,14 @@ def check_networks(
     """Whether the networks read and write what the decoder does.
 
     Raises:
+        TypeError: if the actor gives no distribution.
         ValueError: naming the network and the key or size.
     """
+    if not isinstance(actor, ProbabilisticTensorDictSequential):
+        raise TypeError(
+            f"the actor must be the ProbabilisticActor alone, without a decoder behind it, got "
+            f"{type(actor).__name__}"
+        )
     written = [unravel_key(key) for key in actor.dist_sample_keys]
     if written != [decoder.delta_key]:
         raise ValueError(f"the actor writes {written}, but the decoder reads {decoder.delta_key}")
@@ -207,6 +235,13 @@ def check_networks(
         for module in critics:
             if key not in [unravel_key(k) for k in module.in_keys]:
                 raise ValueError(f"{name} must read {key}, it reads {module.in_keys}")
+
+
+def check_counts(**counts: int) -> None:
+    """Raise ValueError for the first of them that is below one."""
+    for name, count in counts.items():
+        if count < 1:
+            raise ValueError(f"{name} must be at least 1, got {count}")
 
 
 def check_finite(losses: Mapping[str, Tensor]) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Literal
@@ -11,13 +10,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.objectives.utils import _vmap_func
 
 from warmprior import keys
 from warmprior.modules.decoder import PriorDecoder
 from warmprior.modules.residual import ResidualDistribution, ResidualSampler
-from warmprior.objectives._prior_space import PriorSpaceLoss, check_networks
+from warmprior.objectives._prior_space import PriorSpaceLoss, check_counts, check_networks
 
 __all__ = ["DSRLNALoss"]
 
@@ -58,14 +57,14 @@ class DSRLNALoss(PriorSpaceLoss):
             if "loss_qvalue" in losses.keys():
                 updater.step()
 
-    One optimiser does for all: Adam passes over parameters without gradient. :meth:`forward` computes all
-    four losses on one batch.
+    One optimiser does for all: Adam passes over parameters without gradient.
 
     Args:
         actor_network: the policy over residuals, see :func:`~warmprior.make_prior_space_actor`.
         qvalue_network: :math:`Q^A`, which reads ``decoder.chunk_key`` (all ``P`` actions, or its targets
-            would not be Markov for WP-Preview); one module, initialised ``num_qvalue_nets`` times anew, or a
-            list.
+            would not be Markov for WP-Preview; for what else see
+            :func:`~warmprior.make_prior_space_critic`); one module, initialised ``num_qvalue_nets`` times
+            anew, or a list.
         noise_qvalue_network: :math:`Q^W`, which reads ``decoder.delta_key``; the same.
         decoder: the frozen policy. It is not among the loss's submodules: ``parameters()``,
             ``state_dict()`` and target updates never see it. For the official implementation's unscaled
@@ -99,7 +98,9 @@ class DSRLNALoss(PriorSpaceLoss):
         the chunk is not needed.
 
     Raises:
-        ValueError: for an unknown option or a network that does not fit the decoder.
+        TypeError: if the actor gives no distribution.
+        ValueError: for an unknown option or a network that does not fit the decoder; (when called) if a
+            critic gives several values.
         KeyError: (when called) if the batch lacks a key.
         FloatingPointError: (when called) if a loss is NaN or infinite, naming it.
 
@@ -140,8 +141,6 @@ class DSRLNALoss(PriorSpaceLoss):
     noise_qvalue_network: TensorDictModule
     noise_qvalue_network_params: TensorDictParams
     target_noise_qvalue_network_params: TensorDictParams
-    log_alpha: Tensor
-    target_entropy: Tensor
 
     def __init__(
         self,
@@ -167,10 +166,7 @@ class DSRLNALoss(PriorSpaceLoss):
         super().__init__(
             decoder, backup=backup, bootstrap_timeouts=bootstrap_timeouts, discount=discount
         )
-        if noise_critic_steps < 1:
-            raise ValueError(f"noise_critic_steps must be at least 1, got {noise_critic_steps}")
-        if not alpha_init > 0:
-            raise ValueError(f"alpha_init must be > 0, got {alpha_init}")
+        check_counts(num_qvalue_nets=num_qvalue_nets, noise_critic_steps=noise_critic_steps)
         check_networks(actor_network, qvalue_network, noise_qvalue_network, decoder)
         self.backup_entropy = backup_entropy
         self.noise_critic_steps = noise_critic_steps
@@ -183,13 +179,7 @@ class DSRLNALoss(PriorSpaceLoss):
             qvalue_network, "qvalue_network", num_qvalue_nets, create_target_params=True
         )
         self.convert_to_functional(noise_qvalue_network, "noise_qvalue_network", num_qvalue_nets)
-        device = self._default_device
-        log_alpha = torch.tensor(math.log(alpha_init), device=device)
-        if fixed_alpha:
-            self.register_buffer("log_alpha", log_alpha)
-        else:
-            self.register_parameter("log_alpha", nn.Parameter(log_alpha))
-        self.register_buffer("target_entropy", torch.tensor(float(target_entropy), device=device))
+        self._register_temperature(alpha_init, fixed_alpha, target_entropy)
         self._make_vmap()
 
     def _make_vmap(self) -> None:
@@ -234,8 +224,7 @@ class DSRLNALoss(PriorSpaceLoss):
         Raises:
             ValueError: if ``updates < 1``.
         """
-        if updates < 1:
-            raise ValueError(f"updates must be at least 1, got {updates}")
+        check_counts(updates=updates)
         return iter(
             [self.reinforcement_loss] * updates + [self.distillation_loss] * self.noise_critic_steps
         )
