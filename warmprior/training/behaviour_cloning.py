@@ -17,6 +17,7 @@ from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
+    check_identity,
     load_state,
     module_tensors,
     named,
@@ -285,13 +286,7 @@ class BehaviourCloning:
 
     def _restore(self) -> None:
         tensors, facts = load_state(self.state_path)
-        for part, mine in self.identity.items():
-            theirs = facts["identity"].get(part)
-            if theirs != mine:
-                raise ValueError(
-                    f"{self.state_path} belongs to another {part}: it has {theirs}, this run has "
-                    f"{mine}. Use the same options, another output folder, or do not resume."
-                )
+        check_identity(self.state_path, facts["identity"], self.identity)
         try:
             self.actor.network.load_state_dict(select("network", tensors))
             self.ema.load_state_dict(select("ema", tensors))

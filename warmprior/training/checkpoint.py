@@ -45,6 +45,20 @@ def load_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise ValueError(f"{path} is not a readable training state: {error}") from error
 
 
+def check_identity(path: Path, theirs: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
+    """Whether a stored state belongs to the training that wants to continue it.
+
+    Raises:
+        ValueError: naming the first part that differs.
+    """
+    for part, value in mine.items():
+        if theirs.get(part) != value:
+            raise ValueError(
+                f"{path} belongs to another {part}: it has {theirs.get(part)}, this run has {value}. Use "
+                "the same options, another output folder, or do not resume."
+            )
+
+
 def snapshot_optimizer(optimizer: Optimizer) -> dict[str, Tensor]:
     """The optimiser's per-parameter tensors, by position and name."""
     state = optimizer.state_dict()["state"]

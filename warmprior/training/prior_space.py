@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.training.checkpoint import load_state, save_state
+from warmprior.training.checkpoint import check_identity, load_state, save_state
 from warmprior.training.evaluation import Episode, evaluate, watched
 from warmprior.training.prior_space_agent import PriorSpaceAgent
 from warmprior.training.prior_space_config import PriorSpaceConfig
@@ -232,13 +232,7 @@ class PriorSpaceTraining:
 
     def _restore(self) -> None:
         tensors, facts = load_state(self.state_path)
-        for part, mine in self.identity.items():
-            theirs = facts["identity"].get(part)
-            if theirs != mine:
-                raise ValueError(
-                    f"{self.state_path} belongs to another {part}: it has {theirs}, this run has "
-                    f"{mine}. Use the same options, or another output folder."
-                )
+        check_identity(self.state_path, facts["identity"], self.identity)
         self.segments = ReplaySegments(self.directory / "buffer", facts["segments"])
         transitions = self.segments.load()
         if transitions is not None:
