@@ -249,14 +249,20 @@ def start_comparison(
     )
 
 
-def finished_run(run: Path, device: str) -> tuple[dict[str, Any], dict[str, list[WarmPriorActor]]]:
-    """The facts of a run of robomimic.py and its last policies, by prior one per seed."""
+def run_facts(run: Path) -> dict[str, Any]:
+    """What the results of a finished run of robomimic.py tell about it."""
     path = run / "results.json"
     if not path.is_file():
         raise FileNotFoundError(f"--run {run}: it has no results.json; name a run of robomimic.py")
     meta = json.loads(path.read_text())["meta"]
     if not {"policies", "task"} <= meta.keys():
         raise ValueError(f"{path} does not say where its policies lie: run robomimic.py again")
+    return meta
+
+
+def finished_run(run: Path, device: str) -> tuple[dict[str, Any], dict[str, list[WarmPriorActor]]]:
+    """The facts of a run of robomimic.py and its last policies, by prior one per seed."""
+    meta = run_facts(run)
     entries = [(Prior.from_config(entry["prior"]), entry["folder"]) for entry in meta["policies"]]
     described = {prior.describe(): prior.name for prior, _ in entries}
     if len(set(described.values())) < len(described):

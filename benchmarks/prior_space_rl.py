@@ -15,17 +15,19 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import _experiment as experiment
 import torch
+from _prior_space_budgets import BUDGETS, PRIORS, Budget, algorithms, make_config
 from torchrl.envs import EnvBase, TransformedEnv
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, PriorAnchor, WarmPriorActor
+from warmprior import Prior, PriorAnchor, WarmPriorActor
 from warmprior._files import check_writable, write_atomic
 from warmprior.data.tasks import EVALUATION_SEED
 from warmprior.diagnostics import (
@@ -38,94 +40,17 @@ from warmprior.diagnostics import (
 from warmprior.diagnostics.results import PRIOR_LABELS
 from warmprior.envs import GoalNavigationEnv
 from warmprior.training import (
-    NAVIGATION_PRESETS,
     PRESETS,
     NavigationStudy,
-    Preset,
     PriorSpaceConfig,
     PriorSpaceTraining,
     parallel_env,
 )
+from warmprior.training.policies import Policies
 from warmprior.transforms import policy_transforms
 
-PRIORS: dict[str, type[Prior]] = {"base": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
 TASKS = ("navigation", "lift", "can", "square", "transport")
-OFFICIAL = {
-    "lift": {"gamma": 0.99, "updates": 30, "warmup_steps": 24_000},
-    "can": {"gamma": 0.99, "updates": 20, "warmup_steps": 24_000},
-    "square": {"gamma": 0.999, "updates": 20, "warmup_steps": 32_000},
-    "transport": {"gamma": 0.99, "updates": 20, "warmup_steps": 640_000, "hidden_dim": 128},
-}
-"""DSRL's hyper-parameters per task, where they differ from :class:`PriorSpaceConfig`'s."""
-
-
-@dataclass(frozen=True)
-class Budget:
-    """What a preset spends; options of the command line replace its parts."""
-
-    summary: str
-    config: PriorSpaceConfig
-    pretraining: Preset
-    priors: tuple[str, ...]
-    seeds: int
-    envs: int
-    chunk: int
-
-
-BUDGETS = {
-    "unit": Budget(
-        summary="the navigation toy with a goal, three seeds: under two minutes",
-        config=PriorSpaceConfig(
-            environment_steps=14_000,
-            warmup_steps=3_000,
-            nfe=2,
-            updates=6,
-            noise_critic_steps=3,
-            learning_rate=1e-3,
-            gamma=1.0,
-            hidden_dim=128,
-            num_layers=2,
-            reward_offset=0.0,
-            evaluate_every=7_000,
-            evaluation_episodes=128,
-        ),
-        pretraining=PRESETS["quick"],  # not used: the toy has a recipe of its own
-        priors=("past",),
-        seeds=3,
-        envs=32,
-        chunk=4,
-    ),
-    "quick": Budget(
-        summary="can from a weak policy, WP-Past against the base, two seeds: half an hour",
-        config=PriorSpaceConfig(
-            environment_steps=24_000,
-            warmup_steps=4_000,
-            nfe=1,
-            updates=4,
-            noise_critic_steps=2,
-            batch_size=128,
-            hidden_dim=128,
-            evaluate_every=8_000,
-            evaluation_episodes=25,
-        ),
-        pretraining=replace(
-            PRESETS["quick"], training=replace(PRESETS["quick"].training, iterations=500)
-        ),
-        priors=("base", "past"),
-        seeds=2,
-        envs=2,
-        chunk=8,
-    ),
-    "paper": Budget(
-        summary="DSRL's hyper-parameters per task, three seeds: needs a GPU",
-        config=PriorSpaceConfig(environment_steps=1_000_000),
-        pretraining=PRESETS["paper"],
-        priors=("base", "past", "preview"),
-        seeds=3,
-        envs=4,
-        chunk=4,
-    ),
-}
+Task = tuple[WarmPriorActor, Callable[[int], EnvBase]]
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -139,7 +64,9 @@ def make_parser() -> argparse.ArgumentParser:
     add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (%(default)s)")
     add("--dataset", type=Path, help="a robomimic HDF5 file for the frozen policy")
     add("--download", action="store_true", help="fetch the official file from the hub instead")
-    add("--run", type=Path, help="take the frozen policies of this finished run of robomimic.py")
+    add(
+        "--run", type=Path, help="take policies, task and data of this finished run of robomimic.py"
+    )
     add(
         "--algorithm",
         nargs="+",
@@ -172,49 +99,16 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def default_task(args: argparse.Namespace) -> str:
+    if args.run is not None:
+        return str(experiment.run_facts(args.run)["task"])
     return "navigation" if args.preset == "unit" else "can"
 
 
-def make_config(args: argparse.Namespace) -> tuple[Budget, PriorSpaceConfig]:
-    budget = BUDGETS[args.preset]
-    values: dict[str, Any] = dict(OFFICIAL[args.task]) if args.preset == "paper" else {}
-    values |= {
-        name: value
-        for name, value in {
-            "delta": args.delta,
-            "nfe": args.nfe,
-            "environment_steps": args.steps,
-            "warmup_steps": args.warmup,
-            "updates": args.updates,
-            "evaluate_every": args.evaluate_every,
-            "evaluation_episodes": args.episodes,
-        }.items()
-        if value is not None
-    }
-    config = replace(budget.config, **values)
-    for name in ("seeds", "envs", "chunk"):
-        value = getattr(args, name)
-        if value is not None:
-            if value < 1:
-                raise ValueError(f"--{name} must be at least 1, got {value}")
-            budget = replace(budget, **{name: value})
-    if args.prior is not None:
-        budget = replace(budget, priors=tuple(dict.fromkeys(args.prior)))
-    if args.iterations is not None:
-        training = replace(budget.pretraining.training, iterations=args.iterations)
-        budget = replace(budget, pretraining=replace(budget.pretraining, training=training))
-    return budget, config
-
-
-Task = tuple[WarmPriorActor, Callable[[int], EnvBase]]
-
-
-def toy_task(budget: Budget, folder: Path, name: str, seed: int) -> Task:
+def toy_task(args: argparse.Namespace, budget: Budget, name: str, seed: int) -> Task:
     """A policy that knows both routes, and the toy that rewards one."""
-    quick = NAVIGATION_PRESETS["quick"]
-    preset = replace(quick, training=replace(quick.training, iterations=1_000, save_every=1_000))
-    study = NavigationStudy(preset, {name: PRIORS[name](budget.chunk)}, folder)
-    actor = study.train(name, seed)
+    priors = {name: PRIORS[name](budget.chunk)}
+    study = NavigationStudy(budget.pretraining, priors, args.out / "policies")
+    actor = study.train(name, seed).to(args.device)
 
     def make_env(env_seed: int) -> EnvBase:
         transforms = policy_transforms(actor.prior, observation_steps=1)
@@ -231,18 +125,26 @@ def manipulation_env(make_workers: Callable[[], EnvBase], prior: Prior, env_seed
     return env
 
 
-def manipulation_tasks(args: argparse.Namespace, budget: Budget) -> Callable[[str, int], Task]:
-    """Frozen policies and simulators, by prior and seed."""
-    policies = experiment.find_policies(args, budget.pretraining)
-    stored = experiment.finished_run(args.run, args.device)[1] if args.run else None
+def manipulation_tasks(
+    args: argparse.Namespace, budget: Budget
+) -> tuple[Callable[[str, int], Task], dict[str, Any]]:
+    """Frozen policies and simulators, by prior and seed; and the facts about them."""
+    stored = None
+    if args.run is None:
+        policies = experiment.find_policies(args, budget.pretraining)
+    else:
+        policies, stored = finished_policies(args)
+        missing = [name for name in budget.priors if PRIORS[name].name not in stored]
+        if missing:
+            raise ValueError(
+                f"--run {args.run} has policies of {', '.join(stored)}, but none of {', '.join(missing)}"
+            )
 
     def task(name: str, seed: int) -> Task:
         if stored is None:
             actor = policies.policy(PRIORS[name](budget.chunk), seed)
         else:
-            group = stored.get(PRIORS[name].name, [])
-            if not group:
-                raise ValueError(f"--run {args.run} has no policy of the prior {name}")
+            group = stored[PRIORS[name].name]
             actor = group[seed % len(group)]
         transforms = partial(
             policy_transforms,
@@ -253,7 +155,28 @@ def manipulation_tasks(args: argparse.Namespace, budget: Budget) -> Callable[[st
         workers = partial(parallel_env, policies.make_env, transforms, budget.envs)
         return actor, partial(manipulation_env, workers, actor.prior)
 
-    return task
+    return task, policies.facts()
+
+
+def finished_policies(
+    args: argparse.Namespace,
+) -> tuple[Policies, dict[str, list[WarmPriorActor]]]:
+    """The data of a finished run, from which its simulators and normaliser follow, and its policies."""
+    meta, actors = experiment.finished_run(args.run, args.device)
+    if args.task != meta["task"]:
+        raise ValueError(f"--run {args.run} is of {meta['task']}, not of {args.task}")
+    options = meta["options"]
+    data = {key: options[key] for key in ("data", "dataset", "download", "demonstrations")}
+    data["dataset"] = data["dataset"] and Path(data["dataset"])
+    theirs = argparse.Namespace(**vars(args) | data)
+    policies = experiment.find_policies(theirs, PRESETS[options["preset"]])
+    if policies.demonstrations.sha256 != meta["data"]["sha256"]:
+        raise ValueError(
+            f"{policies.demonstrations.path} is not the file that --run {args.run} was trained on: its "
+            "policies would meet observations normalised in another way. Put the file back, or run "
+            "robomimic.py again"
+        )
+    return policies, actors
 
 
 def summarize(name: str, seed: int, config: PriorSpaceConfig, training: Any) -> dict[str, Any]:
@@ -324,52 +247,47 @@ def draw(rows: list[dict[str, Any]], out: Path, curve: Any, title: str, warmup: 
 def main(argv: list[str] | None = None) -> int:
     try:
         args = experiment.parse(make_parser, argv, "rl-", default_task)
-        unit = args.task == "navigation"
-        if unit != (args.preset == "unit"):
-            raise ValueError("--task navigation and --preset unit belong together")
         budget, config = make_config(args)
         experiment.check(args)
         check_writable(args.out)
         options = experiment.store_options(args)
         print(f"Output folder: {args.out}", flush=True)
-        task = (
-            partial(toy_task, budget, args.out / "policies")
-            if unit
-            else manipulation_tasks(args, budget)
-        )
-        if unit:
+        if args.preset == "unit":
             torch.set_num_threads(1)  # more of them only wait for each other
+            task, facts = partial(toy_task, args, budget), {"task": args.task}
+        else:
+            task, facts = manipulation_tasks(args, budget)
         packages = ("warmprior", "torch", "torchrl", "tensordict")
         meta: dict[str, Any] = {
             "versions": {package: version(package) for package in packages},
             "hardware": {"cores": os.cpu_count(), "torch_threads": torch.get_num_threads()},
             "options": options,
+            "config": asdict(config),
+            **facts,
         }
         rows: list[dict[str, Any]] = []
         curve: list[dict[str, Any]] = []
         started = time.monotonic()
-        for seed in range(budget.seeds):
-            for algorithm in args.algorithm or ["dsrl-na"]:
-                for name in budget.priors:
-                    mine = replace(config, algorithm=algorithm, seed=seed)
-                    actor, make_env = task(name, seed)
-                    training = PriorSpaceTraining(
-                        actor,
-                        make_env,
-                        mine,
-                        args.out / f"{algorithm}-{name}-seed{seed}",
-                        evaluation_seed=EVALUATION_SEED,
-                        description=f"{algorithm} {name}, seed {seed}",
-                    )
-                    training.run()
-                    rows.append(summarize(name, seed, mine, training))
-                    key = {"algorithm": algorithm, "prior": PRIORS[name].name, "seed": seed}
-                    curve += [key | row for row in training.curve]
-                    meta["wall_time_s"] = time.monotonic() - started
-                    write_results(args.out / "results.json", meta, rows, curve=curve)
+        for seed, algorithm, name in product(range(budget.seeds), algorithms(args), budget.priors):
+            mine = replace(config, algorithm=algorithm, seed=seed)
+            actor, make_env = task(name, seed)
+            training = PriorSpaceTraining(
+                actor,
+                make_env,
+                mine,
+                args.out / f"{algorithm}-{name}-seed{seed}",
+                evaluation_seed=EVALUATION_SEED,
+                description=f"{algorithm} {name}, seed {seed}",
+            )
+            training.run()
+            rows.append(summarize(name, seed, mine, training))
+            key = {"algorithm": algorithm, "prior": PRIORS[name].name, "seed": seed}
+            curve += [key | row for row in training.curve]
+            meta["wall_time_s"] = time.monotonic() - started
+            write_results(args.out / "results.json", meta, rows, curve=curve)
         table = make_table(rows)
         write_atomic(args.out / "table.md", lambda path: path.write_text(table))
-        where = "navigation to a goal" if unit else f"{args.task} {args.data}"
+        where = " ".join(facts[key] for key in ("task", "style") if key in facts)
         draw(rows, args.out, curve, f"{where}, NFE {config.nfe}", config.warmup_steps)
     except experiment.ERRORS as error:
         print(f"prior_space_rl.py: error: {error}", file=sys.stderr)
