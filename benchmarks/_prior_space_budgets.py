@@ -106,6 +106,8 @@ def make_config(args: argparse.Namespace) -> tuple[Budget, PriorSpaceConfig]:
     """
     _refuse_ignored(args)
     budget = BUDGETS[args.preset]
+    if (args.preset, args.task) == ("paper", "transport"):
+        budget = replace(budget, chunk=8)
     values: dict[str, Any] = dict(OFFICIAL[args.task]) if args.preset == "paper" else {}
     values |= {
         name: value
