@@ -44,21 +44,21 @@ BUDGETS = {
     "unit": Budget(
         summary="the navigation toy with a goal, three seeds: under two minutes",
         config=PriorSpaceConfig(
-            environment_steps=14_000,
+            environment_steps=12_000,
             warmup_steps=3_000,
             nfe=2,
             updates=6,
-            noise_critic_steps=3,
+            noise_critic_steps=2,
             learning_rate=1e-3,
             gamma=1.0,
             hidden_dim=128,
             num_layers=2,
             reward_offset=0.0,
-            evaluate_every=7_000,
+            evaluate_every=6_000,
             evaluation_episodes=128,
         ),
         pretraining=replace(
-            TOY, training=replace(TOY.training, iterations=1_000, save_every=1_000)
+            TOY, training=replace(TOY.training, iterations=800, save_every=800)
         ),
         priors=("past",),
         seeds=3,
