@@ -57,9 +57,7 @@ BUDGETS = {
             evaluate_every=6_000,
             evaluation_episodes=128,
         ),
-        pretraining=replace(
-            TOY, training=replace(TOY.training, iterations=800, save_every=800)
-        ),
+        pretraining=replace(TOY, training=replace(TOY.training, iterations=800, save_every=800)),
         priors=("past",),
         seeds=3,
         envs=32,

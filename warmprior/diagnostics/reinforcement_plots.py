@@ -57,7 +57,7 @@ def plot_reinforcement(
             label = f"{algorithm.upper()}, {PRIOR_LABELS.get(prior, prior)} ({len(seeds)} seeds)"
             axis.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
             axis.plot(x, mean, color=color, ls=style, marker="o", ms=3, lw=1.4, label=label)
-        axis.axvspan(0, warmup_steps, color="0.92", lw=0)
+        axis.axvspan(0, warmup_steps, color="0.92", lw=0, zorder=-1)
         axis.set_title(f"{kind} agent; at 0 the frozen policy", fontsize=9)
         axis.set_xlabel("control steps (shaded: warm-up)")
         axis.set_ylim(-0.02, 1.02)
