@@ -131,18 +131,19 @@ def make_preset(args: argparse.Namespace) -> Preset:
     """The chosen preset with the options that replace parts of it."""
     preset = PRESETS[args.preset]
     if args.iterations is not None:
-        kept = min(preset.training.checkpoints, args.iterations)
-        preset = replace(
-            preset,
-            training=replace(preset.training, iterations=args.iterations, checkpoints=kept),
-        )
-    for option in ("seeds", "episodes", "envs"):
-        value = getattr(args, option)
+        preset = replace(preset, training=preset.training.with_iterations(args.iterations))
+    return with_counts(preset, args, ("seeds", "episodes", "envs"))
+
+
+def with_counts(budget: Any, args: argparse.Namespace, names: Sequence[str]) -> Any:
+    """Replace the named parts of a budget by the options of the same name that were given."""
+    for name in names:
+        value = getattr(args, name)
         if value is not None:
             if value < 1:
-                raise ValueError(f"--{option} must be at least 1, got {value}")
-            preset = replace(preset, **{option: value})
-    return preset
+                raise ValueError(f"--{name} must be at least 1, got {value}")
+            budget = replace(budget, **{name: value})
+    return budget
 
 
 def output_folder(args: argparse.Namespace, prefix: str = "", default_task: str = "square") -> Path:

@@ -6,6 +6,8 @@ import argparse
 from dataclasses import dataclass, replace
 from typing import Any
 
+import _experiment as experiment
+
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
 from warmprior.training import (
     NAVIGATION_PRESETS,
@@ -121,18 +123,11 @@ def make_config(args: argparse.Namespace) -> tuple[Budget, PriorSpaceConfig]:
         if value is not None
     }
     config = replace(budget.config, **values)
-    for name in ("seeds", "envs", "chunk"):
-        value = getattr(args, name)
-        if value is not None:
-            if value < 1:
-                raise ValueError(f"--{name} must be at least 1, got {value}")
-            budget = replace(budget, **{name: value})
+    budget = experiment.with_counts(budget, args, ("seeds", "envs", "chunk"))
     if args.prior is not None:
         budget = replace(budget, priors=tuple(dict.fromkeys(args.prior)))
     if args.iterations is not None:
-        training = budget.pretraining.training
-        kept = min(training.checkpoints, args.iterations)
-        training = replace(training, iterations=args.iterations, checkpoints=kept)
+        training = budget.pretraining.training.with_iterations(args.iterations)
         budget = replace(budget, pretraining=replace(budget.pretraining, training=training))
     return budget, config
 

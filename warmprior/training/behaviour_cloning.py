@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,15 @@ class TrainingConfig:
             raise ValueError(
                 f"cannot keep {self.checkpoints} checkpoints of {self.iterations} iterations"
             )
+
+    def with_iterations(self, iterations: int) -> TrainingConfig:
+        """The same recipe with another number of gradient steps, and no more checkpoints than those.
+
+        Raises:
+            ValueError: if ``iterations < 1``.
+        """
+        kept = min(self.checkpoints, iterations)
+        return replace(self, iterations=iterations, checkpoints=kept)
 
     @property
     def checkpoint_iterations(self) -> list[int]:
