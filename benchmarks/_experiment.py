@@ -23,9 +23,10 @@ from warmprior.data import TASKS, download_robomimic, generate_demonstrations, g
 from warmprior.training import PRESETS, Preset
 from warmprior.training.comparison import Comparison
 from warmprior.training.demonstrations import Demonstrations
+from warmprior.training.evaluation import WorkerError
 from warmprior.training.policies import Policies
 
-ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError)
+ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError)
 """What a user can mend: reported without a traceback."""
 
 
@@ -155,7 +156,9 @@ def output_folder(args: argparse.Namespace, prefix: str = "", default_task: str 
             )
         return args.out
     task = args.task or (args.dataset.stem if args.dataset else default_task)
-    name = f"{prefix}{task}-{args.data}-{args.preset}"
+    run = getattr(args, "run", None)
+    style = args.data if run is None else run_facts(run)["style"]
+    name = f"{prefix}{task}-{style}-{args.preset}"
     return numbered_folder(Path("runs"), name, latest=args.resume)
 
 

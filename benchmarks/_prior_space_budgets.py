@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import _experiment as experiment
@@ -18,18 +19,32 @@ from warmprior.training import (
 )
 
 PRIORS: dict[str, type[Prior]] = {"base": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
-OFFICIAL: dict[str, dict[str, Any]] = {
-    "lift": {"gamma": 0.99, "updates": 30, "warmup_steps": 24_000},
-    "can": {"gamma": 0.99, "updates": 20, "warmup_steps": 24_000},
-    "square": {"gamma": 0.999, "updates": 20, "warmup_steps": 32_000},
-    "transport": {"gamma": 0.99, "updates": 20, "warmup_steps": 640_000, "hidden_dim": 128},
-}
-"""DSRL's hyper-parameters per task, where they differ from :class:`PriorSpaceConfig`'s."""
+
+
+@dataclass(frozen=True)
+class TaskBudget:
+    """What a preset does differently on one task.
+
+    Attributes:
+        config: parts of the recipe.
+        horizon: time limit in control steps, if not that of the task.
+        demonstrations: of the frozen policy.
+        iterations: of the frozen policy.
+        chunk: chunk length ``H`` of the frozen policy.
+        base_delta: half the side of the box around zero, if not 1.5.
+    """
+
+    config: Mapping[str, Any] = field(default_factory=dict)
+    horizon: int | None = None
+    demonstrations: int | None = None
+    iterations: int | None = None
+    chunk: int | None = None
+    base_delta: float | None = None
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a preset spends; options of the command line replace its parts."""
+    """What a preset spends; ``tasks`` and options of the command line replace parts of it."""
 
     summary: str
     config: PriorSpaceConfig
@@ -38,6 +53,13 @@ class Budget:
     seeds: int
     envs: int
     chunk: int
+    tasks: Mapping[str, TaskBudget] = field(default_factory=dict)
+    horizon: int | None = None
+    base_delta: float | None = None
+
+    def delta(self, config: PriorSpaceConfig, prior: str) -> float | None:
+        """Half the side of an agent's box; ``None`` for the default of its prior."""
+        return self.base_delta if config.delta is None and prior == "base" else config.delta
 
 
 TOY = NAVIGATION_PRESETS["quick"]
@@ -66,25 +88,32 @@ BUDGETS = {
         chunk=4,
     ),
     "quick": Budget(
-        summary="can from a weak policy, WP-Past against the base, two seeds: half an hour",
+        summary="lift from a weak policy, WP-Past against the base, two seeds: half an hour",
         config=PriorSpaceConfig(
-            environment_steps=24_000,
-            warmup_steps=4_000,
+            environment_steps=40_000,
+            warmup_steps=3_000,
             nfe=1,
             updates=4,
             noise_critic_steps=2,
-            batch_size=128,
+            learning_rate=1e-3,
+            gamma=0.97,
             hidden_dim=128,
-            evaluate_every=8_000,
-            evaluation_episodes=25,
+            # At 1, the entropy of 56 coordinates outweighs the 8 control steps of a decision: the agent
+            # would be paid for not solving the task, until the temperature has fallen.
+            alpha_init=0.05,
+            evaluate_every=10_000,
+            evaluation_episodes=40,
         ),
-        pretraining=replace(
-            PRESETS["quick"], training=replace(PRESETS["quick"].training, iterations=500)
-        ),
+        pretraining=PRESETS["quick"],
         priors=("base", "past"),
         seeds=2,
-        envs=2,
+        envs=4,
         chunk=8,
+        tasks={
+            # Weak policies: solved in 0.3 to 0.6 of the episodes.
+            "lift": TaskBudget(demonstrations=5, iterations=300, horizon=90),
+            "can": TaskBudget(iterations=500),
+        },
     ),
     "paper": Budget(
         summary="DSRL's hyper-parameters per task, three seeds: needs a GPU",
@@ -94,6 +123,17 @@ BUDGETS = {
         seeds=3,
         envs=4,
         chunk=4,
+        tasks={
+            "lift": TaskBudget({"updates": 30}, horizon=300),
+            "can": TaskBudget(horizon=300),
+            "square": TaskBudget({"gamma": 0.999, "warmup_steps": 32_000}, horizon=400),
+            "transport": TaskBudget(
+                {"hidden_dim": 128, "warmup_steps": 640_000},
+                horizon=800,
+                chunk=8,
+                base_delta=1.0,
+            ),
+        },
     ),
 }
 
@@ -106,10 +146,8 @@ def make_config(args: argparse.Namespace) -> tuple[Budget, PriorSpaceConfig]:
     """
     _refuse_ignored(args)
     budget = BUDGETS[args.preset]
-    if (args.preset, args.task) == ("paper", "transport"):
-        budget = replace(budget, chunk=8)
-    values: dict[str, Any] = dict(OFFICIAL[args.task]) if args.preset == "paper" else {}
-    values |= {
+    task = budget.tasks.get(args.task, TaskBudget())
+    values = dict(task.config) | {
         name: value
         for name, value in {
             "delta": args.delta,
@@ -123,13 +161,26 @@ def make_config(args: argparse.Namespace) -> tuple[Budget, PriorSpaceConfig]:
         if value is not None
     }
     config = replace(budget.config, **values)
-    budget = experiment.with_counts(budget, args, ("seeds", "envs", "chunk"))
+    budget = replace(
+        budget,
+        pretraining=_pretraining(args, budget.pretraining, task),
+        chunk=task.chunk or budget.chunk,
+        horizon=task.horizon,
+        base_delta=task.base_delta,
+    )
+    budget = experiment.with_counts(budget, args, ("seeds", "envs", "chunk", "horizon"))
     if args.prior is not None:
         budget = replace(budget, priors=tuple(dict.fromkeys(args.prior)))
-    if args.iterations is not None:
-        training = budget.pretraining.training.with_iterations(args.iterations)
-        budget = replace(budget, pretraining=replace(budget.pretraining, training=training))
     return budget, config
+
+
+def _pretraining(args: argparse.Namespace, preset: Any, task: TaskBudget) -> Any:
+    iterations = task.iterations if args.iterations is None else args.iterations
+    if iterations is not None:
+        preset = replace(preset, training=preset.training.with_iterations(iterations))
+    if task.demonstrations is not None:
+        preset = replace(preset, demonstrations={args.data: task.demonstrations})
+    return preset
 
 
 def algorithms(args: argparse.Namespace) -> list[str]:
@@ -146,7 +197,8 @@ def _refuse_ignored(args: argparse.Namespace) -> None:
     data = {"data": "ph", "dataset": None, "download": False, "demonstrations": None}
     training = {"compile": False, "logger": "csv"}
     if args.preset == "unit":
-        told, unused = "the toy has demonstrations of its own", data | training | {"run": None}
+        told = "the toy has demonstrations and a time limit of its own"
+        unused = data | training | {"run": None, "horizon": None}
     elif args.run is not None:
         told = "--run brings its policies and their data"
         unused = data | training | {"chunk": None, "iterations": None}

@@ -1,7 +1,7 @@
 """The paper's Fig. 7: reinforcement learning in the source space of a frozen policy.
 
 python benchmarks/prior_space_rl.py --preset unit            # the navigation toy, under two minutes
-python benchmarks/prior_space_rl.py                          # can from a weak policy, half an hour
+python benchmarks/prior_space_rl.py                          # lift from a weak policy, half an hour
 python benchmarks/prior_space_rl.py --preset paper --task square --run runs/square-ph-paper
 python benchmarks/prior_space_rl.py --resume                 # after an interruption
 
@@ -25,24 +25,18 @@ from typing import Any
 import _experiment as experiment
 import torch
 from _prior_space_budgets import BUDGETS, PRIORS, Budget, algorithms, make_config
+from _prior_space_report import draw, make_table, summarize
 from torchrl.envs import EnvBase, TransformedEnv
 
 from warmprior import Prior, PriorAnchor, WarmPriorActor
 from warmprior._files import check_writable, write_atomic
+from warmprior.data import get_task
 from warmprior.data.tasks import EVALUATION_SEED
-from warmprior.diagnostics import (
-    Row,
-    plot_reinforcement,
-    plot_success,
-    summarize_seeds,
-    write_results,
-)
-from warmprior.diagnostics.results import PRIOR_LABELS
+from warmprior.diagnostics import write_results
 from warmprior.envs import GoalNavigationEnv
 from warmprior.training import (
     PRESETS,
     NavigationStudy,
-    PriorSpaceConfig,
     PriorSpaceTraining,
     parallel_env,
 )
@@ -60,7 +54,7 @@ def make_parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     told = "; ".join(f"{name}: {budget.summary}" for name, budget in BUDGETS.items())
     add("--preset", default="quick", choices=BUDGETS, help=f"{told} (%(default)s)")
-    add("--task", choices=TASKS, help="default: navigation, the toy, in unit; can otherwise")
+    add("--task", choices=TASKS, help="default: navigation, the toy, in unit; lift otherwise")
     add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (%(default)s)")
     add("--dataset", type=Path, help="a robomimic HDF5 file for the frozen policy")
     add("--download", action="store_true", help="fetch the official file from the hub instead")
@@ -75,6 +69,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add("--prior", nargs="+", choices=PRIORS, help="default: the preset's")
     add("--delta", type=float, help="half the agent's box (default: 0.5 around a mean, 1.5 else)")
+    add("--horizon", type=int, help="time limit in control steps (default: the preset's or task's)")
     add("--nfe", type=int, help="network evaluations per chunk (default: the preset's)")
     add(
         "--chunk", type=int, help="chunk length H of a newly trained policy (default: the preset's)"
@@ -101,7 +96,7 @@ def make_parser() -> argparse.ArgumentParser:
 def default_task(args: argparse.Namespace) -> str:
     if args.run is not None:
         return str(experiment.run_facts(args.run)["task"])
-    return "navigation" if args.preset == "unit" else "can"
+    return "navigation" if args.preset == "unit" else "lift"
 
 
 def toy_task(args: argparse.Namespace, budget: Budget, name: str, seed: int) -> Task:
@@ -146,16 +141,21 @@ def manipulation_tasks(
         else:
             group = stored[PRIORS[name].name]
             actor = group[seed % len(group)]
+            if seed >= len(group):
+                print(f"--run has {len(group)} seeds of {name}: agent {seed} shares a policy")
         transforms = partial(
             policy_transforms,
             actor.prior,
             normalizer=policies.normalizer,
             observation_steps=actor.network.observation_steps,
         )
-        workers = partial(parallel_env, policies.make_env, transforms, budget.envs)
+        make_worker = partial(policies.make_env, horizon=budget.horizon)
+        workers = partial(parallel_env, make_worker, transforms, budget.envs)
         return actor, partial(manipulation_env, workers, actor.prior)
 
-    return task, policies.facts()
+    facts = policies.facts()
+    horizon = budget.horizon or get_task(facts["task"]).horizon(facts["style"])
+    return task, facts | {"horizon": horizon}
 
 
 def finished_policies(
@@ -177,71 +177,6 @@ def finished_policies(
             "robomimic.py again"
         )
     return policies, actors
-
-
-def summarize(name: str, seed: int, config: PriorSpaceConfig, training: Any) -> dict[str, Any]:
-    """One row per agent: from where to where."""
-    last = {row["evaluation"]: row for row in training.curve}
-    return {
-        "algorithm": config.algorithm,
-        "prior": PRIORS[name].name,
-        "delta": training.decoder.delta,
-        "nfe": config.nfe,
-        "chunk": training.actor.prior.chunk_length,
-        "seed": seed,
-        "environment_steps": training.steps,
-        "episodes": config.evaluation_episodes,
-        "base_success": last["base"]["success_rate"],
-        "final_success": last["greedy"]["success_rate"],
-        "final_success_stochastic": last["stochastic"]["success_rate"],
-    }
-
-
-def make_table(rows: list[dict[str, Any]]) -> str:
-    lines = [
-        "| agent | delta | control steps | frozen policy (%) | greedy agent (%) | stochastic agent (%) |",
-        "|" + "---|" * 6,
-    ]
-    for algorithm, prior in dict.fromkeys((row["algorithm"], row["prior"]) for row in rows):
-        group = [row for row in rows if (row["algorithm"], row["prior"]) == (algorithm, prior)]
-        cells = []
-        for key in ("base_success", "final_success", "final_success_stochastic"):
-            summary = summarize_seeds([row[key] for row in group])
-            spread = f" ± {100 * summary.std:.1f}" if summary.seeds > 1 else ""
-            cells.append(f"{100 * summary.mean:.1f}{spread}")
-        label = f"{algorithm.upper()}, {PRIOR_LABELS[prior]} ({len(group)} seeds)"
-        steps = max(row["environment_steps"] for row in group)
-        lines.append(f"| {label} | {group[0]['delta']:g} | {steps} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def draw(rows: list[dict[str, Any]], out: Path, curve: Any, title: str, warmup: int) -> None:
-    plot_reinforcement(curve, out / "curves.png", title=title, warmup_steps=warmup)
-    for algorithm in dict.fromkeys(row["algorithm"] for row in rows):
-        cells = [
-            Row(
-                task="",
-                data="",
-                prior=row["prior"],
-                sigma=0.0,
-                chunk=row["chunk"],
-                nfe=row["nfe"],
-                seed=row["seed"],
-                checkpoint=0,
-                episodes=row["episodes"],
-                successes=round(row["final_success"] * row["episodes"]),
-                mean_steps=0.0,
-            )
-            for row in rows
-            if row["algorithm"] == algorithm
-        ]
-        plot_success(
-            cells,
-            out / f"success_{algorithm}.png",
-            priors=list(dict.fromkeys(cell.prior for cell in cells)),
-            nfes=[cells[0].nfe],
-            title=f"{title}: greedy {algorithm.upper()} agents",
-        )
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -269,7 +204,7 @@ def main(argv: list[str] | None = None) -> int:
         curve: list[dict[str, Any]] = []
         started = time.monotonic()
         for seed, algorithm, name in product(range(budget.seeds), algorithms(args), budget.priors):
-            mine = replace(config, algorithm=algorithm, seed=seed)
+            mine = replace(config, algorithm=algorithm, seed=seed, delta=budget.delta(config, name))
             actor, make_env = task(name, seed)
             training = PriorSpaceTraining(
                 actor,

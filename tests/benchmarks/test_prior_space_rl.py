@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import math
 import os
 import signal
 import subprocess
@@ -134,7 +135,12 @@ def test_resume_goes_on_where_it_stopped(benchmark, tmp_path, monkeypatch):
         ("--preset unit --device nowhere", "--device nowhere does not work here"),
         ("--preset quick --task navigation", "navigation and --preset unit belong together"),
         ("--preset unit --task can", "navigation and --preset unit belong together"),
-        ("--preset unit --data mh", "the toy has demonstrations of its own: leave out --data"),
+        ("--preset unit --horizon 9", "a time limit of its own: leave out --horizon"),
+        ("--horizon 0", "--horizon must be at least 1, got 0"),
+        (
+            "--preset unit --data mh",
+            "the toy has demonstrations and a time limit of its own: leave out --data",
+        ),
         ("--preset unit --demonstrations 9 --compile", "leave out --demonstrations, --compile"),
         ("--preset quick --run {tmp}", "it has no results.json; name a run of robomimic.py"),
         ("--preset quick --dataset {tmp}/none.hdf5", "no such file"),
@@ -167,21 +173,38 @@ def test_unknown_choices(benchmark, capsys, words, message):
 def test_papers_recipes(benchmark):
     """DSRL's table of hyper-parameters; its choice for Transport is SAC."""
     known = {
-        "lift": (0.99, 30, 24_000, 2048),
-        "can": (0.99, 20, 24_000, 2048),
-        "square": (0.999, 20, 32_000, 2048),
-        "transport": (0.99, 20, 640_000, 128),
+        "lift": (0.99, 30, 24_000, 2048, 300, 4, 1.5),
+        "can": (0.99, 20, 24_000, 2048, 300, 4, 1.5),
+        "square": (0.999, 20, 32_000, 2048, 400, 4, 1.5),
+        "transport": (0.99, 20, 640_000, 128, 800, 8, 1.0),
     }
     for task, values in known.items():
         args = benchmark.make_parser().parse_args(["--preset", "paper", "--task", task])
         budget, config = benchmark.make_config(args)
+        base = budget.delta(config, "base") or 1.5
         found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
-        assert found == values and budget.priors == ("base", "past", "preview")
+        assert (*found, budget.horizon, budget.chunk, base) == values
+        assert budget.delta(config, "past") is None  # the paper's 0.5
+        assert (config.alpha_init, config.tau, config.batch_size) == (1.0, 0.005, 256)
+        assert budget.priors == ("base", "past", "preview")
         expected = ["dsrl-na", "dsrl-sac"] if task == "transport" else ["dsrl-na"]
         assert benchmark.algorithms(args) == expected
+    args = benchmark.make_parser().parse_args(
+        ["--preset", "paper", "--task", "transport", "--delta", "0.7"]
+    )
+    budget, config = benchmark.make_config(args)
+    assert budget.delta(config, "base") == budget.delta(config, "past") == 0.7
     args = benchmark.make_parser().parse_args(["--preset", "paper", "--dataset", "x.hdf5"])
     with pytest.raises(ValueError, match=r"add the --task of --dataset x.hdf5"):
         benchmark.make_config(args)
+
+
+def test_quick_pays_for_solving_the_task(benchmark):
+    """The entropy bonus of a decision must not exceed what its control steps cost."""
+    budget, config = benchmark.make_config(benchmark.make_parser().parse_args(["--task", "lift"]))
+    bonus = config.alpha_init * budget.chunk * 7 * math.log(2)  # uniform in units of the box
+    assert bonus < config.reward_offset * budget.chunk
+    assert (budget.horizon, budget.pretraining.demonstrations["ph"]) == (90, 5)
 
 
 def test_a_training_that_diverges_keeps_what_was_there(benchmark, tmp_path, capsys, monkeypatch):
@@ -216,11 +239,13 @@ def test_policies_of_a_finished_run(benchmark, finished, tmp_path, capsys):
     out = tmp_path / "agents"
     short = {"steps": 60, "warmup": 30, "evaluate-every": 60, "episodes": 1, "envs": 1}
     words = [str(word) for key, value in short.items() for word in (f"--{key}", value)]
-    run = ["--run", str(finished), "--out", str(out)]
-    assert benchmark.main([*run, *words, "--seeds", "1", "--prior", "past"]) == 0
+    run = ["--run", str(finished), "--out", str(out), "--horizon", "20"]
+    assert benchmark.main([*run, *words, "--seeds", "2", "--prior", "past"]) == 0
+    assert "--run has 1 seeds of past: agent 1 shares a policy" in capsys.readouterr().out
     result = stored(out)
-    assert result["meta"]["task"] == "lift" and len(result["rows"]) == 1
-    (row,) = result["rows"]
+    assert result["meta"]["task"] == "lift" and result["meta"]["horizon"] == 20
+    row, other = result["rows"]
+    assert other["seed"] == 1
     assert row["prior"] == "past" and row["chunk"] == 8 and 60 <= row["environment_steps"] < 68
     assert is_png(out / "curves.png")
     after = {path: path.stat().st_mtime_ns for path in finished.parent.rglob("*.safetensors")}

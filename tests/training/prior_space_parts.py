@@ -38,17 +38,18 @@ class SolvableEnv(CountingEnv):
 def make_actor(prior=None, seed=0, action_dim=ACTION_DIM):
     prior = PastPrior(H) if prior is None else prior
     torch.manual_seed(seed)
-    network = VelocityMLP(action_dim, 2 + ACTION_DIM, prior.prediction_length, 1, hidden_dim=8)
+    observation_dim = 2 + ACTION_DIM + prior.context_dim(action_dim)
+    network = VelocityMLP(action_dim, observation_dim, prior.prediction_length, 1, hidden_dim=8)
     return WarmPriorActor(network, prior, nfe=2, clip=1.0)
 
 
-def make_env(seed, prior=None, truncate=True, hook=None):
+def make_env(seed, prior=None, truncate=True, hook=None, **chunking):
     """Two environments; the hook gets what those of the training (and not of evaluations) return."""
     prior = PastPrior(H) if prior is None else prior
     bases = [SolvableEnv(length, truncate) for length in LENGTHS]
     for base in bases:
         base.before_step = None if seed == 0 else hook
-    transforms = policy_transforms(prior, observation_steps=1)
+    transforms = policy_transforms(prior, observation_steps=1, **chunking)
     transforms.append(PriorAnchor(prior, seed=seed))
     return TransformedEnv(SerialEnv(2, [lambda base=base: base for base in bases]), transforms)
 

@@ -20,7 +20,15 @@ from tests.training.prior_space_parts import (
     make_env,
     make_training,
 )
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, PriorAnchor, policy_transforms
+from warmprior import (
+    GaussianPrior,
+    HistoryPrior,
+    PastPrior,
+    PreviewPrior,
+    PriorAnchor,
+    keys,
+    policy_transforms,
+)
 from warmprior.training import PriorSpaceConfig, PriorSpaceTraining, parallel_env
 
 pytest.importorskip("tqdm")
@@ -116,7 +124,7 @@ def test_the_warm_up_draws_from_the_prior_and_learns_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-@pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
+@pytest.mark.parametrize("prior_class", [GaussianPrior, HistoryPrior, PastPrior, PreviewPrior])
 def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, prior_class):
     prior = prior_class(H)
     actor = make_actor(prior)
@@ -137,7 +145,7 @@ def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, 
     critics = {"qvalue_network_params", "target_qvalue_network_params"}
     distilled = {"noise_qvalue_network_params"} if algorithm == "dsrl-na" else set()
     assert moved >= {"actor_network_params", "log_alpha"} | critics | distilled
-    delta = {"gaussian": 1.5}.get(prior.name, 0.5)
+    delta = {"gaussian": 1.5, "history": 1.5}.get(prior.name, 0.5)
     assert training.decoder.delta == delta
     assert training.buffer[:]["prior", "delta"].abs().max() <= delta
 
@@ -149,6 +157,35 @@ def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, 
     assert all(30 * k <= step < 30 * k + 2 * H for k, step in enumerate(steps[1::2], 1))
     for row in curve:
         assert row["episodes"] == 2 and row["success_rate"] == row["successes"] / 2
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_agent_sees_a_mean_that_conditions_the_policy(tmp_path, algorithm):
+    """Its anchor is zero, so that without the mean the agent could not tell what is decoded."""
+    prior = HistoryPrior(H)
+    training = make_training(
+        tmp_path, make_actor(prior), {"prior": prior}, algorithm=algorithm, environment_steps=30
+    )
+    training.run()
+    data = training.buffer[:][:1].clone()
+    residuals = []
+    for mean in (0.0, 1.0):
+        data[keys.LOC] = torch.full_like(data[keys.LOC], mean)
+        torch.manual_seed(0)
+        residuals.append(training.agent.policy(data)[keys.DELTA].clone())
+    assert not data[keys.ANCHOR].isnan().any() and not torch.equal(*residuals)
+
+
+@pytest.mark.parametrize("prior_class", [PastPrior, GaussianPrior])
+def test_chunks_executed_in_part_are_refused_where_the_mean_would_hold_them(tmp_path, prior_class):
+    prior = prior_class(H)
+    training = make_training(tmp_path, make_actor(prior), {"prior": prior, "execute": 2})
+    if prior_class is GaussianPrior:
+        training.run()
+        return
+    with pytest.raises(ValueError, match="executes 2 of H = 3 actions per decision"):
+        training.run()
+    assert len(training.buffer) == 0
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

@@ -26,6 +26,10 @@ from warmprior.modules.actor import WarmPriorActor
 __all__ = ["Episode", "evaluate", "parallel_env"]
 
 
+class WorkerError(RuntimeError):
+    """A worker process of an environment died."""
+
+
 @dataclass(frozen=True)
 class Episode:
     """Outcome of one evaluation episode.
@@ -147,7 +151,7 @@ def watched(env: EnvBase) -> Iterator[None]:
                 with suppress(ValueError):  # already closed
                     worker.terminate()
         if dead:
-            raise RuntimeError(
+            raise WorkerError(
                 f"an environment worker died: {dead[0]}. It may have been killed for lack of memory; "
                 "use fewer --envs, or run one environment in this process to see its own error."
             ) from error
@@ -206,7 +210,7 @@ def evaluate(
 
     Raises:
         ValueError: if ``episodes < 1``.
-        RuntimeError: if a worker process dies.
+        WorkerError: if a worker process dies, a ``RuntimeError``.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")

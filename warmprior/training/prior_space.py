@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.priors import GaussianPrior
 from warmprior.training.checkpoint import check_identity, load_state, save_state
 from warmprior.training.evaluation import Episode, evaluate, watched
 from warmprior.training.prior_space_agent import PriorSpaceAgent
@@ -102,10 +103,11 @@ class PriorSpaceTraining:
             ``"greedy"``, ``"stochastic"``), ``episodes``, ``successes``, ``success_rate``.
 
         Raises:
-            ValueError: if the environment does not fit the policy, see :meth:`PriorDecoder.check_env`.
+            ValueError: if the environment does not fit the policy, see :meth:`PriorDecoder.check_env`, or
+                executes less than ``H`` actions of a chunk.
             FloatingPointError: if a loss, a parameter or what the environment gives becomes NaN or
                 infinite; the last save stays.
-            RuntimeError: if a worker process of an environment dies.
+            WorkerError: if a worker process of an environment dies, a ``RuntimeError``.
         """
         config = self.config
         if self.steps >= config.environment_steps:
@@ -170,9 +172,21 @@ class PriorSpaceTraining:
         transitions = self._transitions(data)
         # Before they are saved: they would end every later training on them.
         _check_finite(transitions)
+        self._check_executed(transitions["next"])
         self.buffer.extend(transitions)
         self.segments.append(transitions)
         return following, int(data["next", keys.EXECUTED].sum())
+
+    def _check_executed(self, after: TensorDictBase) -> None:
+        """Partial execution would put actions into the next mean that the critics do not see."""
+        prior = self.decoder.prior
+        short = (after[keys.EXECUTED] < prior.chunk_length) & ~after["done"]
+        if short.any() and not isinstance(prior, GaussianPrior):
+            raise ValueError(
+                f"the environment executes {int(after[keys.EXECUTED][short].max())} of H = "
+                f"{prior.chunk_length} actions per decision, but the agent's critics judge whole chunks: "
+                "leave execute out of policy_transforms"
+            )
 
     @property
     def _keys(self) -> list[NestedKey]:

@@ -38,6 +38,7 @@ class PriorSpaceAgent:
 
     Attributes:
         decoder: the frozen policy as a decoder.
+        state_keys: what the agent and the noise critic read of a state.
         policy: the agent followed by the decoder.
         warmup: residuals from the prior, clipped to the agent's box, followed by the decoder.
         loss: DSRL-NA's or TorchRL's SAC.
@@ -61,7 +62,12 @@ class PriorSpaceAgent:
         self.warmup = TensorDictSequential(
             ResidualSampler(self.decoder, distribution="clipped"), self.decoder
         )
-        network = self._make(make_prior_space_actor, delta=self.decoder.delta).to(self.device)
+        self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
+        if keys.LOC in self.decoder.in_keys:  # A mean that conditions the policy; the anchor is zero.
+            self.state_keys.append(keys.LOC)
+        network = self._make(
+            make_prior_space_actor, delta=self.decoder.delta, in_keys=self.state_keys
+        ).to(self.device)
         self.policy = TensorDictSequential(network, self.decoder)
         self.loss = self._make_loss(network).to(self.device)
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
@@ -82,11 +88,15 @@ class PriorSpaceAgent:
 
     def _make_loss(self, network: Any) -> Any:
         config, delta = self.config, self.decoder.delta
-        noise_critic = self._make(make_prior_space_critic, delta=delta)
+        noise_critic = self._make(
+            make_prior_space_critic, delta=delta, in_keys=(*self.state_keys, keys.DELTA)
+        )
         if config.algorithm == "dsrl-na":
             return DSRLNALoss(
                 network,
-                self._make(make_prior_space_critic, in_keys=(keys.OBSERVATION, keys.CHUNK)),
+                self._make(
+                    make_prior_space_critic, in_keys=(self.decoder.observation_key, keys.CHUNK)
+                ),
                 noise_critic,
                 self.decoder,
                 backup=config.backup,
