@@ -90,7 +90,7 @@ BUDGETS = {
     "quick": Budget(
         summary="lift from a weak policy, WP-Past against the base, two seeds: half an hour",
         config=PriorSpaceConfig(
-            environment_steps=40_000,
+            environment_steps=32_000,
             warmup_steps=3_000,
             nfe=1,
             updates=4,
@@ -101,7 +101,7 @@ BUDGETS = {
             # At 1, the entropy of 56 coordinates outweighs the 8 control steps of a decision: the agent
             # would be paid for not solving the task, until the temperature has fallen.
             alpha_init=0.05,
-            evaluate_every=10_000,
+            evaluate_every=8_000,
             evaluation_episodes=40,
         ),
         pretraining=PRESETS["quick"],
