@@ -56,6 +56,8 @@ class Budget:
     tasks: Mapping[str, TaskBudget] = field(default_factory=dict)
     horizon: int | None = None
     base_delta: float | None = None
+    threads: int | None = None
+    """Of the agents' training: more than one only wait for each other in small networks."""
 
     def delta(self, config: PriorSpaceConfig, prior: str) -> float | None:
         """Half the side of an agent's box; ``None`` for the default of its prior."""
@@ -86,11 +88,12 @@ BUDGETS = {
         seeds=3,
         envs=32,
         chunk=4,
+        threads=1,
     ),
     "quick": Budget(
         summary="lift from a weak policy, WP-Past against the base, two seeds: half an hour",
         config=PriorSpaceConfig(
-            environment_steps=32_000,
+            environment_steps=24_000,
             warmup_steps=3_000,
             nfe=1,
             updates=4,
@@ -101,7 +104,7 @@ BUDGETS = {
             # At 1, the entropy of 56 coordinates outweighs the 8 control steps of a decision: the agent
             # would be paid for not solving the task, until the temperature has fallen.
             alpha_init=0.05,
-            evaluate_every=8_000,
+            evaluate_every=6_000,
             evaluation_episodes=40,
         ),
         pretraining=PRESETS["quick"],
@@ -109,6 +112,7 @@ BUDGETS = {
         seeds=2,
         envs=4,
         chunk=8,
+        threads=1,
         tasks={
             # Weak policies: solved in 0.3 to 0.6 of the episodes.
             "lift": TaskBudget(demonstrations=5, iterations=300, horizon=90),
@@ -151,6 +155,7 @@ def make_config(args: argparse.Namespace) -> tuple[Budget, PriorSpaceConfig]:
         name: value
         for name, value in {
             "delta": args.delta,
+            "alpha_init": args.alpha,
             "nfe": args.nfe,
             "environment_steps": args.steps,
             "warmup_steps": args.warmup,

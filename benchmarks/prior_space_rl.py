@@ -70,6 +70,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--prior", nargs="+", choices=PRIORS, help="default: the preset's")
     add("--delta", type=float, help="half the agent's box (default: 0.5 around a mean, 1.5 else)")
     add("--horizon", type=int, help="time limit in control steps (default: the preset's or task's)")
+    add("--alpha", type=float, help="initial temperature (default: the preset's)")
     add("--nfe", type=int, help="network evaluations per chunk (default: the preset's)")
     add(
         "--chunk", type=int, help="chunk length H of a newly trained policy (default: the preset's)"
@@ -103,7 +104,8 @@ def toy_task(args: argparse.Namespace, budget: Budget, name: str, seed: int) -> 
     """A policy that knows both routes, and the toy that rewards one."""
     priors = {name: PRIORS[name](budget.chunk)}
     study = NavigationStudy(budget.pretraining, priors, args.out / "policies")
-    actor = study.train(name, seed).to(args.device)
+    with experiment.threads(budget.threads):
+        actor = study.train(name, seed).to(args.device)
 
     def make_env(env_seed: int) -> EnvBase:
         transforms = policy_transforms(actor.prior, observation_steps=1)
@@ -188,14 +190,16 @@ def main(argv: list[str] | None = None) -> int:
         options = experiment.store_options(args)
         print(f"Output folder: {args.out}", flush=True)
         if args.preset == "unit":
-            torch.set_num_threads(1)  # more of them only wait for each other
             task, facts = partial(toy_task, args, budget), {"task": args.task}
         else:
             task, facts = manipulation_tasks(args, budget)
         packages = ("warmprior", "torch", "torchrl", "tensordict")
         meta: dict[str, Any] = {
             "versions": {package: version(package) for package in packages},
-            "hardware": {"cores": os.cpu_count(), "torch_threads": torch.get_num_threads()},
+            "hardware": {
+                "cores": os.cpu_count(),
+                "torch_threads": budget.threads or torch.get_num_threads(),
+            },
             "options": options,
             "config": asdict(config),
             **facts,
@@ -214,7 +218,8 @@ def main(argv: list[str] | None = None) -> int:
                 evaluation_seed=EVALUATION_SEED,
                 description=f"{algorithm} {name}, seed {seed}",
             )
-            training.run()
+            with experiment.threads(budget.threads):
+                training.run()
             rows.append(summarize(name, seed, mine, training))
             key = {"algorithm": algorithm, "prior": PRIORS[name].name, "seed": seed}
             curve += [key | row for row in training.curve]

@@ -15,6 +15,7 @@ from warmprior.training import PriorSpaceConfig, PriorSpaceTraining
 H = 3
 LENGTHS = (5, 7)
 EVALUATION_SEED = 100
+ALGORITHMS = ("dsrl-na", "dsrl-sac")
 
 
 class SolvableEnv(CountingEnv):

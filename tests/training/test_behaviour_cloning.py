@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import errno
 import os
 import signal
 import subprocess
@@ -13,65 +12,18 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torchrl.record.loggers.common import Logger
 
+from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, same, training, weights
 from warmprior import (
-    ChiTransformer,
     FlowMatchingLoss,
     Normalizer,
-    PastPrior,
-    PreviewPrior,
     VelocityMLP,
     WarmPriorActor,
     window_replay_buffer,
 )
-from warmprior.training import BehaviourCloning, TrainingConfig, ema_of, make_optimizer
+from warmprior.training import TrainingConfig, ema_of, make_optimizer
 from warmprior.training.checkpoint import load_state
-
-CONFIG = TrainingConfig(
-    iterations=40, batch_size=16, learning_rate=1e-2, checkpoints=2, save_every=7, log_every=10
-)
-
-
-def dataset():
-    generator = torch.Generator().manual_seed(0)
-    return TensorDict(
-        {
-            "observation": torch.randn(120, 3, generator=generator),
-            "action": torch.randn(120, 2, generator=generator).clamp(-1, 1),
-            "episode": torch.arange(120) // 30,
-        },
-        [120],
-    )
-
-
-def actor_for(prior=None, network=None):
-    prior = PastPrior(4, cold_probability=0.25) if prior is None else prior
-    torch.manual_seed(7)
-    if network is None:  # with dropout: the global generator has to be restored too
-        network = ChiTransformer(
-            2, 3, prior.prediction_length, embedding_dim=8, num_layers=1, num_heads=2, dropout=0.2
-        )
-    return WarmPriorActor(network, prior, nfe=2)
-
-
-def training(folder, config=CONFIG, **options):
-    actor = options.pop("actor", None) or actor_for()
-    data = options.pop("data", None)
-    data = dataset() if data is None else data
-    return BehaviourCloning(actor, data, config, folder, **options)
-
-
-def weights(cloning):
-    return {
-        **{f"net.{n}": v.clone() for n, v in cloning.actor.network.state_dict().items()},
-        **{f"ema.{n}": v.clone() for n, v in cloning.ema.state_dict().items()},
-    }
-
-
-def same(one, two):
-    return one.keys() == two.keys() and all(torch.equal(one[k], two[k]) for k in one)
 
 
 def test_the_loop_by_hand(tmp_path):
@@ -252,95 +204,6 @@ def _iteration(folder):
     return load_state(path)[1]["iteration"] if path.exists() else 0
 
 
-@pytest.mark.parametrize(
-    ("part", "change"),
-    [
-        ("config", {"config": dataclasses.replace(CONFIG, learning_rate=2e-2)}),
-        ("config", {"config": dataclasses.replace(CONFIG, seed=1)}),
-        ("config", {"config": dataclasses.replace(CONFIG, iterations=80)}),
-        ("prior", {"actor": lambda: actor_for(PastPrior(4, sigma=0.1))}),
-        ("prior", {"actor": lambda: actor_for(PreviewPrior(4))}),
-        ("network", {"actor": lambda: actor_for(PastPrior(4, cold_probability=0.25), mlp())}),
-        ("data", {"data": lambda: dataset().set("action", torch.zeros(120, 2))}),
-    ],
-)
-def test_a_state_of_another_run(tmp_path, part, change):
-    training(tmp_path).run()
-    before = (tmp_path / "state.safetensors").read_bytes()
-    change = {k: v() if callable(v) else v for k, v in change.items()}
-    with pytest.raises(ValueError, match=rf"belongs to another {part}: .*(folder|resume)"):
-        training(tmp_path, **change)
-    assert (tmp_path / "state.safetensors").read_bytes() == before
-
-
-def mlp():
-    torch.manual_seed(3)
-    return VelocityMLP(2, 3, 4, hidden_dim=8)
-
-
-def test_a_damaged_state(tmp_path):
-    training(tmp_path).run()
-    path = tmp_path / "state.safetensors"
-    path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ValueError, match="not a readable training state"):
-        training(tmp_path)
-
-
-@pytest.mark.parametrize("moment", [1, 2, 5])
-def test_a_full_disk(tmp_path, monkeypatch, moment):
-    cloning = training(tmp_path)
-    replace, calls = os.replace, 0
-
-    def failing(*args):
-        nonlocal calls
-        calls += 1
-        if calls >= moment:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return replace(*args)
-
-    monkeypatch.setattr(os, "replace", failing)
-    with pytest.raises(OSError, match=str(tmp_path)):
-        cloning.run()
-    monkeypatch.undo()
-    whole = training(tmp_path / "whole")
-    whole.run()
-    again = training(tmp_path)  # what was there before can be read, and training goes on
-    assert again.iteration <= 35
-    again.run()
-    assert same(weights(again), weights(whole))
-
-
-@pytest.mark.parametrize("bad", [8, 10, 13, 15, 21])
-def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
-    """Wherever it appears between two logs or two saves, no NaN reaches the disk."""
-    cloning = training(tmp_path)
-    forward = cloning.loss_module.forward
-    calls = 0
-
-    def broken(data):
-        nonlocal calls
-        calls += 1
-        out = forward(data)
-        if calls >= bad:
-            out["loss_flow_matching"] = out["loss_flow_matching"] * float("nan")
-        return out
-
-    cloning.loss_module.forward = broken
-    with pytest.raises(FloatingPointError, match=r"loss became nan .*state.safetensors"):
-        cloning.run()
-    tensors, facts = load_state(tmp_path / "state.safetensors")
-    assert facts["iteration"] < bad
-    assert all(torch.isfinite(v).all() for v in tensors.values() if v.is_floating_point())
-    for folder in tmp_path.glob("policy_*"):
-        network = WarmPriorActor.from_pretrained(folder).network
-        assert all(torch.isfinite(p).all() for p in network.parameters())
-    whole = training(tmp_path / "whole")
-    whole.run()
-    again = training(tmp_path)
-    again.run()
-    assert same(weights(again), weights(whole))
-
-
 class ListLogger(Logger):
     def __init__(self):
         super().__init__("list", None)
@@ -384,39 +247,6 @@ def test_compiled_training_is_close(tmp_path):
     assert one.keys() == two.keys()
     for name in one:
         torch.testing.assert_close(one[name], two[name])
-
-
-def test_infinite_weights_are_not_saved(tmp_path):
-    """A finite loss whose gradient is not: the weights are bad before any loss is."""
-    cloning = training(tmp_path)
-    step = cloning.step
-
-    def broken():
-        out = step()
-        if cloning.iteration == 14:
-            with torch.no_grad():
-                next(cloning.actor.network.parameters()).view(-1)[0] = float("inf")
-        return out
-
-    cloning.step = broken
-    with pytest.raises(FloatingPointError, match="weights became NaN or infinite"):
-        cloning.run()
-    assert load_state(tmp_path / "state.safetensors")[1]["iteration"] == 7
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"iterations": 0}, "iterations must be at least 1"),
-        ({"batch_size": 0}, "batch_size"),
-        ({"checkpoints": 0}, "checkpoints"),
-        ({"log_every": 0}, "log_every"),
-        ({"iterations": 3, "checkpoints": 4}, "cannot keep 4 checkpoints of 3 iterations"),
-    ],
-)
-def test_bad_config(options, message):
-    with pytest.raises(ValueError, match=message):
-        TrainingConfig(**options)
 
 
 def test_default_config_is_the_paper_s():

@@ -17,7 +17,6 @@ from torchrl.envs import EnvBase, TransformedEnv
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.baselines import RegressionPrior
-from warmprior.modules.ode import _steps
 from warmprior.modules.prior import Prior
 from warmprior.modules.priors import GaussianPrior
 
@@ -111,8 +110,7 @@ class PriorDecoder(TensorDictModuleBase):
         self.differentiable = differentiable
         self.ode = copy.deepcopy(actor.ode)
         self.nfe = self.ode.nfe if nfe is None else nfe
-        self.ode._check_nfe(self.nfe)
-        _steps(self.nfe, self.ode.solver)
+        self.ode.check_nfe(self.nfe)
         self.normalizer = copy.deepcopy(actor.normalizer)
         self.prior = actor.prior
         _freeze(self)

@@ -173,13 +173,12 @@ class ODEActor(TensorDictModuleBase):
             nfe = DEFAULT_NFE
             if prior is not None and prior.max_nfe is not None:
                 nfe = min(nfe, prior.max_nfe)
-        self._check_nfe(nfe)
-        _steps(nfe, solver)
+        self.solver = solver
+        self.check_nfe(nfe)
         if clip is not None and clip <= 0:
             raise ValueError(f"clip must be > 0 or None, got {clip}")
         self.network = network
         self.nfe = nfe
-        self.solver = solver
         self.clip = clip
         self.path_key = path_key
         self.in_keys = [noise_key, observation_key]
@@ -187,7 +186,13 @@ class ODEActor(TensorDictModuleBase):
             self.in_keys += [loc_key, warm_key]
         self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
 
-    def _check_nfe(self, nfe: int) -> None:
+    def check_nfe(self, nfe: int) -> None:
+        """Whether the solver and the prior can spend ``nfe`` network evaluations.
+
+        Raises:
+            ValueError: if one of them cannot.
+        """
+        _steps(nfe, self.solver)
         limit = None if self.prior is None else self.prior.max_nfe
         if limit is not None and nfe > limit:
             raise ValueError(
@@ -198,7 +203,7 @@ class ODEActor(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
         """Write the chunk (and the path, where asked for)."""
         nfe = self.nfe if nfe is None else nfe
-        self._check_nfe(nfe)
+        self.check_nfe(nfe)
         a0, observation, *mean = (tensordict.get(key, None) for key in self.in_keys)
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
         if missing:

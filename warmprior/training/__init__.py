@@ -4,7 +4,7 @@
 modules: they need ``warmprior[sim]``.
 """
 
-from warmprior.training.behaviour_cloning import BehaviourCloning, TrainingConfig
+from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.evaluation import Episode, evaluate, parallel_env
 from warmprior.training.filmstrip import Filmstrip, record_filmstrip
 from warmprior.training.navigation1d import (
@@ -18,6 +18,7 @@ from warmprior.training.presets import PRESETS, Preset
 from warmprior.training.prior_space import PriorSpaceTraining
 from warmprior.training.prior_space_config import PriorSpaceConfig
 from warmprior.training.replay_segments import ReplaySegments
+from warmprior.training.training_config import TrainingConfig
 
 __all__ = [
     "NAVIGATION_PRESETS",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -29,75 +29,13 @@ from warmprior.training.checkpoint import (
     snapshot_optimizer,
 )
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer
 
-__all__ = ["BehaviourCloning", "TrainingConfig"]
-
+__all__ = ["BehaviourCloning"]
 
 STATE_FORMAT = 1
 """Part of every state's identity; raised whenever the same options give other weights."""
-
-
-@dataclass(frozen=True)
-class TrainingConfig:
-    """The recipe; the defaults are the paper's (Table 4, Robomimic, state observations).
-
-    Attributes:
-        iterations: gradient steps.
-        batch_size: windows per step.
-        learning_rate: peak of the schedule.
-        weight_decay: AdamW's decay of matrix weights.
-        betas: AdamW's decay rates.
-        eps: AdamW's epsilon.
-        warmup_ratio: share of the iterations over which the learning rate rises.
-        ema_rate: decay of the averaged weights that are evaluated.
-        checkpoints: how many policies to keep, evenly spaced, the last at the end.
-        save_every: iterations between saves of the training state; ``None`` for ten per checkpoint.
-        log_every: iterations per logged mean loss.
-        seed: of sampling, source, times and dropout.
-    """
-
-    iterations: int = 200_000
-    batch_size: int = 1024
-    learning_rate: float = 1e-4
-    weight_decay: float = 1e-5
-    betas: tuple[float, float] = (0.9, 0.999)
-    eps: float = 1e-8
-    warmup_ratio: float = 0.2
-    ema_rate: float = 0.995
-    checkpoints: int = 10
-    save_every: int | None = None
-    log_every: int = 100
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        for name in ("iterations", "batch_size", "checkpoints", "log_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.checkpoints > self.iterations:
-            raise ValueError(
-                f"cannot keep {self.checkpoints} checkpoints of {self.iterations} iterations"
-            )
-
-    def with_iterations(self, iterations: int) -> TrainingConfig:
-        """The same recipe with another number of gradient steps, and no more checkpoints than those.
-
-        Raises:
-            ValueError: if ``iterations < 1``.
-        """
-        kept = min(self.checkpoints, iterations)
-        return replace(self, iterations=iterations, checkpoints=kept)
-
-    @property
-    def checkpoint_iterations(self) -> list[int]:
-        """After which iterations a policy is kept.
-
-        Examples:
-            >>> TrainingConfig(iterations=1000, checkpoints=4).checkpoint_iterations
-            [250, 500, 750, 1000]
-        """
-        n = self.checkpoints
-        return [round(self.iterations * (i + 1) / n) for i in range(n)]
 
 
 class BehaviourCloning:

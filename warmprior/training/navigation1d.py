@@ -32,7 +32,8 @@ from warmprior.modules import (
     VelocityMLP,
     WarmPriorActor,
 )
-from warmprior.training.behaviour_cloning import BehaviourCloning, TrainingConfig
+from warmprior.training.behaviour_cloning import BehaviourCloning
+from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms import policy_transforms
 
 __all__ = ["NAVIGATION_PRESETS", "NavigationPreset", "NavigationStudy", "navigation_priors"]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from warmprior.modules import ChiTransformer, VelocityMLP, VelocityNetwork
-from warmprior.training.behaviour_cloning import TrainingConfig
+from warmprior.training.training_config import TrainingConfig
 
 __all__ = ["PRESETS", "Preset"]
 

@@ -63,7 +63,9 @@ class PriorSpaceAgent:
             ResidualSampler(self.decoder, distribution="clipped"), self.decoder
         )
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
-        if keys.LOC in self.decoder.in_keys:  # A mean that conditions the policy; the anchor is zero.
+        if (
+            keys.LOC in self.decoder.in_keys
+        ):  # A mean that conditions the policy; the anchor is zero.
             self.state_keys.append(keys.LOC)
         network = self._make(
             make_prior_space_actor, delta=self.decoder.delta, in_keys=self.state_keys

@@ -32,7 +32,9 @@ class PriorSpaceConfig:
         hidden_dim: width of actor and critics.
         num_layers: their number of hidden layers.
         backup: ``"min"`` or ``"mean"`` over critics, DSRL-NA only.
-        alpha_init: initial temperature; 1 is meant for returns in the hundreds.
+        alpha_init: initial temperature, DSRL's 1. Where success ends the episode, below
+            ``reward_offset * H / (P * d_a * log 2)``: otherwise the entropy of further decisions is worth
+            more than success, until the temperature has fallen.
         target_entropy: in units of the box.
         reward_offset: subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
         bootstrap_timeouts: whether the value after a time-out counts; DSRL takes it for a termination.

@@ -1,0 +1,58 @@
+"""A tiny behaviour cloning with dropout, whose every draw has to be restored."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict
+
+from warmprior import ChiTransformer, PastPrior, VelocityMLP, WarmPriorActor
+from warmprior.training import BehaviourCloning, TrainingConfig
+
+CONFIG = TrainingConfig(
+    iterations=40, batch_size=16, learning_rate=1e-2, checkpoints=2, save_every=7, log_every=10
+)
+
+
+def dataset():
+    generator = torch.Generator().manual_seed(0)
+    return TensorDict(
+        {
+            "observation": torch.randn(120, 3, generator=generator),
+            "action": torch.randn(120, 2, generator=generator).clamp(-1, 1),
+            "episode": torch.arange(120) // 30,
+        },
+        [120],
+    )
+
+
+def actor_for(prior=None, network=None):
+    prior = PastPrior(4, cold_probability=0.25) if prior is None else prior
+    torch.manual_seed(7)
+    if network is None:  # with dropout: the global generator has to be restored too
+        network = ChiTransformer(
+            2, 3, prior.prediction_length, embedding_dim=8, num_layers=1, num_heads=2, dropout=0.2
+        )
+    return WarmPriorActor(network, prior, nfe=2)
+
+
+def training(folder, config=CONFIG, **options):
+    actor = options.pop("actor", None) or actor_for()
+    data = options.pop("data", None)
+    data = dataset() if data is None else data
+    return BehaviourCloning(actor, data, config, folder, **options)
+
+
+def weights(cloning):
+    return {
+        **{f"net.{n}": v.clone() for n, v in cloning.actor.network.state_dict().items()},
+        **{f"ema.{n}": v.clone() for n, v in cloning.ema.state_dict().items()},
+    }
+
+
+def same(one, two):
+    return one.keys() == two.keys() and all(torch.equal(one[k], two[k]) for k in one)
+
+
+def mlp():
+    torch.manual_seed(3)
+    return VelocityMLP(2, 3, 4, hidden_dim=8)

@@ -1,0 +1,140 @@
+"""Training: whose state is refused, and what a full disk or a NaN leaves behind."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import os
+
+import pytest
+import torch
+
+from tests.training.cloning_parts import (
+    CONFIG,
+    actor_for,
+    dataset,
+    mlp,
+    same,
+    training,
+    weights,
+)
+from warmprior import PastPrior, PreviewPrior, WarmPriorActor
+from warmprior.training import TrainingConfig
+from warmprior.training.checkpoint import load_state
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("config", {"config": dataclasses.replace(CONFIG, learning_rate=2e-2)}),
+        ("config", {"config": dataclasses.replace(CONFIG, seed=1)}),
+        ("config", {"config": dataclasses.replace(CONFIG, iterations=80)}),
+        ("prior", {"actor": lambda: actor_for(PastPrior(4, sigma=0.1))}),
+        ("prior", {"actor": lambda: actor_for(PreviewPrior(4))}),
+        ("network", {"actor": lambda: actor_for(PastPrior(4, cold_probability=0.25), mlp())}),
+        ("data", {"data": lambda: dataset().set("action", torch.zeros(120, 2))}),
+    ],
+)
+def test_a_state_of_another_run(tmp_path, part, change):
+    training(tmp_path).run()
+    before = (tmp_path / "state.safetensors").read_bytes()
+    change = {k: v() if callable(v) else v for k, v in change.items()}
+    with pytest.raises(ValueError, match=rf"belongs to another {part}: .*(folder|resume)"):
+        training(tmp_path, **change)
+    assert (tmp_path / "state.safetensors").read_bytes() == before
+
+
+def test_a_damaged_state(tmp_path):
+    training(tmp_path).run()
+    path = tmp_path / "state.safetensors"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(ValueError, match="not a readable training state"):
+        training(tmp_path)
+
+
+@pytest.mark.parametrize("moment", [1, 2, 5])
+def test_a_full_disk(tmp_path, monkeypatch, moment):
+    cloning = training(tmp_path)
+    replace, calls = os.replace, 0
+
+    def failing(*args):
+        nonlocal calls
+        calls += 1
+        if calls >= moment:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return replace(*args)
+
+    monkeypatch.setattr(os, "replace", failing)
+    with pytest.raises(OSError, match=str(tmp_path)):
+        cloning.run()
+    monkeypatch.undo()
+    whole = training(tmp_path / "whole")
+    whole.run()
+    again = training(tmp_path)  # what was there before can be read, and training goes on
+    assert again.iteration <= 35
+    again.run()
+    assert same(weights(again), weights(whole))
+
+
+@pytest.mark.parametrize("bad", [8, 10, 13, 15, 21])
+def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
+    """Wherever it appears between two logs or two saves, no NaN reaches the disk."""
+    cloning = training(tmp_path)
+    forward = cloning.loss_module.forward
+    calls = 0
+
+    def broken(data):
+        nonlocal calls
+        calls += 1
+        out = forward(data)
+        if calls >= bad:
+            out["loss_flow_matching"] = out["loss_flow_matching"] * float("nan")
+        return out
+
+    cloning.loss_module.forward = broken
+    with pytest.raises(FloatingPointError, match=r"loss became nan .*state.safetensors"):
+        cloning.run()
+    tensors, facts = load_state(tmp_path / "state.safetensors")
+    assert facts["iteration"] < bad
+    assert all(torch.isfinite(v).all() for v in tensors.values() if v.is_floating_point())
+    for folder in tmp_path.glob("policy_*"):
+        network = WarmPriorActor.from_pretrained(folder).network
+        assert all(torch.isfinite(p).all() for p in network.parameters())
+    whole = training(tmp_path / "whole")
+    whole.run()
+    again = training(tmp_path)
+    again.run()
+    assert same(weights(again), weights(whole))
+
+
+def test_infinite_weights_are_not_saved(tmp_path):
+    """A finite loss whose gradient is not: the weights are bad before any loss is."""
+    cloning = training(tmp_path)
+    step = cloning.step
+
+    def broken():
+        out = step()
+        if cloning.iteration == 14:
+            with torch.no_grad():
+                next(cloning.actor.network.parameters()).view(-1)[0] = float("inf")
+        return out
+
+    cloning.step = broken
+    with pytest.raises(FloatingPointError, match="weights became NaN or infinite"):
+        cloning.run()
+    assert load_state(tmp_path / "state.safetensors")[1]["iteration"] == 7
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"iterations": 0}, "iterations must be at least 1"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"checkpoints": 0}, "checkpoints"),
+        ({"log_every": 0}, "log_every"),
+        ({"iterations": 3, "checkpoints": 4}, "cannot keep 4 checkpoints of 3 iterations"),
+    ],
+)
+def test_bad_config(options, message):
+    with pytest.raises(ValueError, match=message):
+        TrainingConfig(**options)
