@@ -171,7 +171,10 @@ def output_folder(args: argparse.Namespace, prefix: str = "", default_task: str 
     run = getattr(args, "run", None)
     style = args.data if run is None else run_facts(run)["style"]
     name = f"{prefix}{task}-{style}-{args.preset}"
-    return numbered_folder(Path("runs"), name, latest=args.resume)
+    folder = numbered_folder(Path("runs"), name, latest=args.resume)
+    if args.resume and not folder.is_dir():
+        raise ValueError(f"--resume: there is no run in {folder}; name its folder with --out")
+    return folder
 
 
 def numbered_folder(parent: Path, name: str, *, latest: bool = False) -> Path:

@@ -59,9 +59,17 @@ class Budget:
     threads: int | None = None
     """Of the agents' training: more than one only wait for each other in small networks."""
 
-    def delta(self, config: PriorSpaceConfig, prior: str) -> float | None:
-        """Half the side of an agent's box; ``None`` for the default of its prior."""
-        return self.base_delta if config.delta is None and prior == "base" else config.delta
+    def agent(
+        self, config: PriorSpaceConfig, algorithm: Any, prior: str, seed: int
+    ) -> PriorSpaceConfig:
+        """The recipe of one agent."""
+        return replace(
+            config,
+            algorithm=algorithm,
+            backup_entropy=config.backup_entropy or algorithm == "dsrl-sac",
+            delta=self.base_delta if config.delta is None and prior == "base" else config.delta,
+            seed=seed,
+        )
 
 
 TOY = NAVIGATION_PRESETS["quick"]
@@ -73,12 +81,16 @@ BUDGETS = {
             environment_steps=12_000,
             warmup_steps=3_000,
             nfe=2,
-            updates=6,
-            noise_critic_steps=2,
+            updates=12,
+            noise_critic_steps=4,
             learning_rate=1e-3,
+            tau=0.05,
             gamma=1.0,
             hidden_dim=128,
             num_layers=2,
+            # Failure ends the episode: entropy in the targets would pay for not failing, whatever the reward.
+            backup_entropy=False,
+            alpha_init=0.02,
             reward_offset=0.0,
             evaluate_every=6_000,
             evaluation_episodes=128,
@@ -87,7 +99,7 @@ BUDGETS = {
         priors=("past",),
         seeds=3,
         envs=32,
-        chunk=4,
+        chunk=8,
         threads=1,
     ),
     "quick": Budget(
@@ -121,7 +133,10 @@ BUDGETS = {
     ),
     "paper": Budget(
         summary="DSRL's hyper-parameters per task, three seeds: needs a GPU",
-        config=PriorSpaceConfig(environment_steps=1_000_000),
+        # Success ends the episode here, unlike in DSRL: entropy in the targets would pay for not solving it.
+        config=PriorSpaceConfig(
+            environment_steps=1_000_000, backup_entropy=False, evaluate_every=50_000
+        ),
         pretraining=PRESETS["paper"],
         priors=("base", "past", "preview"),
         seeds=3,

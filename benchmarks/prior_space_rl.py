@@ -15,7 +15,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
 from itertools import product
@@ -43,6 +43,7 @@ from warmprior.training import (
 from warmprior.training.policies import Policies
 from warmprior.transforms import policy_transforms
 
+PER_AGENT = ("algorithm", "backup_entropy", "delta", "seed")
 TASKS = ("navigation", "lift", "can", "square", "transport")
 Task = tuple[WarmPriorActor, Callable[[int], EnvBase]]
 
@@ -201,14 +202,15 @@ def main(argv: list[str] | None = None) -> int:
                 "torch_threads": budget.threads or torch.get_num_threads(),
             },
             "options": options,
-            "config": asdict(config),
+            "config": {k: v for k, v in asdict(config).items() if k not in PER_AGENT},
             **facts,
         }
         rows: list[dict[str, Any]] = []
         curve: list[dict[str, Any]] = []
+        diverged: list[str] = []
         started = time.monotonic()
         for seed, algorithm, name in product(range(budget.seeds), algorithms(args), budget.priors):
-            mine = replace(config, algorithm=algorithm, seed=seed, delta=budget.delta(config, name))
+            mine = budget.agent(config, algorithm, name, seed)
             actor, make_env = task(name, seed)
             training = PriorSpaceTraining(
                 actor,
@@ -218,9 +220,12 @@ def main(argv: list[str] | None = None) -> int:
                 evaluation_seed=EVALUATION_SEED,
                 description=f"{algorithm} {name}, seed {seed}",
             )
-            with experiment.threads(budget.threads):
-                training.run()
-            rows.append(summarize(name, seed, mine, training))
+            try:
+                with experiment.threads(budget.threads):
+                    training.run()
+                rows.append(summarize(name, seed, mine, training))
+            except FloatingPointError as error:  # no reason to keep the other agents from learning
+                diverged.append(f"{algorithm} {name}, seed {seed}: {error}")
             key = {"algorithm": algorithm, "prior": PRIORS[name].name, "seed": seed}
             curve += [key | row for row in training.curve]
             meta["wall_time_s"] = time.monotonic() - started
@@ -228,7 +233,10 @@ def main(argv: list[str] | None = None) -> int:
         table = make_table(rows)
         write_atomic(args.out / "table.md", lambda path: path.write_text(table))
         where = " ".join(facts[key] for key in ("task", "style") if key in facts)
-        draw(rows, args.out, curve, f"{where}, NFE {config.nfe}", config.warmup_steps)
+        if rows:
+            draw(rows, args.out, curve, f"{where}, NFE {config.nfe}", config.warmup_steps)
+        if diverged:
+            raise FloatingPointError("; ".join(diverged))
     except experiment.ERRORS as error:
         print(f"prior_space_rl.py: error: {error}", file=sys.stderr)
         return 2

@@ -9,6 +9,7 @@ the extra ``warmprior[sim]``.
 from importlib.metadata import version
 
 from warmprior.modules import (
+    BoxTanhNormal,
     ChiTransformer,
     GaussianPrior,
     HistoryPrior,
@@ -49,6 +50,7 @@ __version__ = version("warmprior")
 __all__ = [
     "ActionHistory",
     "ActionWindow",
+    "BoxTanhNormal",
     "ChiTransformer",
     "ChunkStep",
     "DSRLNALoss",

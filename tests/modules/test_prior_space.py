@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from warmprior import (
+    BoxTanhNormal,
     GaussianPrior,
     HistoryPrior,
     PastPrior,
@@ -42,6 +43,28 @@ def make_decoder(prior, delta):
     return PriorDecoder(
         WarmPriorActor(VelocityMLP(D_A, D_O + prior.context_dim(D_A), P), prior), delta=delta
     )
+
+
+@pytest.mark.parametrize("delta", [0.1, 1.0, 1.5])
+def test_densities_in_units_of_the_box(delta):
+    """Those of the squashed Gaussian on [-1, 1], for drawn values and for given ones."""
+    torch.manual_seed(0)
+    loc, scale = torch.randn(40, P, D_A), torch.rand(40, P, D_A) + 0.5
+    box = BoxTanhNormal(loc, scale, low=-delta, high=delta, event_dims=2)
+    for draw in (box.rsample_and_log_prob, box.sample_and_log_prob):
+        value, log_prob = draw()
+        assert value.abs().max() <= delta
+        u = (value / delta).double().clamp(-1 + 1e-7, 1 - 1e-7).atanh()
+        reference = stats.norm.logpdf(
+            u.detach().numpy(), loc.double().numpy(), scale.double().numpy()
+        )
+        reference = torch.as_tensor(reference) - torch.log(1 - u.tanh() ** 2)
+        inside = (value.abs() < 0.999 * delta).all(-1).all(-1)
+        assert inside.sum() > 10
+        for found in (log_prob, box.log_prob(value)):
+            torch.testing.assert_close(
+                found.double()[inside], reference.sum((1, 2))[inside], rtol=1e-2, atol=1e-2
+            )
 
 
 @pytest.mark.parametrize("delta", [0.5, 1.5])
@@ -155,7 +178,8 @@ def test_sampler_options():
     with pytest.raises(ValueError, match="must be 'normal', 'clipped' or 'uniform'"):
         ResidualSampler(decoder, distribution="laplace")
     with pytest.raises(ValueError, match="sigma must be a finite number > 0"):
-        ResidualSampler(make_decoder(PastPrior(P, sigma=0.0), 0.5))
-    ResidualSampler(make_decoder(PastPrior(P, sigma=0.0), 0.5), distribution="uniform")
+        ResidualSampler(make_decoder(PastPrior(P, sigma=0.0), 0.5), distribution="clipped")
+    # Without noise of the prior's own, the box is all there is.
+    assert ResidualSampler(make_decoder(PastPrior(P, sigma=0.0), 0.5)).distribution == "uniform"
     with pytest.raises(KeyError, match="PriorAnchor writes it"):
         ResidualSampler(decoder)(TensorDict({}, [2]))

@@ -192,7 +192,7 @@ def test_the_agent_climbs_its_critic(tmp_path, algorithm):
 
 
 def test_both_algorithms_want_the_same_entropy(tmp_path):
-    """TorchRL's SAC counts it in units of the residual, DSRL-NA in units of the box."""
+    """In units of the box."""
     losses = {}
     for algorithm in ALGORITHMS:
         options = {"alpha_init": 3.0, "target_entropy": -2.5, "delta": 0.7}
@@ -206,8 +206,42 @@ def test_both_algorithms_want_the_same_entropy(tmp_path):
         loss.actor_network_params.data.copy_(weights.data)
         torch.manual_seed(0)
         losses[algorithm] = loss(data.clone())["loss_alpha"].item()
-    # Without the change of units they would be 2.4 apart; TorchRL inverts the squashing numerically.
+    # In other units they would be 2.4 apart; TorchRL inverts the squashing numerically.
     assert losses["dsrl-sac"] == pytest.approx(losses["dsrl-na"], abs=0.05)
+
+
+@pytest.mark.parametrize("delta", [0.5, 1.5])
+def test_the_targets_of_sac_by_hand(tmp_path, delta):
+    """Squared errors to rewards and soft values, with entropies that do not depend on the box."""
+    options = {"algorithm": "dsrl-sac", "alpha_init": 0.7, "delta": delta, "gamma": 0.9}
+    training = make_training(tmp_path, environment_steps=30, **options)
+    training.run()
+    loss, data = training.agent.loss, training.buffer[:]
+    for params in (loss.qvalue_network_params, loss.target_qvalue_network_params):
+        params.data.zero_()  # values are zero: what is left is the reward and the entropy
+    with torch.no_grad():
+        for value in loss.actor_network_params.values(True, True):
+            value.zero_()  # a standard normal before the squashing
+    torch.manual_seed(0)
+    u = torch.randn(200_000, H, 2).double()
+    entropy = -(torch.distributions.Normal(0.0, 1.0).log_prob(u) - (1 - u.tanh() ** 2).log())
+    bonus = 0.7 * entropy.sum((1, 2)).mean()
+    after = data["next"]
+    follows = 0.9 * (~after["terminated"].flatten()).double()
+    errors = (after["reward"].flatten().double() + follows * bonus).square()
+    # The rest is the variance of the single draw per transition.
+    variance = 0.7**2 * entropy.sum((1, 2)).var() * follows.square()
+    expected = (errors + variance).mean().item()
+    found = sum(loss(data.clone())["loss_qvalue"].item() for _ in range(300)) / 300
+    assert found == pytest.approx(2 * expected, rel=0.02)  # summed over two critics
+
+
+def test_a_prior_without_noise_warms_up_in_its_box(tmp_path):
+    prior = PastPrior(H, sigma=0.0)
+    training = make_training(tmp_path, make_actor(prior), {"prior": prior}, environment_steps=30)
+    training.run()
+    delta = training.buffer[:][keys.DELTA]
+    assert 0.2 < delta.std() < 0.4 and delta.abs().max() <= 0.5
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

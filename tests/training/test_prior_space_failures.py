@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.envs import TransformedEnv
+from torchrl.envs import SerialEnv, TransformedEnv
 
 from tests.training.prior_space_parts import (
     ALGORITHMS,
@@ -48,10 +48,11 @@ def test_a_replay_buffer_of_another_wiring_is_refused(tmp_path, wiring):
     (segment,) = (tmp_path / "buffer").iterdir()
     tensors = load_file(segment)
     if wiring == "keys":  # PriorSpace writes the chunk elsewhere
-        tensors["next.decoded.chunk"] = tensors.pop("vla_action.chunk")
+        tensors['["next", "decoded", "chunk"]'] = tensors.pop('["vla_action", "chunk"]')
         message = r"another wiring: it lacks \[\('vla_action', 'chunk'\)\].*decoded"
     else:
-        tensors["prior.delta"] = tensors["prior.delta"][:, :-1].clone()
+        delta = '["prior", "delta"]'
+        tensors[delta] = tensors[delta][:, :-1].clone()
         message = r"another policy: its .*delta.* is .*\(P, d_a\) = \(3, 2\)"
     save_file(tensors, segment)
     with pytest.raises(ValueError, match=message):
@@ -175,6 +176,20 @@ def test_chunks_executed_in_part_are_refused_where_the_mean_would_hold_them(tmp_
     assert len(training.buffer) == 0
 
 
+def test_an_environment_without_an_anchor_is_refused_before_any_work(tmp_path):
+    def bare(seed):
+        bases = [SolvableEnv(length) for length in (5, 7)]
+        transforms = policy_transforms(PastPrior(H), observation_steps=1)
+        return TransformedEnv(SerialEnv(2, [lambda base=base: base for base in bases]), transforms)
+
+    training = PriorSpaceTraining(
+        make_actor(), bare, make_config(), tmp_path, evaluation_seed=EVALUATION_SEED
+    )
+    with pytest.raises(KeyError, match="append PriorAnchor"):
+        training.run()
+    assert training.curve == []
+
+
 def test_an_environment_that_does_not_start_closes_the_other(tmp_path):
     opened = []
 
@@ -240,6 +255,13 @@ def test_a_killed_worker_ends_the_training(tmp_path):
         ({"warmup_steps": 9, "environment_steps": 8}, r"warmup_steps \(9\) exceed .* \(8\)"),
         ({"gamma": 1.5}, r"gamma must lie in \(0, 1\], got 1.5"),
         ({"tau": 0.0}, r"tau must lie in \(0, 1\], got 0.0"),
+        ({"noise_critic_steps": 0}, "noise_critic_steps must be at least 1"),
+        ({"hidden_dim": 0}, "hidden_dim must be at least 1"),
+        ({"backup": "max"}, "backup must be 'min' or 'mean', got 'max'"),
+        ({"reward_offset": float("nan")}, "reward_offset must be a finite number"),
+        ({"target_entropy": float("inf")}, "target_entropy must be a finite number"),
+        ({"algorithm": "dsrl-sac", "backup_entropy": False}, "dsrl-sac has .* leave them out"),
+        ({"algorithm": "dsrl-sac", "backup": "mean"}, "dsrl-sac has .* leave them out"),
         ({"learning_rate": 0.0}, "learning_rate must be a finite number > 0"),
         ({"alpha_init": -1.0}, "alpha_init must be a finite number > 0"),
     ],

@@ -33,7 +33,7 @@ def tensordicts(draw):
     """Nested keys of every depth and type, with rows that differ."""
     paths = draw(
         st.lists(
-            st.lists(st.sampled_from("abc"), min_size=1, max_size=3).map(
+            st.lists(st.sampled_from(["a", "b", "c.d"]), min_size=1, max_size=3).map(
                 lambda path: (*path, "leaf")
             ),
             min_size=1,

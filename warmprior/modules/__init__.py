@@ -2,6 +2,7 @@
 
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.baselines import HistoryPrior, RegressionPrior
+from warmprior.modules.box_normal import BoxTanhNormal
 from warmprior.modules.chi_transformer import ChiTransformer
 from warmprior.modules.decoder import PriorDecoder
 from warmprior.modules.interpolant import (
@@ -20,6 +21,7 @@ from warmprior.modules.residual import ResidualSampler
 from warmprior.modules.sampler import PriorSampler
 
 __all__ = [
+    "BoxTanhNormal",
     "ChiTransformer",
     "GaussianPrior",
     "HistoryPrior",

@@ -117,6 +117,7 @@ def make_prior_space_actor(
     num_layers: int = 3,
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR),
     delta_key: NestedKey = keys.DELTA,
+    distribution_class: type[TanhNormal] = TanhNormal,
 ) -> ProbabilisticActor:
     r"""A squashed Gaussian over residuals, :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`, for SAC.
 
@@ -138,6 +139,8 @@ def make_prior_space_actor(
             or the next mean depends on: for :class:`~warmprior.HistoryPrior`, and for WP-Past with
             ``execute < H``.
         delta_key: where the residual is written; its log-probability is summed over the chunk.
+        distribution_class: :class:`~warmprior.BoxTanhNormal` for entropies in units of the box in TorchRL's
+            own losses; :class:`~warmprior.DSRLNALoss` gives the same for both.
 
     Raises:
         ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
@@ -168,7 +171,7 @@ def make_prior_space_actor(
         in_keys=dict(zip(("loc", "scale"), parameters, strict=True)),
         out_keys=[delta_key],
         spec=Composite({delta_key: Bounded(-delta, delta, chunk)}),
-        distribution_class=TanhNormal,
+        distribution_class=distribution_class,
         # Two event dimensions: one log-probability per chunk and not per action.
         distribution_kwargs={"low": -delta, "high": delta, "event_dims": 2},
         return_log_prob=True,

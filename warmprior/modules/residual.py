@@ -36,8 +36,8 @@ class ResidualSampler(TensorDictModuleBase):
         decoder: the frozen policy.
 
     Keyword Args:
-        distribution: see above. By default ``"clipped"`` around a mean and ``"normal"`` around zero, as
-            in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
+        distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
+            noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
         sigma: the prior's own by default.
         generator: source of randomness on the data's device; PyTorch's global one by default.
 
@@ -64,14 +64,16 @@ class ResidualSampler(TensorDictModuleBase):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        if distribution is None:
-            distribution = "clipped" if moves_source(decoder.prior) else "normal"
+        if sigma is None:
+            sigma = decoder.prior.sigma if moves_source(decoder.prior) else 1.0
+        if distribution is None and moves_source(decoder.prior):
+            distribution = "clipped" if sigma > 0 else "uniform"
+        elif distribution is None:
+            distribution = "normal"
         if distribution not in ("normal", "clipped", "uniform"):
             raise ValueError(
                 f"the distribution must be 'normal', 'clipped' or 'uniform', got {distribution!r}"
             )
-        if sigma is None:
-            sigma = decoder.prior.sigma if moves_source(decoder.prior) else 1.0
         if distribution != "uniform" and not (sigma > 0 and math.isfinite(sigma)):
             raise ValueError(
                 f"sigma must be a finite number > 0, got {sigma}; a prior without noise leaves 'uniform'"

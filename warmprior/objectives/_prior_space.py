@@ -17,6 +17,7 @@ from torchrl.objectives.common import LossModule
 from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import dispatch_value_estimator
 
+from warmprior.modules.box_normal import BoxTanhNormal
 from warmprior.modules.decoder import PriorDecoder
 
 __all__ = ["PriorSpaceLoss", "check_counts", "check_finite", "check_networks"]
@@ -164,13 +165,16 @@ class PriorSpaceLoss(LossModule):
             set_exploration_type(ExplorationType.RANDOM),
             self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
         ):
-            delta, log_prob = compute_rsample_log_prob(self.actor_network.get_dist(state))
+            distribution = self.actor_network.get_dist(state)
+            delta, log_prob = compute_rsample_log_prob(distribution)
         if log_prob.shape != state.shape:
             raise ValueError(
                 f"the actor gives log-probabilities {tuple(log_prob.shape)} for {tuple(state.shape)} "
                 "states: its distribution needs event_dims=2"
             )
-        return delta, log_prob + delta.shape[-2:].numel() * math.log(self.decoder.delta)
+        if not isinstance(distribution, BoxTanhNormal):
+            log_prob = log_prob + delta.shape[-2:].numel() * math.log(self.decoder.delta)
+        return delta, log_prob
 
     def _values(self, data: TensorDictBase) -> Tensor:
         key = self.tensor_keys.state_action_value

@@ -67,8 +67,8 @@ class DSRLNALoss(PriorSpaceLoss):
             anew, or a list.
         noise_qvalue_network: :math:`Q^W`, which reads ``decoder.delta_key``; the same.
         decoder: the frozen policy. It is not among the loss's submodules: ``parameters()``,
-            ``state_dict()`` and target updates never see it. For the official implementation's unscaled
-            box see its ``unscaled_box``.
+            ``state_dict()`` and target updates never see it; ``loss.to(device)`` moves it along. For the
+            official implementation's unscaled box see its ``unscaled_box``.
 
     Keyword Args:
         num_qvalue_nets: critics of each kind.

@@ -38,7 +38,7 @@ class PriorSpaceTraining:
     cannot be saved, so that the episodes under way at an interruption are lost and new ones started.
 
     Args:
-        actor: the frozen policy; copied.
+        actor: the frozen policy; not changed, but for its evaluation mode.
         make_env: ``make_env(seed) -> EnvBase``, a batched environment ``[n]`` with the policy's
             transforms and :class:`~warmprior.PriorAnchor`; called for training and evaluation.
         config: the recipe.
@@ -74,7 +74,7 @@ class PriorSpaceTraining:
         torch.manual_seed(config.seed)
         self.agent = PriorSpaceAgent(actor, config)
         self.decoder, self.device = self.agent.decoder, self.agent.device
-        # No transition is ever dropped: at least one control step each.
+        # A transition takes at least one control step, so that all fit.
         self.buffer = ReplayBuffer(
             storage=LazyTensorStorage(config.environment_steps, device=self.device),
             batch_size=config.batch_size,
@@ -103,6 +103,7 @@ class PriorSpaceTraining:
             ``"greedy"``, ``"stochastic"``), ``episodes``, ``successes``, ``success_rate``.
 
         Raises:
+            KeyError: if the environment has no anchor.
             ValueError: if the environment does not fit the policy, see :meth:`PriorDecoder.check_env`, or
                 executes less than ``H`` actions of a chunk.
             FloatingPointError: if a loss, a parameter or what the environment gives becomes NaN or
@@ -114,6 +115,8 @@ class PriorSpaceTraining:
             return self.curve
         with self._environments() as (evaluation_env, env), self._bar() as bar:
             self.decoder.check_env(env)
+            if keys.ANCHOR not in env.observation_spec.keys(True, True):
+                raise KeyError(f"the environment writes no {keys.ANCHOR}: append PriorAnchor")
             if not self.curve:
                 self._evaluate(evaluation_env, {"base": self.actor})
                 self._save()
@@ -124,7 +127,7 @@ class PriorSpaceTraining:
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
                     told = self.agent.learn(self.buffer)
-                    bar.set_postfix(told, refresh=False)
+                    bar.set_postfix(told | self._last_success(), refresh=False)
                 due = self.steps // config.evaluate_every > before // config.evaluate_every
                 if due or self.steps >= config.environment_steps:
                     self.agent.state()  # Raises for an agent that is not worth an evaluation.
@@ -156,9 +159,15 @@ class PriorSpaceTraining:
             disable=self.description is None,
         )
 
+    def _last_success(self) -> dict[str, float]:
+        """Of the last evaluations, for the progress bar."""
+        return {row["evaluation"]: row["success_rate"] for row in self.curve}
+
     def _seed(self) -> int:
         # Away from evaluation and demonstrations; a continued training plays new episodes.
-        return 6_000_000 + 100_000 * (self.config.seed % 10) + self.steps % 100_000
+        if self.steps:
+            return 1_000_000_000 + 10_000_000 * (self.config.seed % 100) + self.steps % 10_000_000
+        return 6_000_000 + 100_000 * (self.config.seed % 10)
 
     @torch.no_grad()
     def _collect(self, env: EnvBase, data: TensorDictBase) -> tuple[TensorDictBase, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping
 from itertools import chain
 from typing import Any
@@ -11,12 +10,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
-from torchrl.data import Bounded, Composite, ReplayBuffer
+from torchrl.data import ReplayBuffer
+from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.decoder import PriorDecoder
+from warmprior.modules.box_normal import BoxTanhNormal
+from warmprior.modules.decoder import PriorDecoder, moves_source
 from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
 from warmprior.modules.residual import ResidualSampler
 from warmprior.objectives import DSRLNALoss
@@ -59,8 +60,9 @@ class PriorSpaceAgent:
         self.config, self._prior, self._network = config, actor.prior, actor.network
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
+        noisy = actor.prior.sigma > 0 or not moves_source(actor.prior)
         self.warmup = TensorDictSequential(
-            ResidualSampler(self.decoder, distribution="clipped"), self.decoder
+            ResidualSampler(self.decoder, distribution="clipped" if noisy else None), self.decoder
         )
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
         if (
@@ -68,7 +70,11 @@ class PriorSpaceAgent:
         ):  # A mean that conditions the policy; the anchor is zero.
             self.state_keys.append(keys.LOC)
         network = self._make(
-            make_prior_space_actor, delta=self.decoder.delta, in_keys=self.state_keys
+            make_prior_space_actor,
+            delta=self.decoder.delta,
+            in_keys=self.state_keys,
+            # DSRL-NA changes units by itself, TorchRL's SAC does not.
+            distribution_class=BoxTanhNormal if config.algorithm == "dsrl-sac" else TanhNormal,
         ).to(self.device)
         self.policy = TensorDictSequential(network, self.decoder)
         self.loss = self._make_loss(network).to(self.device)
@@ -104,19 +110,18 @@ class PriorSpaceAgent:
                 backup=config.backup,
                 discount="decision",
                 noise_critic_steps=config.noise_critic_steps,
+                backup_entropy=config.backup_entropy,
                 bootstrap_timeouts=config.bootstrap_timeouts,
                 alpha_init=config.alpha_init,
                 target_entropy=config.target_entropy,
             )
-        size = (self._prior.prediction_length, int(network.spec[keys.DELTA].shape[-1]))
-        box = Composite({keys.DELTA: Bounded(-delta, delta, size)})
         return SACLoss(
             network,
             noise_critic,
-            action_spec=box,
+            loss_function="l2",
+            action_spec=network.spec,
             alpha_init=config.alpha_init,
-            # TorchRL's log-probabilities are those of the residual, not of units of the box.
-            target_entropy=config.target_entropy + math.prod(size) * math.log(delta),
+            target_entropy=config.target_entropy,
         )
 
     def _schedule(self) -> Iterator[Callable[[TensorDictBase], TensorDict]]:

@@ -32,6 +32,8 @@ class PriorSpaceConfig:
         hidden_dim: width of actor and critics.
         num_layers: their number of hidden layers.
         backup: ``"min"`` or ``"mean"`` over critics, DSRL-NA only.
+        backup_entropy: whether the targets of DSRL-NA's critic hold the entropy term; TorchRL's SAC always
+            has it.
         alpha_init: initial temperature, DSRL's 1. Where success ends the episode, below
             ``reward_offset * H / (P * d_a * log 2)``: otherwise the entropy of further decisions is worth
             more than success, until the temperature has fallen.
@@ -60,6 +62,7 @@ class PriorSpaceConfig:
     hidden_dim: int = 2048
     num_layers: int = 3
     backup: Literal["min", "mean"] = "min"
+    backup_entropy: bool = True
     alpha_init: float = 1.0
     target_entropy: float = 0.0
     reward_offset: float = 1.0
@@ -71,6 +74,13 @@ class PriorSpaceConfig:
     def __post_init__(self) -> None:
         if self.algorithm not in ("dsrl-na", "dsrl-sac"):
             raise ValueError(f"algorithm must be dsrl-na or dsrl-sac, got {self.algorithm!r}")
+        if self.backup not in ("min", "mean"):
+            raise ValueError(f"backup must be 'min' or 'mean', got {self.backup!r}")
+        if self.algorithm == "dsrl-sac" and (self.backup, self.backup_entropy) != ("min", True):
+            raise ValueError("dsrl-sac has backup='min' and backup_entropy=True; leave them out")
+        for name in ("target_entropy", "reward_offset"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} must be a finite number, got {getattr(self, name)}")
         for name in ("delta", "learning_rate", "alpha_init"):
             value = getattr(self, name)
             if value is not None and not (value > 0 and math.isfinite(value)):
@@ -79,7 +89,8 @@ class PriorSpaceConfig:
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in (0, 1], got {getattr(self, name)}")
         counts = ("environment_steps", "warmup_steps", "nfe", "updates", "batch_size")
-        for name in (*counts, "evaluate_every", "evaluation_episodes"):
+        sizes = ("noise_critic_steps", "hidden_dim", "num_layers")
+        for name in (*counts, *sizes, "evaluate_every", "evaluation_episodes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.warmup_steps > self.environment_steps:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 
 from warmprior._files import load_file, save_file, write_atomic
 
 __all__ = ["ReplaySegments"]
-
-SEPARATOR = "."
 
 
 class ReplaySegments:
@@ -54,7 +54,7 @@ class ReplaySegments:
             return
         data: Any = torch.cat(self._pending)  # type: ignore[arg-type]
         tensors = {
-            SEPARATOR.join(key) if isinstance(key, tuple) else key: value.cpu().contiguous()
+            json.dumps(key): value.cpu().contiguous()  # names may hold any separator
             for key, value in data.items(True, True)
         }
         write_atomic(self._path(self.committed), lambda path: save_file(tensors, path))
@@ -78,8 +78,11 @@ class ReplaySegments:
                     "or choose another output folder"
                 ) from error
             size = len(next(iter(tensors.values())))
-            nested = {
-                tuple(k.split(SEPARATOR)) if SEPARATOR in k else k: v for k, v in tensors.items()
-            }
+            nested = {_key(name): value for name, value in tensors.items()}
             parts.append(TensorDict(nested, batch_size=[size]))
         return torch.cat(parts) if parts else None
+
+
+def _key(name: str) -> NestedKey:
+    key = json.loads(name)
+    return tuple(key) if isinstance(key, list) else key
