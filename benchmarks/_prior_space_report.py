@@ -45,7 +45,9 @@ def make_table(rows: list[dict[str, Any]]) -> str:
             summary = summarize_seeds([row[key] for row in group])
             spread = f" ± {100 * summary.std:.1f}" if summary.seeds > 1 else ""
             cells.append(f"{100 * summary.mean:.1f}{spread}")
-        label = f"{algorithm.upper()}, {PRIOR_LABELS[prior]} ({len(group)} seed{"s"[: len(group) > 1]})"
+        label = (
+            f"{algorithm.upper()}, {PRIOR_LABELS[prior]} ({len(group)} seed{'s'[: len(group) > 1]})"
+        )
         steps = max(row["environment_steps"] for row in group)
         lines.append(f"| {label} | {group[0]['delta']:g} | {steps} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"

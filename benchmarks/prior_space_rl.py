@@ -138,14 +138,21 @@ def manipulation_tasks(
                 f"--run {args.run} has policies of {', '.join(stored)}, but none of {', '.join(missing)}"
             )
 
-    def task(name: str, seed: int) -> Task:
+    def frozen(name: str, seed: int) -> WarmPriorActor:
         if stored is None:
-            actor = policies.policy(PRIORS[name](budget.chunk), seed)
-        else:
-            group = stored[PRIORS[name].name]
-            actor = group[seed % len(group)]
-            if seed >= len(group):
-                print(f"--run has {len(group)} seeds of {name}: agent {seed} shares a policy")
+            return policies.policy(PRIORS[name](budget.chunk), seed)
+        group = stored[PRIORS[name].name]
+        if seed >= len(group):
+            print(f"--run has {len(group)} seeds of {name}: agent {seed} shares a policy")
+        return group[seed % len(group)]
+
+    def task(name: str, seed: int) -> Task:
+        # A copy of its own: to continue, an agent must find the very policy it began with, even if
+        # another number of threads or version would train another by now.
+        kept = args.out / "policies" / f"{name}-seed{seed}"
+        if not (kept / "config.json").exists():
+            frozen(name, seed).save_pretrained(kept)
+        actor = WarmPriorActor.from_pretrained(kept, device=args.device)
         transforms = partial(
             policy_transforms,
             actor.prior,

@@ -13,8 +13,10 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 from tests.benchmarks.conftest import options
+from warmprior import WarmPriorActor
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("tqdm")
@@ -261,6 +263,14 @@ def test_policies_of_a_finished_run(benchmark, finished, tmp_path, capsys):
     assert is_png(out / "curves.png")
     after = {path: path.stat().st_mtime_ns for path in finished.parent.rglob("*.safetensors")}
     assert after == before  # nothing was trained
+
+    # An agent goes on with the very policy it began with, whatever has become of the run's.
+    for folder in (finished.parent / "policies").glob("*/policy_*"):
+        actor = WarmPriorActor.from_pretrained(folder)
+        torch.nn.init.normal_(next(actor.parameters()))
+        actor.save_pretrained(folder)
+    assert benchmark.main(["--resume", "--out", str(out)]) == 0
+    assert stored(out)["rows"] == result["rows"]
 
     other = ["--run", str(finished), "--out", str(tmp_path / "other")]
     for extra, message in {
