@@ -8,7 +8,7 @@ from typing import Any
 from _prior_space_budgets import PRIORS
 
 from warmprior.diagnostics import Row, plot_reinforcement, plot_success, summarize_seeds
-from warmprior.diagnostics.results import PRIOR_LABELS
+from warmprior.diagnostics.reinforcement_plots import agent_label
 from warmprior.training import PriorSpaceConfig, PriorSpaceTraining
 
 
@@ -45,9 +45,7 @@ def make_table(rows: list[dict[str, Any]]) -> str:
             summary = summarize_seeds([row[key] for row in group])
             spread = f" ± {100 * summary.std:.1f}" if summary.seeds > 1 else ""
             cells.append(f"{100 * summary.mean:.1f}{spread}")
-        label = (
-            f"{algorithm.upper()}, {PRIOR_LABELS[prior]} ({len(group)} seed{'s'[: len(group) > 1]})"
-        )
+        label = agent_label(algorithm, prior, len(group))
         steps = max(row["environment_steps"] for row in group)
         lines.append(f"| {label} | {group[0]['delta']:g} | {steps} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"

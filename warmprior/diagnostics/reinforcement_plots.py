@@ -16,6 +16,12 @@ __all__ = ["plot_reinforcement"]
 STYLES = {"dsrl-na": "-", "dsrl-sac": "--"}
 
 
+def agent_label(algorithm: str, prior: str, seeds: int) -> str:
+    """What figures and tables call the agents of one algorithm and prior."""
+    many = "" if seeds == 1 else "s"
+    return f"{algorithm.upper()}, {PRIOR_LABELS.get(prior, prior)} ({seeds} seed{many})"
+
+
 def plot_reinforcement(
     curve: Iterable[Mapping[str, Any]], path: str | Path, *, title: str, warmup_steps: int
 ) -> None:
@@ -54,7 +60,7 @@ def plot_reinforcement(
                 low.append(summary.mean - spread)
                 high.append(summary.mean + spread)
             color, style = COLORS.get(prior), STYLES.get(algorithm, "-")
-            label = f"{algorithm.upper()}, {PRIOR_LABELS.get(prior, prior)} ({len(seeds)} seeds)"
+            label = agent_label(algorithm, prior, len(seeds))
             axis.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
             axis.plot(x, mean, color=color, ls=style, marker="o", ms=3, lw=1.4, label=label)
         axis.axvspan(0, warmup_steps, color="0.92", lw=0, zorder=-1)
