@@ -20,6 +20,7 @@ def summarize(
     return {
         "algorithm": config.algorithm,
         "prior": PRIORS[name].name,
+        "backup_entropy": config.backup_entropy,
         "delta": training.decoder.delta,
         "nfe": config.nfe,
         "chunk": training.actor.prior.chunk_length,

@@ -150,7 +150,7 @@ def manipulation_tasks(
         # A copy of its own: to continue, an agent must find the very policy it began with, even if
         # another number of threads or version would train another by now.
         kept = args.out / "policies" / f"{name}-seed{seed}"
-        if not (kept / "config.json").exists():
+        if not (args.resume and (kept / "config.json").exists()):
             frozen(name, seed).save_pretrained(kept)
         actor = WarmPriorActor.from_pretrained(kept, device=args.device)
         transforms = partial(

@@ -271,6 +271,10 @@ def test_policies_of_a_finished_run(benchmark, finished, tmp_path, capsys):
         actor.save_pretrained(folder)
     assert benchmark.main(["--resume", "--out", str(out)]) == 0
     assert stored(out)["rows"] == result["rows"]
+    # Started anew, the folder's agent is not passed off as one of the present policy.
+    (out / "results.json").unlink()
+    assert benchmark.main([*run, *words, "--seeds", "2", "--prior", "past"]) == 2
+    assert "belongs to another policy" in capsys.readouterr().err
 
     other = ["--run", str(finished), "--out", str(tmp_path / "other")]
     for extra, message in {

@@ -19,7 +19,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.box_normal import BoxTanhNormal
 from warmprior.modules.decoder import PriorDecoder, moves_source
 from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
-from warmprior.modules.residual import ResidualSampler
+from warmprior.modules.residual import ResidualDistribution, ResidualSampler
 from warmprior.objectives import DSRLNALoss
 from warmprior.objectives._prior_space import check_finite
 from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
@@ -60,9 +60,10 @@ class PriorSpaceAgent:
         self.config, self._prior, self._network = config, actor.prior, actor.network
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
-        noisy = actor.prior.sigma > 0 or not moves_source(actor.prior)
+        # By default what is drawn around a mean stays in the box, but not what is drawn around zero.
+        drawn: ResidualDistribution | None = None if moves_source(actor.prior) else "clipped"
         self.warmup = TensorDictSequential(
-            ResidualSampler(self.decoder, distribution="clipped" if noisy else None), self.decoder
+            ResidualSampler(self.decoder, distribution=drawn), self.decoder
         )
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
         if (
