@@ -1,4 +1,4 @@
-"""VelocityMLP: shapes, its residual form and its errors."""
+"""VelocityMLP: shapes, the modulation by time and its errors."""
 
 from __future__ import annotations
 
@@ -17,19 +17,27 @@ def test_shapes(action, observation, length, steps):
     assert out.shape == (5, length, action)
 
 
-def test_predicts_a_residual():
-    """With zeroed output weights the velocity is exactly minus the point."""
-    network = VelocityMLP(2, 3, 4, hidden_dim=16)
+def perturbed(network):
+    """Modulation starts from no effect; give it some."""
     with torch.no_grad():
-        network.head[-1].weight.zero_()
-        network.head[-1].bias.zero_()
-    a = torch.randn(5, 4, 2)
-    assert torch.equal(network(torch.rand(5), a, torch.randn(5, 2, 3)), -a)
+        for block in network.blocks:
+            block.modulation.weight.normal_(std=0.1)
+    return network
+
+
+def test_modulation_starts_from_no_effect():
+    torch.manual_seed(0)
+    network = VelocityMLP(2, 3, 4, hidden_dim=16)
+    a, o = torch.randn(1, 4, 2).expand(5, 4, 2), torch.randn(1, 2, 3).expand(5, 2, 3)
+    velocity = network(torch.linspace(0, 1, 5), a, o)
+    torch.testing.assert_close(velocity, velocity[:1].expand_as(velocity))
+    velocity = perturbed(network)(torch.linspace(0, 1, 5), a, o)
+    assert (velocity.diff(dim=0).abs() > 1e-4).flatten(1).any(1).all()
 
 
 def test_every_input_matters():
     torch.manual_seed(0)
-    network = VelocityMLP(2, 3, 4, hidden_dim=16)
+    network = perturbed(VelocityMLP(2, 3, 4, hidden_dim=16))
     t, a, o = torch.rand(1), torch.randn(1, 4, 2), torch.randn(1, 2, 3)
     for value in (t, a, o):
         value.requires_grad_()
@@ -38,14 +46,26 @@ def test_every_input_matters():
         assert (value.grad.abs() > 0).all()
 
 
+def test_blocks_by_hand():
+    """Adaptive layer norm: x + (1 + gate) f((1 + scale) norm(x) + shift), with numbers of its own."""
+    torch.manual_seed(0)
+    network = perturbed(VelocityMLP(2, 3, 4, hidden_dim=16, num_blocks=1))
+    block, time, x = network.blocks[0], torch.randn(5, 64), torch.randn(5, 16)
+    m = time @ block.modulation.weight.T + block.modulation.bias
+    norm = (x - x.mean(1, keepdim=True)) / (x.var(1, unbiased=False, keepdim=True) + 1e-5).sqrt()
+    inner = block.layers(norm * (1 + m[:, :16]) + m[:, 16:32])
+    torch.testing.assert_close(block(x, time), x + (1 + m[:, 32:]) * inner)
+
+
 @pytest.mark.parametrize("blocks", [0, 1, 3])
 def test_parameter_count(blocks):
     h, dim = 24, 8
     chunk, observation = 4 * 2, 2 * 3
     network = VelocityMLP(2, 3, 4, 2, hidden_dim=h, num_blocks=blocks, timestep_embedding_dim=dim)
-    expected = (chunk + dim) * h + h  # chunk and time
+    expected = chunk * h + h
+    expected += dim * 2 * dim + 2 * dim  # time
     expected += observation * h + h + h * h + h  # observation encoder
-    expected += blocks * (2 * h + 2 * (h * h + h))  # norm and two layers
+    expected += blocks * (2 * (h * h + h) + 2 * dim * 3 * h + 3 * h)  # layers and modulation
     expected += 2 * h + h * chunk + chunk  # head
     assert sum(p.numel() for p in network.parameters()) == expected
 

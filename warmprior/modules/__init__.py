@@ -14,6 +14,7 @@ from warmprior.modules.interpolant import (
 from warmprior.modules.mlp import VelocityMLP
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 from warmprior.modules.ode import ODEActor, integrate
+from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
 from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
@@ -30,12 +31,14 @@ __all__ = [
     "ODEActor",
     "PastPrior",
     "PolynomialInterpolant",
+    "PreconditionedNetwork",
     "PreviewPrior",
     "Prior",
     "PriorDecoder",
     "PriorSampler",
     "RegressionPrior",
     "ResidualSampler",
+    "SourceMoments",
     "TimestepEmbedding",
     "TrigonometricInterpolant",
     "VelocityMLP",

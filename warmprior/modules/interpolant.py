@@ -24,6 +24,12 @@ class Interpolant:
     """
 
     name: ClassVar[str]
+    _registry: ClassVar[dict[str, type[Interpolant]]] = {}
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if "name" in cls.__dict__:
+            Interpolant._registry[cls.name] = cls
 
     def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         r"""Return :math:`\alpha, \beta, \dot\alpha, \dot\beta` at times ``t`` in [0, 1], each like ``t``."""
@@ -44,8 +50,29 @@ class Interpolant:
         return alpha * a0 + beta * a1, d_alpha * a0 + d_beta * a1
 
     def config(self) -> dict[str, Any]:
-        """JSON-serialisable description."""
+        """JSON-serialisable description; :meth:`from_config` reverses it."""
         return {"name": self.name}
+
+    @staticmethod
+    def from_config(config: dict[str, Any]) -> Interpolant:
+        """Build an interpolant from :meth:`config`'s output; subclasses are found by their ``name``.
+
+        Raises:
+            ValueError: if no imported class has that name.
+
+        Examples:
+            >>> Interpolant.from_config({"name": "polynomial", "n": 3.0}).config()
+            {'name': 'polynomial', 'n': 3.0}
+        """
+        kwargs = dict(config)
+        name = kwargs.pop("name", None)
+        if name not in Interpolant._registry:
+            known = ", ".join(sorted(Interpolant._registry))
+            raise ValueError(
+                f"unknown interpolant {name!r}; known: {known}. Import the module that defines a custom "
+                "one before loading it."
+            )
+        return Interpolant._registry[name](**kwargs)
 
 
 class LinearInterpolant(Interpolant):

@@ -31,7 +31,8 @@ class FlowMatchingLoss(LossModule):
         actor_network: the policy whose velocity network is trained; its prior gives the source.
 
     Keyword Args:
-        interpolant: the path; linear by default.
+        interpolant: the path; by default the one that the network is preconditioned for
+            (:class:`~warmprior.PreconditionedNetwork`), or the straight line.
         reduction: ``"mean"`` over unpadded coordinates (Algorithm 1 divided by their number),
             ``"sum"`` (Algorithm 1's squared norm, summed over the batch) or ``"none"``
             (``[*B, P, d_a]``, zero where padded).
@@ -43,8 +44,8 @@ class FlowMatchingLoss(LossModule):
         and ``observation`` ``[*B, To, d_o]``.
 
     Raises:
-        ValueError: for an unknown ``reduction``, or a curved path with a prior whose field is used for
-            a single step.
+        ValueError: for an unknown ``reduction``, a curved path with a prior whose field is used for
+            a single step, or another path than the network is preconditioned for.
 
     Examples:
         >>> import torch
@@ -91,7 +92,15 @@ class FlowMatchingLoss(LossModule):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         self.convert_to_functional(actor_network.network, "velocity_network")
         self.prior = actor_network.prior
-        self.interpolant = LinearInterpolant() if interpolant is None else interpolant
+        built_for = getattr(actor_network.network, "interpolant", None)
+        if interpolant is None:
+            interpolant = LinearInterpolant() if built_for is None else built_for
+        elif built_for is not None and built_for.config() != interpolant.config():
+            raise ValueError(
+                f"the network is preconditioned for the path {built_for.config()}, but the loss is given "
+                f"{interpolant.config()}: give both the same interpolant"
+            )
+        self.interpolant = interpolant
         if self.prior.max_nfe == 1 and not isinstance(self.interpolant, LinearInterpolant):
             raise ValueError(
                 f"{self.prior} is evaluated with one step, which ends at the data only on a straight "

@@ -43,7 +43,7 @@ def make_optimizer(
         groups = network.parameter_groups(weight_decay)
     else:
         groups = [{"params": list(network.parameters()), "weight_decay": weight_decay}]
-    return AdamW(groups, lr=learning_rate, betas=betas, eps=eps)
+    return AdamW(groups, lr=learning_rate, betas=betas, eps=eps, fused=True)
 
 
 def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0.2) -> LambdaLR:

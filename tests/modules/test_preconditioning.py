@@ -1,0 +1,384 @@
+"""Preconditioning: moments against Monte Carlo, coefficients against brute-force regression."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import nn
+
+from warmprior import (
+    FlowMatchingLoss,
+    GaussianPrior,
+    LinearInterpolant,
+    PastPrior,
+    PolynomialInterpolant,
+    PreconditionedNetwork,
+    PreviewPrior,
+    RegressionPrior,
+    SourceMoments,
+    TrigonometricInterpolant,
+    VelocityMLP,
+    VelocityNetwork,
+    WarmPriorActor,
+    window_replay_buffer,
+)
+
+PATHS = [LinearInterpolant(), TrigonometricInterpolant(), PolynomialInterpolant(3.0)]
+
+
+class Nothing(VelocityNetwork):
+    """A network that has learnt nothing."""
+
+    def __init__(self, action_dim, observation_dim, prediction_length, observation_steps=2):
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+
+    def forward(self, t, a, observation):
+        return torch.zeros_like(a)
+
+
+class Spy(Nothing):
+    """Keeps its input and answers with a constant."""
+
+    def forward(self, t, a, observation):
+        self.seen = a
+        return torch.ones_like(a)
+
+
+def moments_of(m0, m1, v0, v1, c, length=1, dim=1):
+    return SourceMoments(*(torch.full((length, dim), float(x)) for x in (m0, m1, v0, v1, c)))
+
+
+def gaussian_steps(episodes=400, length=30, dim=2, keep=0.0, seed=0):
+    """Actions of a stationary Gaussian AR(1) process: ``keep`` is the correlation of neighbours."""
+    rng = np.random.default_rng(seed)
+    action = np.empty((episodes, length, dim))
+    action[:, 0] = rng.normal(size=(episodes, dim))
+    for i in range(1, length):
+        noise = rng.normal(size=(episodes, dim))
+        action[:, i] = keep * action[:, i - 1] + math.sqrt(1 - keep**2) * noise
+    action = 0.4 * action + np.array([0.3, -0.2])
+    n = episodes * length
+    return TensorDict(
+        {
+            "observation": torch.zeros(n, 3),
+            "action": torch.from_numpy(action).float().reshape(n, dim),
+            "episode": torch.arange(n) // length,
+        },
+        [n],
+    )
+
+
+def buffer_of(data, prior, batch_size=4096, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return window_replay_buffer(data, prior, batch_size=batch_size, generator=generator)
+
+
+def observations(a):
+    return torch.zeros(len(a), 2, 3)
+
+
+variances = st.floats(0.01, 4.0)
+correlations = st.floats(-0.99, 0.99)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    path=st.sampled_from(PATHS),
+    t=st.floats(0.0, 1.0),
+    means=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
+    v0=variances,
+    v1=variances,
+    rho=correlations,
+    a=st.floats(-2, 2),
+)
+def test_coefficients_are_gaussian_conditioning(path, t, means, v0, v1, rho, a):
+    """E[u_t | a_t] and Var[u_t | a_t] by 2 x 2 matrices in float64, for any path and any moments."""
+    c = rho * math.sqrt(v0 * v1)
+    alpha, beta, d_alpha, d_beta = (
+        float(x) for x in path.coefficients(torch.tensor(t, dtype=torch.float64))
+    )
+    joint = np.array([[v0, c], [c, v1]])
+    maps = np.array([[alpha, beta], [d_alpha, d_beta]])
+    mean_a, mean_u = maps @ np.array(means)
+    (var_a, cov), (_, var_u) = maps @ joint @ maps.T
+    expected = mean_u + cov / var_a * (a - mean_a)
+    rest = math.sqrt(max(var_u - cov**2 / var_a, 0.0))
+    moments = moments_of(*means, v0, v1, c)
+    point = torch.full((1, 1, 1), a)
+    inputs = torch.tensor([t]), point, torch.zeros(1, 2, 3)
+    mean = PreconditionedNetwork(Nothing(1, 3, 1), moments=moments, interpolant=path)(*inputs)
+    spy = Spy(1, 3, 1)
+    shifted = PreconditionedNetwork(spy, moments=moments, interpolant=path)(*inputs)
+    tolerance = {"rel": 1e-3, "abs": 2e-3}
+    assert float(mean) == pytest.approx(expected, **tolerance)
+    assert float(spy.seen) == pytest.approx((a - mean_a) / math.sqrt(var_a), **tolerance)
+    assert float(shifted - mean) == pytest.approx(rest, **tolerance)
+
+
+def test_ends_are_exact():
+    moments = moments_of(0.1, -0.3, 0.5, 0.8, 0.2)
+    network = PreconditionedNetwork(Nothing(1, 3, 1), moments=moments)
+    a = torch.tensor([[[0.7]], [[0.7]]])
+    start, end = network(torch.tensor([0.0, 1.0]), a, observations(a)).flatten().tolist()
+    assert start == pytest.approx(-0.4 + (0.2 / 0.5 - 1) * (0.7 - 0.1), rel=1e-6)
+    assert end == pytest.approx(-0.4 + (1 - 0.2 / 0.8) * (0.7 + 0.3), rel=1e-6)
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    ("prior", "keep"),
+    [
+        (GaussianPrior(3), 0.0),
+        (PastPrior(1), 0.9),
+        (PastPrior(2), 0.0),
+        (PreviewPrior(2), 0.0),
+        (PreviewPrior(2, sigma=0.3, cold_probability=0.5), 0.0),
+        (GaussianPrior(1), 0.9),
+    ],
+    ids=str,
+)
+def test_zero_network_is_optimal_for_gaussian_data(prior, keep, path):
+    """Brute force: least squares of the velocity on the whole point finds nothing that it misses."""
+    dim, length = 2, prior.prediction_length
+    data = gaussian_steps(keep=keep)
+    windows = buffer_of(data, prior)
+    moments = SourceMoments.fit(
+        windows, prior, samples=80_000, generator=torch.Generator().manual_seed(1)
+    )
+    network = PreconditionedNetwork(Nothing(dim, 3, length), moments=moments, interpolant=path)
+    batch = torch.cat([windows.sample() for _ in range(20)])
+    batch = batch[~batch["action_is_pad"].any(1)]
+    if not isinstance(prior, GaussianPrior) and prior.cold_probability == 0:
+        batch = batch[
+            batch["prior", "warm"].any(1).squeeze(-1)
+        ]  # of one Gaussian, not of a mixture
+        moments = SourceMoments.fit(batch, prior, generator=torch.Generator().manual_seed(1))
+        network = PreconditionedNetwork(Nothing(dim, 3, length), moments=moments, interpolant=path)
+    a1 = batch["vla_action", "chunk"]
+    a0 = prior.sample(
+        batch["prior", "loc"], batch["prior", "warm"], torch.Generator().manual_seed(2)
+    )
+    for t in (0.0, 0.3, 0.8, 1.0):
+        times = torch.full((len(a1),), t)
+        a_t, u = path(a0, a1, times)
+        with torch.no_grad():
+            mine = network(times, a_t, observations(a_t))
+        design = np.column_stack([np.ones(len(a_t)), a_t.flatten(1).numpy()])
+        target = u.flatten(1).numpy()
+        solution = np.linalg.lstsq(design, target, rcond=None)[0]
+        best = ((design @ solution - target) ** 2).mean()
+        assert float((mine - u).square().mean()) == pytest.approx(best, rel=0.01, abs=1e-6)
+
+
+def test_remainder_is_standardised():
+    """Input and target of the network inside have mean 0, variance 1 and no correlation."""
+    torch.manual_seed(0)
+    m0, m1, v0, v1, c = 0.2, -0.5, 0.7, 0.3, 0.35
+    factor = torch.linalg.cholesky(torch.tensor([[v0, c], [c, v1]]))
+    pairs = torch.randn(200_000, 2) @ factor.T + torch.tensor([m0, m1])
+    a0, a1 = (column[:, None, None] for column in pairs.unbind(-1))
+    spy, moments = Spy(1, 3, 1), moments_of(m0, m1, v0, v1, c)
+    for t in (0.0, 0.25, 0.7, 1.0):
+        times = torch.full((len(a0),), t)
+        a_t, u = LinearInterpolant()(a0, a1, times)
+        shifted = PreconditionedNetwork(spy, moments=moments)(times, a_t, observations(a_t))
+        mean = PreconditionedNetwork(Nothing(1, 3, 1), moments=moments)(
+            times, a_t, observations(a_t)
+        )
+        target = (u - mean) / (shifted - mean)
+        both = torch.cat([spy.seen, target], dim=-1).squeeze(1)
+        torch.testing.assert_close(both.mean(0), torch.zeros(2), atol=0.01, rtol=0)
+        torch.testing.assert_close(both.T.cov(), torch.eye(2), atol=0.02, rtol=0)
+
+
+def test_moments_against_monte_carlo():
+    """Of AR(1) actions, in closed form: a0 is the action H steps ago plus noise."""
+    keep, sigma, chunk = 0.8, 0.5, 2
+    prior = PastPrior(chunk, sigma=sigma)
+    windows = buffer_of(gaussian_steps(episodes=3000, keep=keep), prior, 60_000).sample()
+    warm = windows["prior", "warm"].any(1).squeeze(-1) & ~windows["action_is_pad"].any(1)
+    moments = SourceMoments.fit(windows[warm], prior, generator=torch.Generator().manual_seed(0))
+    mean = torch.tensor([0.3, -0.2]).expand(chunk, 2)
+    one = torch.ones(chunk, 2)
+    close = {"atol": 0.01, "rtol": 0.02}
+    torch.testing.assert_close(moments.source_mean, mean, **close)
+    torch.testing.assert_close(moments.target_mean, mean, **close)
+    torch.testing.assert_close(moments.target_variance, 0.16 * one, **close)
+    torch.testing.assert_close(moments.source_variance, (0.16 + sigma**2) * one, **close)
+    torch.testing.assert_close(moments.covariance, 0.16 * keep**chunk * one, **close)
+
+
+def test_padded_positions_do_not_count():
+    """Every episode is 3 steps long and its last action is far away: position 3 is never seen."""
+    data = TensorDict(
+        {
+            "observation": torch.zeros(300, 3),
+            "action": torch.tensor([[0.1], [0.2], [9.0]]).repeat(100, 1),
+            "episode": torch.arange(300) // 3,
+        },
+        [300],
+    )
+    prior = GaussianPrior(4)
+    windows = buffer_of(data, prior, batch_size=3000).sample()
+    moments = SourceMoments.fit(windows, prior, generator=torch.Generator().manual_seed(0))
+    assert moments.target_mean[2:].flatten().tolist() == pytest.approx([9.0, 0.0])
+    assert float(moments.target_variance[2]) == pytest.approx(1e-4)  # constant: the floor
+    assert float(moments.target_variance[3]) == 1.0 and float(moments.covariance[3]) == 0.0
+    chunk = windows["vla_action", "chunk"][:, 1].double()
+    seen = chunk[~windows["action_is_pad"][:, 1]]
+    assert float(moments.target_mean[1]) == pytest.approx(float(seen.mean()), rel=1e-5)
+    assert float(moments.target_variance[1]) == pytest.approx(float(seen.var()), rel=1e-2)
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "prior",
+    [PreviewPrior(2, sigma=0.0), PastPrior(2, sigma=0.0), GaussianPrior(2), RegressionPrior(2)],
+    ids=str,
+)
+def test_degenerate_ends_stay_finite(prior, path):
+    """A constant action, a source without noise, a source that is its target: no NaN, no explosion."""
+    data = gaussian_steps(episodes=20)
+    data["action"][:, 1] = 0.25
+    windows = buffer_of(data, prior, batch_size=512)
+    moments = SourceMoments.fit(windows, prior, generator=torch.Generator().manual_seed(0))
+    inner = VelocityMLP(2, 3, prior.prediction_length, hidden_dim=16)
+    network = PreconditionedNetwork(inner, moments=moments, interpolant=path)
+    batch = windows.sample()
+    a1 = batch["vla_action", "chunk"]
+    a0 = prior.sample(batch["prior", "loc"], batch["prior", "warm"])
+    for t in (0.0, 1e-6, 0.5, 1.0):
+        times = torch.full((len(a1),), t)
+        a_t, _ = path(a0, a1, times)
+        velocity = network(times, a_t, batch["observation"])
+        assert torch.isfinite(velocity).all() and velocity.abs().max() < 100
+    network.zero_grad()
+    velocity.square().mean().backward()
+    assert all(torch.isfinite(p.grad).all() for p in inner.parameters())
+
+
+def test_source_that_is_its_target_does_not_move():
+    prior = PreviewPrior(2, sigma=0.0)
+    windows = buffer_of(gaussian_steps(episodes=20), prior, batch_size=512)
+    moments = SourceMoments.fit(windows, prior)
+    network = PreconditionedNetwork(Spy(2, 3, 4), moments=moments)
+    a = torch.randn(5, 4, 2)
+    velocity = network(torch.rand(5), a, observations(a))[:, :2]
+    torch.testing.assert_close(velocity, torch.zeros(5, 2, 2), atol=1e-3, rtol=0)
+
+
+def test_fit_is_deterministic_and_leaves_the_global_generator():
+    data, prior = gaussian_steps(episodes=20), PastPrior(2)
+
+    def fit(seed):
+        generator = torch.Generator().manual_seed(seed)
+        return SourceMoments.fit(
+            buffer_of(data, prior, 256, seed), prior, samples=1000, generator=generator
+        ).state_dict()
+
+    before = torch.get_rng_state()
+    one, again, other = fit(0), fit(0), fit(1)
+    assert torch.equal(before, torch.get_rng_state())
+    assert all(torch.equal(one[key], again[key]) for key in one)
+    assert any(not torch.equal(one[key], other[key]) for key in one)
+
+
+def test_saved_with_the_policy(tmp_path):
+    data, prior = gaussian_steps(episodes=20), PreviewPrior(2)
+    windows = buffer_of(data, prior, 256)
+    torch.manual_seed(0)
+    network = PreconditionedNetwork(
+        VelocityMLP(2, 3, 4, hidden_dim=16),
+        moments=SourceMoments.fit(windows, prior),
+        interpolant=PolynomialInterpolant(1.5),
+    )
+    actor = WarmPriorActor(network, prior, nfe=3).eval()
+    actor.save_pretrained(tmp_path)
+    json.loads((tmp_path / "config.json").read_text())
+    again = WarmPriorActor.from_pretrained(tmp_path)
+    assert again.network.config() == network.config()
+    assert again.network.interpolant.n == 1.5
+    for key, value in network.moments.state_dict().items():
+        assert torch.equal(value, again.network.moments.state_dict()[key])
+    batch = windows.sample()
+    actor.sampler.generator = torch.Generator().manual_seed(3)
+    again.sampler.generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        one, two = actor(batch.clone()), again(batch.clone())
+    assert torch.equal(one["vla_action", "chunk"], two["vla_action", "chunk"])
+
+
+@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
+def test_the_same_compiled(backend):
+    torch.manual_seed(0)
+    moments = moments_of(0.1, 0.2, 0.5, 0.8, 0.3, 4, 2)
+    network = PreconditionedNetwork(VelocityMLP(2, 3, 4, hidden_dim=16), moments=moments)
+    compiled = torch.compile(network, backend=backend, fullgraph=True)
+    inputs = torch.linspace(0, 1, 6), torch.randn(6, 4, 2), torch.randn(6, 2, 3)
+    torch.testing.assert_close(compiled(*inputs), network(*inputs))
+
+
+def test_trains_only_what_is_inside_with_its_own_path():
+    path = TrigonometricInterpolant()
+    network = PreconditionedNetwork(
+        VelocityMLP(2, 3, 2, hidden_dim=16),
+        moments=moments_of(0, 0, 1, 1, 0, 2, 2),
+        interpolant=path,
+    )
+    prior = PastPrior(2)
+    loss_module = FlowMatchingLoss(WarmPriorActor(network, prior))
+    assert loss_module.interpolant is path
+    assert {id(p) for p in network.parameters()} == {id(p) for p in network.network.parameters()}
+    grouped = [p for group in network.parameter_groups(0.1) for p in group["params"]]
+    assert len(grouped) == len(list(network.parameters()))
+    before = {key: value.clone() for key, value in network.state_dict().items()}
+    optimizer = torch.optim.SGD(network.parameters(), lr=0.1)
+    batch = buffer_of(gaussian_steps(episodes=5), prior, 64).sample()
+    loss_module(batch)["loss_flow_matching"].backward()
+    optimizer.step()
+    changed = {k for k, v in network.state_dict().items() if not torch.equal(v, before[k])}
+    assert changed and not any("moments" in key for key in changed)
+
+
+def test_another_path_than_that_of_the_loss_is_refused():
+    network = PreconditionedNetwork(Nothing(2, 3, 2), interpolant=PolynomialInterpolant(2.0))
+    actor = WarmPriorActor(network, PastPrior(2))
+    FlowMatchingLoss(actor, interpolant=PolynomialInterpolant(2.0))
+    with pytest.raises(ValueError, match=r"preconditioned for the path .*polynomial.*linear"):
+        FlowMatchingLoss(actor, interpolant=LinearInterpolant())
+
+
+def test_bad_moments():
+    one = torch.ones(2, 3)
+    with pytest.raises(ValueError, match=r"one shape \[P, d_a\]"):
+        SourceMoments(one, one, one, one, torch.ones(3, 2))
+    with pytest.raises(ValueError, match="NaN or infinity"):
+        SourceMoments(one, one, one, one * math.nan, one)
+    with pytest.raises(ValueError, match=r"\(2, 3\), but the network was built for \(4, 3\)"):
+        PreconditionedNetwork(Nothing(3, 5, 4), moments=SourceMoments(one, one, one, one, 0 * one))
+
+
+def test_too_few_windows():
+    prior = GaussianPrior(2)
+    windows = buffer_of(gaussian_steps(episodes=2), prior, 8)
+    with pytest.raises(ValueError, match="at least 2 samples, got 1"):
+        SourceMoments.fit(windows, prior, samples=1)
+    with pytest.raises(ValueError, match="at least 2 windows, got 1"):
+        SourceMoments.fit(windows.sample()[:1], prior)
+
+
+def test_config_inside_config():
+    network = PreconditionedNetwork(VelocityMLP(2, 3, 4, hidden_dim=8))
+    config = json.loads(json.dumps(network.config()))
+    again = VelocityNetwork.from_config(config)
+    assert isinstance(again, PreconditionedNetwork) and isinstance(again.network, nn.Module)
+    assert again.config() == network.config()
+    with pytest.raises(ValueError, match="unknown interpolant 'bent'"):
+        VelocityNetwork.from_config(config | {"interpolant": {"name": "bent"}})

@@ -1,0 +1,241 @@
+"""Preconditioning of velocity networks by the second moments of a prior's source and its targets."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import ReplayBuffer
+
+from warmprior import keys
+from warmprior.modules.interpolant import Interpolant, LinearInterpolant
+from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.prior import Prior
+
+__all__ = ["PreconditionedNetwork", "SourceMoments"]
+
+VARIANCE_FLOOR = 1e-4
+"""A standard deviation of 0.01, half a percent of the normalised range: what varies less is constant."""
+
+
+class SourceMoments(nn.Module):
+    r"""Means, variances and covariance of the source :math:`a_0` and the target :math:`a_1`.
+
+    One set per chunk position and action dimension, each ``[P, d_a]`` in normalised units. Variances are
+    at least :data:`VARIANCE_FLOOR`, and covariances at most what the variances allow, so that constant
+    dimensions, positions that are always padded and deterministic sources stay harmless.
+
+    Args:
+        source_mean: :math:`m_0`.
+        target_mean: :math:`m_1`.
+        source_variance: :math:`v_0`.
+        target_variance: :math:`v_1`.
+        covariance: :math:`c = Cov(a_0, a_1)`.
+
+    Raises:
+        ValueError: if the shapes differ, or an entry is NaN or infinite.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PreviewPrior, window_replay_buffer
+        >>> data = TensorDict({"observation": torch.zeros(999, 3), "action": torch.randn(999, 2),
+        ...                    "episode": torch.arange(999) // 333}, [999])
+        >>> prior = PreviewPrior(4)
+        >>> windows = window_replay_buffer(data, prior, batch_size=256)
+        >>> moments = SourceMoments.fit(windows, prior, generator=torch.Generator().manual_seed(0))
+        >>> (moments.covariance.mean(1) > 0.5).tolist()  # the first half is warm, the second cold
+        [True, True, True, True, False, False, False, False]
+    """
+
+    source_mean: Tensor
+    target_mean: Tensor
+    source_variance: Tensor
+    target_variance: Tensor
+    covariance: Tensor
+
+    def __init__(
+        self,
+        source_mean: Tensor,
+        target_mean: Tensor,
+        source_variance: Tensor,
+        target_variance: Tensor,
+        covariance: Tensor,
+    ) -> None:
+        super().__init__()
+        given = (source_mean, target_mean, source_variance, target_variance, covariance)
+        shapes = [tuple(value.shape) for value in given]
+        if len(set(shapes)) > 1 or source_mean.ndim != 2:
+            raise ValueError(f"all moments must have one shape [P, d_a], got {shapes}")
+        if not all(bool(torch.isfinite(value).all()) for value in given):
+            raise ValueError("the moments hold NaN or infinity")
+        source_variance, target_variance = (
+            value.clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance)
+        )
+        limit = (source_variance * target_variance).sqrt()
+        # Copies: a tensor given twice must not become one buffer under two names.
+        self.register_buffer("source_mean", source_mean.clone())
+        self.register_buffer("target_mean", target_mean.clone())
+        self.register_buffer("source_variance", source_variance)
+        self.register_buffer("target_variance", target_variance)
+        self.register_buffer("covariance", covariance.clamp(-limit, limit))
+
+    @classmethod
+    def identity(cls, prediction_length: int, action_dim: int) -> SourceMoments:
+        """Those of independent standard normal ends, to be replaced by loading a state dict."""
+        zero, one = (f(prediction_length, action_dim) for f in (torch.zeros, torch.ones))
+        return cls(zero, zero, one, one, zero)
+
+    @classmethod
+    @torch.no_grad()
+    def fit(
+        cls,
+        windows: ReplayBuffer | TensorDictBase,
+        prior: Prior,
+        *,
+        samples: int = 16_384,
+        generator: torch.Generator | None = None,
+    ) -> SourceMoments:
+        """Estimate them from training windows and draws of the prior.
+
+        Args:
+            windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[n]``.
+            prior: the source distribution that these windows were made for.
+
+        Keyword Args:
+            samples: windows to draw from a buffer, in its batches; windows given as a tensordict are
+                used once each.
+            generator: source of randomness of the source samples, on the windows' device; the buffer
+                draws from its own.
+
+        Returns:
+            The moments over the positions that are not padded, as float32. A position that is padded in
+            all windows gets the moments of independent standard normal ends: no loss ever reads it.
+
+        Raises:
+            ValueError: if ``samples < 2``, or there are fewer than two windows.
+        """
+        if isinstance(windows, TensorDictBase):
+            batches = [windows]
+        else:
+            if samples < 2:
+                raise ValueError(f"moments need at least 2 samples, got {samples}")
+            batches = []
+            while sum(map(len, batches)) < samples:
+                batches.append(windows.sample())
+        batch = TensorDict.cat(batches)
+        if len(batch) < 2:
+            raise ValueError(f"moments need at least 2 windows, got {len(batch)}")
+        a1 = batch[keys.CHUNK].double()
+        a0 = prior.sample(batch[keys.LOC], batch[keys.WARM], generator).double()
+        weight = (~batch[keys.IS_PAD]).unsqueeze(-1).double()
+        count = weight.sum(0)
+
+        def mean(values: Tensor) -> Tensor:
+            return (weight * values).sum(0) / count.clamp_min(1)
+
+        m0, m1 = mean(a0), mean(a1)
+        v0, v1 = mean((a0 - m0).square()), mean((a1 - m1).square())
+        c = mean((a0 - m0) * (a1 - m1))
+        seen = (count > 0).expand_as(m0)
+        v0, v1 = (torch.where(seen, value, 1.0) for value in (v0, v1))
+        return cls(*(value.float() for value in (m0, m1, v0, v1, c)))
+
+
+class PreconditionedNetwork(VelocityNetwork):
+    r"""A velocity network that learns only what the best linear prediction leaves.
+
+    With :math:`a_t = \alpha a_0 + \beta a_1`, the velocity
+    :math:`u_t = \dot\alpha a_0 + \dot\beta a_1` and the moments of :math:`(a_0, a_1)`, per chunk
+    position and action dimension,
+
+    .. math::
+        v_\theta(t, a_t, o) = E[u_t] + \frac{Cov(u_t, a_t)}{Var(a_t)} (a_t - E[a_t])
+        + \sqrt{Var(u_t) - \frac{Cov(u_t, a_t)^2}{Var(a_t)}} \;
+        F_\theta\Big(t, \frac{a_t - E[a_t]}{\sqrt{Var(a_t)}}, o\Big).
+
+    The first two terms are the best linear predictor of the velocity from the point, and :math:`F` is
+    trained on a standardised remainder: its input and target have mean 0 and variance 1 at every time
+    and for every source. A network that has learnt nothing (:math:`F = 0`) is optimal where
+    :math:`(a_0, a_1)` is jointly Gaussian and independent of the observation. In the manner of EDM
+    (Karras et al., 2022, Eq. 7), whose constants assume zero means and an independent source.
+
+    The scale is computed as :math:`|\alpha\dot\beta - \dot\alpha\beta| \sqrt{(v_0 v_1 - c^2) / Var(a_t)}`,
+    which is the same (both are a ratio of determinants) and loses no digits.
+
+    Args:
+        network: :math:`F`, whose sizes this network takes over; or its :meth:`config`.
+
+    Keyword Args:
+        moments: of the prior's source and the targets; where they are missing, those of independent
+            standard normal ends, to be replaced by loading a state dict.
+        interpolant: the path, that of the loss; linear by default. Or its ``config()``.
+
+    Raises:
+        ValueError: if the moments do not have the network's chunk shape.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import VelocityMLP
+        >>> one, zero = torch.ones(8, 7), torch.zeros(8, 7)
+        >>> moments = SourceMoments(zero, one, one, 0.25 * one, zero)
+        >>> network = PreconditionedNetwork(VelocityMLP(7, 23, 8), moments=moments)
+        >>> network(torch.rand(4), torch.randn(4, 8, 7), torch.randn(4, 2, 23)).shape
+        torch.Size([4, 8, 7])
+    """
+
+    def __init__(
+        self,
+        network: VelocityNetwork | dict[str, Any],
+        *,
+        moments: SourceMoments | None = None,
+        interpolant: Interpolant | dict[str, Any] | None = None,
+    ) -> None:
+        if isinstance(network, dict):
+            network = VelocityNetwork.from_config(network)
+        if isinstance(interpolant, dict):
+            interpolant = Interpolant.from_config(interpolant)
+        super().__init__(
+            network.action_dim,
+            network.observation_dim,
+            network.prediction_length,
+            network.observation_steps,
+        )
+        self.network = network
+        self.interpolant = LinearInterpolant() if interpolant is None else interpolant
+        shape = (network.prediction_length, network.action_dim)
+        self.moments = SourceMoments.identity(*shape) if moments is None else moments
+        if tuple(self.moments.covariance.shape) != shape:
+            raise ValueError(
+                f"the moments are of chunks (P, d_a) = {tuple(self.moments.covariance.shape)}, but the "
+                f"network was built for {shape}"
+            )
+
+    def config(self) -> dict[str, Any]:
+        """JSON-serialisable class name and constructor arguments; the moments are buffers."""
+        return {
+            "name": type(self).__name__,
+            "network": self.network.config(),
+            "interpolant": self.interpolant.config(),
+        }
+
+    def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
+        """The groups of the network inside."""
+        return self.network.parameter_groups(weight_decay)
+
+    def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
+        """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        self.check_shapes(a, observation)
+        alpha, beta, d_alpha, d_beta = self.interpolant.coefficients(t[:, None, None])
+        m0, m1 = self.moments.source_mean, self.moments.target_mean
+        v0, v1 = self.moments.source_variance, self.moments.target_variance
+        c = self.moments.covariance
+        scale = (alpha.square() * v0 + beta.square() * v1 + 2 * alpha * beta * c).rsqrt()
+        standardised = (a - alpha * m0 - beta * m1) * scale
+        covariance = alpha * d_alpha * v0 + beta * d_beta * v1
+        covariance = covariance + (alpha * d_beta + d_alpha * beta) * c
+        remainder = (alpha * d_beta - d_alpha * beta).abs() * (v0 * v1 - c * c).clamp_min(0).sqrt()
+        learnt = covariance * standardised + remainder * self.network(t, standardised, observation)
+        return d_alpha * m0 + d_beta * m1 + scale * learnt
