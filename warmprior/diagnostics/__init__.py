@@ -25,6 +25,7 @@ from warmprior.diagnostics.smoothness import (
     executed_actions,
     smoothness,
 )
+from warmprior.diagnostics.source_leak import SourceLeak, source_leak
 from warmprior.diagnostics.statistics import (
     SeedSummary,
     bootstrap_ratio,
@@ -48,6 +49,7 @@ __all__ = [
     "SeedSummary",
     "SharedObservations",
     "Smoothness",
+    "SourceLeak",
     "bootstrap_ratio",
     "branching_bound",
     "branching_cost",
@@ -71,6 +73,7 @@ __all__ = [
     "plot_success_bars",
     "probability_better",
     "smoothness",
+    "source_leak",
     "straightness",
     "success_posterior",
     "success_table",

@@ -127,3 +127,24 @@ def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
     finally:
         for module, mode in modes:
             module.training = mode
+
+
+class RunningVariance:
+    """Mean and variance of tensors that arrive one by one, per element (Welford)."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.mean = torch.zeros(())
+        self.deviations = torch.zeros(())
+
+    def add(self, value: Tensor) -> Tensor:
+        """Take another one in, and return it."""
+        self.count += 1
+        difference = value - self.mean
+        self.mean = self.mean + difference / self.count
+        self.deviations = self.deviations + difference * (value - self.mean)
+        return value
+
+    def variance(self, *, unbiased: bool = False) -> Tensor:
+        """Squared deviations by their number, or by one less."""
+        return self.deviations / (self.count - unbiased)

@@ -12,7 +12,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics._flow import check_flow, evaluation_mode, field_of, flat_windows
+from warmprior.diagnostics._flow import (
+    RunningVariance,
+    check_flow,
+    evaluation_mode,
+    field_of,
+    flat_windows,
+)
 from warmprior.diagnostics.branching import branching_cost, executed_positions
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant
@@ -22,22 +28,6 @@ __all__ = ["compare_curvature", "curvature"]
 
 NO_MOTION = 0.95
 """Share of a zero field's loss from which on a field counts as not having learnt to move."""
-
-
-class _Velocities:
-    """Running mean and squared deviations of a path's velocities, per coordinate (Welford)."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self.mean: Tensor | float = 0.0
-        self.deviations: Tensor | float = 0.0
-
-    def add(self, velocity: Tensor) -> Tensor:
-        self.count += 1
-        difference = velocity - self.mean
-        self.mean = self.mean + difference / self.count
-        self.deviations = self.deviations + difference * (velocity - self.mean)
-        return velocity
 
 
 def curvature(
@@ -147,11 +137,10 @@ def _measure(
     policy: WarmPriorActor, a0: Tensor, observation: Tensor, n_steps: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Mean squared deviation and mean of the velocity, and the one-step error, each ``[n, P, d_a]``."""
-    field, track = field_of(policy, observation), _Velocities()
+    field, track = field_of(policy, observation), RunningVariance()
     end = integrate(lambda t, a: track.add(field(t, a)), a0, nfe=n_steps)
     one = a0 + field(torch.zeros_like(a0[:, 0, 0]), a0)
-    assert isinstance(track.deviations, Tensor) and isinstance(track.mean, Tensor)
-    return track.deviations / track.count, track.mean, one - end
+    return track.variance(), track.mean, one - end
 
 
 def _flag_no_motion(

@@ -1,0 +1,325 @@
+"""Source leak against closed forms, and the data's spread against loops over the windows."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import nn
+
+from tests.diagnostics.fields import D_A, Field, H, batch, policy
+from warmprior import (
+    GaussianPrior,
+    HistoryPrior,
+    PastPrior,
+    PreviewPrior,
+    RegressionPrior,
+    WarmPriorActor,
+)
+from warmprior.diagnostics import SourceLeak, source_leak
+
+
+def windows(n=400, length=H, d_a=D_A, seed=2):
+    """Windows with random targets, all cold."""
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.randn(n, length, d_a, generator=generator)
+    return batch(n, length, d_a, vla_action={"chunk": target})
+
+
+def goal(o):
+    """A target that depends on the observation, ``[n, 1, 1]``."""
+    return o.sum((1, 2))[:, None, None]
+
+
+def passing(share):
+    """At NFE 1 the chunk is ``goal(o) + share * a0``."""
+    return lambda t, a, o: goal(o) + (share - 1) * a
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 1.2])
+@pytest.mark.parametrize("sigma", [None, 0.3])
+def test_spread_is_the_share_of_the_source_that_passes(share, sigma):
+    data = windows()
+    prior = GaussianPrior(H)
+    if sigma is not None:
+        prior = PastPrior(H, sigma=sigma)
+        data["prior", "loc"] = torch.randn_like(data["prior", "loc"])  # no spread of its own
+        data["prior", "warm"] = torch.ones_like(data["prior", "warm"])
+    result = source_leak(policy(passing(share), prior), data, nfes=(9, 1), draws=16)
+    assert list(result) == [1, 9]
+    assert result[1].spread == pytest.approx(share * (sigma or 1.0), rel=0.02)
+    # Nine Euler steps multiply the same draws of the source by another factor.
+    ratio = share / (1 + (share - 1) / 9) ** 9
+    assert result[1].ratio_to_last == pytest.approx(ratio, rel=1e-3)
+    assert result[9].ratio_to_last == 1.0
+    assert result[1].leak == pytest.approx(result[1].spread / result[1].data_spread)
+
+
+def test_spread_and_steps_against_separate_draws():
+    data = windows(30)
+    actor = policy(lambda t, a, o: torch.tanh(2 * a) - goal(o) * t)
+    generator = torch.Generator().manual_seed(5)
+    result = source_leak(actor, data, draws=3, generator=generator, split=7)
+    generator = torch.Generator().manual_seed(5)
+    sources = [torch.randn(30, H, D_A, generator=generator) for _ in range(3)]
+    for nfe in (1, 9):
+        chunks = torch.stack(
+            [
+                actor.ode(data.clone().set(("prior", "noise"), a0), nfe=nfe)["vla_action", "chunk"]
+                for a0 in sources
+            ]
+        )
+        deviation = chunks.std(0)
+        assert result[nfe].spread == pytest.approx(
+            float(deviation.square().mean().sqrt()), rel=1e-5
+        )
+        steps = [
+            math.dist(chunks[d, i, p].tolist(), chunks[d, i, p + 1].tolist())
+            for d in range(3)
+            for i in range(30)
+            for p in range(H - 1)
+        ]
+        assert result[nfe].inner_step == pytest.approx(sum(steps) / len(steps), rel=1e-5)
+
+
+@pytest.mark.parametrize("s", [0.1, 0.7])
+def test_exact_sampler_of_a_gaussian(s):
+    """a1 | o ~ N(m(o), s^2): the field is linear, one step finds the mean and many the distribution."""
+
+    def exact(t, a, o):
+        variance = (1 - t) ** 2 + t**2 * s**2
+        return goal(o) + (t * s**2 - (1 - t)) / variance * (a - t * goal(o))
+
+    data = windows(200)
+    # Every observation occurs twice: the nearest other window has the same one.
+    data["observation"] = data["observation"][:100].repeat(2, 1, 1)
+    noise = torch.randn(200, H, D_A, generator=torch.Generator().manual_seed(8))
+    data["vla_action", "chunk"] = goal(data["observation"]) + s * noise
+    result = source_leak(policy(exact), data, nfes=(1, 100), draws=16)
+    assert result[1].spread < 1e-5
+    assert result[100].spread == pytest.approx(s, rel=0.05)
+    assert result[1].data_spread == pytest.approx(s, rel=0.1)
+    assert result[100].leak == pytest.approx(1.0, rel=0.12)
+
+
+def test_one_exact_step_from_a_telling_source_spreads_less_than_the_data():
+    """WP-Preview: a1 ~ N(0, s^2), a0 = a1 + sigma eps and E[a1 | a0] = s^2 / (s^2 + sigma^2) a0."""
+    s, sigma = 0.5, 0.8
+    gain = s**2 / (s**2 + sigma**2)
+    data = windows(500, 2 * H)
+    data["vla_action", "chunk"] *= s
+    warm = torch.arange(2 * H).view(1, -1, 1) < H
+    data["prior", "warm"] = warm.expand(500, 2 * H, 1)
+    data["prior", "loc"] = data["vla_action", "chunk"] * warm
+    # The forecast beyond H is wild, and not executed.
+    actor = policy(
+        lambda t, a, o: torch.where(warm, gain - 1, 99.0) * a, PreviewPrior(H, sigma=sigma)
+    )
+    result = source_leak(actor, data, nfes=(1,))[1]
+    assert result.spread == pytest.approx(gain * sigma, rel=0.03)
+    assert result.data_spread == pytest.approx(s, rel=0.06)
+    assert result.leak < 0.6
+    assert result.inner_step < 3
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.data())
+def test_data_spread_against_loops(data):
+    n = data.draw(st.integers(2, 12))
+    episodes = data.draw(st.lists(st.integers(0, 4), min_size=n, max_size=n))
+    others = len(set(episodes)) - 1
+    if others == 0:
+        episodes[0], others = 9, 1
+    neighbours = data.draw(st.integers(1, others))
+    generator = torch.Generator().manual_seed(data.draw(st.integers(0, 10**6)))
+    rows = windows(n).update({"observation": torch.randn(n, 2, 3, generator=generator)})
+    target = torch.randn(n, H, D_A, generator=generator)
+    length = torch.randint(1, H + 1, (n,), generator=generator)
+    rows["vla_action", "chunk"] = target
+    rows["action_is_pad"] = torch.arange(H) >= length[:, None]
+    squares = []
+    for i in range(n):
+        distance = [
+            math.dist(rows["observation"][i].flatten(), o.flatten()) for o in rows["observation"]
+        ]
+        best = {}
+        for j in sorted(range(n), key=distance.__getitem__):
+            if episodes[j] != episodes[i]:
+                best.setdefault(episodes[j], j)
+        for j in list(best.values())[:neighbours]:
+            for p in range(min(int(length[i]), int(length[j]))):
+                squares += ((target[i, p] - target[j, p]) ** 2 / 2).tolist()
+    result = source_leak(
+        policy(passing(0.5)),
+        rows,
+        neighbours=neighbours,
+        episodes=torch.tensor(episodes),
+        nfes=(1,),
+    )
+    expected = math.sqrt(sum(squares) / len(squares))
+    assert result[1].data_spread == pytest.approx(expected, rel=1e-4)
+
+
+def test_data_spread_in_parts(monkeypatch):
+    data, episodes = windows(50), torch.arange(50) // 4
+    whole = source_leak(policy(passing(0.5)), data, neighbours=3, episodes=episodes)
+    # The function has the same name as its module.
+    monkeypatch.setattr(sys.modules["warmprior.diagnostics.source_leak"], "DISTANCES", 160)
+    parts = source_leak(policy(passing(0.5)), data, neighbours=3, episodes=episodes, split=9)
+    for nfe in (1, 9):
+        assert parts[nfe].data_spread == pytest.approx(whole[nfe].data_spread, rel=1e-5)
+        assert parts[nfe].spread == pytest.approx(whole[nfe].spread, rel=1e-5)
+
+
+def test_neighbours_come_from_other_episodes():
+    """Four episodes of slow observations, each with an action of its own: +1 or -1."""
+    episodes = torch.arange(4).repeat_interleave(20)
+    side = (episodes % 2 * 2.0 - 1)[:, None, None]
+    data = windows(80).update(
+        {
+            "observation": torch.arange(20.0).repeat(4)[:, None, None] + 0.01 * side,
+            "vla_action": {"chunk": side.expand(80, H, D_A).clone()},
+        }
+    )
+    actor = policy(passing(0.5))
+    # The nearest episode agrees with the window, the other two do not.
+    three = source_leak(actor, data, neighbours=3, episodes=episodes, nfes=(1,))[1]
+    assert three.data_spread == pytest.approx(math.sqrt(2 / 3 * 4 / 2))
+    assert source_leak(actor, data, episodes=episodes, nfes=(1,))[1].data_spread == 0.0
+    carried = data.clone().set("episode", episodes)
+    assert source_leak(actor, carried, neighbours=3, nfes=(1,))[1] == three
+    # Without episodes the other windows of one's own are neighbours, too.
+    alone = data[:20].clone()
+    assert math.isnan(source_leak(actor, alone, nfes=(1,))[1].leak)
+    with pytest.raises(ValueError, match="1 other episode"):
+        source_leak(actor, alone, episodes=episodes[:20])
+
+
+def test_padded_positions_do_not_count():
+    data = windows(40)
+    data["action_is_pad"] = (torch.arange(H) >= 2).expand(40, H)
+    wild = torch.tensor([0.3, 0.3, 50.0]).view(1, H, 1)
+    noisy = data.clone()
+    noisy["vla_action", "chunk"][:, 2] += 99 * torch.randn(40, D_A)
+    expected = source_leak(policy(passing(0.3)), data)
+    assert source_leak(policy(lambda t, a, o: goal(o) + (wild - 1) * a), noisy)[1].spread < 0.4
+    assert source_leak(policy(passing(0.3)), noisy) == expected
+    first = data["vla_action", "chunk"][:, :2].diff(dim=1).norm(dim=-1).mean()
+    assert expected[1].data_inner_step == pytest.approx(float(first))
+
+
+def test_single_actions_have_no_inner_step():
+    result = source_leak(policy(passing(0.5), GaussianPrior(1)), windows(20, 1))[1]
+    assert math.isnan(result.inner_step)
+    assert math.isnan(result.data_inner_step)
+    assert math.isnan(result.inner_step_ratio)
+    assert result.spread > 0.4
+
+
+def test_the_warning_names_what_exceeds_its_bound():
+    assert SourceLeak(1, 1.0, 1.0, 1.0, 1.3, 1.0).warning is None
+    assert SourceLeak(1, 1.0, 0.0, math.nan, math.nan, math.nan).warning is None
+    spread = SourceLeak(3, 1.1, 1.0, 1.0, 1.0, 1.0).warning
+    assert "NFE 3" in spread and "spread is 1.10 times" in spread and "inside" not in spread
+    steps = SourceLeak(1, 0.5, 1.0, 1.0, 1.4, 1.0).warning
+    assert "chunks are 1.40 times" in steps and "spread" not in steps
+
+
+def test_a_network_that_sees_the_mean():
+    """History-conditioned: the mean moves the chunk, the source around it does not spread by it."""
+    prior = HistoryPrior(H)
+    data = windows(100)
+    data["prior", "warm"] = torch.ones_like(data["prior", "warm"])
+    data["prior", "loc"] = torch.randn(100, H, D_A)
+
+    def field(t, a, o):
+        assert o.shape[-1] == 4 + prior.context_dim(D_A)
+        return goal(o[..., 4:]) + (0.2 - 1) * a
+
+    result = source_leak(policy(field, prior), data, draws=16)[1]
+    assert result.spread == pytest.approx(0.2, rel=0.03)
+    # Neighbours in what the policy alone is shown would be others.
+    gaussian = source_leak(policy(passing(0.2)), data)[1]
+    assert result.data_spread == gaussian.data_spread
+
+
+def test_a_prior_of_one_evaluation_is_measured_at_that():
+    result = source_leak(policy(lambda t, a, o: goal(o) - a, RegressionPrior(H)), windows(30))
+    assert list(result) == [1]
+    assert result[1].spread == 0.0
+    assert math.isnan(result[1].ratio_to_last)
+    with pytest.raises(ValueError, match="none of the NFEs"):
+        source_leak(policy(passing(0.5), RegressionPrior(H)), windows(30), nfes=(3, 9))
+
+
+class Dropping(Field):
+    """Loses inputs in training mode."""
+
+    def __init__(self):
+        super().__init__(passing(0.5))
+        self.dropout = nn.Dropout(0.5)
+
+    def forward(self, t, a, observation):
+        return super().forward(t, self.dropout(a), observation)
+
+
+def test_nothing_changes_but_the_generator_given():
+    own = torch.Generator().manual_seed(3)
+    actor = WarmPriorActor(Dropping(), GaussianPrior(H), generator=own)
+    actor.network.eval()
+    actor.network.dropout.train()
+    modes = [module.training for module in actor.modules()]
+    data = windows(20).to("cpu")  # on the policy's device: nothing needs to be copied there
+    before, states = data.clone(), (own.get_state(), torch.get_rng_state())
+    given_one = torch.Generator().manual_seed(4)
+    runs = [
+        source_leak(actor, data),
+        source_leak(actor, data),
+        source_leak(actor, data, generator=given_one),
+        source_leak(actor, data, generator=given_one),
+        source_leak(actor, data, generator=torch.Generator().manual_seed(4)),
+    ]
+    assert runs[0] == runs[1]
+    assert runs[2] != runs[3]
+    assert runs[2] == runs[4]
+    assert [module.training for module in actor.modules()] == modes
+    assert actor.sampler.generator is own
+    assert torch.equal(own.get_state(), states[0])
+    assert torch.equal(torch.get_rng_state(), states[1])
+    assert (data == before).all()
+    assert set(data.keys(True)) == set(before.keys(True))
+    assert torch.is_grad_enabled()
+
+
+def test_windows_of_any_batch_shape():
+    data, actor = windows(24), policy(passing(0.5))
+    episodes = torch.arange(24) // 3
+    expected = source_leak(actor, data, episodes=episodes)
+    assert source_leak(actor, data.reshape(4, 6), episodes=episodes.reshape(4, 6)) == expected
+
+
+def test_bad_input_is_named():
+    actor, data = policy(passing(0.5)), windows(5)
+    for key in ("observation", ("vla_action", "chunk"), ("prior", "loc")):
+        with pytest.raises(KeyError, match=key if isinstance(key, str) else key[1]):
+            source_leak(actor, data.exclude(key))
+    with pytest.raises(ValueError, match="4 other episode"):
+        source_leak(actor, data[:4], neighbours=4)
+    with pytest.raises(ValueError, match="each of the 5 windows"):
+        source_leak(actor, data, episodes=torch.zeros(4))
+    for option in ({"draws": 1}, {"neighbours": 0}, {"split": 0}):
+        with pytest.raises(ValueError, match="need draws"):
+            source_leak(actor, data, **option)
+    with pytest.raises(ValueError, match="network evaluations"):
+        source_leak(actor, data, nfes=(0, 1))
+    with pytest.raises(ValueError, match="none of the NFEs"):
+        source_leak(actor, data, nfes=())
+    with pytest.raises(FloatingPointError, match="NFE 9"):
+        source_leak(policy(lambda t, a, o: a / (t < 0.5)), data)
+    with pytest.raises(ValueError, match="no observation"):
+        source_leak(actor, TensorDict(data[:0], [0]))

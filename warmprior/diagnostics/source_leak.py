@@ -1,0 +1,235 @@
+"""Source leak: how much of the source's noise a policy lets through to the actions it executes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from warmprior import keys
+from warmprior.diagnostics._flow import RunningVariance, evaluation_mode, flat_windows
+from warmprior.modules.actor import WarmPriorActor
+
+__all__ = ["INNER_STEP_BOUND", "LEAK_BOUND", "SourceLeak", "source_leak"]
+
+LEAK_BOUND = 1.0
+"""Largest leak of a sampler that spreads like the data; what spreads more carries noise of its own."""
+
+INNER_STEP_BOUND = 1.3
+"""Largest inner step ratio that passes; sound policies are near 1 or, at few steps, smoother than data."""
+
+DISTANCES = 2**22
+"""Distances between observations that are held at a time: 16 MiB in single precision."""
+
+
+@dataclass(frozen=True)
+class SourceLeak:
+    """What the source's noise does to the executed actions, in normalised action units.
+
+    Attributes:
+        nfe: network evaluations per chunk.
+        spread: standard deviation of predictions over draws of the source at fixed observation and mean,
+            root mean square over windows, positions and dimensions.
+        data_spread: the same of the targets at like observations.
+        ratio_to_last: ``spread`` over that at the largest ``nfe`` measured.
+        inner_step: mean distance between consecutive actions inside predicted chunks; NaN at ``H = 1``.
+        data_inner_step: the same of the targets.
+    """
+
+    nfe: int
+    spread: float
+    data_spread: float
+    ratio_to_last: float
+    inner_step: float
+    data_inner_step: float
+
+    @property
+    def leak(self) -> float:
+        """Spread over the data's; NaN where the data do not spread."""
+        return _ratio(self.spread, self.data_spread)
+
+    @property
+    def inner_step_ratio(self) -> float:
+        """Inner step over the data's; NaN where the data do not move."""
+        return _ratio(self.inner_step, self.data_inner_step)
+
+    @property
+    def warning(self) -> str | None:
+        """A sentence that names the bounds exceeded, ``None`` if none is.
+
+        Examples:
+            >>> SourceLeak(1, 0.3, 0.2, 1.5, 0.11, 0.1).warning
+            "at NFE 1 the actions carry noise of the source: their spread is 1.50 times the data's (bound 1)"
+        """
+        signs = (
+            ("spread is", self.leak, LEAK_BOUND),
+            ("steps inside chunks are", self.inner_step_ratio, INNER_STEP_BOUND),
+        )
+        exceeded = [
+            f"their {what} {ratio:.2f} times the data's (bound {bound:g})"
+            for what, ratio, bound in signs
+            if ratio > bound
+        ]
+        if not exceeded:
+            return None
+        return f"at NFE {self.nfe} the actions carry noise of the source: {', '.join(exceeded)}"
+
+
+def source_leak(
+    policy: WarmPriorActor,
+    windows: TensorDictBase,
+    *,
+    nfes: Sequence[int] = (1, 9),
+    draws: int = 8,
+    neighbours: int = 1,
+    episodes: Tensor | None = None,
+    split: int = 4096,
+    generator: torch.Generator | None = None,
+) -> dict[int, SourceLeak]:
+    r"""How far predictions spread over draws of the source, beside how far the data spread.
+
+    An exact sampler turns the source's noise into the data's variety, so at fixed observation and mean
+    it spreads at most like the targets at that observation: the leak is at most 1. A velocity network
+    that has not learnt to ignore the noise at ``t = 0`` hands it on to the actions, most of all at few
+    steps. With one step an exact field returns :math:`E[a_1 \mid a_0, o]`, which for a source independent
+    of the target, as the standard normal one is, does not depend on :math:`a_0`: its spread is 0.
+    WP-Preview's source tells about the target, WP-Past's wherever the history does, so theirs is not 0
+    but still at most the data's, by the law of total variance.
+
+    The data's variance is half the mean squared difference between a window's target and those at the
+    nearest observations (Euclidean, all ``To`` steps), one in each of the nearest other episodes: steps
+    of one episode, or several of another one, would agree too well. It is conditioned on the observation
+    alone for every prior, because WP-Preview's training mean is cut from the target, given which nothing
+    would be left to spread. It therefore errs upwards: neighbours' observations differ, and a mean that
+    tells about the target leaves less to spread than the observation does. Several modes at one
+    observation spread far enough to hide a leak; noise between the actions of one chunk shows all the
+    same, as steps inside chunks that are longer than the data's.
+
+    Positions past the first ``H`` or past an episode's end do not count.
+
+    Args:
+        policy: the policy; its state stays as it is.
+        windows: ``[*B]`` of the policy's own prior with observations ``[*B, To, d_o]`` and targets
+            ``[*B, P, d_a]``, normalised, see :class:`~warmprior.ActionWindow` and
+            :meth:`SharedObservations.windows`.
+
+    Keyword Args:
+        nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
+        draws: samples of the source per window, at least 2, the same ones for every NFE.
+        neighbours: windows that each one's target is compared with. More are further away.
+        episodes: each window's episode, ``[*B]``, such as :attr:`SharedObservations.episodes`;
+            ``"episode"`` in the windows by default, and without that every window counts as an episode
+            of its own.
+        split: network batch size, for bounded memory; it changes nothing else.
+        generator: source of randomness on the policy's device; by default one of its own with a fixed
+            seed.
+
+    Returns:
+        The measures by NFE, in ascending order.
+
+    Raises:
+        KeyError: if the windows lack a key.
+        ValueError: for bad windows or options, fewer other episodes than neighbours, or if the prior
+            allows none of the NFEs.
+        FloatingPointError: if a prediction is NaN or infinite.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import SharedObservations
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> shared = SharedObservations(navigation_demonstrations(), 4)
+        >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4))
+        >>> windows = shared.windows(untrained.prior)
+        >>> one_step = source_leak(untrained, windows, episodes=shared.episodes)[1]
+        >>> one_step.inner_step_ratio > 2, one_step.warning is None  # noise, to smooth demonstrations
+        (True, False)
+    """
+    if draws < 2 or neighbours < 1 or split < 1:
+        raise ValueError(
+            f"need draws >= 2, neighbours >= 1 and split >= 1, got {draws}, {neighbours} and {split}"
+        )
+    prior, limit = policy.prior, policy.prior.max_nfe
+    allowed = sorted({nfe for nfe in nfes if limit is None or nfe <= limit})
+    if not allowed:
+        raise ValueError(f"{prior} allows none of the NFEs {tuple(nfes)}")
+    for nfe in allowed:
+        policy.ode.check_nfe(nfe)
+    flat = flat_windows(policy, windows, target_needed=True)
+    assert flat.target is not None
+    n, device, horizon = len(flat), flat.loc.device, prior.chunk_length
+    if episodes is None:
+        episodes = windows.get(keys.EPISODE, None)
+    episodes = torch.arange(n) if episodes is None else episodes.flatten()
+    if len(episodes) != n:
+        raise ValueError(f"each of the {n} windows needs its episode, got {len(episodes)}")
+    others = len(episodes.unique()) - 1
+    if others < neighbours:
+        raise ValueError(
+            f"each window needs neighbours in {neighbours} other episode(s), but there are {others}"
+        )
+    if generator is None:
+        generator = torch.Generator(device).manual_seed(0)
+    rows = windows.select(*policy.in_keys).reshape(n).to(device)
+    target, counted = flat.target[:, :horizon], flat.counted[:, :horizon, 0]
+    moments = {nfe: RunningVariance() for nfe in allowed}
+    steps = {nfe: 0.0 for nfe in allowed}
+    with evaluation_mode(policy):
+        observation = rows.get(policy.in_keys[0]).flatten(1)
+        data_spread = _data_spread(observation, target, counted, episodes.to(device), neighbours)
+        for _ in range(draws):
+            a0 = prior.sample(flat.loc, flat.warm, generator)
+            parts = rows.set(keys.NOISE, a0).split(split)
+            for nfe in allowed:
+                chunk = torch.cat([policy.ode(part, nfe=nfe).get(keys.CHUNK) for part in parts])
+                if not torch.isfinite(chunk).all():
+                    raise FloatingPointError(f"at NFE {nfe} a prediction is NaN or infinite")
+                chunk = moments[nfe].add(chunk[:, :horizon])
+                steps[nfe] += _inner_step(chunk, counted) / draws
+    spread = {
+        nfe: math.sqrt(float(moment.variance(unbiased=True)[counted].mean()))
+        for nfe, moment in moments.items()
+    }
+    return {
+        nfe: SourceLeak(
+            nfe=nfe,
+            spread=spread[nfe],
+            data_spread=data_spread,
+            ratio_to_last=_ratio(spread[nfe], spread[allowed[-1]]),
+            inner_step=steps[nfe],
+            data_inner_step=_inner_step(target, counted),
+        )
+        for nfe in allowed
+    }
+
+
+def _data_spread(
+    observation: Tensor, target: Tensor, counted: Tensor, episodes: Tensor, neighbours: int
+) -> float:
+    size = max(DISTANCES // len(observation), 1)
+    squares = []
+    for i in range(0, len(observation), size):
+        s = slice(i, i + size)
+        # The faster form by matrix products loses the small distances, the ones that matter here.
+        distance = torch.cdist(
+            observation[s], observation, compute_mode="donot_use_mm_for_euclid_dist"
+        )
+        taken = episodes[s, None] == episodes
+        for _ in range(neighbours):
+            nearest = distance.masked_fill_(taken, math.inf).argmin(1)
+            taken = episodes[nearest, None] == episodes
+            difference = (target[s] - target[nearest]).square()
+            squares.append(difference[counted[s] & counted[nearest]])
+    return math.sqrt(float(torch.cat(squares).mean()) / 2)
+
+
+def _inner_step(chunk: Tensor, counted: Tensor) -> float:
+    step = torch.linalg.vector_norm(chunk.diff(dim=1), dim=-1)
+    return float(step[counted[:, 1:] & counted[:, :-1]].mean())
+
+
+def _ratio(value: float, reference: float) -> float:
+    return value / reference if reference else math.nan
