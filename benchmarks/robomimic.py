@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable
 
 import _experiment as experiment
 
@@ -34,10 +35,8 @@ BASELINES = (RegressionPrior, HistoryPrior)
 PRIORS: dict[str, type[Prior]] = {prior.name: prior for prior in COMPARED + BASELINES}
 
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_options(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
+    """Add the options of a comparison of sources and return ``parser.add_argument``."""
     add = experiment.add_options(parser)
     add(
         "--prior",
@@ -49,6 +48,14 @@ def make_parser() -> argparse.ArgumentParser:
     add("--sigma", type=float, help="noise of the warm priors (default: past 0.5, preview 1.0)")
     add("--nfe", nargs="+", type=int, default=[9, 3, 1], help="evaluations per chunk (%(default)s)")
     add("--chunk", type=int, default=8, help="chunk length H (%(default)s)")
+    return add
+
+
+def make_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_options(parser)
     return parser
 
 

@@ -28,6 +28,7 @@ import _prior_space_figures as prior_space
 import numpy as np
 import torch
 from tensordict import TensorDict
+from torch import nn
 from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 
@@ -35,6 +36,7 @@ from warmprior import (
     ChiTransformer,
     Normalizer,
     PastPrior,
+    VelocityMLP,
     WarmPriorActor,
     policy_transforms,
     window_replay_buffer,
@@ -43,7 +45,7 @@ from warmprior.data.scripted.episode import Episode
 from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs._simulator import task_env_args
-from warmprior.training import BehaviourCloning, TrainingConfig, make_optimizer
+from warmprior.training import BehaviourCloning, TrainingConfig, precondition
 
 D_O, D_A, H, TO, BATCH = 23, 7, 8, 2, 256
 PRIOR = PastPrior(H)
@@ -148,16 +150,60 @@ def train_step_over_network(clock: Clock) -> float:
         config = TrainingConfig(batch_size=BATCH)
         training = BehaviourCloning(actor, steps(400, 200), config, folder, observation_steps=TO)
         actor.train()
-    optimizer = make_optimizer(bare)
+    return clock.ratio(training.step, step_of(bare))
+
+
+def small_network() -> VelocityMLP:
+    """That of the quick preset."""
+    torch.manual_seed(0)
+    return VelocityMLP(D_A, D_O, PRIOR.prediction_length, TO, hidden_dim=384)
+
+
+class Unmodulated(nn.Module):
+    """The small network in bare torch, with time as one more input instead of adaptive norms."""
+
+    def __init__(self, width: int = 384, chunk: int = H * D_A) -> None:
+        super().__init__()
+
+        def layers(before: int, after: int) -> list[nn.Module]:
+            return [nn.Linear(before, width), nn.GELU(), nn.Linear(width, after)]
+
+        self.embed = nn.Linear(chunk + 1, width)
+        self.encode = nn.Sequential(*layers(TO * D_O, width))
+        self.blocks = nn.ModuleList(
+            nn.Sequential(nn.LayerNorm(width), *layers(width, width)) for _ in range(2)
+        )
+        self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, chunk))
+
+    def forward(self, t: torch.Tensor, a: torch.Tensor, o: torch.Tensor) -> torch.Tensor:
+        """The velocity, as of any velocity network."""
+        x = self.embed(torch.cat([a.flatten(1), t[:, None]], dim=-1)) + self.encode(o.flatten(1))
+        for block in self.blocks:
+            x = x + block(x)
+        return self.head(x).view_as(a)
+
+
+def step_of(network: nn.Module) -> Callable[[], None]:
+    """A training step of a network alone, on random numbers."""
+    optimizer = torch.optim.AdamW(network.parameters(), fused=True)
     t, a, o = torch.rand(BATCH), torch.randn(BATCH, H, D_A), torch.randn(BATCH, TO, D_O)
 
-    def bare_step() -> None:
-        loss = bare(t, a, o).square().mean()
+    def step() -> None:
+        loss = network(t, a, o).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
 
-    return clock.ratio(training.step, bare_step)
+    return step
+
+
+def preconditioning_over_network(clock: Clock) -> float:
+    network = precondition(small_network(), steps(400, 200), PRIOR, observation_steps=TO)
+    return clock.ratio(step_of(network), step_of(small_network()), calls=20)
+
+
+def modulation_over_input(clock: Clock) -> float:
+    return clock.ratio(step_of(small_network()), step_of(Unmodulated()), calls=20)
 
 
 def actor_over_network(clock: Clock, compiled: bool = False) -> dict[str, float]:
@@ -256,6 +302,8 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "windows_per_second": (windows_per_second, ">= 150000"),
     "windows_over_lerobot": (windows_over_lerobot, ""),
     "train_step_over_network": (train_step_over_network, "<= 1.10"),
+    "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
+    "modulation_over_input": (modulation_over_input, "<= 1.20"),
     "actor_over_network": (actor_over_network, "<= 1.10"),
     "actor_over_network_compiled": (partial(actor_over_network, compiled=True), ""),
     "env_over_robosuite": (env_over_robosuite, ">= 2"),

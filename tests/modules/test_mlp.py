@@ -47,14 +47,14 @@ def test_every_input_matters():
 
 
 def test_blocks_by_hand():
-    """Adaptive layer norm: x + (1 + gate) f((1 + scale) norm(x) + shift), with numbers of its own."""
+    """Adaptive layer norm: x + gate f(scale norm(x) + shift), with numbers of its own."""
     torch.manual_seed(0)
     network = perturbed(VelocityMLP(2, 3, 4, hidden_dim=16, num_blocks=1))
-    block, time, x = network.blocks[0], torch.randn(5, 64), torch.randn(5, 16)
+    block, time, x = network.blocks[0], torch.randn(5, 32), torch.randn(5, 16)
     m = time @ block.modulation.weight.T + block.modulation.bias
     norm = (x - x.mean(1, keepdim=True)) / (x.var(1, unbiased=False, keepdim=True) + 1e-5).sqrt()
-    inner = block.layers(norm * (1 + m[:, :16]) + m[:, 16:32])
-    torch.testing.assert_close(block(x, time), x + (1 + m[:, 32:]) * inner)
+    scale, gate, shift = m.split(16, dim=1)
+    torch.testing.assert_close(block(x, time), x + gate * block.layers(norm * scale + shift))
 
 
 @pytest.mark.parametrize("blocks", [0, 1, 3])
@@ -63,9 +63,9 @@ def test_parameter_count(blocks):
     chunk, observation = 4 * 2, 2 * 3
     network = VelocityMLP(2, 3, 4, 2, hidden_dim=h, num_blocks=blocks, timestep_embedding_dim=dim)
     expected = chunk * h + h
-    expected += dim * 2 * dim + 2 * dim  # time
+    expected += dim * dim + dim  # time
     expected += observation * h + h + h * h + h  # observation encoder
-    expected += blocks * (2 * (h * h + h) + 2 * dim * 3 * h + 3 * h)  # layers and modulation
+    expected += blocks * (2 * (h * h + h) + (dim + 1) * 3 * h)  # layers and modulation
     expected += 2 * h + h * chunk + chunk  # head
     assert sum(p.numel() for p in network.parameters()) == expected
 

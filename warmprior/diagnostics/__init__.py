@@ -1,5 +1,6 @@
 """Success statistics, tables and figures."""
 
+from warmprior.diagnostics.action_error import action_error
 from warmprior.diagnostics.branching import branching_bound, branching_cost
 from warmprior.diagnostics.curvature import compare_curvature, curvature
 from warmprior.diagnostics.held_out import SharedObservations
@@ -37,6 +38,7 @@ from warmprior.diagnostics.statistics import (
 )
 from warmprior.diagnostics.straightness import curvature_table, straightness
 from warmprior.diagnostics.study_plots import (
+    plot_budget,
     plot_chunk_lengths,
     plot_sigma,
     plot_success_bars,
@@ -50,6 +52,7 @@ __all__ = [
     "SharedObservations",
     "Smoothness",
     "SourceLeak",
+    "action_error",
     "bootstrap_ratio",
     "branching_bound",
     "branching_cost",
@@ -62,6 +65,7 @@ __all__ = [
     "flow_paths",
     "forecast_mean",
     "paper_success",
+    "plot_budget",
     "plot_chunk_lengths",
     "plot_filmstrip",
     "plot_flow_paths",

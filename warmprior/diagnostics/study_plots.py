@@ -1,4 +1,4 @@
-"""Figures of the studies of sigma and of the chunk length."""
+"""Figures of the studies of sigma, of the chunk length and of the training budget."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any
 from warmprior.diagnostics._figure import COLORS, new_figure
 from warmprior.diagnostics.paper import PAPER_SIGMA
 from warmprior.diagnostics.results import PRIOR_LABELS, Row, summarize_cell
-from warmprior.diagnostics.statistics import SeedSummary
+from warmprior.diagnostics.statistics import SeedSummary, summarize_seeds
 
-__all__ = ["plot_chunk_lengths", "plot_sigma", "plot_success_bars"]
+__all__ = ["plot_budget", "plot_chunk_lengths", "plot_sigma", "plot_success_bars"]
 
 
 def _band(
@@ -198,5 +198,57 @@ def plot_success_bars(
     axis.set_ylabel(f"success rate (NFE {nfe})")
     axis.grid(axis="y", alpha=0.25)
     figure.legend(loc="outside lower center", ncols=len(priors), frameon=False, fontsize=9)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=150)
+
+
+def plot_budget(
+    rows: Sequence[Row],
+    errors: Mapping[tuple[str, int, int], Sequence[float]],
+    path: str | Path,
+    *,
+    top_k: int,
+    title: str,
+) -> None:
+    """Success, and error on held-out demonstrations, against the iterations of the training.
+
+    A column per NFE; shaded is one seed standard deviation.
+
+    Args:
+        rows: evaluations of trainings of several lengths, each row's ``checkpoint`` the last of its own.
+        errors: by prior, iterations and NFE one error per seed, see :func:`action_error`.
+        path: of the PNG.
+
+    Keyword Args:
+        top_k: checkpoints averaged per seed.
+        title: of the figure.
+    """
+    nfes = sorted({row.nfe for row in rows})
+    budgets = sorted({row.checkpoint for row in rows})
+    figure, axes = new_figure(3.6 * len(nfes), 6.0, 2, len(nfes))
+    for column, nfe in enumerate(nfes):
+        above, below = axes[column], axes[len(nfes) + column]
+        for prior in dict.fromkeys(row.prior for row in rows):
+            cells = {
+                n: [r for r in rows if (r.prior, r.nfe, r.checkpoint) == (prior, nfe, n)]
+                for n in budgets
+            }
+            known = {n: summarize_cell(cell, top_k) for n, cell in cells.items() if cell}
+            label = PRIOR_LABELS.get(prior, prior)
+            _band(above, list(known), list(known.values()), prior, label=label)
+            found = {n: errors[prior, n, nfe] for n in budgets if (prior, n, nfe) in errors}
+            _band(below, list(found), [summarize_seeds(e) for e in found.values()], prior)
+        above.set_title(f"NFE {nfe}", fontsize=10)
+        above.set_ylim(-0.02, 1.02)
+        below.set_ylim(bottom=0)
+        below.set_xlabel("iterations")
+        for axis in (above, below):
+            axis.set_xscale("log")
+            axis.set_xticks(budgets, [f"{n:,}" for n in budgets], fontsize=8)
+            axis.minorticks_off()
+            axis.grid(alpha=0.25)
+    axes[0].set_ylabel("success rate")
+    axes[len(nfes)].set_ylabel("squared error of executed actions, held out", fontsize=9)
+    axes[0].legend(frameon=False, fontsize=8)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=150)

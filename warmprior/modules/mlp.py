@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
@@ -16,13 +17,14 @@ class _Block(nn.Module):
         super().__init__()
         self.modulation = nn.Linear(time_dim, 3 * dim)
         nn.init.zeros_(self.modulation.weight)
-        nn.init.zeros_(self.modulation.bias)
+        with torch.no_grad():  # scale and gate 1, shift 0
+            self.modulation.bias.fill_(1.0)[2 * dim :].zero_()
         self.norm = nn.LayerNorm(dim, elementwise_affine=False)
         self.layers = nn.Sequential(nn.Linear(dim, dim), nn.GELU(), nn.Linear(dim, dim))
 
     def forward(self, x: Tensor, time: Tensor) -> Tensor:
-        scale, shift, gate = self.modulation(time).chunk(3, dim=-1)
-        return x + (1 + gate) * self.layers(self.norm(x) * (1 + scale) + shift)
+        scale, gate, shift = self.modulation(time).chunk(3, dim=-1)
+        return torch.addcmul(x, gate, self.layers(torch.addcmul(shift, scale, self.norm(x))))
 
 
 class VelocityMLP(VelocityNetwork):
@@ -75,10 +77,9 @@ class VelocityMLP(VelocityNetwork):
             timestep_embedding_dim=timestep_embedding_dim,
         )
         chunk = prediction_length * action_dim
-        time_dim = 2 * timestep_embedding_dim
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim),
-            nn.Linear(timestep_embedding_dim, time_dim),
+            nn.Linear(timestep_embedding_dim, timestep_embedding_dim),
             nn.GELU(),
         )
         self.encode_observation = nn.Sequential(
@@ -87,7 +88,9 @@ class VelocityMLP(VelocityNetwork):
             nn.Linear(hidden_dim, hidden_dim),
         )
         self.embed_chunk = nn.Linear(chunk, hidden_dim)
-        self.blocks = nn.ModuleList(_Block(hidden_dim, time_dim) for _ in range(num_blocks))
+        self.blocks = nn.ModuleList(
+            _Block(hidden_dim, timestep_embedding_dim) for _ in range(num_blocks)
+        )
         self.head = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, chunk))
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:

@@ -232,10 +232,17 @@ class PreconditionedNetwork(VelocityNetwork):
         m0, m1 = self.moments.source_mean, self.moments.target_mean
         v0, v1 = self.moments.source_variance, self.moments.target_variance
         c = self.moments.covariance
-        scale = (alpha.square() * v0 + beta.square() * v1 + 2 * alpha * beta * c).rsqrt()
-        standardised = (a - alpha * m0 - beta * m1) * scale
-        covariance = alpha * d_alpha * v0 + beta * d_beta * v1
-        covariance = covariance + (alpha * d_beta + d_alpha * beta) * c
+        variance = _combination(v0, alpha.square(), v1, beta.square())
+        scale = torch.addcmul(variance, 2 * alpha * beta, c).rsqrt()
+        centred = torch.addcmul(torch.addcmul(a, alpha, m0, value=-1), beta, m1, value=-1)
+        standardised = centred * scale
+        covariance = _combination(v0, alpha * d_alpha, v1, beta * d_beta)
+        covariance = torch.addcmul(covariance, alpha * d_beta + d_alpha * beta, c)
         remainder = (alpha * d_beta - d_alpha * beta).abs() * (v0 * v1 - c * c).clamp_min(0).sqrt()
-        learnt = covariance * standardised + remainder * self.network(t, standardised, observation)
-        return d_alpha * m0 + d_beta * m1 + scale * learnt
+        learnt = self.network(t, standardised, observation)
+        velocity = torch.addcmul(covariance * standardised, remainder, learnt)
+        return torch.addcmul(_combination(m0, d_alpha, m1, d_beta), scale, velocity)
+
+
+def _combination(x: Tensor, x_weight: Tensor, y: Tensor, y_weight: Tensor) -> Tensor:
+    return torch.addcmul(x_weight * x, y_weight, y)

@@ -4,7 +4,7 @@
 modules: they need ``warmprior[sim]``.
 """
 
-from warmprior.training.behaviour_cloning import BehaviourCloning
+from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
 from warmprior.training.evaluation import Episode, evaluate, parallel_env
 from warmprior.training.filmstrip import Filmstrip, record_filmstrip
 from warmprior.training.navigation1d import (
@@ -38,6 +38,7 @@ __all__ = [
     "make_optimizer",
     "navigation_priors",
     "parallel_env",
+    "precondition",
     "record_filmstrip",
     "warmup_cosine",
 ]

@@ -15,6 +15,9 @@ from tqdm import tqdm
 
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
+from warmprior.modules.prior import Prior
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
     check_identity,
@@ -32,10 +35,34 @@ from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer
 
-__all__ = ["BehaviourCloning"]
+__all__ = ["BehaviourCloning", "precondition"]
 
-STATE_FORMAT = 1
+STATE_FORMAT = 2
 """Part of every state's identity; raised whenever the same options give other weights."""
+
+
+def precondition(
+    network: VelocityNetwork, data: TensorDictBase, prior: Prior, *, observation_steps: int = 2
+) -> PreconditionedNetwork:
+    """Wrap a network in what is known of a prior's source and the demonstrations before any training.
+
+    Args:
+        network: the network to wrap.
+        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`.
+        prior: the source distribution.
+
+    Keyword Args:
+        observation_steps: ``To``.
+
+    Returns:
+        The preconditioned network, for the linear path; the same for the same data and prior.
+    """
+    generator = torch.Generator(data.device or "cpu").manual_seed(0)
+    windows = window_replay_buffer(
+        data, prior, batch_size=1024, observation_steps=observation_steps, generator=generator
+    )
+    moments = SourceMoments.fit(windows, prior, generator=generator)
+    return PreconditionedNetwork(network, moments=moments)
 
 
 class BehaviourCloning:

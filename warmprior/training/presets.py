@@ -26,6 +26,7 @@ class Preset:
         training: the recipe.
         network: ``"mlp"`` or ``"chi_transformer"``.
         network_options: constructor options of the network.
+        precondition: wrap the network in a :class:`~warmprior.PreconditionedNetwork`.
         seeds: number of training seeds.
         episodes: evaluation episodes per cell.
         top_k: checkpoints averaged per seed.
@@ -43,6 +44,7 @@ class Preset:
     envs: int | None = None
     observation_steps: int = 2
     network_options: dict[str, Any] = field(default_factory=dict)
+    precondition: bool = True
 
     def make_network(
         self, action_dim: int, observation_dim: int, prediction_length: int
@@ -95,6 +97,7 @@ PRESETS: dict[str, Preset] = {
         demonstrations={"ph": 200, "mh": 300},
         training=TrainingConfig(),
         network="chi_transformer",
+        precondition=False,
         seeds=3,
         episodes=200,
         top_k=3,

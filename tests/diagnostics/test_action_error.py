@@ -1,0 +1,84 @@
+"""The error of the executed actions against sums by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from warmprior import GaussianPrior, PreviewPrior, RegressionPrior, WarmPriorActor
+from warmprior.diagnostics import action_error
+
+H, D_A = 3, 2
+
+
+class Towards(nn.Module):
+    """One step ends at the observation's first entry, whatever the source."""
+
+    def __init__(self):
+        super().__init__()
+        self.unused = nn.Parameter(torch.zeros(1))
+
+    def forward(self, t, a, observation):
+        return observation[:, -1, 0, None, None] - a
+
+
+def windows(prior, n=5):
+    generator = torch.Generator().manual_seed(0)
+    shape = (n, prior.prediction_length, D_A)
+    pad = torch.zeros(shape[:2], dtype=torch.bool)
+    pad[-1, 1:] = True
+    return TensorDict(
+        {
+            "observation": torch.randn(n, 2, 4, generator=generator),
+            "vla_action": {"chunk": torch.randn(shape, generator=generator)},
+            "prior": {
+                "loc": torch.zeros(shape),
+                "warm": torch.zeros(shape, dtype=torch.bool)[..., :1],
+            },
+            "action_is_pad": pad,
+        },
+        [n],
+    )
+
+
+@pytest.mark.parametrize("prior", [GaussianPrior(H), PreviewPrior(H), RegressionPrior(H)], ids=str)
+@pytest.mark.parametrize("split", [2, 4096])
+def test_by_hand(prior, split):
+    batch = windows(prior)
+    total, count = 0.0, 0
+    for row in batch:
+        for position in range(H):  # not the second half of a preview
+            if not row["action_is_pad"][position]:
+                for value in row["vla_action", "chunk"][position]:
+                    total += float(row["observation"][-1, 0] - value) ** 2
+                    count += 1
+    before = batch.clone()
+    found = action_error(WarmPriorActor(Towards(), prior), batch, nfes=(1,), split=split)
+    assert found == {1: pytest.approx(total / count, rel=1e-5)}
+    assert (batch == before).all()
+
+
+def test_clips_as_the_policy_does_and_skips_what_the_prior_refuses():
+    prior = RegressionPrior(H)
+    batch = windows(prior)
+    batch["observation"][:] = 5.0
+    batch["vla_action", "chunk"][:] = 1.0
+    policy = WarmPriorActor(Towards(), prior, clip=2.0)
+    assert action_error(policy, batch, nfes=(1, 9)) == {1: pytest.approx(1.0)}
+
+
+def test_same_noise_for_every_call_and_the_global_generator_untouched():
+    class Still(Towards):
+        def forward(self, t, a, observation):
+            return torch.zeros_like(a)
+
+    batch = windows(GaussianPrior(H))
+    before = torch.get_rng_state()
+    policy = WarmPriorActor(Still(), GaussianPrior(H)).train()
+    found = action_error(policy, batch, nfes=(1, 9))
+    assert found[1] == found[9] == action_error(policy, batch)[1]
+    assert torch.equal(before, torch.get_rng_state()) and policy.training
+    other = action_error(policy, batch, generator=torch.Generator().manual_seed(9))
+    assert other[1] != found[1]

@@ -1,0 +1,75 @@
+"""How far a policy's actions are from the demonstrated ones, without a simulator."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+
+from warmprior import keys
+from warmprior.diagnostics._flow import evaluation_mode, flat_windows
+from warmprior.modules.actor import WarmPriorActor
+
+__all__ = ["action_error"]
+
+
+def action_error(
+    policy: WarmPriorActor,
+    windows: TensorDictBase,
+    *,
+    nfes: Sequence[int] = (1, 9),
+    split: int = 4096,
+    generator: torch.Generator | None = None,
+) -> dict[int, float]:
+    r"""Mean squared error of the executed actions on windows of demonstrations.
+
+    Its smallest value is reached by the conditional mean :math:`E[a_1 \mid a_0, o]`, which one step of
+    an exact field returns; samples of the data's own distribution have up to twice that error. So it
+    compares policies at one NFE, and not one policy at several.
+
+    Args:
+        policy: the policy; its state stays as it is.
+        windows: ``[*B]`` of the policy's own prior, normalised, see :class:`~warmprior.ActionWindow`;
+            for a fair error, ones that the policy was not trained on.
+
+    Keyword Args:
+        nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
+        split: network batch size, for bounded memory; it changes nothing else.
+        generator: source of randomness on the policy's device; by default one of its own with a fixed
+            seed. One sample of the source per window, the same for every NFE.
+
+    Returns:
+        By NFE, the mean over windows, the first ``H`` positions inside the episode and dimensions, in
+        squared normalised action units.
+
+    Raises:
+        KeyError: if the windows lack a key.
+        ValueError: if the windows are empty, hold NaN or Inf, or belong to another prediction length.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import SharedObservations
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4))
+        >>> windows = SharedObservations(navigation_demonstrations(), 4).windows(untrained.prior)
+        >>> sorted(action_error(untrained, windows))
+        [1, 9]
+    """
+    prior, limit = policy.prior, policy.prior.max_nfe
+    flat = flat_windows(policy, windows, target_needed=True)
+    assert flat.target is not None
+    if generator is None:
+        generator = torch.Generator(flat.loc.device).manual_seed(0)
+    rows = windows.select(*policy.in_keys).reshape(len(flat)).to(flat.loc.device)
+    rows.set(keys.NOISE, prior.sample(flat.loc, flat.warm, generator))
+    counted = flat.counted[:, : prior.chunk_length, 0]
+    errors = {}
+    with evaluation_mode(policy):
+        for nfe in nfes:
+            if limit is not None and nfe > limit:
+                continue
+            parts = [policy.ode(part, nfe=nfe).get(keys.CHUNK) for part in rows.split(split)]
+            error = (torch.cat(parts) - flat.target)[:, : prior.chunk_length].square()
+            errors[nfe] = float(error[counted].mean())
+    return errors
