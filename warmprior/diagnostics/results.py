@@ -144,9 +144,16 @@ class Results:
         """The row of a cell (see :attr:`Row.cell`), if it was evaluated already."""
         return next((row for row in self.rows if row.cell == cell), None)
 
-    def add(self, row: Row) -> None:
-        """Append a row and save."""
+    def add(self, row: Row, order: Sequence[tuple[Any, ...]] = ()) -> None:
+        """Add a row and save.
+
+        Args:
+            row: the new one.
+            order: of the cells, whose rows come first; by default the row comes last.
+        """
         self.rows.append(row)
+        places = {cell: place for place, cell in enumerate(order)}
+        self.rows.sort(key=lambda row: places.get(row.cell, len(places)))
         self.save()
 
     def save(self) -> None:

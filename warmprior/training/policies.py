@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
@@ -22,6 +23,7 @@ from warmprior.modules.prior import Prior
 from warmprior.training.behaviour_cloning import STATE_FORMAT, BehaviourCloning, policy_path
 from warmprior.training.demonstrations import Demonstrations
 from warmprior.training.presets import Preset
+from warmprior.training.threads import torch_threads
 from warmprior.transforms import Normalizer, policy_transforms
 
 __all__ = ["Policies"]
@@ -40,7 +42,7 @@ class Policies:
         preset: the budget.
         directory: where the policies lie.
         logs: folder of the training logs.
-        device: of networks and data.
+        device: to train on.
         compile: compile the velocity network in training.
         logger: TorchRL logger: ``"csv"``, ``"tensorboard"``, ``"wandb"`` or ``"none"``.
 
@@ -64,7 +66,7 @@ class Policies:
         self.task = task_of(dataset)
         self.num_episodes, self.num_steps = dataset.num_episodes, len(dataset.data)
         self.normalizer = Normalizer.fit(dataset.data)
-        self.data = self.normalizer.normalize(dataset.data.exclude("next")).to(self.device)
+        self.data = self.normalizer.normalize(dataset.data.exclude("next"))
         self.make_env = partial(
             RobosuiteEnv, env_args=dataset.env_args, style=self.demonstrations.style
         )
@@ -111,7 +113,6 @@ class Policies:
                 self.preset.observation_steps,
                 self.device,
                 self.compile,
-                torch.get_num_threads(),
                 version("torch"),
                 version("warmprior"),
                 STATE_FORMAT,
@@ -121,12 +122,17 @@ class Policies:
         name = f"{self.task}-{self.demonstrations.style}-{prior.name}-seed{seed}-{digest}"
         return self.directory / name
 
-    def train(self, prior: Prior, seed: int) -> list[tuple[int, float]]:
+    def train(
+        self, prior: Prior, seed: int, progress: Callable[[int], object] | None = None
+    ) -> list[tuple[int, float]]:
         """Train a policy; continue or reuse the stored one of the same options.
+
+        On a CPU it is trained by one thread, wherever: another number would give other weights.
 
         Args:
             prior: its source distribution.
             seed: its training seed.
+            progress: called with the number of iterations after each; a bar if ``None``.
 
         Returns:
             The training curve, ``[(iteration, loss), ...]``.
@@ -136,21 +142,57 @@ class Policies:
         """
         folder = self.folder(prior, seed)
         if folder not in self._losses:
-            training = BehaviourCloning(
-                self.new_actor(prior, seed),
-                self.data,
-                replace(self.preset.training, seed=seed),
-                folder,
-                observation_steps=self.preset.observation_steps,
-                logger=self._logger(folder.name),
-                compile=self.compile,
-            )
-            training.run(f"train {prior.describe()}, seed {seed}")
-            self._losses[folder] = training.losses
+            with torch_threads(1 if torch.device(self.device).type == "cpu" else None):
+                training = BehaviourCloning(
+                    self.new_actor(prior, seed),
+                    self.data.to(self.device),
+                    replace(self.preset.training, seed=seed),
+                    folder,
+                    observation_steps=self.preset.observation_steps,
+                    logger=self._logger(folder.name),
+                    compile=self.compile,
+                )
+                name = f"train {prior.describe()}, seed {seed}" if progress is None else None
+                training.run(name, progress)
+            self.note_trained(prior, seed, training.losses)
         return self._losses[folder]
 
+    def note_trained(self, prior: Prior, seed: int, losses: list[tuple[int, float]]) -> None:
+        """Take note of a policy that another process trained.
+
+        Args:
+            prior: its source distribution.
+            seed: its training seed.
+            losses: what :meth:`train` returned there.
+        """
+        self._losses[self.folder(prior, seed)] = losses
+
     def policy(self, prior: Prior, seed: int, checkpoint: int | None = None) -> WarmPriorActor:
-        """A trained policy of averaged weights, from disk.
+        """A policy of averaged weights, trained if it is not yet.
+
+        Args:
+            prior: its source distribution.
+            seed: its training seed.
+            checkpoint: iteration; the last by default.
+        """
+        self.train(prior, seed)
+        return self.load(prior, seed, checkpoint).to(self.device)
+
+    def load(self, prior: Prior, seed: int, checkpoint: int | None = None) -> WarmPriorActor:
+        """A trained policy of averaged weights, from disk, on the CPU.
+
+        Args:
+            prior: its source distribution.
+            seed: its training seed.
+            checkpoint: iteration; the last by default.
+
+        Raises:
+            FileNotFoundError: if it is not trained that far.
+        """
+        return WarmPriorActor.from_pretrained(self.path(prior, seed, checkpoint), prior=prior)
+
+    def path(self, prior: Prior, seed: int, checkpoint: int | None = None) -> Path:
+        """Where a policy of averaged weights lies, or will lie.
 
         Args:
             prior: its source distribution.
@@ -158,9 +200,7 @@ class Policies:
             checkpoint: iteration; the last by default.
         """
         checkpoint = self.preset.training.iterations if checkpoint is None else checkpoint
-        self.train(prior, seed)
-        path = policy_path(self.folder(prior, seed), checkpoint)
-        return WarmPriorActor.from_pretrained(path, prior=prior, device=self.device)
+        return policy_path(self.folder(prior, seed), checkpoint)
 
     def transforms(self, prior: Prior) -> partial[Any]:
         """Builder of the environment transforms that these policies need."""
