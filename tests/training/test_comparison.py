@@ -21,7 +21,7 @@ from tests.training.cloning_parts import same
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior._files import load_file
 from warmprior.data.tasks import EVALUATION_SEED
-from warmprior.training import PRESETS, TrainingConfig, WorkerError
+from warmprior.training import PRESETS, TrainingConfig, WorkerError, workers
 from warmprior.training.comparison import Comparison
 from warmprior.training.demonstrations import Demonstrations
 from warmprior.training.policies import Policies
@@ -168,6 +168,14 @@ def test_rows_and_weights_do_not_depend_on_the_number_of_workers(
     # The comparison above says something: the policies and their noise decide.
     assert len({row["boundary_jump"] for row in rows}) == len(rows)
     assert 0 < sum(row["successes"] for row in rows) < sum(row["episodes"] for row in rows)
+
+
+def test_spawned_workers_give_the_same_rows(demonstrations, undisturbed, tmp_path, monkeypatch):
+    """As beside CUDA: everything that a worker needs is handed over instead of inherited."""
+    monkeypatch.setattr(workers, "start_method", lambda: "spawn")
+    comparison(demonstrations, tmp_path, 2, priors=PRIORS[1:2], seeds=[0]).run()
+    expected = [r for r in stored(undisturbed)["rows"] if (r["prior"], r["seed"]) == ("past", 0)]
+    assert stored(tmp_path)["rows"] == expected
 
 
 class LastIsFirst(ToyPolicies):

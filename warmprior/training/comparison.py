@@ -164,8 +164,8 @@ class Comparison:
                     mine.append(result)
                     if len(mine) == ended.row.episodes:
                         row = replace(ended.row, **_outcome(played.pop(ended.row)))
-                        self._save_time()
                         self.results.add(row, [row.cell for row in cells])
+                        self._save_time()
                         progress.say(_told(ended.prior, row))
                 progress.trained(sum(worker.iterations))
 

@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 from collections.abc import Callable
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
@@ -142,14 +143,19 @@ class Policies:
         """
         folder = self.folder(prior, seed)
         if folder not in self._losses:
-            with torch_threads(1 if torch.device(self.device).type == "cpu" else None):
+            logger = self._logger(folder.name)
+            with (
+                torch_threads(1 if torch.device(self.device).type == "cpu" else None),
+                # A worker process ends without the exit handlers that some loggers write in.
+                nullcontext() if logger is None else closing(logger),
+            ):
                 training = BehaviourCloning(
                     self.new_actor(prior, seed),
                     self.data.to(self.device),
                     replace(self.preset.training, seed=seed),
                     folder,
                     observation_steps=self.preset.observation_steps,
-                    logger=self._logger(folder.name),
+                    logger=logger,
                     compile=self.compile,
                 )
                 name = f"train {prior.describe()}, seed {seed}" if progress is None else None

@@ -29,7 +29,7 @@ class Preset:
         seeds: number of training seeds.
         episodes: evaluation episodes per cell.
         top_k: checkpoints averaged per seed.
-        envs: parallel environments; ``None`` for one per core.
+        envs: worker processes that train and play; ``None`` for one per core.
         observation_steps: ``To``.
     """
 
@@ -98,6 +98,5 @@ PRESETS: dict[str, Preset] = {
         seeds=3,
         episodes=200,
         top_k=3,
-        envs=20,
     ),
 }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from types import TracebackType
 from typing import Self
 
@@ -38,6 +39,7 @@ class ComparisonProgress:
     def say(self, line: str) -> None:
         """Print a line that stays."""
         tqdm.write(line)
+        sys.stdout.flush()  # a pipe is to show it at once
 
     def trained(self, iterations: int) -> None:
         """Move the bar of the trainings to as many gradient steps."""
