@@ -7,8 +7,7 @@ import importlib.util
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,8 +23,8 @@ from warmprior.data import TASKS, download_robomimic, generate_demonstrations, g
 from warmprior.training import PRESETS, Preset
 from warmprior.training.comparison import Comparison
 from warmprior.training.demonstrations import Demonstrations
-from warmprior.training.evaluation import WorkerError
 from warmprior.training.policies import Policies
+from warmprior.training.workers import WorkerError
 
 ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError)
 """What a user can mend: reported without a traceback."""
@@ -48,7 +47,12 @@ def add_options(parser: argparse.ArgumentParser) -> Callable[..., argparse.Actio
     add("--preset", default="quick", choices=PRESETS, help=f"{presets} (%(default)s)")
     add("--seeds", type=int, help="number of training seeds (default: the preset's)")
     add("--episodes", type=int, help="evaluation episodes per cell (default: the preset's)")
-    add("--envs", type=int, help="parallel environments (default: the preset's, or one per core)")
+    add(
+        "--envs",
+        type=int,
+        help="worker processes that train and play, with the same results (default: the preset's, or "
+        "one per core)",
+    )
     add("--iterations", type=int, help="gradient steps (default: the preset's)")
     add("--demonstrations", type=int, help="scripted demonstrations (default: the preset's)")
     add("--out", type=Path, help="output folder (default: a numbered one under runs/)")
@@ -74,24 +78,14 @@ def launch(main: Callable[[], int]) -> None:
     sys.exit(main())
 
 
-@contextmanager
-def threads(number: int | None) -> Iterator[None]:
-    """Let PyTorch compute with as many threads, and with those of before afterwards."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(number or before)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
-
-
 def parse(
     make_parser: Callable[[], argparse.ArgumentParser],
     argv: list[str] | None,
     prefix: str = "",
     default_task: Callable[[argparse.Namespace], str] = lambda args: "square",
+    changeable: Sequence[str] = ("envs",),
 ) -> argparse.Namespace:
-    """The options; those of the run to continue, where --resume is given."""
+    """The options; those of the run to continue, but for the changeable ones, with --resume."""
     parser = make_parser()
     study = prefix.rstrip("-") or "robomimic"
     parser.set_defaults(study=study)
@@ -116,7 +110,11 @@ def parse(
         parser.set_defaults(**options)
         args = parser.parse_args(argv)
         args.out = out
-        changed = [key for key in options if _plain(getattr(args, key)) != _plain(options[key])]
+        changed = [
+            key
+            for key in options
+            if key not in changeable and _plain(getattr(args, key)) != _plain(options[key])
+        ]
         if changed:
             told = ", ".join(f"--{key.replace('_', '-')} {options[key]}" for key in changed)
             raise ValueError(

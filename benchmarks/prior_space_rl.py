@@ -41,6 +41,7 @@ from warmprior.training import (
     parallel_env,
 )
 from warmprior.training.policies import Policies
+from warmprior.training.threads import torch_threads
 from warmprior.transforms import policy_transforms
 
 PER_AGENT = ("algorithm", "backup_entropy", "delta", "seed")
@@ -105,7 +106,7 @@ def toy_task(args: argparse.Namespace, budget: Budget, name: str, seed: int) -> 
     """A policy that knows both routes, and the toy that rewards one."""
     priors = {name: PRIORS[name](budget.chunk)}
     study = NavigationStudy(budget.pretraining, priors, args.out / "policies")
-    with experiment.threads(budget.threads):
+    with torch_threads(budget.threads):
         actor = study.train(name, seed).to(args.device)
 
     def make_env(env_seed: int) -> EnvBase:
@@ -148,7 +149,7 @@ def manipulation_tasks(
 
     def task(name: str, seed: int) -> Task:
         # A copy of its own: to continue, an agent must find the very policy it began with, even if
-        # another number of threads or version would train another by now.
+        # another version would train another by now.
         kept = args.out / "policies" / f"{name}-seed{seed}"
         if not (args.resume and (kept / "config.json").exists()):
             frozen(name, seed).save_pretrained(kept)
@@ -191,7 +192,7 @@ def finished_policies(
 
 def main(argv: list[str] | None = None) -> int:
     try:
-        args = experiment.parse(make_parser, argv, "rl-", default_task)
+        args = experiment.parse(make_parser, argv, "rl-", default_task, changeable=())
         budget, config = make_config(args)
         experiment.check(args)
         check_writable(args.out)
@@ -228,7 +229,7 @@ def main(argv: list[str] | None = None) -> int:
                 description=f"{algorithm} {name}, seed {seed}",
             )
             try:
-                with experiment.threads(budget.threads):
+                with torch_threads(budget.threads):
                     training.run()
                 rows.append(summarize(name, seed, mine, training))
             except FloatingPointError as error:  # no reason to keep the other agents from learning

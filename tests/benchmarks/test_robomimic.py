@@ -28,7 +28,7 @@ def benchmark():
 
 def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, capsys, monkeypatch):
     out = tmp_path / "runs" / "first"
-    assert benchmark.main(options(dataset, out)) == 0
+    assert benchmark.main(options(dataset, out, episodes=3)) == 0
     stored = json.loads((out / "results.json").read_text())
     assert {row["prior"] for row in stored["rows"]} == {"gaussian", "past", "preview"}
     row = stored["rows"][0]
@@ -45,18 +45,20 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
     if benchmark.rendering_backend() is not None:
         assert len(list(out.glob("filmstrip_*.png"))) == 3
 
-    # The folder is never overwritten, and a second run of the same options trains nothing again.
+    # The folder is never overwritten, and a second run of the same options trains nothing again. Two
+    # workers play other episodes one after another in their simulators than one, with the same rows.
     assert benchmark.main(options(dataset, out)) == 2
     assert "--resume" in capsys.readouterr().err
     policies = sorted((out.parent / "policies").iterdir())
     written = [path.stat().st_mtime_ns for p in policies for path in p.rglob("*.safetensors")]
     monkeypatch.setattr(benchmark, "rendering_backend", lambda: None)
-    assert benchmark.main(options(dataset, tmp_path / "runs" / "second", prior="past")) == 0
+    second = tmp_path / "runs" / "second"
+    assert benchmark.main(options(dataset, second, episodes=3, envs=2, prior="past")) == 0
     assert "libegl1" in capsys.readouterr().out
     again = [path.stat().st_mtime_ns for p in policies for path in p.rglob("*.safetensors")]
     assert again == written
-    second = json.loads((tmp_path / "runs" / "second" / "results.json").read_text())
-    assert second["rows"] == [row for row in stored["rows"] if row["prior"] == "past"]
+    rows = json.loads((second / "results.json").read_text())["rows"]
+    assert rows == [row for row in stored["rows"] if row["prior"] == "past"]
 
 
 @pytest.mark.parametrize(
@@ -89,6 +91,7 @@ def test_resuming_takes_the_stored_options_and_refuses_others(benchmark, dataset
     assert {**vars(again), "resume": False} == {**vars(args), "dataset": dataset.resolve()}
     with pytest.raises(ValueError, match=r"started with --sigma 0\.3"):
         benchmark.parse(["--resume", "--out", str(tmp_path), "--sigma", "0.5"])
+    assert benchmark.parse(["--resume", "--out", str(tmp_path), "--envs", "3"]).envs == 3
 
 
 def test_default_folders_are_numbered_past_the_latest(benchmark, tmp_path, monkeypatch):

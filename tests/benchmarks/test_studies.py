@@ -177,7 +177,7 @@ def test_a_folder_that_is_no_finished_run_is_named(scripts, tmp_path, capsys, co
 
 @pytest.fixture
 def no_training(monkeypatch):
-    def train(*args):
+    def train(*args, **options):
         pytest.fail("something was trained")
 
     monkeypatch.setattr(Policies, "train", train)

@@ -69,16 +69,27 @@ def test_table_shows_gains_marks_and_the_papers_row(tmp_path):
     )
     assert paper == "| Square-PH, paper (official data) | 83.6 | 86.6 (+3.0) | 87.3 (+3.7) |"
     assert "compare gains within a row" in table
-    assert "WP-Preview is below" not in table
+    assert "short of training" not in table and "bound" not in table
 
 
-def test_table_says_when_preview_loses(tmp_path):
+def test_table_says_what_is_short_of_training(tmp_path):
+    options = {"priors": ["gaussian", "past", "preview"], "nfes": [1], "top_k": 1}
+    table = success_table(filled(tmp_path, META | {"short_of_training": ["preview"]}), **options)
+    assert "WP-Preview: short of training" in table and "WP-Past: short" not in table
+
+
+def test_table_shows_what_the_source_leaks(tmp_path):
+    """Means over seeds of the last checkpoints, with a mark above the bound."""
     results = filled(tmp_path)
     results.rows = [
-        replace(row, successes=0) if row.prior == "preview" else row for row in results.rows
+        replace(row, source_leak=0.2 + row.seed / 10, inner_step_ratio=1.5)
+        if (row.prior, row.checkpoint) == ("past", 100)
+        else replace(row, source_leak=9.0 if row.checkpoint == 50 else None)
+        for row in results.rows
     ]
     table = success_table(results, priors=["gaussian", "past", "preview"], nfes=[1], top_k=1)
-    assert "WP-Preview is below the base" in table
+    assert "| spread over draws of the source / data's (bound 1) | - | 0.30 | - |" in table
+    assert "| step inside chunks / data's (bound 1.3) | - | 1.50 (!) | - |" in table
 
 
 def test_paper_numbers_cover_table_1():

@@ -1,4 +1,4 @@
-"""Evaluation: every episode once, whatever the number of workers, and no hang when one dies."""
+"""Evaluation: every episode once, whatever the environment, and no hang when a worker dies."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import time
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -29,7 +30,7 @@ from warmprior import (
     WarmPriorActor,
     policy_transforms,
 )
-from warmprior.training import Episode, evaluate, parallel_env
+from warmprior.training import Episode, evaluate, parallel_env, play_episode
 
 H = 3
 
@@ -144,6 +145,86 @@ class NoiseSuccess(SeededEnv):
     def _step(self, tensordict):
         out = super()._step(tensordict)
         return out.set("success", tensordict["action"].sum(-1, keepdim=True) > 0)
+
+
+class PlainEnv(SeededEnv):
+    """As most of TorchRL's environments: resets are numbered from the seed, and workers unknown."""
+
+    def __init__(self, log=None):
+        super().__init__(log=log)
+
+
+def single(make_env=PlainEnv, prior=None):
+    prior = PastPrior(H) if prior is None else prior
+    return TransformedEnv(make_env(), policy_transforms(prior))
+
+
+def chunks_of(episodes):
+    return torch.cat([episode.decisions["vla_action", "chunk"] for episode in episodes])
+
+
+@pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
+def test_a_single_environment_plays_every_seed_exactly_once(prior_class, tmp_path):
+    log = tmp_path / "resets"
+    prior = prior_class(H)
+    env = single(partial(PlainEnv, log=log), prior)
+    assert evaluate(actor_for(prior), env, episodes=7, first_seed=40) == expected(40, 7)
+    assert [int(line) for line in log.read_text().split()] == list(range(40, 47))
+
+
+def test_an_episode_depends_on_its_seeds_alone():
+    """Not on the environment's history, the policy's generators, or the order of the episodes."""
+    env, actor = single(NoiseSuccess), actor_for()
+    torch.manual_seed(0)
+    whole = evaluate(actor, env, episodes=9, first_seed=3, policy_seed=2)
+    torch.rand(5)
+    again = [
+        play_episode(actor, env if seed % 2 else single(NoiseSuccess), seed, policy_seed=2)
+        for seed in range(11, 2, -1)
+    ]
+    assert again[::-1] == whole
+    assert torch.equal(chunks_of(again[::-1]), chunks_of(whole))
+
+
+def test_the_noise_of_an_episode_is_that_of_the_documented_seed():
+    actor = actor_for(GaussianPrior(H))
+    actor.forward = lambda data, nfe=None: data.set(
+        ("vla_action", "chunk"), actor.sampler(data)["prior", "noise"]
+    )
+    first = {}
+    for seeds in ((0, 7), (7, 0), (1, 7), (0, 8), (2**32, 7)):
+        noise_seed = int(np.random.SeedSequence(seeds).generate_state(1, "uint64")[0])
+        generator = torch.Generator().manual_seed(noise_seed)
+        policy_seed, seed = seeds
+        env = single(prior=GaussianPrior(H))
+        episode = play_episode(actor, env, seed, policy_seed=policy_seed)
+        for chunk in episode.decisions["vla_action", "chunk"]:
+            assert torch.equal(chunk, torch.randn(H, ACTION_DIM, generator=generator))
+        first[seeds] = tuple(episode.decisions["vla_action", "chunk"][0].flatten().tolist())
+    assert len(set(first.values())) == len(first)
+
+
+def test_one_thread_plays_an_episode():
+    seen = []
+    actor = actor_for()
+    forward = actor.network.forward
+    actor.network.forward = lambda *args: seen.append(torch.get_num_threads()) or forward(*args)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(3)
+    try:
+        play_episode(actor, single(), 0, nfe=1)
+        assert set(seen) == {1} and torch.get_num_threads() == 3
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_batched_environments_are_evaluated_and_not_played_one_by_one():
+    env = environments(1)
+    try:
+        with pytest.raises(ValueError, match="single environment"):
+            play_episode(actor_for(), env, 0)
+    finally:
+        env.close(raise_if_closed=False)
 
 
 def test_same_twice_and_other_with_another_policy_seed():
@@ -284,11 +365,8 @@ def test_any_policy_that_writes_chunks():
     finally:
         env.close(raise_if_closed=False)
 
-    def chunks(episodes):
-        return torch.cat([episode.decisions["vla_action", "chunk"] for episode in episodes])
-
-    assert again == one and torch.equal(chunks(again), chunks(one))
-    assert not torch.isclose(chunks(other)[:3], chunks(one)[:3]).any()
+    assert again == one and torch.equal(chunks_of(again), chunks_of(one))
+    assert not torch.isclose(chunks_of(other)[:3], chunks_of(one)[:3]).any()
 
 
 @pytest.mark.parametrize("episodes", [0, -1])

@@ -11,6 +11,7 @@ from typing import Any
 
 from warmprior._files import write_atomic
 from warmprior.diagnostics.paper import paper_success
+from warmprior.diagnostics.source_leak import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.diagnostics.statistics import (
     SeedSummary,
     exceeds_one_sigma,
@@ -56,6 +57,8 @@ class Row:
         boundary_jump: mean distance between the last action of a chunk and the first of the next, in
             normalised action units; ``None`` if no episode has two chunks.
         inner_jump: mean distance between consecutive actions inside chunks; ``None`` at ``H = 1``.
+        source_leak: :attr:`SourceLeak.leak` of the policy on training data; ``None`` if not measured.
+        inner_step_ratio: :attr:`SourceLeak.inner_step_ratio`, likewise; ``None`` also at ``H = 1``.
     """
 
     task: str
@@ -71,6 +74,8 @@ class Row:
     mean_steps: float
     boundary_jump: float | None = None
     inner_jump: float | None = None
+    source_leak: float | None = None
+    inner_step_ratio: float | None = None
 
     @property
     def success_rate(self) -> float:
@@ -144,9 +149,16 @@ class Results:
         """The row of a cell (see :attr:`Row.cell`), if it was evaluated already."""
         return next((row for row in self.rows if row.cell == cell), None)
 
-    def add(self, row: Row) -> None:
-        """Append a row and save."""
+    def add(self, row: Row, order: Sequence[tuple[Any, ...]] = ()) -> None:
+        """Add a row and save.
+
+        Args:
+            row: the new one.
+            order: of the cells, whose rows come first; by default the row comes last.
+        """
         self.rows.append(row)
+        places = {cell: place for place, cell in enumerate(order)}
+        self.rows.sort(key=lambda row: places.get(row.cell, len(places)))
         self.save()
 
     def save(self) -> None:
@@ -270,7 +282,25 @@ def success_table(
     reported = [_paper_cell(first, prior, nfe) for nfe, prior in columns]
     if any(cell != "-" for cell in reported):
         lines.append(f"| {name}, paper (official data) | " + " | ".join(reported) + " |")
+    for name, field, bound in (
+        ("spread over draws of the source / data's", "source_leak", LEAK_BOUND),
+        ("step inside chunks / data's", "inner_step_ratio", INNER_STEP_BOUND),
+    ):
+        cells = [_bounded(results.rows, prior, nfe, field, bound) for nfe, prior in columns]
+        if any(cell != "-" for cell in cells):
+            lines.append(f"| {name} (bound {bound:g}) | " + " | ".join(cells) + " |")
     return "\n".join([*lines, "", *_notes(results, summaries, top_k)]) + "\n"
+
+
+def _bounded(rows: Sequence[Row], prior: str, nfe: int, field: str, bound: float) -> str:
+    """Mean of a measure over the seeds' last checkpoints, marked where it exceeds its bound."""
+    last = max(row.checkpoint for row in rows)
+    cell = [row for row in rows if (row.prior, row.nfe, row.checkpoint) == (prior, nfe, last)]
+    values = [value for row in cell if (value := getattr(row, field)) is not None]
+    if not values:
+        return "-"
+    mean = math.fsum(values) / len(values)
+    return f"{mean:.2f} (!)" if mean > bound else f"{mean:.2f}"
 
 
 def _notes(results: Results, summaries: dict[Any, SeedSummary], top_k: int) -> list[str]:
@@ -289,15 +319,18 @@ def _notes(results: Results, summaries: dict[Any, SeedSummary], top_k: int) -> l
         if seeds > 1
         else "- One seed has no spread: no gain is marked. success.png shows the episodes' posterior.",
     ]
-    bases, previews = (
-        {nfe: summary.mean for (prior, nfe), summary in summaries.items() if prior == name}
-        for name in ("gaussian", "preview")
-    )
-    if any(previews[nfe] < bases.get(nfe, 0.0) for nfe in previews):
+    measured = [row for row in results.rows if row.source_leak is not None]
+    if measured:
         notes.append(
-            "- WP-Preview is below the base here. It trains on a perfect forecast of its target and "
-            "meets its own imperfect one; at small budgets it copies that instead of correcting it "
-            "(docs/benchmarks.md, 'WP-Preview at small budgets')."
+            "- Spread and steps tell how much of the source's noise reaches the actions (last checkpoints, "
+            "training data): at or below the bound, none is seen. What exceeds it says more about the "
+            "network's training than about the source."
+        )
+    short = [PRIOR_LABELS.get(name, name) for name in results.meta.get("short_of_training", ())]
+    if short:
+        notes.append(
+            f"- {', '.join(short)}: short of training. Success still rises with more iterations than "
+            "these (docs/evidence.md, 'Training budget')."
         )
     if results.meta["data_source"] != "official":
         notes.append(

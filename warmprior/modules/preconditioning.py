@@ -70,7 +70,7 @@ class SourceMoments(nn.Module):
         if len(set(shapes)) > 1 or source_mean.ndim != 2:
             raise ValueError(f"all moments must have one shape [P, d_a], got {shapes}")
         if not all(bool(torch.isfinite(value).all()) for value in given):
-            raise ValueError("the moments hold NaN or infinity")
+            raise ValueError("the moments hold NaN or infinity: check the actions they come from")
         source_variance, target_variance = (
             value.clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance)
         )

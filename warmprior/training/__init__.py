@@ -5,7 +5,7 @@ modules: they need ``warmprior[sim]``.
 """
 
 from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
-from warmprior.training.evaluation import Episode, evaluate, parallel_env
+from warmprior.training.evaluation import Episode, evaluate, parallel_env, play_episode
 from warmprior.training.filmstrip import Filmstrip, record_filmstrip
 from warmprior.training.navigation1d import (
     NAVIGATION_PRESETS,
@@ -19,6 +19,7 @@ from warmprior.training.prior_space import PriorSpaceTraining
 from warmprior.training.prior_space_config import PriorSpaceConfig
 from warmprior.training.replay_segments import ReplaySegments
 from warmprior.training.training_config import TrainingConfig
+from warmprior.training.workers import WorkerError
 
 __all__ = [
     "NAVIGATION_PRESETS",
@@ -33,11 +34,13 @@ __all__ = [
     "PriorSpaceTraining",
     "ReplaySegments",
     "TrainingConfig",
+    "WorkerError",
     "ema_of",
     "evaluate",
     "make_optimizer",
     "navigation_priors",
     "parallel_env",
+    "play_episode",
     "precondition",
     "record_filmstrip",
     "warmup_cosine",

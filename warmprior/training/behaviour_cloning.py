@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import time
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -165,11 +167,16 @@ class BehaviourCloning:
         self.iteration += 1
         return loss.detach()
 
-    def run(self, description: str = "train") -> None:
+    def run(
+        self,
+        description: str | None = "train",
+        progress: Callable[[int], object] | None = None,
+    ) -> None:
         """Train to the end.
 
         Args:
-            description: of the progress bar.
+            description: of the progress bar; no bar if ``None``.
+            progress: called with the number of iterations after each.
 
         Raises:
             FloatingPointError: if the loss becomes NaN or infinite; the last saved state and all
@@ -185,12 +192,16 @@ class BehaviourCloning:
             desc=description,
             unit="it",
             dynamic_ncols=True,
+            disable=description is None,
         )
+        self._logged = self.iteration, time.monotonic()
         with bar:
             while self.iteration < config.iterations:
                 self._running.append(self.step())
                 bar.update()
                 i = self.iteration
+                if progress is not None:
+                    progress(i)
                 logs = i % config.log_every == 0 or i == config.iterations
                 saves = i in keep or i % save_every == 0
                 if logs or saves:
@@ -221,12 +232,16 @@ class BehaviourCloning:
         self.losses.append((self.iteration, loss))
         bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
         if self.logger is not None:
-            rate = bar.format_dict["rate"]
-            values = {"train/loss": loss, "train/learning_rate": self.schedule.get_last_lr()[0]}
+            iteration, moment = self._logged
+            self._logged = self.iteration, time.monotonic()
+            values = {
+                "train/loss": loss,
+                "train/learning_rate": self.schedule.get_last_lr()[0],
+                "train/iterations_per_second": (self.iteration - iteration)
+                / (self._logged[1] - moment),
+            }
             for name, value in values.items():
                 self.logger.log_scalar(name, value, step=self.iteration)
-            if rate:
-                self.logger.log_scalar("train/iterations_per_second", rate, step=self.iteration)
 
     def _averaged_actor(self) -> WarmPriorActor:
         ode = self.actor.ode

@@ -18,9 +18,14 @@ from warmprior._files import check_writable
 from warmprior.data.tasks import EVALUATION_SEED
 from warmprior.diagnostics.results import Results, Row
 from warmprior.diagnostics.smoothness import smoothness
+from warmprior.diagnostics.source_leak import SourceLeak
 from warmprior.modules.prior import Prior
-from warmprior.training.evaluation import Episode, evaluate, parallel_env
+from warmprior.training.evaluation import Episode
 from warmprior.training.policies import Policies
+from warmprior.training.policy_worker import PolicyWorker
+from warmprior.training.progress import ComparisonProgress
+from warmprior.training.schedule import LeakJob, PlayJob, Schedule, TrainJob
+from warmprior.training.workers import WorkerPool, available_cores
 
 __all__ = ["Comparison"]
 
@@ -70,11 +75,9 @@ class Comparison:
         self._earlier = self.results.meta.get("wall_time_s", 0.0)
 
     @property
-    def num_envs(self) -> int:
-        """Parallel environments: the preset's, or one per core that this process may use."""
-        preset = self.policies.preset
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        return min(preset.envs or cores or 1, preset.episodes)
+    def num_workers(self) -> int:
+        """Worker processes: the preset's, or one per core that this process may use."""
+        return self.policies.preset.envs or available_cores()
 
     @property
     def losses(self) -> dict[str, list[list[tuple[int, float]]]]:
@@ -96,79 +99,119 @@ class Comparison:
             "hardware": {
                 "machine": platform.machine(),
                 "cores": os.cpu_count(),
-                "torch_threads": torch.get_num_threads(),
+                "workers": self.num_workers,
+                "torch_threads": 1,
                 "device": torch.cuda.get_device_name() if cuda else "cpu",
             },
             **policies.facts(),
             "options": self.options,
-            "training": asdict(preset.training),
-            "network": {"name": preset.network, **preset.network_options},
+            "training": asdict(preset.training) | {"device": policies.device},
+            "network": {
+                "name": preset.network,
+                **preset.network_options,
+                "precondition": preset.precondition,
+            },
             "priors": [prior.config() for prior in self.priors],
+            "short_of_training": preset.short_of_training(self.priors),
             "policies": [
                 {"prior": p.config(), "seed": s, "folder": policies.folder(p, s).name}
                 for p in self.priors
                 for s in self.seeds
             ],
-            # The number of environments is part of it: it decides which noise an episode meets.
             "evaluation": {
                 "episodes": preset.episodes,
-                "envs": self.num_envs,
                 "nfes": list(self.nfes),
                 "seeds": list(self.seeds),
-                "device": policies.device,
             },
         }
 
     def run(self) -> Results:
-        """Train what is missing, evaluate what is missing.
+        """Train what is missing and play what is missing, in worker processes.
+
+        A policy is played as soon as it is trained and a worker is free. The rows and their order are the
+        same for any number of workers.
 
         Returns:
             The results, also in ``results.json``.
+
+        Raises:
+            FloatingPointError: if the loss of a training becomes NaN or infinite; the other trainings
+                stop, and continue from their last states when the run is resumed.
+            WorkerError: if a worker process dies, a ``RuntimeError``.
         """
         self._save_time()
-        for prior in self.priors:
-            for seed in self.seeds:
-                self.policies.train(prior, seed)
-                self._save_time()
-        for prior in self.priors:
-            self.evaluate(prior)
-        return self.results
+        cells = self._cells()
+        trainings = self._trainings(cells)
+        cuda = torch.device(self.policies.device).type == "cuda"
+        schedule = Schedule(trainings, trainings_at_once=1 if cuda else None)
+        worker = PolicyWorker(self.policies, len(trainings))
+        played: dict[Row, list[Episode]] = {}
+        leaks: dict[LeakJob, dict[int, SourceLeak]] = {}
+        iterations = len(trainings) * self.policies.preset.training.iterations
+        jobs = [job for following in trainings.values() for job in following]
+        episodes = sum(isinstance(job, PlayJob) for job in jobs)
+        workers = min(self.num_workers, len(trainings) + len(jobs))
+        with (
+            ComparisonProgress(iterations, episodes) as progress,
+            WorkerPool(workers, worker) as pool,
+        ):
+            while True:
+                while pool.idle and (job := schedule.next()) is not None:
+                    pool.submit(job)
+                if not pool.running:
+                    return self.results
+                for ended, result in pool.wait(0.5):
+                    if isinstance(ended, TrainJob):
+                        schedule.trained(ended)
+                        self.policies.note_trained(ended.prior, ended.seed, result)
+                        self._save_time()
+                        progress.say(f"trained {ended.prior.describe()}, seed {ended.seed}")
+                    elif isinstance(ended, LeakJob):
+                        leaks[ended] = result
+                    else:
+                        progress.played()
+                        played.setdefault(ended.row, []).append(result)
+                for empty, prior in cells.items():
+                    leak = leaks.get(self._leak_job(prior, empty))
+                    if leak is None or len(played.get(empty, ())) < empty.episodes:
+                        continue
+                    row = replace(empty, **_outcome(played.pop(empty), leak.get(empty.nfe)))
+                    self.results.add(row, [row.cell for row in cells])
+                    self._save_time()
+                    progress.say(_told(prior, row))
+                progress.trained(sum(worker.iterations))
 
-    def evaluate(self, prior: Prior) -> None:
-        """Play the evaluation episodes of every checkpoint, seed and NFE of one prior.
-
-        NFEs above the prior's maximum are left out.
-        """
-        policies, preset = self.policies, self.policies.preset
-        nfes = [nfe for nfe in self.nfes if prior.max_nfe is None or nfe <= prior.max_nfe]
-        todo = [
-            (seed, checkpoint, nfe)
+    def _cells(self) -> dict[Row, Prior]:
+        """All rows, without the outcomes, in order."""
+        return {
+            self._row(prior, seed, checkpoint, nfe): prior
+            for prior in self.priors
             for seed in self.seeds
-            for checkpoint in preset.training.checkpoint_iterations
-            for nfe in nfes
-            if self.results.find(self._row(prior, seed, checkpoint, nfe).cell) is None
-        ]
-        if not todo:
-            return
-        env = parallel_env(policies.make_env, policies.transforms(prior), self.num_envs)
-        try:
-            for seed, checkpoint, nfe in todo:
-                episodes = evaluate(
-                    policies.policy(prior, seed, checkpoint),
-                    env,
-                    episodes=preset.episodes,
-                    first_seed=EVALUATION_SEED,
-                    nfe=nfe,
-                    policy_seed=seed,
-                    description=f"evaluate {prior.describe()}, NFE {nfe}, seed {seed}, "
-                    f"iteration {checkpoint}",
-                )
-                row = self._row(prior, seed, checkpoint, nfe)
-                self.results.add(replace(row, **_outcome(episodes)))
-                self._save_time()
-        finally:
-            if not env.is_closed:
-                env.close()
+            for checkpoint in self.policies.preset.training.checkpoint_iterations
+            for nfe in self.nfes
+            if prior.max_nfe is None or nfe <= prior.max_nfe
+        }
+
+    def _leak_job(self, prior: Prior, row: Row) -> LeakJob:
+        return LeakJob(prior, row.seed, row.checkpoint, tuple(self.nfes))
+
+    def _trainings(self, cells: dict[Row, Prior]) -> dict[TrainJob, list[LeakJob | PlayJob]]:
+        """All trainings, with what the missing rows need of their policies."""
+        # By folder: two workers must not train the same policy.
+        policies = {self.policies.folder(p, s): (p, s) for p in self.priors for s in self.seeds}
+        missing = [item for item in cells.items() if self.results.find(item[0].cell) is None]
+        trainings: dict[TrainJob, list[LeakJob | PlayJob]] = {}
+        for number, (prior, seed) in enumerate(policies.values()):
+            mine = [row for row, owner in missing if (owner, row.seed) == (prior, seed)]
+            trainings[TrainJob(prior, seed, number)] = [
+                *dict.fromkeys(self._leak_job(prior, row) for row in mine),
+                *(
+                    PlayJob(prior, row, EVALUATION_SEED + episode)
+                    for row in mine
+                    for episode in range(row.episodes)
+                ),
+            ]
+        return trainings
 
     def _row(self, prior: Prior, seed: int, checkpoint: int, nfe: int) -> Row:
         return Row(
@@ -190,15 +233,34 @@ class Comparison:
         self.results.save()
 
 
-def _outcome(episodes: Sequence[Episode]) -> dict[str, Any]:
+def _outcome(episodes: Sequence[Episode], leak: SourceLeak | None) -> dict[str, Any]:
     outcome: dict[str, Any] = {
         "successes": sum(episode.success for episode in episodes),
         "mean_steps": sum(episode.steps for episode in episodes) / len(episodes),
     }
+    # Sums depend on the order: that of the seeds, not that in which the episodes ended.
+    episodes = sorted(episodes, key=lambda episode: episode.seed)
     rollout = torch.cat([episode.decisions for episode in episodes])
     # Episodes of a single decision have no boundary between chunks.
     if any(len(episode.decisions) > 1 for episode in episodes):
         smooth = smoothness(rollout)
         outcome["boundary_jump"] = smooth.boundary_jump
-        outcome["inner_jump"] = None if math.isnan(smooth.inner_jump) else smooth.inner_jump
+        outcome["inner_jump"] = _known(smooth.inner_jump)
+    if leak is not None:
+        outcome["source_leak"] = _known(leak.leak)
+        outcome["inner_step_ratio"] = _known(leak.inner_step_ratio)
     return outcome
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _told(prior: Prior, row: Row) -> str:
+    told = (
+        f"played {prior.describe()}, seed {row.seed}, iteration {row.checkpoint}, NFE {row.nfe}: "
+        f"{row.successes} of {row.episodes} solved"
+    )
+    if row.source_leak is not None:
+        told += f", source leak {row.source_leak:.2f}"
+    return told

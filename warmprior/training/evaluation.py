@@ -1,17 +1,15 @@
-"""Success rates in parallel environments, the same episodes for every policy."""
+"""Episodes of a policy and their outcomes, the same episodes for every policy."""
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import threading
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -22,12 +20,10 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.training.threads import torch_threads
+from warmprior.training.workers import end_with_parent, start_method, worker_died
 
-__all__ = ["Episode", "evaluate", "parallel_env"]
-
-
-class WorkerError(RuntimeError):
-    """A worker process of an environment died."""
+__all__ = ["Episode", "evaluate", "parallel_env", "play_episode"]
 
 
 @dataclass(frozen=True)
@@ -52,26 +48,8 @@ class Episode:
 def _transformed(
     make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]
 ) -> EnvBase:
-    _end_with_parent()
+    end_with_parent()
     return TransformedEnv(make_env(), make_transforms())
-
-
-def _end_with_parent() -> None:
-    """Let this process end when the one that started it dies, however abruptly.
-
-    A killed process cannot tell its workers to stop, and they would wait for hours: its ends of their
-    pipes stay open in whatever else it forked later. The main process is left alone.
-    """
-    if multiprocessing.parent_process() is None:
-        return
-    parent = os.getppid()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)  # nobody is left to be told, and the environment may be in the middle of a step
-
-    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 
 
 def parallel_env(
@@ -101,11 +79,9 @@ def parallel_env(
         )
         for i in range(num_envs)
     ]
-    # Forking starts in a second instead of a minute, but a process that uses CUDA must not fork.
     # Without shared buffers the parent sleeps while workers simulate; with them it polls and would
     # take a core from the workers.
-    method = "spawn" if torch.cuda.is_initialized() else "fork"
-    return ParallelEnv(num_envs, workers, mp_start_method=method, use_buffers=False)
+    return ParallelEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
 
 
 @contextmanager
@@ -151,10 +127,8 @@ def watched(env: EnvBase) -> Iterator[None]:
                 with suppress(ValueError):  # already closed
                     worker.terminate()
         if dead:
-            raise WorkerError(
-                f"an environment worker died: {dead[0]}. It may have been killed for lack of memory; "
-                "use fewer --envs, or run one environment in this process to see its own error."
-            ) from error
+            advice = "run one environment in this process to see its own error"
+            raise worker_died(dead[0], advice) from error
         raise
     finally:
         finished.set()
@@ -178,6 +152,60 @@ def _drawing(policy: TensorDictModuleBase, seed: int, device: torch.device) -> I
 
 
 @torch.no_grad()
+def play_episode(
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    seed: int,
+    *,
+    nfe: int | None = None,
+    policy_seed: int = 0,
+) -> Episode:
+    """Play the episode of one seed.
+
+    The policy's noise belongs to the episode: its generator is seeded by
+    ``numpy.random.SeedSequence((policy_seed, seed)).generate_state(1, "uint64")``. With decisions made
+    one at a time and by one thread, the outcome depends on the arguments alone, whatever was played
+    before and wherever.
+
+    Args:
+        policy: as for :func:`evaluate`.
+        env: an environment without batch dimensions, with the policy's transforms; it tells
+            ``"success"`` and starts the same episode after every ``set_seed(seed)``.
+        seed: of the environment, at least 0.
+
+    Keyword Args:
+        nfe: as for :func:`evaluate`.
+        policy_seed: of the policy's random draws, at least 0.
+
+    Raises:
+        ValueError: if the environment has batch dimensions, or a seed is negative.
+
+    Examples:
+        >>> env = TransformedEnv(RobosuiteEnv("lift"), policy_transforms(prior))  # doctest: +SKIP
+        >>> play_episode(actor, env, seed=10_000_000, nfe=1).success  # doctest: +SKIP
+        True
+    """
+    if env.batch_size:
+        raise ValueError(f"play_episode needs a single environment, got {env.batch_size}")
+    policy.eval()
+    device = _device(policy)
+    home = env.device or torch.device("cpu")
+    options = {} if nfe is None else {"nfe": nfe}
+    noise_seed = np.random.SeedSequence((policy_seed, seed)).generate_state(1, np.uint64)
+    chunks: list[Tensor] = []
+    executed: list[Tensor] = []
+    with torch_threads(1), _drawing(policy, int(noise_seed[0]), device):
+        env.set_seed(seed)
+        data = env.reset()
+        while True:
+            data = env.step(policy(data.to(device), **options).to(home))
+            chunks.append(data[keys.CHUNK].cpu())
+            executed.append(data["next", keys.EXECUTED].cpu())
+            if data["next", "done"].all():
+                return _outcome(data["next"], seed, _decisions(chunks, executed))
+            data = env.step_mdp(data)
+
+
 def evaluate(
     policy: TensorDictModuleBase,
     env: EnvBase,
@@ -193,7 +221,9 @@ def evaluate(
     Args:
         policy: a :class:`~warmprior.WarmPriorActor`, or any module that writes chunks, such as an agent
             followed by a :class:`~warmprior.PriorDecoder`; set to evaluation mode.
-        env: a batched environment ``[n]`` with the policy's transforms, such as :func:`parallel_env`.
+        env: an environment with the policy's transforms. A single one plays the episodes one after
+            another, see :func:`play_episode`. A batched one ``[n]``, such as :func:`parallel_env`, plays
+            ``n`` at a time, and the noise that an episode meets depends on ``n``.
 
     Keyword Args:
         episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
@@ -209,57 +239,77 @@ def evaluate(
         result.
 
     Raises:
-        ValueError: if ``episodes < 1``.
+        ValueError: if ``episodes < 1``, or the environment has several batch dimensions.
         WorkerError: if a worker process dies, a ``RuntimeError``.
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")
+    if len(env.batch_size) > 1:
+        raise ValueError(f"evaluate needs a batch size [] or [n], got {list(env.batch_size)}")
+    outcomes: list[Episode] = []
+    bar = tqdm(total=episodes, desc=description, unit="ep", disable=description is None)
+
+    def report(outcome: Episode) -> None:
+        outcomes.append(outcome)
+        bar.update()
+        wins = sum(outcome.success for outcome in outcomes)
+        bar.set_postfix(success=f"{wins / len(outcomes):.2f}", refresh=False)
+
+    seeds = range(first_seed, first_seed + episodes)
+    with bar:
+        if env.batch_size:
+            _play_batched(policy, env, seeds, nfe, policy_seed, report)
+        else:
+            for seed in seeds:
+                report(play_episode(policy, env, seed, nfe=nfe, policy_seed=policy_seed))
+    return sorted(outcomes, key=lambda outcome: outcome.seed)
+
+
+@torch.no_grad()
+def _play_batched(
+    policy: TensorDictModuleBase,
+    env: EnvBase,
+    seeds: range,
+    nfe: int | None,
+    policy_seed: int,
+    report: Callable[[Episode], None],
+) -> None:
     num_envs = env.batch_size[0]
     policy.eval()
-    # Policies without an agent, such as residuals drawn for a decoder, have buffers alone, or nothing.
-    tensors = chain(policy.parameters(), policy.buffers())
-    device = next((tensor.device for tensor in tensors), torch.device("cpu"))
+    device = _device(policy)
     options = {} if nfe is None else {"nfe": nfe}
-    # The simulators need the cores; a policy's call is small, and its idle threads would spin.
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     played = [0] * num_envs
-    outcomes: list[Episode] = []
     chunks: list[list[Tensor]] = [[] for _ in played]
     executed: list[list[Tensor]] = [[] for _ in played]
-    bar = tqdm(total=episodes, desc=description, unit="ep", disable=description is None)
-    try:
-        with bar, watched(env), _drawing(policy, policy_seed, device):
-            env.set_seed(first_seed, static_seed=True)
-            data = env.reset()
-            while len(outcomes) < episodes:
-                # A worker whose episodes are all played rests; its episode numbers are i + n * played.
-                active = torch.tensor(
-                    [i + num_envs * played[i] < episodes for i in range(num_envs)]
-                )
-                if not active.all():
-                    data.set("_step", active)
-                data = env.step(policy(data.to(device), **options).to("cpu"))
-                done = data["next", "done"].flatten() & active
-                chunk, steps = data[keys.CHUNK], data["next", keys.EXECUTED]
-                for i in active.nonzero().flatten().tolist():
-                    chunks[i].append(chunk[i])
-                    executed[i].append(steps[i])
-                for i in done.nonzero().flatten().tolist():
-                    seed = first_seed + i + num_envs * played[i]
-                    decisions = _decisions(chunks[i], executed[i])
-                    outcomes.append(_outcome(data["next"][i], seed, decisions))
-                    chunks[i], executed[i] = [], []
-                    played[i] += 1
-                    bar.update()
-                    wins = sum(outcome.success for outcome in outcomes)
-                    bar.set_postfix(success=f"{wins / len(outcomes):.2f}", refresh=False)
-                data = env.step_mdp(data)
-                if done.any() and len(outcomes) < episodes:
-                    data = env.reset(data.set("_reset", done.unsqueeze(-1)))
-    finally:
-        torch.set_num_threads(threads)
-    return sorted(outcomes, key=lambda outcome: outcome.seed)
+    # The simulators need the cores; a policy's call is small, and its idle threads would spin.
+    with torch_threads(1), watched(env), _drawing(policy, policy_seed, device):
+        env.set_seed(seeds.start, static_seed=True)
+        data = env.reset()
+        while sum(played) < len(seeds):
+            # A worker whose episodes are all played rests; its episode numbers are i + n * played.
+            active = torch.tensor([i + num_envs * played[i] < len(seeds) for i in range(num_envs)])
+            if not active.all():
+                data.set("_step", active)
+            data = env.step(policy(data.to(device), **options).to("cpu"))
+            done = data["next", "done"].flatten() & active
+            chunk, steps = data[keys.CHUNK], data["next", keys.EXECUTED]
+            for i in active.nonzero().flatten().tolist():
+                chunks[i].append(chunk[i])
+                executed[i].append(steps[i])
+            for i in done.nonzero().flatten().tolist():
+                decisions = _decisions(chunks[i], executed[i])
+                report(_outcome(data["next"][i], seeds[i + num_envs * played[i]], decisions))
+                chunks[i], executed[i] = [], []
+                played[i] += 1
+            data = env.step_mdp(data)
+            if done.any() and sum(played) < len(seeds):
+                data = env.reset(data.set("_reset", done.unsqueeze(-1)))
+
+
+def _device(policy: TensorDictModuleBase) -> torch.device:
+    # Policies without an agent, such as residuals drawn for a decoder, have buffers alone, or nothing.
+    tensors = chain(policy.parameters(), policy.buffers())
+    return next((tensor.device for tensor in tensors), torch.device("cpu"))
 
 
 def _decisions(chunks: list[Tensor], executed: list[Tensor]) -> TensorDict:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
+from collections.abc import Callable, Sequence
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
@@ -16,15 +18,26 @@ from torchrl.record.loggers import get_logger
 
 from warmprior._files import check_writable
 from warmprior.data import RobomimicExperienceReplay
+from warmprior.diagnostics.held_out import SharedObservations
+from warmprior.diagnostics.source_leak import SourceLeak, source_leak
 from warmprior.envs import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
-from warmprior.training.behaviour_cloning import STATE_FORMAT, BehaviourCloning, policy_path
+from warmprior.training.behaviour_cloning import (
+    STATE_FORMAT,
+    BehaviourCloning,
+    policy_path,
+    precondition,
+)
 from warmprior.training.demonstrations import Demonstrations
 from warmprior.training.presets import Preset
+from warmprior.training.threads import torch_threads
 from warmprior.transforms import Normalizer, policy_transforms
 
 __all__ = ["Policies"]
+
+LEAK_WINDOWS = 512
+"""Observations on which the source leak of every policy is measured."""
 
 
 @dataclass
@@ -40,7 +53,7 @@ class Policies:
         preset: the budget.
         directory: where the policies lie.
         logs: folder of the training logs.
-        device: of networks and data.
+        device: to train on.
         compile: compile the velocity network in training.
         logger: TorchRL logger: ``"csv"``, ``"tensorboard"``, ``"wandb"`` or ``"none"``.
 
@@ -64,7 +77,7 @@ class Policies:
         self.task = task_of(dataset)
         self.num_episodes, self.num_steps = dataset.num_episodes, len(dataset.data)
         self.normalizer = Normalizer.fit(dataset.data)
-        self.data = self.normalizer.normalize(dataset.data.exclude("next")).to(self.device)
+        self.data = self.normalizer.normalize(dataset.data.exclude("next"))
         self.make_env = partial(
             RobosuiteEnv, env_args=dataset.env_args, style=self.demonstrations.style
         )
@@ -93,6 +106,9 @@ class Policies:
             self.data["observation"].shape[-1] + prior.context_dim(action_dim),
             prior.prediction_length,
         )
+        if self.preset.precondition:
+            steps = self.preset.observation_steps
+            network = precondition(network, self.data, prior, observation_steps=steps)
         # A copy: the policy moves to the device, the environments' normaliser stays on the CPU.
         normalizer = copy.deepcopy(self.normalizer)
         # The normalised demonstrations span [-1, 1]: what leaves it is executed, and remembered, at
@@ -108,10 +124,10 @@ class Policies:
                 prior.config(),
                 self.preset.network,
                 self.preset.network_options,
+                self.preset.precondition,
                 self.preset.observation_steps,
                 self.device,
                 self.compile,
-                torch.get_num_threads(),
                 version("torch"),
                 version("warmprior"),
                 STATE_FORMAT,
@@ -121,12 +137,17 @@ class Policies:
         name = f"{self.task}-{self.demonstrations.style}-{prior.name}-seed{seed}-{digest}"
         return self.directory / name
 
-    def train(self, prior: Prior, seed: int) -> list[tuple[int, float]]:
+    def train(
+        self, prior: Prior, seed: int, progress: Callable[[int], object] | None = None
+    ) -> list[tuple[int, float]]:
         """Train a policy; continue or reuse the stored one of the same options.
+
+        On a CPU it is trained by one thread, wherever: another number would give other weights.
 
         Args:
             prior: its source distribution.
             seed: its training seed.
+            progress: called with the number of iterations after each; a bar if ``None``.
 
         Returns:
             The training curve, ``[(iteration, loss), ...]``.
@@ -136,21 +157,62 @@ class Policies:
         """
         folder = self.folder(prior, seed)
         if folder not in self._losses:
-            training = BehaviourCloning(
-                self.new_actor(prior, seed),
-                self.data,
-                replace(self.preset.training, seed=seed),
-                folder,
-                observation_steps=self.preset.observation_steps,
-                logger=self._logger(folder.name),
-                compile=self.compile,
-            )
-            training.run(f"train {prior.describe()}, seed {seed}")
-            self._losses[folder] = training.losses
+            logger = self._logger(folder.name)
+            with (
+                torch_threads(1 if torch.device(self.device).type == "cpu" else None),
+                # A worker process ends without the exit handlers that some loggers write in.
+                nullcontext() if logger is None else closing(logger),
+            ):
+                training = BehaviourCloning(
+                    self.new_actor(prior, seed),
+                    self.data.to(self.device),
+                    replace(self.preset.training, seed=seed),
+                    folder,
+                    observation_steps=self.preset.observation_steps,
+                    logger=logger,
+                    compile=self.compile,
+                )
+                name = f"train {prior.describe()}, seed {seed}" if progress is None else None
+                training.run(name, progress)
+            self.note_trained(prior, seed, training.losses)
         return self._losses[folder]
 
+    def note_trained(self, prior: Prior, seed: int, losses: list[tuple[int, float]]) -> None:
+        """Take note of a policy that another process trained.
+
+        Args:
+            prior: its source distribution.
+            seed: its training seed.
+            losses: what :meth:`train` returned there.
+        """
+        self._losses[self.folder(prior, seed)] = losses
+
     def policy(self, prior: Prior, seed: int, checkpoint: int | None = None) -> WarmPriorActor:
-        """A trained policy of averaged weights, from disk.
+        """A policy of averaged weights, trained if it is not yet.
+
+        Args:
+            prior: its source distribution.
+            seed: its training seed.
+            checkpoint: iteration; the last by default.
+        """
+        self.train(prior, seed)
+        return self.load(prior, seed, checkpoint).to(self.device)
+
+    def load(self, prior: Prior, seed: int, checkpoint: int | None = None) -> WarmPriorActor:
+        """A trained policy of averaged weights, from disk, on the CPU.
+
+        Args:
+            prior: its source distribution.
+            seed: its training seed.
+            checkpoint: iteration; the last by default.
+
+        Raises:
+            FileNotFoundError: if it is not trained that far.
+        """
+        return WarmPriorActor.from_pretrained(self.path(prior, seed, checkpoint), prior=prior)
+
+    def path(self, prior: Prior, seed: int, checkpoint: int | None = None) -> Path:
+        """Where a policy of averaged weights lies, or will lie.
 
         Args:
             prior: its source distribution.
@@ -158,9 +220,7 @@ class Policies:
             checkpoint: iteration; the last by default.
         """
         checkpoint = self.preset.training.iterations if checkpoint is None else checkpoint
-        self.train(prior, seed)
-        path = policy_path(self.folder(prior, seed), checkpoint)
-        return WarmPriorActor.from_pretrained(path, prior=prior, device=self.device)
+        return policy_path(self.folder(prior, seed), checkpoint)
 
     def transforms(self, prior: Prior) -> partial[Any]:
         """Builder of the environment transforms that these policies need."""
@@ -170,6 +230,30 @@ class Policies:
             normalizer=self.normalizer,
             observation_steps=self.preset.observation_steps,
         )
+
+    def source_leak(
+        self, prior: Prior, seed: int, checkpoint: int, nfes: Sequence[int]
+    ) -> dict[int, SourceLeak]:
+        """How much of the source's noise a trained policy lets through, on its own training data.
+
+        Args:
+            prior: its source distribution.
+            seed: its training seed.
+            checkpoint: its iteration.
+            nfes: network evaluations per chunk to measure at.
+
+        Returns:
+            By NFE; nothing where the data have no two episodes with steps to compare.
+        """
+        steps = self.preset.observation_steps
+        data = self.data.to("cpu")
+        shared = SharedObservations(data, prior.chunk_length, observation_steps=steps)
+        chosen = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
+        shared = shared.subset(chosen[:LEAK_WINDOWS].sort()[0])
+        if len(shared.episodes.unique()) < 2:
+            return {}
+        policy = self.load(prior, seed, checkpoint)
+        return source_leak(policy, shared.windows(prior), nfes=nfes, episodes=shared.episodes)
 
     def _logger(self, name: str) -> Any:
         if self.logger == "none":
