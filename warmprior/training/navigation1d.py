@@ -32,7 +32,7 @@ from warmprior.modules import (
     VelocityMLP,
     WarmPriorActor,
 )
-from warmprior.training.behaviour_cloning import BehaviourCloning
+from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms import policy_transforms
 
@@ -49,7 +49,8 @@ class NavigationPreset:
     Attributes:
         summary: one line for ``--help``.
         training: the recipe.
-        hidden_dim: width of the network, a :class:`~warmprior.VelocityMLP` of four hidden layers.
+        hidden_dim: width of the network, a preconditioned :class:`~warmprior.VelocityMLP` of four hidden
+            layers.
     """
 
     summary: str
@@ -161,8 +162,11 @@ class NavigationStudy:
         prior = self.priors[name]
         torch.manual_seed(seed)
         width = self.data[keys.OBSERVATION].shape[-1] + prior.context_dim(1)
-        network = VelocityMLP(
-            1, width, prior.prediction_length, 1, hidden_dim=self.preset.hidden_dim
+        network = precondition(
+            VelocityMLP(1, width, prior.prediction_length, 1, hidden_dim=self.preset.hidden_dim),
+            self.data,
+            prior,
+            observation_steps=1,
         )
         nfe = self.nfe if prior.max_nfe is None else min(self.nfe, prior.max_nfe)
         training = BehaviourCloning(
