@@ -55,6 +55,11 @@ def add_options(parser: argparse.ArgumentParser) -> Callable[..., argparse.Actio
     )
     add("--iterations", type=int, help="gradient steps (default: the preset's)")
     add("--demonstrations", type=int, help="scripted demonstrations (default: the preset's)")
+    add(
+        "--precondition",
+        action=argparse.BooleanOptionalAction,
+        help="by the second moments of source and data (default: the preset's)",
+    )
     add("--out", type=Path, help="output folder (default: a numbered one under runs/)")
     add(
         "--resume",
@@ -143,6 +148,8 @@ def make_preset(args: argparse.Namespace) -> Preset:
     preset = PRESETS[args.preset]
     if args.iterations is not None:
         preset = replace(preset, training=preset.training.with_iterations(args.iterations))
+    if args.precondition is not None:
+        preset = replace(preset, precondition=args.precondition)
     return with_counts(preset, args, ("seeds", "episodes", "envs"))
 
 

@@ -41,7 +41,7 @@ def make_parser() -> argparse.ArgumentParser:
         nargs="+",
         type=int,
         default=[2_500, 5_000, 10_000, 20_000],
-        help="iterations to train for (%(default)s); --iterations has no effect",
+        help="iterations to train for, instead of --iterations (%(default)s)",
     )
     measurement.add_options(parser, observations=1000)
     return parser
@@ -121,6 +121,8 @@ def main(argv: list[str] | None = None) -> int:
     try:
         args = experiment.parse(make_parser, argv, "budget-")
         budgets = sorted(set(args.budgets))
+        if args.iterations is not None:
+            raise ValueError("--iterations is one budget: name it with --budgets")
         preset = experiment.make_preset(args)
         presets = [replace(preset, training=preset.training.with_iterations(n)) for n in budgets]
         presets = [replace(p, training=replace(p.training, checkpoints=1)) for p in presets]
