@@ -197,6 +197,13 @@ def numbered_folder(parent: Path, name: str, *, latest: bool = False) -> Path:
     return last if latest else parent / f"{name}-{number(last) + 1}"
 
 
+def check_nfes(nfes: Sequence[int]) -> list[int]:
+    """The numbers of network evaluations to compare, the largest first."""
+    if min(nfes) < 1:
+        raise ValueError(f"--nfe must be at least 1, got {min(nfes)}")
+    return sorted(set(nfes), reverse=True)
+
+
 def check(args: argparse.Namespace) -> None:
     """Refuse options that cannot work, before anything is generated or downloaded."""
     try:
@@ -256,8 +263,7 @@ def start_comparison(
     args: argparse.Namespace, preset: Preset, priors: Sequence[Prior], nfes: Sequence[int]
 ) -> Comparison:
     """Check the options, store them, and get the data: everything before the first training."""
-    if min(nfes) < 1:
-        raise ValueError(f"--nfe must be at least 1, got {min(nfes)}")
+    nfes = check_nfes(nfes)
     check(args)
     check_writable(args.out)
     options = store_options(args)
@@ -265,7 +271,7 @@ def start_comparison(
     return Comparison(
         find_policies(args, preset),
         priors,
-        nfes=sorted(set(nfes), reverse=True),
+        nfes=nfes,
         directory=args.out,
         seeds=range(preset.seeds),
         resume=args.resume,

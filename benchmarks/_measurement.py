@@ -17,8 +17,8 @@ from warmprior.training.policies import task_of
 from warmprior.transforms import Normalizer
 
 
-def add_options(parser: argparse.ArgumentParser, *, observations: int) -> None:
-    """Add the options of measurements on held-out observations."""
+def add_observation_options(parser: argparse.ArgumentParser, *, observations: int) -> None:
+    """Add the options that say what to measure on."""
     add = parser.add_argument
     add(
         "--validation",
@@ -29,8 +29,14 @@ def add_options(parser: argparse.ArgumentParser, *, observations: int) -> None:
         "--observations",
         type=int,
         default=observations,
-        help="observations to measure curvature on (%(default)s; the paper: 2000)",
+        help="held-out observations to measure on (%(default)s; the paper's curvature: 2000)",
     )
+
+
+def add_options(parser: argparse.ArgumentParser, *, observations: int) -> None:
+    """Add the options of curvature on held-out observations."""
+    add_observation_options(parser, observations=observations)
+    add = parser.add_argument
     add("--steps", type=int, default=100, help="Euler steps (%(default)s, the paper's)")
     add("--draws", type=int, default=1, help="source samples per observation (%(default)s)")
 
@@ -38,7 +44,7 @@ def add_options(parser: argparse.ArgumentParser, *, observations: int) -> None:
 def check(args: argparse.Namespace) -> None:
     """Refuse options that cannot work, before anything is generated or trained."""
     for option, least in (("observations", 1), ("steps", 2), ("draws", 1)):
-        if getattr(args, option) < least:
+        if getattr(args, option, least) < least:
             raise ValueError(f"--{option} must be at least {least}, got {getattr(args, option)}")
     if args.validation is not None and not args.validation.is_file():
         raise FileNotFoundError(f"--validation {args.validation}: no such file")

@@ -22,9 +22,13 @@ import robomimic
 import torch
 
 from warmprior._files import check_writable, write_atomic
-from warmprior.diagnostics import action_error, plot_budget, summarize_cell
+from warmprior.diagnostics import (
+    SharedObservations,
+    action_error,
+    plot_budget,
+    summarize_cell,
+)
 from warmprior.diagnostics.results import PRIOR_LABELS, Row, write_results
-from warmprior.training import Preset
 from warmprior.training.comparison import Comparison
 
 Errors = dict[tuple[str, int, int], list[float]]
@@ -43,44 +47,53 @@ def make_parser() -> argparse.ArgumentParser:
         default=[2_500, 5_000, 10_000, 20_000],
         help="iterations to train for, instead of --iterations (%(default)s)",
     )
-    measurement.add_options(parser, observations=1000)
+    measurement.add_observation_options(parser, observations=1000)
     return parser
 
 
-def compare(args: argparse.Namespace, preset: Preset, options: dict[str, Any]) -> Comparison:
-    """Train and evaluate all sources at one budget."""
-    iterations = preset.training.iterations
-    comparison = Comparison(
-        experiment.find_policies(args, preset),
-        robomimic.make_priors(args),
-        nfes=sorted(set(args.nfe), reverse=True),
-        directory=args.out / f"iterations-{iterations}",
-        seeds=range(preset.seeds),
-        resume=args.resume,
-        options=options,
-    )
-    print(f"\nBudget: {iterations} iterations", flush=True)
-    comparison.run()
-    return comparison
-
-
-def held_out_errors(args: argparse.Namespace, comparison: Comparison) -> Errors:
-    """Of the last policies, on demonstrations that no policy was trained on."""
-    policies, errors = comparison.policies, Errors()
-    for prior in comparison.priors:
-        observations, _ = measurement.observe(
-            args,
-            comparison.results.meta,
-            policies.normalizer,
-            chunk_length=prior.chunk_length,
-            observation_steps=policies.preset.observation_steps,
+def make_comparisons(
+    args: argparse.Namespace, nfes: list[int], options: dict[str, Any]
+) -> list[Comparison]:
+    """One comparison of all sources per budget, the smallest first."""
+    preset, comparisons = experiment.make_preset(args), []
+    for iterations in sorted(set(args.budgets)):
+        training = replace(preset.training.with_iterations(iterations), checkpoints=1)
+        comparisons.append(
+            Comparison(
+                experiment.find_policies(args, replace(preset, training=training)),
+                robomimic.make_priors(args),
+                nfes=nfes,
+                directory=args.out / f"iterations-{iterations}",
+                seeds=range(preset.seeds),
+                resume=args.resume,
+                options=options,
+            )
         )
+    return comparisons
+
+
+def observe(args: argparse.Namespace, comparison: Comparison) -> SharedObservations:
+    """The held-out observations, the same for all policies."""
+    policies = comparison.policies
+    observations, _ = measurement.observe(
+        args,
+        comparison.results.meta,
+        policies.normalizer,
+        chunk_length=args.chunk,
+        observation_steps=policies.preset.observation_steps,
+    )
+    return observations
+
+
+def held_out_errors(comparison: Comparison, observations: SharedObservations) -> Errors:
+    """Of the last policies, on demonstrations that no policy was trained on."""
+    iterations, errors = comparison.policies.preset.training.iterations, Errors()
+    for prior in comparison.priors:
         windows = observations.windows(prior)
         for seed in comparison.seeds:
-            found = action_error(policies.policy(prior, seed), windows, nfes=comparison.nfes)
-            for nfe, error in found.items():
-                key = (prior.name, policies.preset.training.iterations, nfe)
-                errors.setdefault(key, []).append(error)
+            policy = comparison.policies.policy(prior, seed)
+            for nfe, error in action_error(policy, windows, nfes=comparison.nfes).items():
+                errors.setdefault((prior.name, iterations, nfe), []).append(error)
     return errors
 
 
@@ -117,34 +130,56 @@ def rows_of(errors: Mapping[tuple[str, int, int], list[float]]) -> list[dict[str
     ]
 
 
+def report(args: argparse.Namespace, comparisons: Sequence[Comparison], errors: Errors) -> str:
+    """Write what is known so far: results, table and picture."""
+    rows = [row for comparison in comparisons for row in comparison.results.rows]
+    meta, top_k = comparisons[0].results.meta, comparisons[0].policies.preset.top_k
+    budgets = [
+        {"iterations": c.policies.preset.training.iterations, "folder": c.directory.name}
+        for c in comparisons
+    ]
+    records = (row.record() for row in rows)
+    facts = {key: meta[key] for key in ("versions", "task", "style", "data", "options", "priors")}
+    path = args.out / "results.json"
+    write_results(path, facts | {"budgets": budgets}, records, held_out=rows_of(errors))
+    if not rows:
+        return ""
+    table = make_table(rows, errors, top_k)
+    write_atomic(args.out / "table.md", lambda path: path.write_text(table))
+    title = f"{meta['task']} {meta['style']} ({meta['data_source']} data)"
+    plot_budget(rows, errors, args.out / "budget.png", top_k=top_k, title=title)
+    return table
+
+
 def main(argv: list[str] | None = None) -> int:
     try:
         args = experiment.parse(make_parser, argv, "budget-")
-        budgets = sorted(set(args.budgets))
         if args.iterations is not None:
             raise ValueError("--iterations is one budget: name it with --budgets")
-        preset = experiment.make_preset(args)
-        presets = [replace(preset, training=preset.training.with_iterations(n)) for n in budgets]
-        presets = [replace(p, training=replace(p.training, checkpoints=1)) for p in presets]
+        if min(args.budgets) < 1:
+            raise ValueError(f"--budgets must be at least 1, got {min(args.budgets)}")
         robomimic.make_priors(args)
+        nfes = experiment.check_nfes(args.nfe)
         experiment.check(args)
         measurement.check(args)
         check_writable(args.out)
         options = experiment.store_options(args)
         print(f"Output folder: {args.out}", flush=True)
-        rows: list[Row] = []
+        comparisons = make_comparisons(args, nfes, options)
+        # Before the hours of training: what cannot be measured on is better known now.
+        observations = observe(args, comparisons[0])
         errors: Errors = {}
-        for each in presets:
-            comparison = compare(args, each, options)
-            rows += comparison.results.rows
-            errors |= held_out_errors(args, comparison)
-            table = make_table(rows, errors, preset.top_k)
-            meta = comparison.results.meta
-            path = args.out / "results.json"
-            write_results(path, meta, map(vars, rows), held_out=rows_of(errors))
-            write_atomic(args.out / "table.md", lambda path, table=table: path.write_text(table))
-            title = f"{meta['task']} {meta['style']} ({meta['data_source']} data)"
-            plot_budget(rows, errors, args.out / "budget.png", top_k=preset.top_k, title=title)
+        finished: list[Comparison] = []
+        if not (args.out / "results.json").exists():  # from now on the folder holds a run
+            report(args, comparisons, errors)
+        for comparison in comparisons:
+            print(
+                f"\nBudget: {comparison.policies.preset.training.iterations} iterations", flush=True
+            )
+            comparison.run()
+            finished.append(comparison)
+            errors |= held_out_errors(comparison, observations)
+            table = report(args, finished, errors)
     except experiment.ERRORS as error:
         print(f"budget.py: error: {error}", file=sys.stderr)
         return 2

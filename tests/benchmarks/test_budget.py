@@ -39,6 +39,9 @@ def test_every_budget_is_a_training_of_its_own(budget, dataset, validation, tmp_
     assert budget.main(argv) == 0
     stored = json.loads((out / "results.json").read_text())
     assert [row["checkpoint"] for row in stored["rows"]] == [2, 4]
+    assert all("success_rate" in row for row in stored["rows"])
+    assert [b["iterations"] for b in stored["meta"]["budgets"]] == [2, 4]
+    assert all((out / b["folder"] / "results.json").exists() for b in stored["meta"]["budgets"])
     table = (out / "table.md").read_text()
     assert table in capsys.readouterr().out and "| 2 |" in table and "| 4 |" in table
     assert (out / "budget.png").read_bytes().startswith(b"\x89PNG")
@@ -77,11 +80,16 @@ def test_bad_options_stop_before_any_work(
         raise AssertionError("training started")
 
     monkeypatch.setattr(Policies, "train", never)
-    for extra, message in (
-        ({"iterations": 3}, "name it with --budgets"),
-        ({"budgets": [0]}, "iterations must be at least 1"),
-        ({"observations": 0}, "--observations must be at least 1"),
-        ({"validation": tmp_path / "none.hdf5"}, "none.hdf5"),
+    for i, (extra, message) in enumerate(
+        (
+            ({"iterations": 3}, "name it with --budgets"),
+            ({"budgets": [0]}, "--budgets must be at least 1, got 0"),
+            ({"nfe": 0}, "--nfe must be at least 1"),
+            ({"validation": None}, "add --validation"),
+            ({"observations": 1_000}, "1000 observations are asked for"),
+            ({"observations": 0}, "--observations must be at least 1"),
+            ({"validation": tmp_path / "none.hdf5"}, "none.hdf5"),
+        )
     ):
-        assert budget.main(arguments(dataset, tmp_path / "out", validation, **extra)) == 2
+        assert budget.main(arguments(dataset, tmp_path / str(i), validation, **extra)) == 2
         assert message in capsys.readouterr().err

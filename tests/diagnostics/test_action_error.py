@@ -21,7 +21,7 @@ class Towards(nn.Module):
         self.unused = nn.Parameter(torch.zeros(1))
 
     def forward(self, t, a, observation):
-        return observation[:, -1, 0, None, None] - a
+        return observation[:, -1, 0, None, None] - a + self.unused
 
 
 def windows(prior, n=5):
@@ -82,3 +82,14 @@ def test_same_noise_for_every_call_and_the_global_generator_untouched():
     assert torch.equal(before, torch.get_rng_state()) and policy.training
     other = action_error(policy, batch, generator=torch.Generator().manual_seed(9))
     assert other[1] != found[1]
+
+
+def test_what_cannot_be_measured_is_refused():
+    policy = WarmPriorActor(Towards(), RegressionPrior(H))
+    with pytest.raises(ValueError, match="allows none of the NFEs"):
+        action_error(policy, windows(RegressionPrior(H)), nfes=(9,))
+    policy = WarmPriorActor(Towards(), GaussianPrior(H))
+    with torch.no_grad():
+        policy.network.unused.fill_(torch.nan)
+    with pytest.raises(FloatingPointError, match="at NFE 1 a prediction is NaN"):
+        action_error(policy, windows(GaussianPrior(H)), nfes=(1,))

@@ -237,7 +237,7 @@ def edit(path, **changes):
 def test_another_format(tmp_path, version):
     saved(tmp_path)
     edit(tmp_path / "config.json", format=version)
-    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 1"):
+    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 2"):
         WarmPriorActor.from_pretrained(tmp_path)
 
 

@@ -18,7 +18,13 @@ from tests.training.cloning_parts import (
     training,
     weights,
 )
-from warmprior import PastPrior, PreviewPrior, WarmPriorActor
+from warmprior import (
+    PastPrior,
+    PreconditionedNetwork,
+    PreviewPrior,
+    SourceMoments,
+    WarmPriorActor,
+)
 from warmprior.training import TrainingConfig
 from warmprior.training.checkpoint import load_state
 
@@ -42,6 +48,20 @@ def test_a_state_of_another_run(tmp_path, part, change):
     with pytest.raises(ValueError, match=rf"belongs to another {part}: .*(folder|resume)"):
         training(tmp_path, **change)
     assert (tmp_path / "state.safetensors").read_bytes() == before
+
+
+def test_a_state_of_other_moments(tmp_path):
+    """The weights alone would fit; what they were trained to add to would be another."""
+    one = torch.ones(4, 2)
+
+    def actor(scale):
+        moments = SourceMoments(0 * one, 0 * one, one, scale * one, 0 * one)
+        return actor_for(PastPrior(4), PreconditionedNetwork(mlp(), moments=moments))
+
+    training(tmp_path, actor=actor(0.5)).run()
+    with pytest.raises(ValueError, match="belongs to another network"):
+        training(tmp_path, actor=actor(0.25))
+    assert training(tmp_path, actor=actor(0.5)).iteration == CONFIG.iterations
 
 
 def test_a_damaged_state(tmp_path):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -127,6 +127,36 @@ def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
     finally:
         for module, mode in modes:
             module.training = mode
+
+
+def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
+    """Those that the prior allows, ascending.
+
+    Raises:
+        ValueError: if it allows none, or the solver cannot spend one.
+    """
+    limit = policy.prior.max_nfe
+    allowed = sorted({nfe for nfe in nfes if limit is None or nfe <= limit})
+    if not allowed:
+        raise ValueError(f"{policy.prior} allows none of the NFEs {tuple(nfes)}")
+    for nfe in allowed:
+        policy.ode.check_nfe(nfe)
+    return allowed
+
+
+def predict(
+    policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, *, nfe: int, split: int
+) -> Tensor:
+    """The chunks ``[N, P, d_a]`` that windows ``[N]`` and sources lead to, ``split`` at a time.
+
+    Raises:
+        FloatingPointError: if one is NaN or infinite.
+    """
+    parts = rows.clone(recurse=False).set(keys.NOISE, a0).split(split)
+    chunk = torch.cat([policy.ode(part, nfe=nfe).get(keys.CHUNK) for part in parts])
+    if not torch.isfinite(chunk).all():
+        raise FloatingPointError(f"at NFE {nfe} a prediction is NaN or infinite")
+    return chunk
 
 
 class RunningVariance:

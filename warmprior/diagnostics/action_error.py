@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 
-from warmprior import keys
-from warmprior.diagnostics._flow import evaluation_mode, flat_windows
+from warmprior.diagnostics._flow import allowed_nfes, evaluation_mode, flat_windows, predict
 from warmprior.modules.actor import WarmPriorActor
 
 __all__ = ["action_error"]
@@ -40,12 +39,14 @@ def action_error(
             seed. One sample of the source per window, the same for every NFE.
 
     Returns:
-        By NFE, the mean over windows, the first ``H`` positions inside the episode and dimensions, in
-        squared normalised action units.
+        By NFE, ascending, the mean over windows, the first ``H`` positions inside the episode and
+        dimensions, in squared normalised action units.
 
     Raises:
         KeyError: if the windows lack a key.
-        ValueError: if the windows are empty, hold NaN or Inf, or belong to another prediction length.
+        ValueError: if the windows are empty, hold NaN or Inf, or belong to another prediction length, or
+            the prior allows none of the NFEs.
+        FloatingPointError: if a prediction is NaN or infinite.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -56,20 +57,18 @@ def action_error(
         >>> sorted(action_error(untrained, windows))
         [1, 9]
     """
-    prior, limit = policy.prior, policy.prior.max_nfe
+    prior, allowed = policy.prior, allowed_nfes(policy, nfes)
     flat = flat_windows(policy, windows, target_needed=True)
     assert flat.target is not None
     if generator is None:
         generator = torch.Generator(flat.loc.device).manual_seed(0)
     rows = windows.select(*policy.in_keys).reshape(len(flat)).to(flat.loc.device)
-    rows.set(keys.NOISE, prior.sample(flat.loc, flat.warm, generator))
+    a0 = prior.sample(flat.loc, flat.warm, generator)
     counted = flat.counted[:, : prior.chunk_length, 0]
     errors = {}
     with evaluation_mode(policy):
-        for nfe in nfes:
-            if limit is not None and nfe > limit:
-                continue
-            parts = [policy.ode(part, nfe=nfe).get(keys.CHUNK) for part in rows.split(split)]
-            error = (torch.cat(parts) - flat.target)[:, : prior.chunk_length].square()
+        for nfe in allowed:
+            chunk = predict(policy, rows, a0, nfe=nfe, split=split)
+            error = (chunk - flat.target)[:, : prior.chunk_length].square()
             errors[nfe] = float(error[counted].mean())
     return errors

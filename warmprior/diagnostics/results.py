@@ -82,6 +82,10 @@ class Row:
         """Share of successful episodes."""
         return self.successes / self.episodes
 
+    def record(self) -> dict[str, Any]:
+        """The row as it is stored."""
+        return asdict(self) | {"success_rate": self.success_rate}
+
     @property
     def cell(self) -> tuple[Any, ...]:
         """What was evaluated, without the outcome."""
@@ -163,8 +167,7 @@ class Results:
 
     def save(self) -> None:
         """Write the file atomically."""
-        rows = [asdict(row) | {"success_rate": row.success_rate} for row in self.rows]
-        write_results(self.path, self.meta, rows, **self.extra)
+        write_results(self.path, self.meta, (row.record() for row in self.rows), **self.extra)
 
 
 def write_results(

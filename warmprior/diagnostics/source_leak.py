@@ -11,7 +11,13 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics._flow import RunningVariance, evaluation_mode, flat_windows
+from warmprior.diagnostics._flow import (
+    RunningVariance,
+    allowed_nfes,
+    evaluation_mode,
+    flat_windows,
+    predict,
+)
 from warmprior.modules.actor import WarmPriorActor
 
 __all__ = ["INNER_STEP_BOUND", "LEAK_BOUND", "SourceLeak", "source_leak"]
@@ -152,12 +158,7 @@ def source_leak(
         raise ValueError(
             f"need draws >= 2, neighbours >= 1 and split >= 1, got {draws}, {neighbours} and {split}"
         )
-    prior, limit = policy.prior, policy.prior.max_nfe
-    allowed = sorted({nfe for nfe in nfes if limit is None or nfe <= limit})
-    if not allowed:
-        raise ValueError(f"{prior} allows none of the NFEs {tuple(nfes)}")
-    for nfe in allowed:
-        policy.ode.check_nfe(nfe)
+    prior, allowed = policy.prior, allowed_nfes(policy, nfes)
     flat = flat_windows(policy, windows, target_needed=True)
     assert flat.target is not None
     n, device, horizon = len(flat), flat.loc.device, prior.chunk_length
@@ -182,11 +183,8 @@ def source_leak(
         data_spread = _data_spread(observation, target, counted, episodes.to(device), neighbours)
         for _ in range(draws):
             a0 = prior.sample(flat.loc, flat.warm, generator)
-            parts = rows.set(keys.NOISE, a0).split(split)
             for nfe in allowed:
-                chunk = torch.cat([policy.ode(part, nfe=nfe).get(keys.CHUNK) for part in parts])
-                if not torch.isfinite(chunk).all():
-                    raise FloatingPointError(f"at NFE {nfe} a prediction is NaN or infinite")
+                chunk = predict(policy, rows, a0, nfe=nfe, split=split)
                 chunk = moments[nfe].add(chunk[:, :horizon])
                 steps[nfe] += _inner_step(chunk, counted) / draws
     spread = {

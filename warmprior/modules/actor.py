@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["WarmPriorActor"]
 
-FORMAT = 1
+FORMAT = 2
 """Version of the layout that :meth:`WarmPriorActor.save_pretrained` writes."""
 
 

@@ -13,7 +13,10 @@ __all__ = ["ChiTransformer"]
 
 
 class _ModulatedLayer(nn.TransformerDecoderLayer):
-    """PyTorch's pre-norm decoder layer, modulated by the memory's first token, the time."""
+    """PyTorch's pre-norm decoder layer, modulated by the memory's first token, the time.
+
+    Of its options it knows those used here: batch first, norm first, a causal mask, none on the memory.
+    """
 
     def __init__(self, dim: int, num_heads: int, **kwargs: Any) -> None:
         super().__init__(dim, num_heads, **kwargs)

@@ -19,8 +19,9 @@ __all__ = [
 class Interpolant:
     r"""The path :math:`a_t = \alpha(t) a_0 + \beta(t) a_1` and its velocity.
 
-    Subclasses give :meth:`coefficients`; they must satisfy :math:`\alpha(0)=\beta(1)=1` and
-    :math:`\alpha(1)=\beta(0)=0`, so that the flow starts at the source and ends at the data.
+    Subclasses give a ``name``, :meth:`coefficients` and, if they take arguments, :meth:`config`. The
+    coefficients must satisfy :math:`\alpha(0)=\beta(1)=1` and :math:`\alpha(1)=\beta(0)=0`, so that the flow
+    starts at the source and ends at the data.
     """
 
     name: ClassVar[str]

@@ -19,12 +19,15 @@ __all__ = ["PreconditionedNetwork", "SourceMoments"]
 VARIANCE_FLOOR = 1e-4
 """A standard deviation of 0.01, half a percent of the normalised range: what varies less is constant."""
 
+CORRELATION_LIMIT = 1 - 1e-6
+"""Source and target of a higher correlation determine each other."""
+
 
 class SourceMoments(nn.Module):
     r"""Means, variances and covariance of the source :math:`a_0` and the target :math:`a_1`.
 
     One set per chunk position and action dimension, each ``[P, d_a]`` in normalised units. Variances are
-    at least :data:`VARIANCE_FLOOR`, and covariances at most what the variances allow, so that constant
+    at least :data:`VARIANCE_FLOOR` and correlations at most :data:`CORRELATION_LIMIT`, so that constant
     dimensions, positions that are always padded and deterministic sources stay harmless.
 
     Args:
@@ -55,6 +58,7 @@ class SourceMoments(nn.Module):
     source_variance: Tensor
     target_variance: Tensor
     covariance: Tensor
+    conditional_deviation: Tensor
 
     def __init__(
         self,
@@ -71,16 +75,22 @@ class SourceMoments(nn.Module):
             raise ValueError(f"all moments must have one shape [P, d_a], got {shapes}")
         if not all(bool(torch.isfinite(value).all()) for value in given):
             raise ValueError("the moments hold NaN or infinity: check the actions they come from")
-        source_variance, target_variance = (
-            value.clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance)
+        v0, v1 = (
+            value.double().clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance)
         )
-        limit = (source_variance * target_variance).sqrt()
-        # Copies: a tensor given twice must not become one buffer under two names.
-        self.register_buffer("source_mean", source_mean.clone())
-        self.register_buffer("target_mean", target_mean.clone())
-        self.register_buffer("source_variance", source_variance)
-        self.register_buffer("target_variance", target_variance)
-        self.register_buffer("covariance", covariance.clamp(-limit, limit))
+        limit = CORRELATION_LIMIT * (v0 * v1).sqrt()
+        c = covariance.double().clamp(-limit, limit)
+        for name, value in {
+            "source_mean": source_mean,
+            "target_mean": target_mean,
+            "source_variance": v0,
+            "target_variance": v1,
+            "covariance": c,
+            # Of the target given the source. Here, because lower precisions lose the difference.
+            "conditional_deviation": (v1 - c.square() / v0).sqrt(),
+        }.items():
+            # Copies: a tensor given twice must not become one buffer under two names.
+            self.register_buffer(name, value.to(source_mean.dtype, copy=True))
 
     @classmethod
     def identity(cls, prediction_length: int, action_dim: int) -> SourceMoments:
@@ -101,7 +111,7 @@ class SourceMoments(nn.Module):
         """Estimate them from training windows and draws of the prior.
 
         Args:
-            windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[n]``.
+            windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[*B]``.
             prior: the source distribution that these windows were made for.
 
         Keyword Args:
@@ -115,7 +125,7 @@ class SourceMoments(nn.Module):
             all windows gets the moments of independent standard normal ends: no loss ever reads it.
 
         Raises:
-            ValueError: if ``samples < 2``, or there are fewer than two windows.
+            ValueError: if ``samples < 2``, there are fewer than two windows, or they are not of this prior.
         """
         if isinstance(windows, TensorDictBase):
             batches = [windows]
@@ -125,9 +135,14 @@ class SourceMoments(nn.Module):
             batches = []
             while sum(map(len, batches)) < samples:
                 batches.append(windows.sample())
-        batch = TensorDict.cat(batches)
+        batch = TensorDict.cat([batch.reshape(-1) for batch in batches])
         if len(batch) < 2:
             raise ValueError(f"moments need at least 2 windows, got {len(batch)}")
+        if batch[keys.CHUNK].shape[-2] != prior.prediction_length:
+            raise ValueError(
+                f"the windows have {batch[keys.CHUNK].shape[-2]} positions, but {prior} predicts "
+                f"{prior.prediction_length}: sample them with this very prior"
+            )
         a1 = batch[keys.CHUNK].double()
         a0 = prior.sample(batch[keys.LOC], batch[keys.WARM], generator).double()
         weight = (~batch[keys.IS_PAD]).unsqueeze(-1).double()
@@ -162,8 +177,9 @@ class PreconditionedNetwork(VelocityNetwork):
     :math:`(a_0, a_1)` is jointly Gaussian and independent of the observation. In the manner of EDM
     (Karras et al., 2022, Eq. 7), whose constants assume zero means and an independent source.
 
-    The scale is computed as :math:`|\alpha\dot\beta - \dot\alpha\beta| \sqrt{(v_0 v_1 - c^2) / Var(a_t)}`,
-    which is the same (both are a ratio of determinants) and loses no digits.
+    Variance and scale are computed without differences, with :math:`s_0 = \sqrt{v_0}` and the deviation
+    :math:`q` of the target given the source: :math:`Var(a_t) = (\alpha s_0 + \beta c / s_0)^2 + (\beta q)^2`
+    and :math:`|\alpha\dot\beta - \dot\alpha\beta| \, s_0 q / \sqrt{Var(a_t)}`.
 
     Args:
         network: :math:`F`, whose sizes this network takes over; or its :meth:`config`.
@@ -174,7 +190,8 @@ class PreconditionedNetwork(VelocityNetwork):
         interpolant: the path, that of the loss; linear by default. Or its ``config()``.
 
     Raises:
-        ValueError: if the moments do not have the network's chunk shape.
+        ValueError: if the moments do not have the network's chunk shape, or the path has no finite velocity
+            at its ends.
 
     Examples:
         >>> import torch
@@ -205,6 +222,12 @@ class PreconditionedNetwork(VelocityNetwork):
         )
         self.network = network
         self.interpolant = LinearInterpolant() if interpolant is None else interpolant
+        ends = self.interpolant.coefficients(torch.tensor([0.0, 1.0]))
+        if not all(bool(torch.isfinite(value).all()) for value in ends):
+            raise ValueError(
+                f"the path {self.interpolant.config()} has no finite velocity at its ends, where samplers "
+                "evaluate it: choose another interpolant"
+            )
         shape = (network.prediction_length, network.action_dim)
         self.moments = SourceMoments.identity(*shape) if moments is None else moments
         if tuple(self.moments.covariance.shape) != shape:
@@ -229,16 +252,18 @@ class PreconditionedNetwork(VelocityNetwork):
         """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
         alpha, beta, d_alpha, d_beta = self.interpolant.coefficients(t[:, None, None])
-        m0, m1 = self.moments.source_mean, self.moments.target_mean
-        v0, v1 = self.moments.source_variance, self.moments.target_variance
-        c = self.moments.covariance
-        variance = _combination(v0, alpha.square(), v1, beta.square())
-        scale = torch.addcmul(variance, 2 * alpha * beta, c).rsqrt()
+        moments = self.moments
+        m0, m1, c = moments.source_mean, moments.target_mean, moments.covariance
+        v0, v1, q = moments.source_variance, moments.target_variance, moments.conditional_deviation
+        s0 = v0.sqrt()
+        # Along the source, and across: a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
+        along, across = _combination(s0, alpha, c / s0, beta), beta * q
+        scale = torch.addcmul(along * along, across, across).rsqrt()
         centred = torch.addcmul(torch.addcmul(a, alpha, m0, value=-1), beta, m1, value=-1)
         standardised = centred * scale
         covariance = _combination(v0, alpha * d_alpha, v1, beta * d_beta)
         covariance = torch.addcmul(covariance, alpha * d_beta + d_alpha * beta, c)
-        remainder = (alpha * d_beta - d_alpha * beta).abs() * (v0 * v1 - c * c).clamp_min(0).sqrt()
+        remainder = (alpha * d_beta - d_alpha * beta).abs() * (s0 * q)
         learnt = self.network(t, standardised, observation)
         velocity = torch.addcmul(covariance * standardised, remainder, learnt)
         return torch.addcmul(_combination(m0, d_alpha, m1, d_beta), scale, velocity)

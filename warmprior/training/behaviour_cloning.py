@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -17,6 +18,7 @@ from tqdm import tqdm
 
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
@@ -44,7 +46,12 @@ STATE_FORMAT = 2
 
 
 def precondition(
-    network: VelocityNetwork, data: TensorDictBase, prior: Prior, *, observation_steps: int = 2
+    network: VelocityNetwork,
+    data: TensorDictBase,
+    prior: Prior,
+    *,
+    observation_steps: int = 2,
+    interpolant: Interpolant | None = None,
 ) -> PreconditionedNetwork:
     """Wrap a network in what is known of a prior's source and the demonstrations before any training.
 
@@ -55,16 +62,17 @@ def precondition(
 
     Keyword Args:
         observation_steps: ``To``.
+        interpolant: the path, that of the loss; linear by default.
 
     Returns:
-        The preconditioned network, for the linear path; the same for the same data and prior.
+        The preconditioned network; the same for the same data and prior.
     """
     generator = torch.Generator(data.device or "cpu").manual_seed(0)
     windows = window_replay_buffer(
         data, prior, batch_size=1024, observation_steps=observation_steps, generator=generator
     )
     moments = SourceMoments.fit(windows, prior, generator=generator)
-    return PreconditionedNetwork(network, moments=moments)
+    return PreconditionedNetwork(network, moments=moments, interpolant=interpolant)
 
 
 class BehaviourCloning:
@@ -176,7 +184,7 @@ class BehaviourCloning:
 
         Args:
             description: of the progress bar; no bar if ``None``.
-            progress: called with the number of iterations after each.
+            progress: called with the number of iterations, at the start and after each.
 
         Raises:
             FloatingPointError: if the loss becomes NaN or infinite; the last saved state and all
@@ -195,13 +203,14 @@ class BehaviourCloning:
             disable=description is None,
         )
         self._logged = self.iteration, time.monotonic()
+        report = progress or (lambda iteration: None)
+        report(self.iteration)
         with bar:
             while self.iteration < config.iterations:
                 self._running.append(self.step())
                 bar.update()
                 i = self.iteration
-                if progress is not None:
-                    progress(i)
+                report(i)
                 logs = i % config.log_every == 0 or i == config.iterations
                 saves = i in keep or i % save_every == 0
                 if logs or saves:
@@ -303,10 +312,14 @@ def policy_path(directory: Path, iteration: int) -> Path:
 
 
 def _network_identity(network: nn.Module) -> Any:
-    config = getattr(network, "config", None)
-    if callable(config):
-        return config()
-    return {name: list(value.shape) for name, value in network.state_dict().items()}
+    config, state = getattr(network, "config", None), network.state_dict()
+    if not callable(config):
+        return {name: list(value.shape) for name, value in state.items()}
+    # What is not trained, such as moments, is part of what a network is.
+    trained = {name for name, _ in network.named_parameters()}
+    fixed = {name: value.tolist() for name, value in state.items() if name not in trained}
+    digest = hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
+    return {**config(), "buffers": digest}
 
 
 def _data_digest(data: TensorDictBase) -> str:

@@ -44,8 +44,8 @@ class Comparison:
         options: recorded in ``results.json``.
 
     Raises:
-        ValueError: if a prior allows none of the ``nfes``, or the folder's results belong to other
-            options.
+        ValueError: if an NFE is below 1, a prior allows none of them, rows could not tell two priors apart,
+            or the folder's results belong to other options.
         OSError: if the folder cannot be written to.
     """
 
@@ -58,6 +58,16 @@ class Comparison:
     options: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if min(self.nfes) < 1:
+            raise ValueError(f"all nfes must be at least 1, got {list(self.nfes)}")
+        told: dict[tuple[str, float, int], Prior] = {}
+        for prior in self.priors:
+            same = told.setdefault((prior.name, prior.sigma, prior.chunk_length), prior)
+            if same.config() != prior.config():
+                raise ValueError(
+                    "rows tell priors apart by name, sigma and chunk length: they would not tell "
+                    f"{prior} from {same}. Compare these in runs of their own"
+                )
         for prior in self.priors:
             if prior.max_nfe is not None and prior.max_nfe < min(self.nfes):
                 raise ValueError(
@@ -172,7 +182,8 @@ class Comparison:
                         progress.played()
                         played.setdefault(ended.row, []).append(result)
                 for empty, prior in cells.items():
-                    leak = leaks.get(self._leak_job(prior, empty))
+                    job = self._leak_job(prior, empty)
+                    leak = {} if job is None else leaks.get(job)
                     if leak is None or len(played.get(empty, ())) < empty.episodes:
                         continue
                     row = replace(empty, **_outcome(played.pop(empty), leak.get(empty.nfe)))
@@ -192,7 +203,10 @@ class Comparison:
             if prior.max_nfe is None or nfe <= prior.max_nfe
         }
 
-    def _leak_job(self, prior: Prior, row: Row) -> LeakJob:
+    def _leak_job(self, prior: Prior, row: Row) -> LeakJob | None:
+        """The measure that a row needs: of the last checkpoint alone, for it costs like many episodes."""
+        if row.checkpoint != self.policies.preset.training.iterations:
+            return None
         return LeakJob(prior, row.seed, row.checkpoint, tuple(self.nfes))
 
     def _trainings(self, cells: dict[Row, Prior]) -> dict[TrainJob, list[LeakJob | PlayJob]]:
@@ -204,7 +218,7 @@ class Comparison:
         for number, (prior, seed) in enumerate(policies.values()):
             mine = [row for row, owner in missing if (owner, row.seed) == (prior, seed)]
             trainings[TrainJob(prior, seed, number)] = [
-                *dict.fromkeys(self._leak_job(prior, row) for row in mine),
+                *dict.fromkeys(job for row in mine if (job := self._leak_job(prior, row))),
                 *(
                     PlayJob(prior, row, EVALUATION_SEED + episode)
                     for row in mine

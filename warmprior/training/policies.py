@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -18,8 +18,6 @@ from torchrl.record.loggers import get_logger
 
 from warmprior._files import check_writable
 from warmprior.data import RobomimicExperienceReplay
-from warmprior.diagnostics.held_out import SharedObservations
-from warmprior.diagnostics.source_leak import SourceLeak, source_leak
 from warmprior.envs import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
@@ -35,9 +33,6 @@ from warmprior.training.threads import torch_threads
 from warmprior.transforms import Normalizer, policy_transforms
 
 __all__ = ["Policies"]
-
-LEAK_WINDOWS = 512
-"""Observations on which the source leak of every policy is measured."""
 
 
 @dataclass
@@ -230,30 +225,6 @@ class Policies:
             normalizer=self.normalizer,
             observation_steps=self.preset.observation_steps,
         )
-
-    def source_leak(
-        self, prior: Prior, seed: int, checkpoint: int, nfes: Sequence[int]
-    ) -> dict[int, SourceLeak]:
-        """How much of the source's noise a trained policy lets through, on its own training data.
-
-        Args:
-            prior: its source distribution.
-            seed: its training seed.
-            checkpoint: its iteration.
-            nfes: network evaluations per chunk to measure at.
-
-        Returns:
-            By NFE; nothing where the data have no two episodes with steps to compare.
-        """
-        steps = self.preset.observation_steps
-        data = self.data.to("cpu")
-        shared = SharedObservations(data, prior.chunk_length, observation_steps=steps)
-        chosen = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
-        shared = shared.subset(chosen[:LEAK_WINDOWS].sort()[0])
-        if len(shared.episodes.unique()) < 2:
-            return {}
-        policy = self.load(prior, seed, checkpoint)
-        return source_leak(policy, shared.windows(prior), nfes=nfes, episodes=shared.episodes)
 
     def _logger(self, name: str) -> Any:
         if self.logger == "none":

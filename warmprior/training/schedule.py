@@ -52,7 +52,7 @@ class LeakJob:
 
     def __call__(self, worker: PolicyWorker) -> dict[int, SourceLeak]:
         """The measures by NFE."""
-        return worker.policies.source_leak(self.prior, self.seed, self.checkpoint, self.nfes)
+        return worker.leak(self.prior, self.seed, self.checkpoint, self.nfes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,8 +33,12 @@ def worker_died(worker: str, advice: str) -> WorkerError:
 
 
 def start_method() -> str:
-    """How to start workers: forking takes a second instead of a minute, but not beside CUDA."""
-    return "spawn" if torch.cuda.is_initialized() else "fork"
+    """How to start workers: forking takes a second instead of a minute.
+
+    But autograd refuses to work in the child of a process that used it where a GPU is in sight, even if
+    that GPU is never used.
+    """
+    return "spawn" if torch.cuda.is_available() else "fork"
 
 
 def available_cores() -> int:
