@@ -126,7 +126,7 @@ BUDGETS = {
         chunk=8,
         threads=1,
         tasks={
-            # Weak policies: solved in 0.3 to 0.6 of the episodes.
+            # Weak policies: solved in 0.3 to 0.8 of the episodes.
             "lift": TaskBudget(demonstrations=5, iterations=300, horizon=90),
             "can": TaskBudget(iterations=500),
         },
