@@ -16,6 +16,8 @@ KEYS = {
     "windows_per_second",
     "windows_over_lerobot",
     "train_step_over_network",
+    "preconditioning_over_network",
+    "modulation_over_input",
     "actor_over_network",
     "actor_over_network_compiled",
     "env_over_robosuite",
