@@ -239,7 +239,8 @@ def _cell(summary: SeedSummary | None, base: SeedSummary | None, best: bool) -> 
     if base is None or summary is base:
         return text
     mark = "*" if exceeds_one_sigma(summary, base) else ""
-    return f"{text} ({100 * (summary.mean - base.mean):+.1f}{mark})"
+    gain = round(100 * (summary.mean - base.mean), 1) + 0.0  # no minus before a zero
+    return f"{text} ({gain:+.1f}{mark})"
 
 
 def _paper_cell(row: Row, prior: str, nfe: int) -> str:
