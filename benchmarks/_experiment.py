@@ -121,12 +121,20 @@ def parse(
             if key not in changeable and _plain(getattr(args, key)) != _plain(options[key])
         ]
         if changed:
-            told = ", ".join(f"--{key.replace('_', '-')} {options[key]}" for key in changed)
+            told = ", ".join(_as_option(key, options[key]) for key in changed)
             raise ValueError(
                 f"{out} was started with {told}: leave these out, or choose another --out"
             )
     args.task = args.task or (None if args.dataset else default_task(args))
     return args
+
+
+def _as_option(key: str, value: Any) -> str:
+    """An option as it is, or is not, on the command line."""
+    name = "--" + key.replace("_", "-")
+    if value is None or value is False:
+        return f"no {name}"
+    return name if value is True else f"{name} {value}"
 
 
 def _plain(value: Any) -> Any:

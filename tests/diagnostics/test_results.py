@@ -74,7 +74,10 @@ def test_table_shows_gains_marks_and_the_papers_row(tmp_path):
 
 def test_a_gain_that_rounds_to_zero_has_no_minus(tmp_path):
     results = Results(tmp_path / "results.json", META)
-    for prior, wins in (("gaussian", (46, 46)), ("past", (45, 47))):  # means differ by rounding alone
+    for prior, wins in (
+        ("gaussian", (46, 46)),
+        ("past", (45, 47)),
+    ):  # means differ by rounding alone
         for seed, k in enumerate(wins):
             results.add(replace(ROW, prior=prior, seed=seed, episodes=50, successes=k))
     table = success_table(results, priors=["gaussian", "past"], nfes=[1], top_k=1)
