@@ -105,6 +105,7 @@ def draw(comparison: Comparison) -> None:
             policies.transforms(prior),
             seed=EVALUATION_SEED,
             nfe=min(comparison.nfes),
+            policy_seed=comparison.seeds[0],
         )
         outcome = "solved" if strip.success else "not solved"
         plot_filmstrip(

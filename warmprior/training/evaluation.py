@@ -151,6 +151,20 @@ def _drawing(policy: TensorDictModuleBase, seed: int, device: torch.device) -> I
         yield
 
 
+@contextmanager
+def episode_noise(policy: TensorDictModuleBase, seed: int, policy_seed: int) -> Iterator[None]:
+    """Let a policy draw the noise that belongs to an episode, see :func:`play_episode`.
+
+    Args:
+        policy: as for :func:`evaluate`.
+        seed: of the environment, at least 0.
+        policy_seed: of the policy's random draws, at least 0.
+    """
+    noise_seed = np.random.SeedSequence((policy_seed, seed)).generate_state(1, np.uint64)
+    with torch_threads(1), _drawing(policy, int(noise_seed[0]), _device(policy)):
+        yield
+
+
 @torch.no_grad()
 def play_episode(
     policy: TensorDictModuleBase,
@@ -191,10 +205,9 @@ def play_episode(
     device = _device(policy)
     home = env.device or torch.device("cpu")
     options = {} if nfe is None else {"nfe": nfe}
-    noise_seed = np.random.SeedSequence((policy_seed, seed)).generate_state(1, np.uint64)
     chunks: list[Tensor] = []
     executed: list[Tensor] = []
-    with torch_threads(1), _drawing(policy, int(noise_seed[0]), device):
+    with episode_noise(policy, seed, policy_seed):
         env.set_seed(seed)
         data = env.reset()
         while True:

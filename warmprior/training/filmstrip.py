@@ -12,6 +12,7 @@ from torchrl.envs.transforms import Compose
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.training.evaluation import episode_noise
 
 __all__ = ["Filmstrip", "record_filmstrip"]
 
@@ -39,6 +40,7 @@ def record_filmstrip(
     *,
     seed: int,
     nfe: int,
+    policy_seed: int = 0,
     frames: int = 9,
     size: int = 160,
 ) -> Filmstrip:
@@ -50,8 +52,9 @@ def record_filmstrip(
         make_transforms: builds the policy's transforms.
 
     Keyword Args:
-        seed: simulator seed of the episode, and of the source samples.
+        seed: simulator seed of the episode.
         nfe: network evaluations per chunk.
+        policy_seed: of the source samples; the episode is the one of :func:`play_episode`.
         frames: how many pictures.
         size: side of a picture in pixels.
 
@@ -60,19 +63,19 @@ def record_filmstrip(
     """
     actor.eval()
     device = next(actor.parameters()).device
-    env = TransformedEnv(make_env(seed=seed), make_transforms())
-    previous = actor.sampler.generator
-    actor.sampler.generator = torch.Generator(device).manual_seed(seed)
+    env = TransformedEnv(make_env(), make_transforms())
     loop = env.base_env.loop
     states, steps = [], []
     try:
-        data = env.reset()
-        while True:
-            states.append(loop.state())
-            steps.append(int(data[keys.ELAPSED]))
-            if bool(data["done"].any()):
-                break
-            data = env.step_mdp(env.step(actor(data.to(device), nfe=nfe).to("cpu")))
+        with episode_noise(actor, seed, policy_seed):
+            env.set_seed(seed)
+            data = env.reset()
+            while True:
+                states.append(loop.state())
+                steps.append(int(data[keys.ELAPSED]))
+                if bool(data["done"].any()):
+                    break
+                data = env.step_mdp(env.step(actor(data.to(device), nfe=nfe).to("cpu")))
         # Rendering is slow, and only now is it known which states are evenly spaced.
         chosen = np.unique(np.linspace(0, len(states) - 1, frames).round().astype(int))
         pictures = []
@@ -80,6 +83,5 @@ def record_filmstrip(
             loop.set_state(states[i])
             pictures.append(env.base_env.render_frame(size=size))
     finally:
-        actor.sampler.generator = previous
         env.close()
     return Filmstrip(pictures, [steps[i] for i in chosen], bool(data["success"]))
