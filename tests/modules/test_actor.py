@@ -233,11 +233,11 @@ def edit(path, **changes):
     path.write_text(json.dumps({k: v for k, v in config.items() if v is not ...}))
 
 
-@pytest.mark.parametrize("version", [1, 3, None, "2", ...])
+@pytest.mark.parametrize("version", [2, 4, None, "3", ...])
 def test_another_format(tmp_path, version):
     saved(tmp_path)
     edit(tmp_path / "config.json", format=version)
-    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 2"):
+    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 3"):
         WarmPriorActor.from_pretrained(tmp_path)
 
 

@@ -21,7 +21,8 @@ def perturbed(network):
     """Modulation starts from no effect; give it some."""
     with torch.no_grad():
         for block in network.blocks:
-            block.modulation.weight.normal_(std=0.1)
+            for layer in (block.scale, block.shift):
+                layer.weight.normal_(std=0.1)
     return network
 
 
@@ -47,14 +48,13 @@ def test_every_input_matters():
 
 
 def test_blocks_by_hand():
-    """Adaptive layer norm: x + gate f(scale norm(x) + shift), with numbers of its own."""
+    """Adaptive layer norm: x + f(scale norm(x) + shift), with numbers of its own."""
     torch.manual_seed(0)
     network = perturbed(VelocityMLP(2, 3, 4, hidden_dim=16, num_blocks=1))
     block, time, x = network.blocks[0], torch.randn(5, 32), torch.randn(5, 16)
-    m = time @ block.modulation.weight.T + block.modulation.bias
+    scale, shift = (time @ m.weight.T + m.bias for m in (block.scale, block.shift))
     norm = (x - x.mean(1, keepdim=True)) / (x.var(1, unbiased=False, keepdim=True) + 1e-5).sqrt()
-    scale, gate, shift = m.split(16, dim=1)
-    torch.testing.assert_close(block(x, time), x + gate * block.layers(norm * scale + shift))
+    torch.testing.assert_close(block(x, time), x + block.layers(norm * scale + shift))
 
 
 @pytest.mark.parametrize("blocks", [0, 1, 3])
@@ -65,7 +65,7 @@ def test_parameter_count(blocks):
     expected = chunk * h + h
     expected += dim * dim + dim  # time
     expected += observation * h + h + h * h + h  # observation encoder
-    expected += blocks * (2 * (h * h + h) + (dim + 1) * 3 * h)  # layers and modulation
+    expected += blocks * (2 * (h * h + h) + (dim + 1) * 2 * h)  # layers and modulation
     expected += 2 * h + h * chunk + chunk  # head
     assert sum(p.numel() for p in network.parameters()) == expected
 

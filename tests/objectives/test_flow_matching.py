@@ -185,7 +185,7 @@ def test_gradients_reach_every_parameter_of_the_actor_s_network():
     actor = actor_for(prior)
     with torch.no_grad():  # modulation starts at zero, which would hide the time embedding
         for block in actor.network.blocks:
-            block.modulation.weight.normal_(std=0.1)
+            block.scale.weight.normal_(std=0.1)
     loss_of(actor, sample(prior, 64)).backward()
     assert all(p.grad is not None and p.grad.any() for p in actor.network.parameters())
 

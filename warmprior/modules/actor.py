@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["WarmPriorActor"]
 
-FORMAT = 2
+FORMAT = 3
 """Version of the layout that :meth:`WarmPriorActor.save_pretrained` writes."""
 
 

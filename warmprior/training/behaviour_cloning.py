@@ -41,7 +41,7 @@ from warmprior.transforms.window import window_replay_buffer
 
 __all__ = ["BehaviourCloning", "precondition"]
 
-STATE_FORMAT = 2
+STATE_FORMAT = 3
 """Part of every state's identity; raised whenever the same options give other weights."""
 
 
