@@ -26,6 +26,9 @@ from warmprior.training.demonstrations import Demonstrations
 from warmprior.training.policies import Policies
 from warmprior.training.workers import WorkerError
 
+COMPARED = ("gaussian", "past", "preview")
+"""What is compared by default: the paper's sources, the base of the gains first."""
+
 ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError)
 """What a user can mend: reported without a traceback."""
 
@@ -75,6 +78,18 @@ def add_options(parser: argparse.ArgumentParser) -> Callable[..., argparse.Actio
         help="TorchRL logger of the training curves (%(default)s)",
     )
     return add
+
+
+def add_prior(parser: argparse.ArgumentParser, default: Sequence[str], what: str) -> None:
+    """Add ``--prior``."""
+    parser.add_argument(
+        "--prior",
+        nargs="+",
+        default=list(default),
+        metavar="NAME",
+        help=f"{what}: of {', '.join(Prior.registered())}, or your own as package.module:Class (default: "
+        f"{' '.join(default)})",
+    )
 
 
 def launch(main: Callable[[], int]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 import _experiment as experiment
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior import Prior
 from warmprior.training import (
     NAVIGATION_PRESETS,
     PRESETS,
@@ -17,8 +17,6 @@ from warmprior.training import (
     Preset,
     PriorSpaceConfig,
 )
-
-PRIORS: dict[str, type[Prior]] = {"base": GaussianPrior, "past": PastPrior, "preview": PreviewPrior}
 
 
 @dataclass(frozen=True)
@@ -60,14 +58,14 @@ class Budget:
     """Of the agents' training: more than one only wait for each other in small networks."""
 
     def agent(
-        self, config: PriorSpaceConfig, algorithm: Any, prior: str, seed: int
+        self, config: PriorSpaceConfig, algorithm: Any, prior: Prior, seed: int
     ) -> PriorSpaceConfig:
         """The recipe of one agent."""
         return replace(
             config,
             algorithm=algorithm,
             backup_entropy=config.backup_entropy or algorithm == "dsrl-sac",
-            delta=self.base_delta if config.delta is None and prior == "base" else config.delta,
+            delta=config.delta or (None if prior.moves_source else self.base_delta),
             seed=seed,
         )
 
@@ -120,7 +118,7 @@ BUDGETS = {
             evaluation_episodes=40,
         ),
         pretraining=PRESETS["quick"],
-        priors=("base", "past"),
+        priors=experiment.COMPARED[:2],
         seeds=2,
         envs=4,
         chunk=8,
@@ -138,7 +136,7 @@ BUDGETS = {
             environment_steps=1_000_000, backup_entropy=False, evaluate_every=50_000
         ),
         pretraining=PRESETS["paper"],
-        priors=("base", "past", "preview"),
+        priors=experiment.COMPARED,
         seeds=3,
         envs=4,
         chunk=4,
@@ -191,6 +189,9 @@ def make_config(args: argparse.Namespace) -> tuple[Budget, PriorSpaceConfig]:
     budget = experiment.with_counts(budget, args, ("seeds", "envs", "chunk", "horizon"))
     if args.prior is not None:
         budget = replace(budget, priors=tuple(dict.fromkeys(args.prior)))
+    for name in budget.priors:
+        if not Prior.find(name).is_flow:
+            raise ValueError(f"--prior {name} is no flow: there is no source space to act in")
     return budget, config
 
 

@@ -5,21 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from _prior_space_budgets import PRIORS
-
 from warmprior.diagnostics import Row, plot_reinforcement, plot_success, summarize_seeds
 from warmprior.diagnostics.reinforcement_plots import agent_label
 from warmprior.training import PriorSpaceConfig, PriorSpaceTraining
 
 
-def summarize(
-    name: str, seed: int, config: PriorSpaceConfig, training: PriorSpaceTraining
-) -> dict[str, Any]:
+def summarize(seed: int, config: PriorSpaceConfig, training: PriorSpaceTraining) -> dict[str, Any]:
     """One row per agent: from where to where."""
     last = {row["evaluation"]: row for row in training.curve}
     return {
         "algorithm": config.algorithm,
-        "prior": PRIORS[name].name,
+        "prior": training.actor.prior.name,
         "backup_entropy": config.backup_entropy,
         "delta": training.decoder.delta,
         "nfe": config.nfe,

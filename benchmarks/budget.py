@@ -26,9 +26,10 @@ from warmprior.diagnostics import (
     SharedObservations,
     action_error,
     plot_budget,
+    prior_label,
     summarize_cell,
 )
-from warmprior.diagnostics.results import PRIOR_LABELS, Row, write_results
+from warmprior.diagnostics.results import Row, write_results
 from warmprior.training.comparison import Comparison
 
 Errors = dict[tuple[str, int, int], list[float]]
@@ -101,7 +102,7 @@ def make_table(rows: Sequence[Row], errors: Errors, top_k: int) -> str:
     budgets = sorted({row.checkpoint for row in rows})
     columns = list(dict.fromkeys((row.nfe, row.prior) for row in rows))
     columns.sort(key=lambda column: -column[0])
-    head = "".join(f" NFE {nfe}: {PRIOR_LABELS[prior]} |" for nfe, prior in columns)
+    head = "".join(f" NFE {nfe}: {prior_label(prior)} |" for nfe, prior in columns)
     lines = [f"| iterations |{head}", "|" + "---|" * (1 + len(columns))]
     for iterations in budgets:
         cells = []

@@ -15,18 +15,16 @@ from collections.abc import Sequence
 
 import _experiment as experiment
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior import Prior
 from warmprior._files import write_atomic
 from warmprior.diagnostics import (
     Row,
     plot_chunk_lengths,
     plot_success,
     plot_success_bars,
+    prior_label,
     summarize_cell,
 )
-from warmprior.diagnostics.results import PRIOR_LABELS
-
-COMPARED = (GaussianPrior, PastPrior, PreviewPrior)
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -34,6 +32,7 @@ def make_parser() -> argparse.ArgumentParser:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = experiment.add_options(parser)
+    experiment.add_prior(parser, experiment.COMPARED, "what to compare")
     add("--chunks", nargs="+", type=int, default=[1, 2, 4, 8, 16], help="values of H (%(default)s)")
     add("--nfe", nargs="+", type=int, default=[9, 3, 1], help="evaluations per chunk (%(default)s)")
     return parser
@@ -41,15 +40,19 @@ def make_parser() -> argparse.ArgumentParser:
 
 def make_priors(args: argparse.Namespace) -> list[Prior]:
     options = {"cold_probability": args.cold_probability}
-    return [prior(chunk, **options) for chunk in sorted(set(args.chunks)) for prior in COMPARED]
+    return [
+        Prior.make(name, chunk, **options)
+        for chunk in sorted(set(args.chunks))
+        for name in dict.fromkeys(args.prior)
+    ]
 
 
 def make_table(rows: Sequence[Row], chunks: Sequence[int], nfes: Sequence[int], top_k: int) -> str:
-    names = [prior.name for prior in COMPARED]
-    columns = [(nfe, name) for nfe in nfes for name in names]
+    columns = list(dict.fromkeys((row.nfe, row.prior) for row in rows))
+    columns.sort(key=lambda column: list(nfes).index(column[0]))
     lines = [
         "| success (%) | "
-        + " | ".join(f"NFE {nfe}: {PRIOR_LABELS[n]}" for nfe, n in columns)
+        + " | ".join(f"NFE {nfe}: {prior_label(n)}" for nfe, n in columns)
         + " |",
         "|" + "---|" * (len(columns) + 1),
     ]
@@ -104,7 +107,7 @@ def main(argv: list[str] | None = None) -> int:
         plot_success(
             shortest,
             args.out / "violins.png",
-            priors=[prior.name for prior in COMPARED],
+            priors=list(dict.fromkeys(row.prior for row in shortest)),
             nfes=nfes,
             title=f"{task}, H = {chunks[0]}",
         )

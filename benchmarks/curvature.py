@@ -25,10 +25,10 @@ from warmprior.diagnostics import (
     curvature_table,
     flow_paths,
     plot_flow_paths,
+    prior_label,
     straightness,
     write_results,
 )
-from warmprior.diagnostics.results import PRIOR_LABELS
 
 SHOWN = 40
 
@@ -70,9 +70,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
 def flows_of(priors: Sequence[Prior]) -> list[Prior]:
     """The priors that have a flow to measure; says which have none."""
     for prior in priors:
-        if prior.max_nfe is not None:
+        if not prior.is_flow:
             print(f"{prior.name} has no flow and is left out.")
-    flows = [prior for prior in priors if prior.max_nfe is None]
+    flows = [prior for prior in priors if prior.is_flow]
     if not flows:
         raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
     return flows
@@ -123,7 +123,7 @@ def draw(
     for name, (actor, *_) in actors.items():
         generator = torch.Generator(args.device).manual_seed(0)
         path = flow_paths(actor, few.windows(actor.prior), args.steps, generator=generator)
-        paths[PRIOR_LABELS[name]] = path[..., 0, args.coordinate].cpu()
+        paths[prior_label(name)] = path[..., 0, args.coordinate].cpu()
     plot_flow_paths(paths, args.out / "flow_paths.png", title=title)
 
 

@@ -20,8 +20,10 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import _experiment as experiment
 import torch
 
+from warmprior import Prior
 from warmprior._files import check_writable, write_atomic
 from warmprior.diagnostics import (
     executed_actions,
@@ -37,6 +39,7 @@ from warmprior.training import (
     NavigationStudy,
     navigation_priors,
 )
+from warmprior.training.navigation1d import NAVIGATION_PRIORS
 
 COLUMNS = {
     "switches at boundaries": "switch_rate",
@@ -51,17 +54,6 @@ COLUMNS = {
     "distance, history shifted": "shifted_distance",
     "distance, NFE 1": "one_step_distance",
 }
-PANELS = {
-    "regression": "regression",
-    "base": "flow matching from N(0, I)",
-    "history": "history-conditioned flow matching",
-    "past 0.1": "WP-Past, sigma = 0.1",
-    "past 0.5": "WP-Past, sigma = 0.5",
-}
-ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError)
-"""What a user can mend: reported without a traceback."""
-
-FLOWS = ("base", "history", "past 0.1", "past 0.5", "preview 0.5")
 
 
 def parse(argv: list[str] | None = None) -> argparse.Namespace:
@@ -72,6 +64,8 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
     presets = "; ".join(f"{name}: {p.summary}" for name, p in NAVIGATION_PRESETS.items())
     add("--preset", default="quick", choices=NAVIGATION_PRESETS, help=presets)
     add("--seeds", type=int, default=1, help="number of training seeds (default: 1)")
+    experiment.add_prior(parser, NAVIGATION_PRIORS, "what to compare, the baseline first")
+    add("--sigmas", nargs="+", type=float, default=[0.1, 0.5], help="of warm priors (%(default)s)")
     add("--chunk", type=int, default=4, help="chunk length H (default: 4)")
     add("--nfe", type=int, default=9, help="network evaluations per chunk (default: 9)")
     add("--rollouts", type=int, default=256, help="rollouts per policy (default: 256)")
@@ -99,7 +93,9 @@ def make_study(args: argparse.Namespace) -> NavigationStudy:
     out = args.out or Path("runs") / f"navigation1d-{args.preset}-h{args.chunk}"
     if (out / "results.json").exists() and not args.resume:
         raise ValueError(f"{out} holds results: add --resume, or choose another --out")
-    priors = navigation_priors(args.chunk, args.cold_probability)
+    priors = navigation_priors(
+        args.chunk, args.cold_probability, names=args.prior, sigmas=args.sigmas
+    )
     study = NavigationStudy(preset, priors, out, nfe=args.nfe, rollouts=args.rollouts)
     check_writable(out)
     return study
@@ -135,20 +131,24 @@ def table(rows: list[dict[str, Any]], names: Sequence[str]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def panel_title(prior: Prior) -> str:
+    return f"{prior.label}, sigma = {prior.sigma:g}" if prior.takes("sigma") else prior.label
+
+
 def draw(study: NavigationStudy, actors: dict[str, Any], rows: list[dict[str, Any]]) -> None:
     seed = rows[0]["seed"]
     by_name = {row["policy"]: row for row in rows if row["seed"] == seed}
     panels = {}
-    for name, label in PANELS.items():
-        row = by_name[name]
+    for name, actor in actors.items():
+        row, prior = by_name[name], actor.prior
         switches = row["switch_rate"]
         text = [f"collides {row['collision_rate']:.0%}"]
         if math.isfinite(switches):
             text[0] = f"switches sides at {switches:.1%} of boundaries, {text[0]}"
-        if name not in ("base", "regression"):
+        if prior.ever_warm:
             text.append(f"with its history shifted: collides {row['shifted_collision_rate']:.0%}")
-        heights = executed_actions(study.play(actors[name], seed))[0].squeeze(-1)
-        panels[label] = (heights, text)
+        heights = executed_actions(study.play(actor, seed))[0].squeeze(-1)
+        panels[panel_title(prior)] = (heights, text)
     chunk = rows[0]["chunk"]
     recipe = f"H = {chunk}, {study.preset.hidden_dim}-d network, "
     recipe += f"{study.preset.training.iterations} iterations, seed {seed}"
@@ -160,7 +160,7 @@ def draw(study: NavigationStudy, actors: dict[str, Any], rows: list[dict[str, An
     )
     # One window of a demonstration, above the first obstacle, from many source samples.
     paths = {}
-    for name in FLOWS:
+    for name in (name for name, actor in actors.items() if actor.prior.is_flow):
         window = study.observations.windows(actors[name].prior)
         index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
         batch = window[index : index + 1].expand(48).contiguous()
@@ -177,7 +177,7 @@ def main(argv: list[str] | None = None) -> int:
     args = parse(argv)
     try:
         study = make_study(args)
-    except ERRORS as error:
+    except experiment.ERRORS as error:
         print(f"navigation1d.py: error: {error}", file=sys.stderr)
         return 2
     if study.preset.hidden_dim < 512:
@@ -202,7 +202,7 @@ def main(argv: list[str] | None = None) -> int:
                 draw(study, actors, rows)
         text = table(rows, list(study.priors))
         write_atomic(study.directory / "table.md", lambda path: path.write_text(text))
-    except ERRORS as error:
+    except experiment.ERRORS as error:
         print(f"navigation1d.py: error: {error}", file=sys.stderr)
         return 2
     print(f"\n{text}\nResults, table and pictures: {study.directory}")

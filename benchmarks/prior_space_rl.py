@@ -24,7 +24,7 @@ from typing import Any
 
 import _experiment as experiment
 import torch
-from _prior_space_budgets import BUDGETS, PRIORS, Budget, algorithms, make_config
+from _prior_space_budgets import BUDGETS, Budget, algorithms, make_config
 from _prior_space_report import draw, make_table, summarize
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -69,7 +69,7 @@ def make_parser() -> argparse.ArgumentParser:
         choices=("dsrl-na", "dsrl-sac"),
         help="default: dsrl-na; for transport in paper dsrl-sac too, the official choice",
     )
-    add("--prior", nargs="+", choices=PRIORS, help="default: the preset's")
+    add("--prior", nargs="+", metavar="NAME", help="as for robomimic.py (default: the preset's)")
     add("--delta", type=float, help="half the agent's box (default: 0.5 around a mean, 1.5 else)")
     add("--horizon", type=int, help="time limit in control steps (default: the preset's or task's)")
     add("--alpha", type=float, help="initial temperature (default: the preset's)")
@@ -102,12 +102,11 @@ def default_task(args: argparse.Namespace) -> str:
     return "navigation" if args.preset == "unit" else "lift"
 
 
-def toy_task(args: argparse.Namespace, budget: Budget, name: str, seed: int) -> Task:
+def toy_task(args: argparse.Namespace, budget: Budget, prior: Prior, seed: int) -> Task:
     """A policy that knows both routes, and the toy that rewards one."""
-    priors = {name: PRIORS[name](budget.chunk)}
-    study = NavigationStudy(budget.pretraining, priors, args.out / "policies")
+    study = NavigationStudy(budget.pretraining, {prior.name: prior}, args.out / "policies")
     with torch_threads(budget.threads):
-        actor = study.train(name, seed).to(args.device)
+        actor = study.train(prior.name, seed).to(args.device)
 
     def make_env(env_seed: int) -> EnvBase:
         transforms = policy_transforms(actor.prior, observation_steps=1)
@@ -126,33 +125,34 @@ def manipulation_env(make_workers: Callable[[], EnvBase], prior: Prior, env_seed
 
 def manipulation_tasks(
     args: argparse.Namespace, budget: Budget
-) -> tuple[Callable[[str, int], Task], dict[str, Any]]:
+) -> tuple[Callable[[Prior, int], Task], dict[str, Any]]:
     """Frozen policies and simulators, by prior and seed; and the facts about them."""
     stored = None
     if args.run is None:
         policies = experiment.find_policies(args, budget.pretraining)
     else:
         policies, stored = finished_policies(args)
-        missing = [name for name in budget.priors if PRIORS[name].name not in stored]
+        names = [Prior.find(name).name for name in budget.priors]
+        missing = [name for name in names if name not in stored]
         if missing:
             raise ValueError(
                 f"--run {args.run} has policies of {', '.join(stored)}, but none of {', '.join(missing)}"
             )
 
-    def frozen(name: str, seed: int) -> WarmPriorActor:
+    def frozen(prior: Prior, seed: int) -> WarmPriorActor:
         if stored is None:
-            return policies.policy(PRIORS[name](budget.chunk), seed)
-        group = stored[PRIORS[name].name]
+            return policies.policy(prior, seed)
+        group = stored[prior.name]
         if seed >= len(group):
-            print(f"--run has {len(group)} seeds of {name}: agent {seed} shares a policy")
+            print(f"--run has {len(group)} seeds of {prior.name}: agent {seed} shares a policy")
         return group[seed % len(group)]
 
-    def task(name: str, seed: int) -> Task:
+    def task(prior: Prior, seed: int) -> Task:
         # A copy of its own: to continue, an agent must find the very policy it began with, even if
         # another version would train another by now.
-        kept = args.out / "policies" / f"{name}-seed{seed}"
+        kept = args.out / "policies" / f"{prior.name}-seed{seed}"
         if not (args.resume and (kept / "config.json").exists()):
-            frozen(name, seed).save_pretrained(kept)
+            frozen(prior, seed).save_pretrained(kept)
         actor = WarmPriorActor.from_pretrained(kept, device=args.device)
         transforms = partial(
             policy_transforms,
@@ -217,24 +217,26 @@ def main(argv: list[str] | None = None) -> int:
         curve: list[dict[str, Any]] = []
         diverged: list[str] = []
         started = time.monotonic()
-        for seed, algorithm, name in product(range(budget.seeds), algorithms(args), budget.priors):
-            mine = budget.agent(config, algorithm, name, seed)
-            actor, make_env = task(name, seed)
+        priors = [Prior.make(name, budget.chunk) for name in budget.priors]
+        for seed, algorithm, prior in product(range(budget.seeds), algorithms(args), priors):
+            agent = f"{algorithm} {prior.name}, seed {seed}"
+            mine = budget.agent(config, algorithm, prior, seed)
+            actor, make_env = task(prior, seed)
             training = PriorSpaceTraining(
                 actor,
                 make_env,
                 mine,
-                args.out / f"{algorithm}-{name}-seed{seed}",
+                args.out / f"{algorithm}-{prior.name}-seed{seed}",
                 evaluation_seed=EVALUATION_SEED,
-                description=f"{algorithm} {name}, seed {seed}",
+                description=agent,
             )
             try:
                 with torch_threads(budget.threads):
                     training.run()
-                rows.append(summarize(name, seed, mine, training))
+                rows.append(summarize(seed, mine, training))
             except FloatingPointError as error:  # no reason to keep the other agents from learning
-                diverged.append(f"{algorithm} {name}, seed {seed}: {error}")
-            key = {"algorithm": algorithm, "prior": PRIORS[name].name, "seed": seed}
+                diverged.append(f"{agent}: {error}")
+            key = {"algorithm": algorithm, "prior": prior.name, "seed": seed}
             curve += [key | row for row in training.curve]
             meta["wall_time_s"] = time.monotonic() - started
             write_results(args.out / "results.json", meta, rows, curve=curve)

@@ -14,37 +14,20 @@ from collections.abc import Callable
 
 import _experiment as experiment
 
-from warmprior import (
-    GaussianPrior,
-    HistoryPrior,
-    PastPrior,
-    PreviewPrior,
-    Prior,
-    RegressionPrior,
-)
+from warmprior import Prior
 from warmprior._files import write_atomic
 from warmprior.data.tasks import EVALUATION_SEED
 from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
-from warmprior.diagnostics.results import PRIOR_LABELS, success_table
+from warmprior.diagnostics.results import success_table
 from warmprior.envs import rendering_backend
 from warmprior.training.comparison import Comparison
 from warmprior.training.filmstrip import record_filmstrip
-
-COMPARED = (GaussianPrior, PastPrior, PreviewPrior)
-BASELINES = (RegressionPrior, HistoryPrior)
-PRIORS: dict[str, type[Prior]] = {prior.name: prior for prior in COMPARED + BASELINES}
 
 
 def add_options(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
     """Add the options of a comparison of sources and return ``parser.add_argument``."""
     add = experiment.add_options(parser)
-    add(
-        "--prior",
-        nargs="+",
-        default=[prior.name for prior in COMPARED],
-        choices=PRIORS,
-        help="sources and baselines; the first in this order is the base (default: the first three)",
-    )
+    experiment.add_prior(parser, experiment.COMPARED, "what to compare, gains being over the first")
     add("--sigma", type=float, help="noise of the warm priors (default: past 0.5, preview 1.0)")
     add("--nfe", nargs="+", type=int, default=[9, 3, 1], help="evaluations per chunk (%(default)s)")
     add("--chunk", type=int, default=8, help="chunk length H (%(default)s)")
@@ -64,15 +47,11 @@ def parse(argv: list[str] | None = None) -> argparse.Namespace:
 
 
 def make_priors(args: argparse.Namespace) -> list[Prior]:
-    if args.sigma is not None and not {"past", "preview"} & set(args.prior):
-        raise ValueError("--sigma belongs to the warm priors past and preview; none is compared")
-    priors = []
-    for name in sorted(set(args.prior), key=list(PRIORS).index):
-        options = {"cold_probability": args.cold_probability}
-        if name in ("past", "preview"):
-            options["sigma"] = args.sigma
-        priors.append(PRIORS[name](args.chunk, **options))
-    return priors
+    names = list(dict.fromkeys(args.prior))
+    if args.sigma is not None and not any(Prior.find(name).takes("sigma") for name in names):
+        raise ValueError(f"--sigma belongs to warm priors; {', '.join(names)} take none")
+    options = {"sigma": args.sigma, "cold_probability": args.cold_probability}
+    return [Prior.make(name, args.chunk, **options) for name in names]
 
 
 def draw(comparison: Comparison) -> None:
@@ -97,14 +76,13 @@ def draw(comparison: Comparison) -> None:
         )
         return
     for prior in comparison.priors:
-        if prior.max_nfe is not None and prior.max_nfe < min(comparison.nfes):
-            continue
+        nfe = min(prior.allowed_nfes(comparison.nfes))
         strip = record_filmstrip(
             policies.policy(prior, comparison.seeds[0]),
             policies.make_env,
             policies.transforms(prior),
             seed=EVALUATION_SEED,
-            nfe=min(comparison.nfes),
+            nfe=nfe,
             policy_seed=comparison.seeds[0],
         )
         outcome = "solved" if strip.success else "not solved"
@@ -112,8 +90,7 @@ def draw(comparison: Comparison) -> None:
             strip.frames,
             [f"step {step}" for step in strip.steps],
             out / f"filmstrip_{prior.name}.png",
-            title=f"{PRIOR_LABELS[prior.name]}, NFE {min(comparison.nfes)}, episode "
-            f"{EVALUATION_SEED}: {outcome}",
+            title=f"{prior.label}, NFE {nfe}, episode {EVALUATION_SEED}: {outcome}",
         )
 
 

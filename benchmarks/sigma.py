@@ -17,7 +17,7 @@ from typing import Any
 import _experiment as experiment
 import _measurement as measurement
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior import Prior
 from warmprior._files import write_atomic
 from warmprior.diagnostics import (
     Row,
@@ -26,11 +26,9 @@ from warmprior.diagnostics import (
     straightness,
     summarize_cell,
 )
-from warmprior.diagnostics.results import PRIOR_LABELS
 from warmprior.training.comparison import Comparison
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
-VARIANTS: dict[str, type[Prior]] = {prior.name: prior for prior in (PastPrior, PreviewPrior)}
 
 
 def make_parser() -> argparse.ArgumentParser:
@@ -39,7 +37,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     add = experiment.add_options(parser)
     add("--sigmas", nargs="+", type=float, default=list(SIGMAS), help="default: the paper's seven")
-    add("--variants", nargs="+", default=list(VARIANTS), choices=VARIANTS, help="default: both")
+    experiment.add_prior(parser, experiment.COMPARED[1:], "warm priors, beside the Gaussian source")
     add("--nfe", type=int, default=1, help="evaluations per chunk (%(default)s, the paper's)")
     add("--chunk", type=int, default=8, help="chunk length H (%(default)s)")
     measurement.add_options(parser, observations=500)
@@ -47,12 +45,19 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def make_priors(args: argparse.Namespace) -> list[Prior]:
-    priors: list[Prior] = [GaussianPrior(args.chunk, cold_probability=args.cold_probability)]
-    for variant in dict.fromkeys(args.variants):
-        for sigma in sorted(set(args.sigmas), reverse=True):
-            options = {"sigma": sigma, "cold_probability": args.cold_probability}
-            priors.append(VARIANTS[variant](args.chunk, **options))
-    return priors
+    names = list(dict.fromkeys(args.prior))
+    fixed = [name for name in names if not Prior.find(name).takes("sigma")]
+    if fixed:
+        raise ValueError(f"--prior {' '.join(fixed)}: sigma has no effect there; name warm priors")
+    cold = args.cold_probability
+    return [
+        Prior.make(experiment.COMPARED[0], args.chunk),
+        *(
+            Prior.make(name, args.chunk, sigma=sigma, cold_probability=cold)
+            for name in names
+            for sigma in sorted(set(args.sigmas), reverse=True)
+        ),
+    ]
 
 
 def observe(args: argparse.Namespace, comparison: Comparison) -> tuple[SharedObservations, str]:
@@ -109,8 +114,7 @@ def make_table(
             f"{trained['bound']:.2f}",
             f"{deployed['bound']:.2f}",
         ]
-        name = PRIOR_LABELS[prior.name]
-        lines.append(f"| {name} | {prior.sigma:g} | " + " | ".join(values) + " |")
+        lines.append(f"| {prior.label} | {prior.sigma:g} | " + " | ".join(values) + " |")
     lines += [
         "",
         "- Curvature (relative to the Gaussian source) and bound (in squared normalised action units) are "

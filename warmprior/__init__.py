@@ -39,12 +39,14 @@ from warmprior.transforms import (
     ActionHistory,
     ActionWindow,
     ChunkStep,
+    MeanObservation,
     Normalizer,
     ObservationStack,
     PriorAnchor,
     PriorSpace,
     policy_transforms,
     window_replay_buffer,
+    window_transforms,
 )
 
 __version__ = version("warmprior")
@@ -61,6 +63,7 @@ __all__ = [
     "HistoryPrior",
     "Interpolant",
     "LinearInterpolant",
+    "MeanObservation",
     "Normalizer",
     "ODEActor",
     "ObservationStack",
@@ -86,4 +89,5 @@ __all__ = [
     "make_prior_space_critic",
     "policy_transforms",
     "window_replay_buffer",
+    "window_transforms",
 ]

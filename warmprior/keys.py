@@ -10,6 +10,7 @@ of the denormalising transform.
 constant                key                                    shape and dtype
 ======================  =====================================  ==================================
 :data:`OBSERVATION`     ``"observation"``                      ``[*B, To, d_o]`` float
+:data:`CONDITIONED`     ``("prior", "observation")``           ``[*B, To, d_o + P * d_a + 1]`` float
 :data:`ACTION`          ``"action"``                           ``[*B, d_a]`` float
 :data:`LOC`             ``("prior", "loc")``                   ``[*B, P, d_a]`` float
 :data:`WARM`            ``("prior", "warm")``                  ``[*B, P, 1]`` bool
@@ -38,6 +39,7 @@ from torchrl.data.vla import ACTION_CHUNK_KEY, ACTION_IS_PAD_KEY, ACTION_KEY, OB
 
 OBSERVATION = OBSERVATION_KEY
 ACTION = ACTION_KEY
+CONDITIONED = ("prior", "observation")
 LOC = ("prior", "loc")
 WARM = ("prior", "warm")
 ANCHOR = ("prior", "anchor")

@@ -16,7 +16,7 @@ import pytest
 import torch
 
 from tests.benchmarks.conftest import options
-from warmprior import WarmPriorActor
+from warmprior import Prior, WarmPriorActor
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("tqdm")
@@ -138,6 +138,8 @@ def test_resume_goes_on_where_it_stopped(benchmark, tmp_path, monkeypatch):
         ("--preset quick --task navigation", "navigation and --preset unit belong together"),
         ("--preset unit --task can", "navigation and --preset unit belong together"),
         ("--preset unit --horizon 9", "a time limit of its own: leave out --horizon"),
+        ("--preset unit --prior regression", "--prior regression is no flow"),
+        ("--preset unit --prior nobodys", "unknown prior 'nobodys'"),
         ("--horizon 0", "--horizon must be at least 1, got 0"),
         (
             "--preset unit --data mh",
@@ -161,7 +163,6 @@ def test_bad_options_stop_before_any_work(benchmark, tmp_path, capsys, words, me
     ("words", "message"),
     [
         ("--algorithm dsrl-xy", "invalid choice: 'dsrl-xy'"),
-        ("--prior regression", "invalid choice: 'regression'"),
         ("--task tool_hang", "invalid choice: 'tool_hang'"),
         ("--detla 0.5", "unrecognized arguments: --detla"),
     ],
@@ -183,22 +184,24 @@ def test_papers_recipes(benchmark):
     for task, values in known.items():
         args = benchmark.make_parser().parse_args(["--preset", "paper", "--task", task])
         budget, config = benchmark.make_config(args)
-        agents = {name: budget.agent(config, "dsrl-na", name, 0) for name in budget.priors}
-        base = agents["base"].delta or 1.5
+        priors = {name: Prior.make(name, budget.chunk) for name in budget.priors}
+        agents = {n: budget.agent(config, "dsrl-na", prior, 0) for n, prior in priors.items()}
+        base = agents["gaussian"].delta or 1.5
         found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
         assert (*found, budget.horizon, budget.chunk, base) == values
         assert agents["past"].delta is None  # the paper's 0.5
-        assert budget.agent(config, "dsrl-sac", "past", 3).seed == 3
+        assert budget.agent(config, "dsrl-sac", priors["past"], 3).seed == 3
         assert (config.alpha_init, config.tau, config.batch_size) == (1.0, 0.005, 256)
-        assert budget.priors == ("base", "past", "preview")
+        assert budget.priors == ("gaussian", "past", "preview")
         expected = ["dsrl-na", "dsrl-sac"] if task == "transport" else ["dsrl-na"]
         assert benchmark.algorithms(args) == expected
     args = benchmark.make_parser().parse_args(
         ["--preset", "paper", "--task", "transport", "--delta", "0.7"]
     )
     budget, config = benchmark.make_config(args)
-    for name in ("base", "past"):
-        assert budget.agent(config, "dsrl-na", name, 0).delta == 0.7
+    for name in ("gaussian", "past"):
+        prior = Prior.make(name, 8)
+        assert budget.agent(config, "dsrl-na", prior, 0).delta == 0.7
     args = benchmark.make_parser().parse_args(["--preset", "paper", "--dataset", "x.hdf5"])
     with pytest.raises(ValueError, match=r"add the --task of --dataset x.hdf5"):
         benchmark.make_config(args)

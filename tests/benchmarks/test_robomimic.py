@@ -61,6 +61,19 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
     assert rows == [row for row in stored["rows"] if row["prior"] == "past"]
 
 
+def test_a_prior_of_ones_own_enters_by_its_place(benchmark, dataset, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(benchmark, "rendering_backend", lambda: None)
+    out, place = tmp_path / "runs" / "own", "tests.benchmarks.user_priors:HeldAction"
+    argv = options(dataset, out, prior=["gaussian", place], sigma=0.2, envs=2)
+    assert benchmark.main(argv) == 0
+    assert "NFE 1: Base | NFE 1: Held action |" in capsys.readouterr().out
+    stored = json.loads((out / "results.json").read_text())
+    assert [(row["prior"], row["sigma"]) for row in stored["rows"]] == [
+        ("gaussian", 1.0),
+        ("held", 0.2),
+    ]
+
+
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
@@ -74,6 +87,8 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
         ({"demonstrations": 5}, "leave out"),
         ({"prior": "gaussian", "sigma": 0.5}, "--sigma"),
         ({"prior": "regression", "nfe": 9}, "regression"),
+        ({"prior": "nobodys"}, "unknown prior 'nobodys'"),
+        ({"prior": "no.such.module:Prior"}, "no prior at no.such.module:Prior"),
         ({"dataset": "missing.hdf5"}, "missing.hdf5"),
     ],
 )

@@ -96,7 +96,7 @@ def test_sigma_study(scripts, finished, dataset, validation):
         dataset,
         seeds=2,
         iterations=60,
-        variants="past",
+        prior="past",
         sigmas=[0.5, 1.0, 0.0],
         **measured(out, validation),
     )

@@ -115,7 +115,7 @@ def test_bad_input_is_named():
         branching_bound(data[:0], GaussianPrior(H))
     with pytest.raises(ValueError, match=r"Eq\. 1"):
         branching_bound(data, HistoryPrior(H))
-    with pytest.raises(ValueError, match="at most 1"):
+    with pytest.raises(ValueError, match="no path of 2 steps"):
         branching_cost(policy(lambda t, a, o: -a, RegressionPrior(H)), data)
     with pytest.raises(ValueError, match="draws"):
         branching_cost(actor, data, draws=0)

@@ -8,7 +8,14 @@ import pytest
 import torch
 
 from tests.diagnostics.fields import D_A, H, batch, policy
-from warmprior import HistoryPrior, PastPrior, PreviewPrior, RegressionPrior, VelocityMLP
+from warmprior import (
+    HistoryPrior,
+    MeanObservation,
+    PastPrior,
+    PreviewPrior,
+    RegressionPrior,
+    VelocityMLP,
+)
 from warmprior.diagnostics import compare_curvature, curvature
 from warmprior.modules import WarmPriorActor
 
@@ -69,7 +76,9 @@ def test_executed_positions_and_padding_count_separately():
 def network_policy(prior=None, seed=0):
     prior = PastPrior(H) if prior is None else prior
     torch.manual_seed(0)
-    network = VelocityMLP(D_A, 4 + prior.context_dim(D_A), prior.prediction_length, 1, hidden_dim=8)
+    network = VelocityMLP(
+        D_A, 4 + MeanObservation.width(prior, D_A), prior.prediction_length, 1, hidden_dim=8
+    )
     return WarmPriorActor(network, prior, generator=torch.Generator().manual_seed(seed))
 
 
@@ -97,10 +106,9 @@ def test_draws_average_independent_sources():
 
 def test_batch_shape_mode_and_generator_are_respected():
     actor = network_policy(HistoryPrior(H)).train()
-    flat = curvature(actor, batch(6), 10, generator=torch.Generator().manual_seed(0))
-    shaped = curvature(
-        actor, batch(6).reshape(2, 3), 10, generator=torch.Generator().manual_seed(0)
-    )
+    data = MeanObservation()(batch(6))
+    flat = curvature(actor, data, 10, generator=torch.Generator().manual_seed(0))
+    shaped = curvature(actor, data.reshape(2, 3), 10, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(shaped["kappa"].flatten(), flat["kappa"])
     assert actor.training and actor.network.training
     assert not flat["kappa"].requires_grad

@@ -14,7 +14,14 @@ from tensordict import TensorDict
 from torchrl.envs import GymEnv, StepCounter, TransformedEnv
 from torchrl.envs.transforms import Compose
 
-from warmprior import ChunkStep, HistoryPrior, PastPrior, VelocityMLP, WarmPriorActor
+from warmprior import (
+    ChunkStep,
+    HistoryPrior,
+    MeanObservation,
+    PastPrior,
+    VelocityMLP,
+    WarmPriorActor,
+)
 from warmprior.diagnostics import HistoryShift, compare_smoothness, executed_actions, smoothness
 
 
@@ -118,7 +125,7 @@ def test_what_is_not_executed_may_be_anything():
 @pytest.mark.parametrize("prior_class", [PastPrior, HistoryPrior])
 def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(prior_class):
     prior = prior_class(2)
-    network = VelocityMLP(1, 3 + prior.context_dim(1), 2, 1, hidden_dim=8)
+    network = VelocityMLP(1, 3 + MeanObservation.width(prior, 1), 2, 1, hidden_dim=8)
     actor = WarmPriorActor(network, prior, generator=torch.Generator().manual_seed(0))
     data = TensorDict(
         {
@@ -133,7 +140,7 @@ def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(prior_clas
     expected = data.clone()
     noise = torch.randn(4, 2, 1, generator=torch.Generator().manual_seed(5))
     expected["prior", "loc"][:2] += 0.3 * noise[:2]
-    chunk = actor(expected)["vla_action", "chunk"]
+    chunk = actor(MeanObservation()(expected))["vla_action", "chunk"]
     actor.sampler.generator.manual_seed(0)
     shifted = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(5))
     out = shifted(data)

@@ -11,7 +11,7 @@ from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
     HistoryPrior,
-    ODEActor,
+    MeanObservation,
     PastPrior,
     PolynomialInterpolant,
     PreviewPrior,
@@ -19,6 +19,7 @@ from warmprior import (
     RegressionPrior,
     VelocityMLP,
     WarmPriorActor,
+    keys,
     policy_transforms,
     window_replay_buffer,
 )
@@ -28,7 +29,7 @@ H, D_A, D_O, TO = 3, 2, 5, 2
 
 def actor_for(prior, **options):
     torch.manual_seed(3)
-    width = D_O + prior.context_dim(D_A)
+    width = D_O + MeanObservation.width(prior, D_A)
     network = VelocityMLP(D_A, width, prior.prediction_length, TO, hidden_dim=16)
     return WarmPriorActor(network, prior, **options)
 
@@ -109,27 +110,28 @@ def test_history_conditions_the_network_at_decisions_and_not_the_source():
         },
         [4],
     )
-    out = actor(data.clone())
+    observe = MeanObservation()
+    out = actor(observe(data.clone()))
     noise = torch.randn(4, H, D_A, generator=torch.Generator().manual_seed(5))
     assert torch.equal(out["prior", "noise"], noise)
     other = data.clone()
     other["prior", "loc"] = other["prior", "loc"] + 1.0
     other["prior", "noise"] = noise
-    again = actor.ode(other)["vla_action", "chunk"]
+    again = actor.ode(observe(other))["vla_action", "chunk"]
     chunk = out["vla_action", "chunk"]
     assert not torch.isclose(again[:2], chunk[:2]).all(-1).any()
     assert torch.equal(again[2:], chunk[2:])  # the mean of a cold sample is not seen
     # Without a batch dimension.
-    single = data[0].clone().set(("prior", "noise"), noise[0])
+    single = observe(data[0].clone()).set(("prior", "noise"), noise[0])
     torch.testing.assert_close(actor.ode(single)["vla_action", "chunk"], chunk[0])
 
 
-def test_history_actor_names_the_keys_it_lacks():
-    actor = actor_for(HistoryPrior(H))
+def test_a_mean_observation_names_the_keys_it_lacks():
     data = TensorDict({"observation": torch.zeros(1, TO, D_O)}, [1])
-    data["prior", "noise"] = torch.zeros(1, H, D_A)
-    with pytest.raises(KeyError, match="warm"):
-        actor.ode(data)
+    with pytest.raises(KeyError, match=r"MeanObservation needs .*missing: .*'loc'.*'warm'"):
+        MeanObservation()(data)
+    with pytest.raises(KeyError, match=r"missing: \[\('prior', 'observation'\)\]"):
+        actor_for(HistoryPrior(H))(windows(PastPrior(H)))
 
 
 def test_a_half_warm_mean_counts_as_history():
@@ -137,33 +139,25 @@ def test_a_half_warm_mean_counts_as_history():
         conditions_network = True
 
     prior = Conditioned(H)
-    assert prior.context_dim(D_A) == 2 * H * D_A + 1
+    assert MeanObservation.width(prior, D_A) == 2 * H * D_A + 1
     batch = windows(prior)
-    out = prior.extend_observation(
-        batch["observation"], batch["prior", "loc"], batch["prior", "warm"]
-    )
-    assert out.shape == (32, TO, D_O + prior.context_dim(D_A))
+    out = batch[keys.CONDITIONED]
+    assert out.shape == (32, TO, D_O + MeanObservation.width(prior, D_A))
+    assert torch.equal(out[..., :D_O], batch["observation"])
     assert (out[..., -1] == 1).all() and not out[..., -1 - H * D_A : -1].any()
 
 
 @pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior, RegressionPrior])
 def test_other_priors_leave_the_observation_alone(prior_class):
-    prior, o = prior_class(H), torch.randn(4, TO, D_O)
-    loc = torch.ones(4, prior.prediction_length, D_A)
-    assert prior.context_dim(D_A) == 0
-    assert prior.extend_observation(o, loc, loc[..., :1].bool()) is o
-    assert ODEActor(lambda t, a, o: a, prior=prior).in_keys == [("prior", "noise"), "observation"]
-
-
-@pytest.mark.parametrize(("prior_class", "sigma"), [(RegressionPrior, 0.1), (HistoryPrior, 0.5)])
-def test_sigma_has_one_possible_value(prior_class, sigma):
-    with pytest.raises(ValueError, match="sigma must be"):
-        prior_class(H, sigma=sigma)
+    prior = prior_class(H)
+    assert MeanObservation.width(prior, D_A) == 0
+    assert keys.CONDITIONED not in windows(prior).keys(True)
+    assert actor_for(prior).in_keys[0] == "observation"
 
 
 @pytest.mark.parametrize("prior_class", [RegressionPrior, HistoryPrior])
 def test_saved_and_loaded_policies_act_alike(prior_class, tmp_path):
-    prior = prior_class(H, cold_probability=0.2)
+    prior = prior_class(H)
     assert Prior.from_config(prior.config()).config() == prior.config()
     actor = actor_for(prior, generator=torch.Generator().manual_seed(1))
     actor.save_pretrained(tmp_path)
@@ -177,7 +171,7 @@ def test_saved_and_loaded_policies_act_alike(prior_class, tmp_path):
 @pytest.mark.parametrize("prior_class", [RegressionPrior, HistoryPrior])
 def test_rollout_in_an_environment(prior_class):
     prior = prior_class(4)
-    network = VelocityMLP(1, 3 + prior.context_dim(1), 4, hidden_dim=8)
+    network = VelocityMLP(1, 3 + MeanObservation.width(prior, 1), 4, hidden_dim=8)
     env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(prior))
     rollout = env.rollout(3, WarmPriorActor(network, prior))
     assert rollout["prior", "warm"].all(1).flatten().tolist() == (

@@ -18,6 +18,7 @@ from warmprior import (
     ChunkStep,
     GaussianPrior,
     HistoryPrior,
+    MeanObservation,
     Normalizer,
     PastPrior,
     PreviewPrior,
@@ -26,6 +27,7 @@ from warmprior import (
     RegressionPrior,
     VelocityMLP,
     WarmPriorActor,
+    keys,
     make_prior_space_actor,
 )
 
@@ -35,7 +37,7 @@ H, D_A, D_O, TO = 3, ACTION_DIM, 5, 2
 def make_actor(prior, **options):
     torch.manual_seed(1)
     network = VelocityMLP(
-        D_A, D_O + prior.context_dim(D_A), prior.prediction_length, TO, hidden_dim=16
+        D_A, D_O + MeanObservation.width(prior, D_A), prior.prediction_length, TO, hidden_dim=16
     )
     return WarmPriorActor(network, prior, **options)
 
@@ -92,10 +94,10 @@ def test_another_number_of_evaluations():
 def test_history_conditioned_policy_sees_its_mean():
     prior = HistoryPrior(H)
     actor = make_actor(prior, nfe=2)
-    data = batch(prior, 4)
+    data = MeanObservation()(batch(prior, 4))
     data["prior", "anchor"] = torch.zeros_like(data["prior", "anchor"])
     decoder = PriorDecoder(actor, delta=1.5)
-    assert {("prior", "loc"), ("prior", "warm")} <= set(decoder.in_keys)
+    assert keys.CONDITIONED in decoder.in_keys
     out = decoder(data.clone())
     with torch.no_grad():
         reference = actor.ode(data.set(("prior", "noise"), data["prior", "delta"]))

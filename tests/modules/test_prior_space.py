@@ -13,6 +13,7 @@ from warmprior import (
     BoxTanhNormal,
     GaussianPrior,
     HistoryPrior,
+    MeanObservation,
     PastPrior,
     PriorDecoder,
     ResidualSampler,
@@ -41,7 +42,8 @@ def batch(n):
 
 def make_decoder(prior, delta):
     return PriorDecoder(
-        WarmPriorActor(VelocityMLP(D_A, D_O + prior.context_dim(D_A), P), prior), delta=delta
+        WarmPriorActor(VelocityMLP(D_A, D_O + MeanObservation.width(prior, D_A), P), prior),
+        delta=delta,
     )
 
 

@@ -9,7 +9,14 @@ from torchrl.data import Categorical
 from torchrl.envs import SerialEnv, TransformedEnv
 
 from tests.toy_env import ACTION_DIM, CountingEnv
-from warmprior import PastPrior, PriorAnchor, VelocityMLP, WarmPriorActor, policy_transforms
+from warmprior import (
+    MeanObservation,
+    PastPrior,
+    PriorAnchor,
+    VelocityMLP,
+    WarmPriorActor,
+    policy_transforms,
+)
 from warmprior.training import PriorSpaceConfig, PriorSpaceTraining
 
 H = 3
@@ -39,7 +46,7 @@ class SolvableEnv(CountingEnv):
 def make_actor(prior=None, seed=0, action_dim=ACTION_DIM):
     prior = PastPrior(H) if prior is None else prior
     torch.manual_seed(seed)
-    observation_dim = 2 + ACTION_DIM + prior.context_dim(action_dim)
+    observation_dim = 2 + ACTION_DIM + MeanObservation.width(prior, action_dim)
     network = VelocityMLP(action_dim, observation_dim, prior.prediction_length, 1, hidden_dim=8)
     return WarmPriorActor(network, prior, nfe=2, clip=1.0)
 

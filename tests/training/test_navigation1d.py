@@ -56,7 +56,7 @@ def test_windows_are_the_demonstrated_steps_with_a_full_history(tiny):
         assert torch.equal(earlier[:, :4].flatten(0, 1)[:4], tiny.data["action"][:4])
 
 
-@pytest.mark.parametrize("name", ["base", "regression", "history", "preview 0.1"])
+@pytest.mark.parametrize("name", ["gaussian", "regression", "history", "preview 0.1"])
 def test_policies_are_reproducible_and_reused(tiny, name):
     actor = tiny.train(name, seed=1)
     assert actor.ode.nfe == (1 if name == "regression" else 9)
@@ -86,9 +86,9 @@ def test_straightness_covers_the_flows(tiny):
     actors = {name: tiny.train(name, seed=1) for name in tiny.priors}
     result = tiny.straightness(actors, seed=0, n_steps=5)
     assert set(result) == set(actors) - {"regression"}
-    assert result["base"]["ratio"] == 1.0 or math.isnan(result["base"]["ratio"])
+    assert result["gaussian"]["ratio"] == 1.0 or math.isnan(result["gaussian"]["ratio"])
     # Windows inside the data: WP-Past's bound is that of a slowly varying height.
-    assert result["past 0.1"]["bound"] < result["past 0.5"]["bound"] < result["base"]["bound"]
+    assert result["past 0.1"]["bound"] < result["past 0.5"]["bound"] < result["gaussian"]["bound"]
     assert "bound" not in result["history"]
 
 
@@ -148,7 +148,10 @@ def test_the_earlier_prediction_has_noise_of_its_own(tiny, monkeypatch):
 
 
 def test_a_study_is_fair_or_refused(tmp_path):
-    mixed = {"base": navigation_priors(4)["base"], "past 0.1": navigation_priors(8)["past 0.1"]}
+    mixed = {
+        "gaussian": navigation_priors(4)["gaussian"],
+        "past 0.1": navigation_priors(8)["past 0.1"],
+    }
     with pytest.raises(ValueError, match="one chunk length"):
         NavigationStudy(NAVIGATION_PRESETS["quick"], mixed, tmp_path)
     with pytest.raises(ValueError, match="rollouts"):
@@ -158,7 +161,7 @@ def test_a_study_is_fair_or_refused(tmp_path):
 def test_warm_sources_stop_mode_switching(tmp_path):
     """A third of the benchmark's budget, one seed: the contrast is far larger than what that costs."""
     study = study_in(tmp_path, iterations=1_000)
-    actors = {name: study.train(name, 0) for name in ("base", "past 0.1")}
+    actors = {name: study.train(name, 0) for name in ("gaussian", "past 0.1")}
     base, past = (study.judge(actor, 0) for actor in actors.values())
     assert base["switch_rate"] > 0.4 and base["collision_rate"] > 0.8
     assert past["switch_rate"] < 0.05 and past["collision_rate"] < 0.3
@@ -171,7 +174,7 @@ def test_the_figure_at_the_benchmarks_budget(tmp_path, seed):
     study = study_in(tmp_path)
     actors = {name: study.train(name, seed) for name in list(study.priors)[:5]}
     rows = {name: study.judge(actor, seed) for name, actor in actors.items()}
-    assert rows["base"]["switch_rate"] > 0.4 and rows["base"]["collision_rate"] > 0.8
+    assert rows["gaussian"]["switch_rate"] > 0.4 and rows["gaussian"]["collision_rate"] > 0.8
     assert rows["past 0.1"]["switch_rate"] < 0.03 and rows["past 0.1"]["collision_rate"] < 0.15
     assert rows["past 0.5"]["route_entropy"] > 1.6 and rows["past 0.5"]["collision_rate"] < 0.15
     assert rows["regression"]["collision_rate"] == 1.0
@@ -181,6 +184,6 @@ def test_the_figure_at_the_benchmarks_budget(tmp_path, seed):
     assert rows["history"]["shifted_distance"] > 2 * rows["past 0.1"]["shifted_distance"]
     straightness = study.straightness(actors, seed)
     assert straightness["past 0.1"]["ratio"] < straightness["past 0.5"]["ratio"] < 0.3
-    heights = executed_actions(study.play(actors["base"], seed))[0].squeeze(-1)
+    heights = executed_actions(study.play(actors["gaussian"], seed))[0].squeeze(-1)
     # Each decision of the base alone is right: it stays near the data, on either side.
     assert navigation_metrics(heights, 4).distance < 0.1

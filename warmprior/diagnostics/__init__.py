@@ -1,5 +1,6 @@
 """Success statistics, tables and figures."""
 
+from warmprior.diagnostics._figure import prior_color, prior_label
 from warmprior.diagnostics.action_error import action_error
 from warmprior.diagnostics.branching import branching_bound, branching_cost
 from warmprior.diagnostics.curvature import compare_curvature, curvature
@@ -75,6 +76,8 @@ __all__ = [
     "plot_sigma",
     "plot_success",
     "plot_success_bars",
+    "prior_color",
+    "prior_label",
     "probability_better",
     "smoothness",
     "source_leak",

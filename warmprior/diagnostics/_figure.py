@@ -1,18 +1,30 @@
-"""What all figures share: a canvas without display, and the colour of each source."""
+"""What all tables and figures share: a canvas without display, and how each source is shown."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from warmprior._extras import require
+from warmprior.modules.prior import Prior
 
-COLORS = {
-    "gaussian": "#7f7f7f",
-    "past": "#1f77b4",
-    "preview": "#d95f02",
-    "regression": "#b8860b",
-    "history": "#6a51a3",
-}
+__all__ = ["new_figure", "prior_color", "prior_label"]
+
+
+def prior_label(name: str) -> str:
+    """What tables and figures call a prior: its own label, or the name where it is not imported.
+
+    Examples:
+        >>> prior_label("past"), prior_label("not imported")
+        ('WP-Past', 'not imported')
+    """
+    prior = Prior.registered().get(name)
+    return name if prior is None else prior.label
+
+
+def prior_color(name: str) -> str | None:
+    """The colour of a prior in figures; ``None`` (matplotlib's next) where it is not imported."""
+    prior = Prior.registered().get(name)
+    return None if prior is None else prior.color
 
 
 def new_figure(

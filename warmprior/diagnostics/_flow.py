@@ -22,7 +22,7 @@ class Windows:
 
     Attributes:
         shape: the batch's own shape.
-        observation: what the network sees, ``[N, To, d_o + context]``.
+        observation: what the network sees, ``[N, To, d_o]``.
         loc: ``[N, P, d_a]``.
         warm: bool ``[N, P, 1]``.
         counted: positions inside the episode, bool ``[N, P, 1]``.
@@ -87,12 +87,18 @@ def flat_windows(
     counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
     return Windows(
         batch.batch_size,
-        prior.extend_observation(observation, loc, warm),
+        observation,
         loc,
         warm,
         counted,
         target,
     )
+
+
+def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
+    """The observations of a batch without the mean that a conditioned network sees beside them."""
+    conditioned = policy.prior.conditions_network
+    return batch.get(keys.OBSERVATION if conditioned else policy.in_keys[0])
 
 
 def check_flow(policy: WarmPriorActor, steps: int) -> None:
@@ -103,11 +109,9 @@ def check_flow(policy: WarmPriorActor, steps: int) -> None:
     """
     if steps < 1:
         raise ValueError(f"a path needs at least 1 step, got {steps}")
-    limit = policy.prior.max_nfe
-    if limit is not None and limit < steps:
+    if not policy.prior.is_flow and steps > 1:
         raise ValueError(
-            f"{policy.prior} trains its field for at most {limit} network evaluation(s): it has no "
-            f"path of {steps} steps"
+            f"{policy.prior} trains its field for one network evaluation: it has no path of {steps} steps"
         )
 
 
@@ -135,10 +139,7 @@ def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
     Raises:
         ValueError: if it allows none, or the solver cannot spend one.
     """
-    limit = policy.prior.max_nfe
-    allowed = sorted({nfe for nfe in nfes if limit is None or nfe <= limit})
-    if not allowed:
-        raise ValueError(f"{policy.prior} allows none of the NFEs {tuple(nfes)}")
+    allowed = sorted(set(policy.prior.allowed_nfes(nfes)))
     for nfe in allowed:
         policy.ode.check_nfe(nfe)
     return allowed

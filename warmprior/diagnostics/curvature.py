@@ -18,6 +18,7 @@ from warmprior.diagnostics._flow import (
     evaluation_mode,
     field_of,
     flat_windows,
+    observed,
 )
 from warmprior.diagnostics.branching import branching_cost, executed_positions
 from warmprior.modules.actor import WarmPriorActor
@@ -207,7 +208,7 @@ def compare_curvature(
     lengths = {name: policy.prior.chunk_length for name, policy in policies.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"curvatures compare at one chunk length only, got {lengths}")
-    observations = [batches[name].get(policy.in_keys[0]) for name, policy in policies.items()]
+    observations = [observed(policy, batches[name]) for name, policy in policies.items()]
     if any(not torch.equal(observations[0], other) for other in observations[1:]):
         raise ValueError("curvatures compare on the same observations only; these batches differ")
     results: dict[str, dict[str, float]] = {}

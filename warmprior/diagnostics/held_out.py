@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -10,7 +12,8 @@ from warmprior import keys
 from warmprior.diagnostics.paths import forecast_mean
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
-from warmprior.transforms.window import ActionWindow
+from warmprior.transforms.mean_observation import MeanObservation
+from warmprior.transforms.window import window_transforms
 
 __all__ = ["SharedObservations"]
 
@@ -94,8 +97,9 @@ class SharedObservations:
                 f"policies compare at one chunk length only: these observations have H = "
                 f"{self.chunk_length}, {prior} has {prior.chunk_length}"
             )
-        whole = Prior.from_config(prior.config() | {"cold_probability": 0.0})
-        window = ActionWindow(self.data, whole, observation_steps=self.observation_steps)
+        whole = copy.copy(prior)
+        whole.cold_probability = 0.0
+        window = window_transforms(self.data, whole, observation_steps=self.observation_steps)
         frames = (self.frames - offset).to(self.data[keys.EPISODE].device)
         return window(TensorDict({keys.FRAME: frames}, [len(frames)]))
 
@@ -112,7 +116,8 @@ class SharedObservations:
         """
         earlier = self.windows(policy.prior, offset=self.chunk_length)
         met = forecast_mean(policy, earlier, generator=generator)
-        return self.windows(policy.prior).to(met.device).update(met)
+        windows = self.windows(policy.prior).to(met.device).update(met)
+        return MeanObservation()(windows) if policy.prior.conditions_network else windows
 
     def subset(self, index: Tensor) -> SharedObservations:
         """Some of the observations.

@@ -7,6 +7,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.transforms.mean_observation import MeanObservation
 
 __all__ = ["HistoryShift"]
 
@@ -50,6 +51,8 @@ class HistoryShift(TensorDictModuleBase):
         _, loc_key, warm_key = self.in_keys
         loc, warm = tensordict.get(loc_key), tensordict.get(warm_key)
         noise = torch.randn(loc.shape, generator=self.generator, dtype=loc.dtype, device=loc.device)
-        seen = tensordict.select(*self.in_keys).set(loc_key, loc + self.std * noise * warm)
+        seen = tensordict.clone(recurse=False).set(loc_key, loc + self.std * noise * warm)
+        if self.policy.prior.conditions_network:
+            seen = MeanObservation()(seen)
         out = self.policy(seen)
         return tensordict.update(out.select(*self.out_keys))

@@ -2,27 +2,44 @@
 
 from __future__ import annotations
 
-__all__ = ["PAPER_CURVATURE", "PAPER_PRIORS", "PAPER_SIGMA", "PAPER_SUCCESS", "paper_success"]
+__all__ = ["PAPER_CURVATURE", "PAPER_SIGMA", "PAPER_SUCCESS", "paper_success"]
 
-PAPER_PRIORS = ("gaussian", "past", "preview")
-
-#: Table 1, Robomimic with state observations, H = 8, percent:
-#: (task, data) -> NFE -> (Gaussian, WP-Past, WP-Preview).
-PAPER_SUCCESS: dict[tuple[str, str], dict[int, tuple[float, float, float]]] = {
-    ("square", "ph"): {9: (86.7, 88.1, 88.1), 3: (86.2, 88.0, 87.9), 1: (83.6, 86.6, 87.3)},
-    ("square", "mh"): {9: (65.9, 69.2, 72.7), 3: (65.4, 73.2, 72.9), 1: (65.9, 70.1, 77.8)},
-    ("transport", "ph"): {9: (34.1, 36.2, 43.3), 3: (39.0, 44.0, 49.1), 1: (36.8, 39.8, 47.6)},
-    ("transport", "mh"): {9: (16.3, 20.7, 24.3), 3: (21.3, 30.7, 30.4), 1: (23.3, 30.2, 34.5)},
-    ("tool_hang", "ph"): {9: (79.4, 80.6, 82.8), 3: (72.3, 75.1, 75.8), 1: (77.7, 78.2, 81.9)},
+#: Table 1, Robomimic with state observations, H = 8, percent: (task, data) -> prior -> NFE -> success rate.
+PAPER_SUCCESS: dict[tuple[str, str], dict[str, dict[int, float]]] = {
+    ("square", "ph"): {
+        "gaussian": {9: 86.7, 3: 86.2, 1: 83.6},
+        "past": {9: 88.1, 3: 88.0, 1: 86.6},
+        "preview": {9: 88.1, 3: 87.9, 1: 87.3},
+    },
+    ("square", "mh"): {
+        "gaussian": {9: 65.9, 3: 65.4, 1: 65.9},
+        "past": {9: 69.2, 3: 73.2, 1: 70.1},
+        "preview": {9: 72.7, 3: 72.9, 1: 77.8},
+    },
+    ("transport", "ph"): {
+        "gaussian": {9: 34.1, 3: 39.0, 1: 36.8},
+        "past": {9: 36.2, 3: 44.0, 1: 39.8},
+        "preview": {9: 43.3, 3: 49.1, 1: 47.6},
+    },
+    ("transport", "mh"): {
+        "gaussian": {9: 16.3, 3: 21.3, 1: 23.3},
+        "past": {9: 20.7, 3: 30.7, 1: 30.2},
+        "preview": {9: 24.3, 3: 30.4, 1: 34.5},
+    },
+    ("tool_hang", "ph"): {
+        "gaussian": {9: 79.4, 3: 72.3, 1: 77.7},
+        "past": {9: 80.6, 3: 75.1, 1: 78.2},
+        "preview": {9: 82.8, 3: 75.8, 1: 81.9},
+    },
 }
 
-#: Table 2, curvature relative to the Gaussian source: (task, data) -> (WP-Past, WP-Preview).
-PAPER_CURVATURE: dict[tuple[str, str], tuple[float, float]] = {
-    ("square", "ph"): (0.823, 0.803),
-    ("square", "mh"): (0.705, 0.559),
-    ("transport", "ph"): (0.720, 0.692),
-    ("transport", "mh"): (0.695, 0.637),
-    ("tool_hang", "ph"): (0.806, 0.807),
+#: Table 2, curvature relative to the Gaussian source: (task, data) -> prior -> ratio.
+PAPER_CURVATURE: dict[tuple[str, str], dict[str, float]] = {
+    ("square", "ph"): {"past": 0.823, "preview": 0.803},
+    ("square", "mh"): {"past": 0.705, "preview": 0.559},
+    ("transport", "ph"): {"past": 0.720, "preview": 0.692},
+    ("transport", "mh"): {"past": 0.695, "preview": 0.637},
+    ("tool_hang", "ph"): {"past": 0.806, "preview": 0.807},
 }
 
 #: Appendix on sigma, square mh, H = 8, NFE 1: prior -> sigma -> success rate, where a number is given.
@@ -41,5 +58,4 @@ def paper_success(task: str, data: str, prior: str, nfe: int, chunk: int = 8) ->
     """
     if chunk != 8:
         return None
-    row = PAPER_SUCCESS.get((task, data), {}).get(nfe)
-    return row[PAPER_PRIORS.index(prior)] if row and prior in PAPER_PRIORS else None
+    return PAPER_SUCCESS.get((task, data), {}).get(prior, {}).get(nfe)

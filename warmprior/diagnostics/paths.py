@@ -69,7 +69,8 @@ def forecast_mean(
 ) -> TensorDict:
     """The mean that deployment meets: made from the policy's own prediction one decision earlier.
 
-    ``batch.update(forecast_mean(policy, previous))`` replaces the training mean of windows by it.
+    ``batch.update(forecast_mean(policy, previous))`` replaces the training mean of windows by it (and
+    :class:`~warmprior.MeanObservation` makes the observation of a conditioned network anew).
 
     Args:
         policy: the policy.

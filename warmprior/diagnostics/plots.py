@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from warmprior.diagnostics._figure import COLORS, new_figure
-from warmprior.diagnostics.results import PRIOR_LABELS, Row, summarize
+from warmprior.diagnostics._figure import new_figure, prior_color, prior_label
+from warmprior.diagnostics.results import Row, summarize
 from warmprior.diagnostics.statistics import success_posterior
 
 __all__ = ["plot_filmstrip", "plot_learning_curves", "plot_success"]
@@ -50,10 +50,10 @@ def plot_success(
                 grid,
                 x - half,
                 x + half,
-                color=COLORS.get(prior),
+                color=prior_color(prior),
                 alpha=0.75,
                 lw=0,
-                label=PRIOR_LABELS.get(prior, prior) if g == 0 else None,
+                label=prior_label(prior) if g == 0 else None,
             )
             axis.plot([x - 0.3, x + 0.3], [posterior.mean()] * 2, color="black", lw=1.2)
             axis.text(x, -0.025, f"{k}/{n}", ha="center", va="top", fontsize=7, color="0.35")
@@ -91,8 +91,8 @@ def plot_learning_curves(
     figure, (left, right) = new_figure(9.0, 3.6, columns=2)
     for prior, seeds in losses.items():
         for i, curve in enumerate(seeds):
-            label = PRIOR_LABELS.get(prior, prior) if i == 0 else None
-            left.plot(*zip(*curve, strict=True), color=COLORS.get(prior), lw=1.0, label=label)
+            label = prior_label(prior) if i == 0 else None
+            left.plot(*zip(*curve, strict=True), color=prior_color(prior), lw=1.0, label=label)
     left.set_yscale("log")
     left.set_ylabel("flow-matching loss (own source)")
     for prior in losses:
@@ -110,7 +110,7 @@ def plot_learning_curves(
             ms=4,
             lw=1.0,
             capsize=2,
-            color=COLORS.get(prior),
+            color=prior_color(prior),
         )
     right.set_xlim(left.get_xlim())
     right.set_ylim(-0.02, 1.02)

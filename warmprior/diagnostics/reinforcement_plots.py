@@ -7,8 +7,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from warmprior.diagnostics._figure import COLORS, new_figure
-from warmprior.diagnostics.results import PRIOR_LABELS
+from warmprior.diagnostics._figure import new_figure, prior_color, prior_label
 from warmprior.diagnostics.statistics import summarize_seeds
 
 __all__ = ["plot_reinforcement"]
@@ -19,7 +18,7 @@ STYLES = {"dsrl-na": "-", "dsrl-sac": "--"}
 def agent_label(algorithm: str, prior: str, seeds: int) -> str:
     """What figures and tables call the agents of one algorithm and prior."""
     many = "" if seeds == 1 else "s"
-    return f"{algorithm.upper()}, {PRIOR_LABELS.get(prior, prior)} ({seeds} seed{many})"
+    return f"{algorithm.upper()}, {prior_label(prior)} ({seeds} seed{many})"
 
 
 def plot_reinforcement(
@@ -59,7 +58,7 @@ def plot_reinforcement(
                 mean.append(summary.mean)
                 low.append(summary.mean - spread)
                 high.append(summary.mean + spread)
-            color, style = COLORS.get(prior), STYLES.get(algorithm, "-")
+            color, style = prior_color(prior), STYLES.get(algorithm, "-")
             label = agent_label(algorithm, prior, len(seeds))
             axis.fill_between(x, low, high, color=color, alpha=0.2, lw=0)
             axis.plot(x, mean, color=color, ls=style, marker="o", ms=3, lw=1.4, label=label)

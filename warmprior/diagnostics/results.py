@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from warmprior._files import write_atomic
+from warmprior.diagnostics._figure import prior_label
 from warmprior.diagnostics.paper import paper_success
 from warmprior.diagnostics.source_leak import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.diagnostics.statistics import (
@@ -20,7 +21,6 @@ from warmprior.diagnostics.statistics import (
 )
 
 __all__ = [
-    "PRIOR_LABELS",
     "Results",
     "Row",
     "success_table",
@@ -28,14 +28,6 @@ __all__ = [
     "summarize_cell",
     "write_results",
 ]
-
-PRIOR_LABELS = {
-    "gaussian": "Base",
-    "past": "WP-Past",
-    "preview": "WP-Preview",
-    "regression": "Regression",
-    "history": "History",
-}
 
 
 @dataclass(frozen=True)
@@ -269,7 +261,7 @@ def success_table(
     meta, summaries = results.meta, summarize(results.rows, top_k)
     first = results.rows[0]
     columns = [(nfe, prior) for nfe in nfes for prior in priors]
-    head = ["Success rate (%)"] + [f"NFE {nfe}: {PRIOR_LABELS.get(p, p)}" for nfe, p in columns]
+    head = ["Success rate (%)"] + [f"NFE {nfe}: {prior_label(p)}" for nfe, p in columns]
     measured = []
     for nfe, prior in columns:
         group = [s for p in priors if (s := summaries.get((p, nfe))) is not None]
@@ -330,7 +322,7 @@ def _notes(results: Results, summaries: dict[Any, SeedSummary], top_k: int) -> l
             "training data): at or below the bound, none is seen. What exceeds it says more about the "
             "network's training than about the source."
         )
-    short = [PRIOR_LABELS.get(name, name) for name in results.meta.get("short_of_training", ())]
+    short = [prior_label(name) for name in results.meta.get("short_of_training", ())]
     if short:
         notes.append(
             f"- {', '.join(short)}: short of training. Success still rises with more iterations than "

@@ -16,6 +16,7 @@ from warmprior.diagnostics._flow import (
     allowed_nfes,
     evaluation_mode,
     flat_windows,
+    observed,
     predict,
 )
 from warmprior.modules.actor import WarmPriorActor
@@ -161,7 +162,7 @@ def source_leak(
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
     flat = flat_windows(policy, windows, target_needed=True)
     assert flat.target is not None
-    n, device, horizon = len(flat), flat.loc.device, prior.chunk_length
+    n, device, chunk_length = len(flat), flat.loc.device, prior.chunk_length
     if episodes is None:
         episodes = windows.get(keys.EPISODE, None)
     episodes = torch.arange(n) if episodes is None else episodes.flatten()
@@ -175,17 +176,17 @@ def source_leak(
     if generator is None:
         generator = torch.Generator(device).manual_seed(0)
     rows = windows.select(*policy.in_keys).reshape(n).to(device)
-    target, counted = flat.target[:, :horizon], flat.counted[:, :horizon, 0]
+    target, counted = flat.target[:, :chunk_length], flat.counted[:, :chunk_length, 0]
     moments = {nfe: RunningVariance() for nfe in allowed}
     steps = {nfe: 0.0 for nfe in allowed}
     with evaluation_mode(policy):
-        observation = rows.get(policy.in_keys[0]).flatten(1)
+        observation = observed(policy, windows).reshape(n, -1).to(device)
         data_spread = _data_spread(observation, target, counted, episodes.to(device), neighbours)
         for _ in range(draws):
             a0 = prior.sample(flat.loc, flat.warm, generator)
             for nfe in allowed:
                 chunk = predict(policy, rows, a0, nfe=nfe, split=split)
-                chunk = moments[nfe].add(chunk[:, :horizon])
+                chunk = moments[nfe].add(chunk[:, :chunk_length])
                 steps[nfe] += _inner_step(chunk, counted) / draws
     spread = {
         nfe: math.sqrt(float(moment.variance(unbiased=True)[counted].mean()))

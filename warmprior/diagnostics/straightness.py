@@ -11,11 +11,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
+from warmprior.diagnostics._figure import prior_label
 from warmprior.diagnostics.branching import branching_bound
 from warmprior.diagnostics.curvature import curvature
 from warmprior.diagnostics.held_out import SharedObservations
-from warmprior.diagnostics.paper import PAPER_CURVATURE, PAPER_PRIORS
-from warmprior.diagnostics.results import PRIOR_LABELS
+from warmprior.diagnostics.paper import PAPER_CURVATURE
 from warmprior.diagnostics.statistics import bootstrap_ratio
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
@@ -131,7 +131,7 @@ def _average(per_seed: Sequence[TensorDict]) -> TensorDict:
 
 
 def _bound(prior: Prior, batch: TensorDictBase) -> float:
-    if type(prior).sample is not Prior.sample or prior.conditions_network:
+    if not prior.is_gaussian:
         return math.nan
     return _mean(branching_bound(batch, prior)["total_executed"])
 
@@ -168,7 +168,7 @@ def curvature_table(rows: Sequence[dict[str, Any]], *, task: str, data: str, sou
     seeds = {row["seed"] for row in rows}
     chosen = [row for row in rows if row["seed"] == (None if None in seeds else min(seeds))]
     names = list(dict.fromkeys(row["policy"] for row in chosen))
-    labels = [PRIOR_LABELS.get(row["policy"], row["policy"]) for row in map(_first(chosen), names)]
+    labels = [prior_label(row["policy"]) for row in map(_first(chosen), names)]
     title = f"{task.replace('_', '-').title()}-{data.upper()}"
     lines = [
         "| curvature relative to the first column | " + " | ".join(labels) + " |",
@@ -188,7 +188,7 @@ def curvature_table(rows: Sequence[dict[str, Any]], *, task: str, data: str, sou
             lines.append(f"| {title}, {what}, {mean} mean | " + " | ".join(cells) + " |")
     paper = PAPER_CURVATURE.get((task, data))
     if paper is not None and chosen[0]["prior"] == "gaussian" and chosen[0]["chunk"] == 8:
-        values = dict(zip(PAPER_PRIORS, (1.0, *paper), strict=True))
+        values = {"gaussian": 1.0, **paper}
         shown = [row["prior"] for row in map(_first(chosen), names)]
         cells = [f"{values[prior]:.3f}" if prior in values else "-" for prior in shown]
         lines.append(f"| {title}, paper (official data) | " + " | ".join(cells) + " |")

@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from warmprior.diagnostics._figure import COLORS, new_figure
+from warmprior.diagnostics._figure import new_figure, prior_color, prior_label
 from warmprior.diagnostics.paper import PAPER_SIGMA
-from warmprior.diagnostics.results import PRIOR_LABELS, Row, summarize_cell
+from warmprior.diagnostics.results import Row, summarize_cell
 from warmprior.diagnostics.statistics import SeedSummary, summarize_seeds
 
 __all__ = ["plot_budget", "plot_chunk_lengths", "plot_sigma", "plot_success_bars"]
@@ -22,8 +22,8 @@ def _band(
     spread = [0.0 if math.isnan(point.std) else point.std for point in points]
     low = [m - s for m, s in zip(mean, spread, strict=True)]
     high = [m + s for m, s in zip(mean, spread, strict=True)]
-    axis.fill_between(x, low, high, color=COLORS.get(prior), alpha=0.2, lw=0)
-    axis.plot(x, mean, color=COLORS.get(prior), marker="o", ms=4, lw=1.4, **line)
+    axis.fill_between(x, low, high, color=prior_color(prior), alpha=0.2, lw=0)
+    axis.plot(x, mean, color=prior_color(prior), marker="o", ms=4, lw=1.4, **line)
 
 
 def plot_sigma(
@@ -63,7 +63,9 @@ def plot_sigma(
         _band(axis, at, points, prior, label="success rate")
         if base:
             level = summarize_cell(base, top_k).mean
-            axis.axhline(level, color=COLORS["gaussian"], ls="--", lw=1.2, label="Gaussian source")
+            axis.axhline(
+                level, color=prior_color("gaussian"), ls="--", lw=1.2, label="Gaussian source"
+            )
         if paper:
             told = PAPER_SIGMA[prior]
             x = [i for i, s in enumerate(sigmas) if s in told]
@@ -84,7 +86,7 @@ def plot_sigma(
         axis.set_xlabel(r"$\sigma$")
         axis.set_ylim(-0.02, 1.02)
         axis.set_ylabel("success rate")
-        axis.set_title(PRIOR_LABELS[prior], fontsize=10)
+        axis.set_title(prior_label(prior), fontsize=10)
         axis.grid(axis="y", alpha=0.25)
         handles = [h for a in (axis, right) for h in a.get_legend_handles_labels()[0]]
         labels = [label for a in (axis, right) for label in a.get_legend_handles_labels()[1]]
@@ -130,7 +132,7 @@ def plot_chunk_lengths(
             }
             known = {c: summarize_cell(cell, top_k) for c, cell in cells.items() if cell}
             at = [chunks.index(c) for c in known]
-            _band(above, at, list(known.values()), prior, label=PRIOR_LABELS.get(prior, prior))
+            _band(above, at, list(known.values()), prior, label=prior_label(prior))
             for name, style in (("boundary_jump", "-"), ("inner_jump", ":")):
                 points = []
                 for c, cell in cells.items():
@@ -140,7 +142,7 @@ def plot_chunk_lengths(
                         points.append((chunks.index(c), math.fsum(jumps) / len(jumps)))
                 if points:
                     x, y = zip(*points, strict=True)
-                    below.plot(x, y, color=COLORS.get(prior), ls=style, marker="o", ms=3, lw=1.2)
+                    below.plot(x, y, color=prior_color(prior), ls=style, marker="o", ms=3, lw=1.2)
         above.set_title(f"NFE {nfe}", fontsize=10)
         above.set_ylim(-0.02, 1.02)
         below.set_ylim(bottom=0)
@@ -186,9 +188,9 @@ def plot_success_bars(
             summary = summarize_cell(cell, top_k)
             x = g * (len(priors) + 0.8) + j
             spread = None if math.isnan(summary.std) else summary.std
-            label = PRIOR_LABELS.get(prior, prior) if g == 0 else None
+            label = prior_label(prior) if g == 0 else None
             axis.bar(
-                x, summary.mean, 0.85, yerr=spread, capsize=3, color=COLORS.get(prior), label=label
+                x, summary.mean, 0.85, yerr=spread, capsize=3, color=prior_color(prior), label=label
             )
             axis.text(x, summary.mean + 0.015, f"{100 * summary.mean:.0f}", ha="center", fontsize=8)
     centre = (len(priors) - 1) / 2
@@ -234,7 +236,7 @@ def plot_budget(
                 for n in budgets
             }
             known = {n: summarize_cell(cell, top_k) for n, cell in cells.items() if cell}
-            label = PRIOR_LABELS.get(prior, prior)
+            label = prior_label(prior)
             _band(above, list(known), list(known.values()), prior, label=label)
             found = {n: errors[prior, n, nfe] for n in budgets if (prior, n, nfe) in errors}
             _band(below, list(found), [summarize_seeds(e) for e in found.values()], prior)

@@ -42,14 +42,15 @@ class WarmPriorActor(TensorDictModuleBase):
         prior: the source distribution.
 
     Keyword Args:
-        nfe: network evaluations per chunk; per call: ``actor(data, nfe=1)``. 9 by default, or the
-            prior's maximum (:attr:`Prior.max_nfe`).
+        nfe: network evaluations per chunk; per call: ``actor(data, nfe=1)``. 9 by default, or 1 where the
+            prior's field is no flow (:attr:`Prior.is_flow`).
         solver: see :func:`~warmprior.modules.ode.integrate`.
         clip: see :class:`ODEActor`.
         normalizer: the normaliser of the data, kept here so that it is saved with the policy; its
             :meth:`~warmprior.Normalizer.env_transforms` go next to the base environment.
-        generator: source of randomness of the sampler.
-        observation_key: key of the observation, ``[*B, To, d_o]``.
+        generator: source of randomness of the sampler; per call: ``actor(data, generator=...)``.
+        observation_key: key of the observation, ``[*B, To, d_o]``. ``"observation"`` by default, or what
+            :class:`~warmprior.MeanObservation` makes of it (:attr:`Prior.conditions_network`).
         path_key: if given, the integration path is written there.
 
     Raises:
@@ -80,10 +81,12 @@ class WarmPriorActor(TensorDictModuleBase):
         clip: float | None = None,
         normalizer: Normalizer | None = None,
         generator: torch.Generator | None = None,
-        observation_key: NestedKey = keys.OBSERVATION,
+        observation_key: NestedKey | None = None,
         path_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
+        if observation_key is None:
+            observation_key = keys.CONDITIONED if prior.conditions_network else keys.OBSERVATION
         built_for = getattr(network, "prediction_length", prior.prediction_length)
         if built_for != prior.prediction_length:
             raise ValueError(
@@ -93,8 +96,8 @@ class WarmPriorActor(TensorDictModuleBase):
         self.sampler = PriorSampler(prior, generator=generator)
         self.ode = ODEActor(
             network,
-            prior=prior,
             nfe=nfe,
+            max_nfe=None if prior.is_flow else 1,
             solver=solver,
             clip=clip,
             observation_key=observation_key,
@@ -114,9 +117,41 @@ class WarmPriorActor(TensorDictModuleBase):
         """The velocity network."""
         return self.ode.network
 
-    def forward(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        nfe: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> TensorDictBase:
         """Sample the source and integrate it to the chunk."""
-        return self.ode(self.sampler(tensordict), nfe=nfe)
+        return self.ode(self.sampler(tensordict, generator=generator), nfe=nfe)
+
+    def replace(self, **changes: Any) -> WarmPriorActor:
+        """A policy of the same parts and options, but for those given.
+
+        Args:
+            changes: constructor arguments, such as ``nfe`` and ``generator`` where a policy is handed to
+                what calls it, or another ``network``.
+
+        Examples:
+            >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+            >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
+            >>> one_step = actor.replace(nfe=1)
+            >>> actor.ode.nfe, one_step.ode.nfe, one_step.network is actor.network
+            (9, 1, True)
+        """
+        mine = {
+            "network": self.network,
+            "prior": self.prior,
+            "nfe": self.ode.nfe,
+            "solver": self.ode.solver,
+            "clip": self.ode.clip,
+            "normalizer": self.normalizer,
+            "generator": self.sampler.generator,
+            "observation_key": self.in_keys[0],
+            "path_key": self.ode.path_key,
+        }
+        return type(self)(**(mine | changes))
 
     def save_pretrained(self, directory: str | Path) -> None:
         """Write ``config.json`` and ``model.safetensors``.

@@ -16,25 +16,15 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.baselines import RegressionPrior
 from warmprior.modules.prior import Prior
-from warmprior.modules.priors import GaussianPrior
 
-__all__ = ["PriorDecoder", "check_delta", "moves_source", "visible_priors"]
+__all__ = ["PriorDecoder", "check_delta", "visible_priors"]
 
 
 def check_delta(delta: float) -> None:
     """Raise ValueError if there is no such box."""
     if not (delta > 0 and math.isfinite(delta)):
         raise ValueError(f"delta must be a finite number > 0, got {delta}")
-
-
-def moves_source(prior: Prior) -> bool:
-    """Whether the prior's mean is the centre of its source, so that an agent can search around it.
-
-    It is not if nothing is ever warm, or if the mean conditions the network instead.
-    """
-    return not isinstance(prior, GaussianPrior) and not prior.conditions_network
 
 
 class PriorDecoder(TensorDictModuleBase):
@@ -101,7 +91,7 @@ class PriorDecoder(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         check_delta(delta)
-        if isinstance(actor.prior, RegressionPrior):
+        if not actor.prior.is_flow:
             raise ValueError(
                 f"{actor.prior} starts at a single point and its field means nothing elsewhere: there is "
                 "no source space to act in"
@@ -112,14 +102,14 @@ class PriorDecoder(TensorDictModuleBase):
         self.nfe = self.ode.nfe if nfe is None else nfe
         self.ode.check_nfe(self.nfe)
         self.normalizer = copy.deepcopy(actor.normalizer)
-        self.prior = actor.prior
+        self.prior = copy.deepcopy(actor.prior)
         _freeze(self)
         self.anchor_key = unravel_key(anchor_key)
         self.delta_key = unravel_key(delta_key)
         self.noise_key = unravel_key(noise_key)
-        self._ode_noise_key, self.observation_key, *mean = self.ode.in_keys
+        self._ode_noise_key, self.observation_key = self.ode.in_keys
         self.chunk_key = unravel_key(self.ode.out_keys[0])
-        self.in_keys = [self.observation_key, self.anchor_key, self.delta_key, *mean]
+        self.in_keys = [self.observation_key, self.anchor_key, self.delta_key]
         self.out_keys = [self.noise_key, self.chunk_key]
 
     @property

@@ -13,7 +13,6 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior import keys
-from warmprior.modules.prior import Prior
 
 __all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "integrate"]
 
@@ -120,24 +119,21 @@ class ODEActor(TensorDictModuleBase):
         network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``.
 
     Keyword Args:
-        prior: the source distribution, for priors that limit ``nfe`` or whose mean the network sees
-            (:attr:`Prior.conditions_network`; ``loc`` and ``warm`` are then inputs too).
-        nfe: number of network evaluations per chunk; an attribute, and overridable per call:
-            ``actor(data, nfe=3)``. 9 by default, or the prior's maximum.
+        nfe: number of network evaluations per chunk; per call: ``actor(data, nfe=3)``. 9 by default, or
+            ``max_nfe``.
+        max_nfe: the most for which the trained field means anything.
         solver: see :func:`integrate`.
         clip: the chunk is clamped to ``[-clip, clip]``; ``None`` (default) leaves it as integrated.
             Set it where the normalised data span ``[-1, 1]``, so that what the environment executes
             is what the prior remembers.
-        loc_key: key of the mean, ``[*B, P, d_a]``.
-        warm_key: key of the warm mask, bool ``[*B, P, 1]``.
         noise_key: key of the source, ``[*B, P, d_a]``.
         observation_key: key of the observation, ``[*B, To, d_o]``.
         chunk_key: key written, ``[*B, P, d_a]``.
         path_key: if given, the integration path ``[*B, steps + 1, P, d_a]`` is written there.
 
     Raises:
-        ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend or that exceeds the prior's
-            maximum, or an unknown solver.
+        ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend or that exceeds ``max_nfe``, or
+            an unknown solver.
         KeyError: if an input key is missing.
 
     Examples:
@@ -156,23 +152,19 @@ class ODEActor(TensorDictModuleBase):
         self,
         network: nn.Module,
         *,
-        prior: Prior | None = None,
         nfe: int | None = None,
+        max_nfe: int | None = None,
         solver: Solver = "euler",
         clip: float | None = None,
-        loc_key: NestedKey = keys.LOC,
-        warm_key: NestedKey = keys.WARM,
         noise_key: NestedKey = keys.NOISE,
         observation_key: NestedKey = keys.OBSERVATION,
         chunk_key: NestedKey = keys.CHUNK,
         path_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
-        self.prior = prior
         if nfe is None:
-            nfe = DEFAULT_NFE
-            if prior is not None and prior.max_nfe is not None:
-                nfe = min(nfe, prior.max_nfe)
+            nfe = DEFAULT_NFE if max_nfe is None else min(DEFAULT_NFE, max_nfe)
+        self.max_nfe = max_nfe
         self.solver = solver
         self.check_nfe(nfe)
         if clip is not None and clip <= 0:
@@ -182,21 +174,18 @@ class ODEActor(TensorDictModuleBase):
         self.clip = clip
         self.path_key = path_key
         self.in_keys = [noise_key, observation_key]
-        if prior is not None and prior.conditions_network:
-            self.in_keys += [loc_key, warm_key]
         self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
 
     def check_nfe(self, nfe: int) -> None:
-        """Whether the solver and the prior can spend ``nfe`` network evaluations.
+        """Whether the solver and the network can spend ``nfe`` network evaluations.
 
         Raises:
             ValueError: if one of them cannot.
         """
         _steps(nfe, self.solver)
-        limit = None if self.prior is None else self.prior.max_nfe
-        if limit is not None and nfe > limit:
+        if self.max_nfe is not None and nfe > self.max_nfe:
             raise ValueError(
-                f"{self.prior} is trained for at most {limit} network evaluation(s) per chunk, got "
+                f"the network is trained for at most {self.max_nfe} network evaluation(s) per chunk, got "
                 f"nfe={nfe}"
             )
 
@@ -204,12 +193,10 @@ class ODEActor(TensorDictModuleBase):
         """Write the chunk (and the path, where asked for)."""
         nfe = self.nfe if nfe is None else nfe
         self.check_nfe(nfe)
-        a0, observation, *mean = (tensordict.get(key, None) for key in self.in_keys)
+        a0, observation = (tensordict.get(key, None) for key in self.in_keys)
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
         if missing:
             raise KeyError(f"ODEActor needs the keys {self.in_keys}; missing: {missing}")
-        if self.prior is not None and mean:
-            observation = self.prior.extend_observation(observation, *mean)
         batch = a0.shape[:-2]
         observation = observation.reshape(-1, *observation.shape[len(batch) :])
         path_or_chunk = integrate(

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+import importlib
+import inspect
+import json
+import zlib
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor
 
 __all__ = ["Prior"]
+
+PALETTE = ("#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", "#984ea3", "#17becf")
+"""Colours in figures of priors that choose none."""
 
 
 class Prior:
@@ -22,8 +31,13 @@ class Prior:
 
     The same object serves the replay buffer (:meth:`training_mean`), the environment
     (:meth:`next_mean`) and the actor (:meth:`sample`), so the three cannot disagree. It holds no
-    state. A subclass sets :attr:`name` and :attr:`prediction_chunks`, and overrides the two means;
-    overriding :meth:`sample` gives any other source.
+    state of an episode. A subclass sets :attr:`name`, and overrides the two means; overriding
+    :meth:`sample` gives any other source, and :meth:`couple` another pairing of source and data. What
+    else benchmarks, figures and agents need to know of it, it tells by the attributes below.
+
+    The constructor's arguments are recorded, so that :meth:`config` is complete for any subclass. One
+    that is an ``nn.Module`` as well (call ``nn.Module.__init__`` first) is trained, saved and frozen with
+    the policy.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
@@ -59,13 +73,31 @@ class Prior:
     """
 
     name: ClassVar[str]
+    """Of the prior in options, files and rows."""
+    label: ClassVar[str]
+    """In tables and figures; the name by default."""
+    color: ClassVar[str]
+    """In figures; of :data:`PALETTE` by default."""
     prediction_chunks: ClassVar[int] = 1
+    """Predicted actions ``P`` per executed ones ``H``."""
     default_sigma: ClassVar[float] = 1.0
-    max_nfe: ClassVar[int | None] = None
-    """The most network evaluations per chunk for which the trained field means anything."""
+    """``sigma`` where none is given."""
+    ever_warm: ClassVar[bool] = True
+    """Whether there is ever a mean. Otherwise ``sigma`` and ``cold_probability`` are without effect."""
+    is_flow: ClassVar[bool] = True
+    """Whether the field is trained at all times. Otherwise it is at ``t = 0`` alone, and one network
+    evaluation is all that it is good for."""
     conditions_network: ClassVar[bool] = False
-    """Whether the network sees the mean as well, see :meth:`extend_observation`."""
+    """Whether the network sees the mean as well, in an observation that :class:`~warmprior.MeanObservation`
+    extends in environments and replay buffers."""
     _registry: ClassVar[dict[str, type[Prior]]] = {}
+    _arguments: dict[str, Any]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Record the arguments, whatever the subclass does with them."""
+        self = super().__new__(cls)
+        self.__dict__["_arguments"] = _bound(cls, args, kwargs)
+        return self
 
     def __init__(
         self, chunk_length: int, *, sigma: float | None = None, cold_probability: float = 0.0
@@ -83,8 +115,112 @@ class Prior:
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        if "name" in cls.__dict__:
-            Prior._registry[cls.name] = cls
+        if "name" not in cls.__dict__:
+            return
+        taken = Prior._registry.get(cls.name)
+        # The same class once more, as when a notebook's cell runs again, replaces itself.
+        if taken is not None and _place(taken) != _place(cls):
+            raise ValueError(
+                f"a prior named {cls.name!r} exists already ({_place(taken)}): choose another name for "
+                f"{_place(cls)}"
+            )
+        Prior._registry[cls.name] = cls
+        if "label" not in cls.__dict__:
+            cls.label = cls.name
+        if "color" not in cls.__dict__:
+            cls.color = PALETTE[zlib.crc32(cls.name.encode()) % len(PALETTE)]
+
+    @staticmethod
+    def registered() -> Mapping[str, type[Prior]]:
+        """All imported priors by name."""
+        return MappingProxyType(Prior._registry)
+
+    @staticmethod
+    def find(name: str) -> type[Prior]:
+        """The class of that name, or at a place such as ``"mypackage.priors:Anchor"``, which is imported.
+
+        Importing runs code: this is for what a user typed, and never for what a file says.
+
+        Args:
+            name: of the prior, or ``"module:Class"``.
+
+        Raises:
+            ValueError: if there is no such prior.
+
+        Examples:
+            >>> Prior.find("past").label
+            'WP-Past'
+        """
+        module, colon, attribute = name.partition(":")
+        if not colon:
+            if name in Prior._registry:
+                return Prior._registry[name]
+            raise ValueError(
+                f"unknown prior {name!r}: it is none of {', '.join(sorted(Prior._registry))}; name your own "
+                "as package.module:Class"
+            )
+        try:
+            found = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"there is no prior at {name}: {error}") from error
+        if not (isinstance(found, type) and issubclass(found, Prior) and hasattr(found, "name")):
+            raise ValueError(f"{name} is no subclass of warmprior.Prior with a name")
+        return found
+
+    @staticmethod
+    def make(
+        name: str, chunk_length: int, *, sigma: float | None = None, cold_probability: float = 0.0
+    ) -> Prior:
+        """One prior of a comparison: what its constructor takes of the options that compare sources.
+
+        Args:
+            name: see :meth:`find`.
+            chunk_length: ``H``.
+
+        Keyword Args:
+            sigma: see :class:`Prior`; left out where it has no effect (:meth:`takes`).
+            cold_probability: likewise.
+
+        Raises:
+            ValueError: see :meth:`find` and :class:`Prior`.
+
+        Examples:
+            >>> [Prior.make(name, 8, sigma=0.3) for name in ("past", "regression")]
+            [PastPrior(chunk_length=8, sigma=0.3, cold_probability=0.0), RegressionPrior(chunk_length=8)]
+        """
+        found = Prior.find(name)
+        options: dict[str, Any] = {"sigma": sigma, "cold_probability": cold_probability}
+        return found(chunk_length, **{k: v for k, v in options.items() if found.takes(k)})
+
+    @classmethod
+    def takes(cls, argument: str) -> bool:
+        """Whether ``sigma`` or ``cold_probability`` is an argument of the constructor, and has an effect.
+
+        Args:
+            argument: its name.
+
+        Examples:
+            >>> [Prior.find(name).takes("sigma") for name in ("past", "gaussian", "regression")]
+            [True, False, False]
+        """
+        parameters = inspect.signature(cls.__init__).parameters
+        kinds = [parameter.kind for parameter in parameters.values()]
+        named = argument in parameters or inspect.Parameter.VAR_KEYWORD in kinds
+        return cls.ever_warm and named
+
+    @property
+    def moves_source(self) -> bool:
+        """Whether the mean is the centre of the source, so that an agent can search around it.
+
+        It is not if nothing is ever warm, or if the mean conditions the network instead.
+        """
+        return self.ever_warm and not self.conditions_network
+
+    @property
+    def is_gaussian(self) -> bool:
+        """Whether the source is that of Eq. 1, drawn independently of the data given the mean."""
+        mine = type(self)
+        return mine.sample is Prior.sample and mine.couple is Prior.couple
 
     @property
     def prediction_length(self) -> int:
@@ -136,51 +272,44 @@ class Prior:
         eps = torch.randn(loc.shape, generator=generator, dtype=loc.dtype, device=loc.device)
         return torch.where(warm, loc + self.sigma * eps, eps)
 
-    def sample_times(
-        self, batch_shape: torch.Size, generator: torch.Generator | None, like: Tensor
-    ) -> Tensor:
-        r"""Draw the times at which the field is trained: :math:`t \sim U(0, 1)` here.
+    def couple(
+        self, a0: Tensor, a1: Tensor, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Pair the sources and targets of a batch; as they come by default.
+
+        Called in training between :meth:`sample` and the loss. The observations belong to the targets:
+        permute ``a0`` (optimal transport), or replace ``a1`` by what a teacher makes of ``a0`` (reflow).
 
         Args:
-            batch_shape: ``*B``.
-            generator: source of randomness on ``like``'s device.
-            like: gives the device and dtype.
+            a0: source samples, ``[*B, P, d_a]``.
+            a1: targets, ``[*B, P, d_a]``.
+            generator: source of randomness on their device; PyTorch's global one by default.
 
         Returns:
-            Times in [0, 1], ``[*B]``.
+            Both, paired.
         """
-        return torch.rand(batch_shape, generator=generator, device=like.device, dtype=like.dtype)
+        return a0, a1
 
-    def context_dim(self, action_dim: int) -> int:
-        """By how much :meth:`extend_observation` widens the observation: ``P * d_a + 1``, or 0.
+    def allowed_nfes(self, nfes: Sequence[int]) -> list[int]:
+        """Those numbers of network evaluations per chunk for which the trained field means anything.
 
         Args:
-            action_dim: ``d_a``.
+            nfes: to choose from; their order stays.
+
+        Raises:
+            ValueError: if none is left.
+
+        Examples:
+            >>> Prior.find("regression")(8).allowed_nfes([9, 3, 1])
+            [1]
         """
-        return self.prediction_length * action_dim + 1 if self.conditions_network else 0
-
-    def extend_observation(self, observation: Tensor, loc: Tensor, warm: Tensor) -> Tensor:
-        """What the network sees: the observation, and the mean where :attr:`conditions_network`.
-
-        The mean (zero on cold positions) is flattened, followed by 1 if anything is warm and else 0,
-        and repeated over the observation steps. The network is then built with
-        ``observation_dim = d_o + prior.context_dim(d_a)``.
-
-        Args:
-            observation: ``[*B, To, d_o]``.
-            loc: mean, ``[*B, P, d_a]``.
-            warm: bool ``[*B, P, 1]``.
-
-        Returns:
-            ``[*B, To, d_o + context_dim]``.
-        """
-        if not self.conditions_network:
-            return observation
-        mean = torch.where(warm, loc, 0.0).flatten(-2)
-        context = torch.cat([mean, warm.any(-2).to(mean)], dim=-1).unsqueeze(-2)
-        steps = observation.shape[-2]
-        context = context.expand(*context.shape[:-2], steps, -1)
-        return torch.cat([observation, context], dim=-1)
+        allowed = [nfe for nfe in nfes if self.is_flow or nfe == 1]
+        if not allowed:
+            raise ValueError(
+                f"{self.name} is trained for one network evaluation per chunk, and {list(nfes)} has none "
+                "of 1: add NFE 1, or leave it out"
+            )
+        return allowed
 
     def withhold(self, warm: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Turn a share ``cold_probability`` of the samples cold, whole samples at a time.
@@ -201,13 +330,22 @@ class Prior:
         return index.unsqueeze(-1).expand(*index.shape, like.shape[-1])
 
     def config(self) -> dict[str, Any]:
-        """JSON-serialisable description; :meth:`from_config` reverses it."""
-        return {
-            "name": self.name,
-            "chunk_length": self.chunk_length,
-            "sigma": self.sigma,
-            "cold_probability": self.cold_probability,
-        }
+        """Name and constructor arguments as JSON holds them; :meth:`from_config` reverses it.
+
+        Raises:
+            TypeError: if an argument is nothing that JSON can hold.
+
+        Examples:
+            >>> Prior.find("regression")(8).config()
+            {'name': 'regression', 'chunk_length': 8}
+        """
+        try:
+            return json.loads(json.dumps({"name": self.name, **self._resolved()}, allow_nan=False))
+        except (TypeError, ValueError) as error:
+            raise TypeError(
+                f"{type(self).__name__} has an argument that cannot be saved ({error}): take numbers, text, "
+                "lists or dictionaries, and build the rest of them"
+            ) from error
 
     @staticmethod
     def from_config(config: dict[str, Any]) -> Prior:
@@ -239,8 +377,37 @@ class Prior:
         """
         return f"{self.name}, sigma {self.sigma:g}, H {self.chunk_length}"
 
+    def _resolved(self) -> dict[str, Any]:
+        """The constructor's arguments, with the defaults that were put in for ``None``."""
+        own = ("chunk_length", "sigma", "cold_probability")
+        return {k: getattr(self, k) if k in own else v for k, v in self._arguments.items()}
+
     def __repr__(self) -> str:
-        return (
-            f"{type(self).__name__}(chunk_length={self.chunk_length}, sigma={self.sigma}, "
-            f"cold_probability={self.cold_probability})"
-        )
+        told = (f"{key}={value!r}" for key, value in self._resolved().items())
+        return f"{type(self).__name__}({', '.join(told)})"
+
+
+def _place(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _bound(cls: type, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Constructor arguments by name, defaults included."""
+    signature = inspect.signature(cls.__init__)  # type: ignore[misc]
+    try:
+        bound = signature.bind(None, *args, **kwargs)
+    except (
+        TypeError
+    ):  # a copy, which brings its arguments along; or a mistake that the call itself tells
+        return {}
+    bound.apply_defaults()
+    arguments: dict[str, Any] = {}
+    for name, parameter in list(signature.parameters.items())[1:]:  # without self
+        value = bound.arguments[name]
+        if parameter.kind is parameter.VAR_KEYWORD:
+            arguments |= value
+        elif parameter.kind is not parameter.VAR_POSITIONAL:
+            arguments[name] = value
+        elif value:
+            raise TypeError(f"{cls.__name__} must name its arguments: *{name} could not be saved")
+    return arguments

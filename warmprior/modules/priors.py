@@ -27,6 +27,9 @@ class GaussianPrior(Prior):
     """
 
     name = "gaussian"
+    label = "Base"
+    color = "#7f7f7f"
+    ever_warm = False
 
     def training_mean(
         self, history: Tensor, history_valid: Tensor, target: Tensor
@@ -58,6 +61,8 @@ class PastPrior(Prior):
     """
 
     name = "past"
+    label = "WP-Past"
+    color = "#1f77b4"
     default_sigma = 0.5
 
     def training_mean(
@@ -103,6 +108,8 @@ class PreviewPrior(Prior):
     """
 
     name = "preview"
+    label = "WP-Preview"
+    color = "#d95f02"
     prediction_chunks = 2
 
     def _first_half(self, forecast: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:

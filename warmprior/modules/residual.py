@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from warmprior.modules.decoder import PriorDecoder, moves_source
+from warmprior.modules.decoder import PriorDecoder
 
 __all__ = ["ResidualSampler"]
 
@@ -65,8 +65,8 @@ class ResidualSampler(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if sigma is None:
-            sigma = decoder.prior.sigma if moves_source(decoder.prior) else 1.0
-        if distribution is None and moves_source(decoder.prior):
+            sigma = decoder.prior.sigma if decoder.prior.moves_source else 1.0
+        if distribution is None and decoder.prior.moves_source:
             distribution = "clipped" if sigma > 0 else "uniform"
         elif distribution is None:
             distribution = "normal"

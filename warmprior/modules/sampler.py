@@ -23,7 +23,8 @@ class PriorSampler(TensorDictModuleBase):
         loc_key: key of the mean, ``[*B, P, d_a]``.
         warm_key: key of the warm mask, bool ``[*B, P, 1]``.
         noise_key: key written, ``[*B, P, d_a]``.
-        generator: source of randomness; PyTorch's global generator by default.
+        generator: source of randomness; PyTorch's global generator by default. Per call:
+            ``sampler(data, generator=...)``.
 
     Raises:
         KeyError: if an input key is missing.
@@ -54,7 +55,9 @@ class PriorSampler(TensorDictModuleBase):
         self.in_keys = [loc_key, warm_key]
         self.out_keys = [noise_key]
 
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def forward(
+        self, tensordict: TensorDictBase, generator: torch.Generator | None = None
+    ) -> TensorDictBase:
         """Write the source sample."""
         loc, warm = (tensordict.get(key, None) for key in self.in_keys)
         if loc is None or warm is None:
@@ -63,4 +66,5 @@ class PriorSampler(TensorDictModuleBase):
                 f"PriorSampler needs the keys {self.in_keys}; missing: {missing}. ActionHistory "
                 "writes them in an environment, ActionWindow in a replay buffer"
             )
-        return tensordict.set(self.out_keys[0], self.prior.sample(loc, warm, self.generator))
+        generator = self.generator if generator is None else generator
+        return tensordict.set(self.out_keys[0], self.prior.sample(loc, warm, generator))

@@ -21,8 +21,8 @@ __all__ = ["FlowMatchingLoss"]
 class FlowMatchingLoss(LossModule):
     r"""Conditional flow matching with the actor's own source (Algorithm 1, training).
 
-    For each window: draw :math:`a_0` from the prior and :math:`t \sim U(0, 1)` (or what
-    :meth:`Prior.sample_times` draws instead), set
+    For each window: draw :math:`a_0` from the prior, pair it with :math:`a_1` (:meth:`Prior.couple`), draw
+    :math:`t \sim U(0, 1)` (:math:`t = 0` where the prior is no flow), set
     :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regress
     :math:`v_\theta(t, a_t, o)` on :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's
     end do not count.
@@ -101,7 +101,7 @@ class FlowMatchingLoss(LossModule):
                 f"{interpolant.config()}: give both the same interpolant"
             )
         self.interpolant = interpolant
-        if self.prior.max_nfe == 1 and not isinstance(self.interpolant, LinearInterpolant):
+        if not self.prior.is_flow and not isinstance(self.interpolant, LinearInterpolant):
             raise ValueError(
                 f"{self.prior} is evaluated with one step, which ends at the data only on a straight "
                 f"path: use LinearInterpolant, not {type(self.interpolant).__name__}"
@@ -158,8 +158,10 @@ class FlowMatchingLoss(LossModule):
             raise KeyError(f"FlowMatchingLoss needs the keys {list(needed)}; missing: {missing}")
         batch = a1.shape[:-2]
         a0 = self.prior.sample(loc, warm, self.generator)
-        t = self.prior.sample_times(batch, self.generator, a1)
-        observation = self.prior.extend_observation(observation, loc, warm)
+        a0, a1 = self.prior.couple(a0, a1, self.generator)
+        t = a1.new_zeros(batch)
+        if self.prior.is_flow:
+            t = torch.rand(batch, generator=self.generator, device=a1.device, dtype=a1.dtype)
         a_t, velocity = self.interpolant(a0, a1, t)
         with self.velocity_network_params.to_module(
             self.velocity_network, preserve_module_state=False

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
@@ -125,7 +125,11 @@ class BehaviourCloning:
             generator=self.generator,
         )
         self.loss_module = FlowMatchingLoss(actor, generator=self.generator)
-        self.ema = ema_of(actor.network, config.ema_rate)
+        #: The network, and the prior where it learns as well.
+        self.trained = nn.ModuleDict({"network": actor.network})
+        if isinstance(actor.prior, nn.Module):
+            self.trained["prior"] = actor.prior
+        self.ema = ema_of(self.trained, config.ema_rate)
         self.optimizer = make_optimizer(
             actor.network,
             learning_rate=config.learning_rate,
@@ -133,6 +137,9 @@ class BehaviourCloning:
             betas=config.betas,
             eps=config.eps,
         )
+        if isinstance(actor.prior, nn.Module):
+            learned = {"params": list(actor.prior.parameters()), "weight_decay": 0.0}
+            self.optimizer.add_param_group(learned)
         self.schedule = warmup_cosine(self.optimizer, config.iterations, config.warmup_ratio)
         self.iteration = 0
         self.losses: list[tuple[int, float]] = []
@@ -171,7 +178,7 @@ class BehaviourCloning:
         loss.backward()
         self.optimizer.step()
         self.schedule.step()
-        self.ema.update_parameters(self.actor.network)
+        self.ema.update_parameters(self.trained)
         self.iteration += 1
         return loss.detach()
 
@@ -227,7 +234,7 @@ class BehaviourCloning:
         # Before every save and not only before logs: a saved NaN could not be resumed from.
         losses = torch.stack(self._running)
         finite = bool(torch.isfinite(losses).all())
-        if finite and all(bool(torch.isfinite(p).all()) for p in self.actor.network.parameters()):
+        if finite and all(bool(torch.isfinite(p).all()) for p in self.trained.parameters()):
             return
         what = "the weights became NaN or infinite"
         if not finite:
@@ -253,20 +260,16 @@ class BehaviourCloning:
                 self.logger.log_scalar(name, value, step=self.iteration)
 
     def _averaged_actor(self) -> WarmPriorActor:
-        ode = self.actor.ode
-        return WarmPriorActor(
-            self.ema.module,
-            self.actor.prior,
-            nfe=ode.nfe,
-            solver=ode.solver,
-            clip=ode.clip,
-            normalizer=self.actor.normalizer,
-            observation_key=self.actor.in_keys[0],
+        averaged = cast(Any, self.ema.module)
+        prior = self.actor.prior
+        return self.actor.replace(
+            network=averaged["network"],
+            prior=averaged["prior"] if isinstance(prior, nn.Module) else prior,
         )
 
     def _save(self) -> None:
         tensors = {
-            **named("network", module_tensors(self.actor.network)),
+            **named("trained", module_tensors(self.trained)),
             **named("ema", module_tensors(self.ema)),
             **named("optimizer", snapshot_optimizer(self.optimizer)),
             **named("rng", rng_tensors(self.generator)),
@@ -286,7 +289,7 @@ class BehaviourCloning:
         tensors, facts = load_state(self.state_path)
         check_identity(self.state_path, facts["identity"], self.identity)
         try:
-            self.actor.network.load_state_dict(select("network", tensors))
+            self.trained.load_state_dict(select("trained", tensors))
             self.ema.load_state_dict(select("ema", tensors))
         except RuntimeError as error:
             raise ValueError(
@@ -297,7 +300,8 @@ class BehaviourCloning:
         self.iteration = facts["iteration"]
         self.losses = [(int(i), float(loss)) for i, loss in facts["losses"]]
         # The factors are functions and not saved; a restored schedule keeps its own.
-        self.schedule.load_state_dict(facts["schedule"] | {"lr_lambdas": [None, None]})
+        kept = [None for _ in self.optimizer.param_groups]
+        self.schedule.load_state_dict(facts["schedule"] | {"lr_lambdas": kept})
         for group, rate in zip(
             self.optimizer.param_groups, self.schedule.get_last_lr(), strict=True
         ):

@@ -69,11 +69,7 @@ class Comparison:
                     f"{prior} from {same}. Compare these in runs of their own"
                 )
         for prior in self.priors:
-            if prior.max_nfe is not None and prior.max_nfe < min(self.nfes):
-                raise ValueError(
-                    f"{prior.name} is evaluated with at most {prior.max_nfe} network evaluation(s): add "
-                    f"--nfe {prior.max_nfe}, or leave it out"
-                )
+            prior.allowed_nfes(self.nfes)
         check_writable(self.directory)
         self._started = time.monotonic()
         self.results = Results(
@@ -199,8 +195,7 @@ class Comparison:
             for prior in self.priors
             for seed in self.seeds
             for checkpoint in self.policies.preset.training.checkpoint_iterations
-            for nfe in self.nfes
-            if prior.max_nfe is None or nfe <= prior.max_nfe
+            for nfe in prior.allowed_nfes(self.nfes)
         }
 
     def _leak_job(self, prior: Prior, row: Row) -> LeakJob | None:

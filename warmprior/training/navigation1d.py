@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,18 +23,13 @@ from warmprior.envs.navigation1d import (
     navigation_metrics,
 )
 from warmprior.modules import (
-    GaussianPrior,
-    HistoryPrior,
-    PastPrior,
-    PreviewPrior,
     Prior,
-    RegressionPrior,
     VelocityMLP,
     WarmPriorActor,
 )
 from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
 from warmprior.training.training_config import TrainingConfig
-from warmprior.transforms import policy_transforms
+from warmprior.transforms import MeanObservation, policy_transforms
 
 __all__ = ["NAVIGATION_PRESETS", "NavigationPreset", "NavigationStudy", "navigation_priors"]
 
@@ -79,8 +74,18 @@ NAVIGATION_PRESETS: dict[str, NavigationPreset] = {
 }
 
 
-def navigation_priors(chunk_length: int, cold_probability: float = 0.1) -> dict[str, Prior]:
-    """The policies of the comparison, the baseline first.
+NAVIGATION_PRIORS = ("gaussian", "regression", "history", "past", "preview")
+"""What the study compares by default, the baseline first."""
+
+
+def navigation_priors(
+    chunk_length: int,
+    cold_probability: float = 0.1,
+    *,
+    names: Sequence[str] = NAVIGATION_PRIORS,
+    sigmas: Sequence[float] = (0.1, 0.5),
+) -> dict[str, Prior]:
+    """The policies of the comparison, by name and, where it has an effect, ``sigma``.
 
     Args:
         chunk_length: ``H``.
@@ -88,20 +93,19 @@ def navigation_priors(chunk_length: int, cold_probability: float = 0.1) -> dict[
             paper's Algorithm 1 withholds none; see :class:`~warmprior.PreviewPrior` for why small
             ``sigma`` needs it.
 
+    Keyword Args:
+        names: see :meth:`Prior.find`; the baseline first.
+        sigmas: of the warm priors, one policy each.
+
     Examples:
         >>> list(navigation_priors(4))[:4]
-        ['base', 'regression', 'history', 'past 0.1']
+        ['gaussian', 'regression', 'history', 'past 0.1']
     """
-    priors: dict[str, Prior] = {
-        "base": GaussianPrior(chunk_length),
-        "regression": RegressionPrior(chunk_length),
-        "history": HistoryPrior(chunk_length, cold_probability=cold_probability),
-    }
-    for prior_class in (PastPrior, PreviewPrior):
-        for sigma in (0.1, 0.5):
-            priors[f"{prior_class.name} {sigma}"] = prior_class(
-                chunk_length, sigma=sigma, cold_probability=cold_probability
-            )
+    priors = {}
+    for name in names:
+        for sigma in sigmas if Prior.find(name).takes("sigma") else (None,):
+            prior = Prior.make(name, chunk_length, sigma=sigma, cold_probability=cold_probability)
+            priors[prior.name if sigma is None else f"{prior.name} {sigma:g}"] = prior
     return priors
 
 
@@ -145,9 +149,9 @@ class NavigationStudy:
         if len(set(lengths.values())) > 1:
             raise ValueError(f"policies compare at one chunk length only, got {lengths}")
         self.data = navigation_demonstrations()
-        horizon = next(iter(lengths.values()))
+        chunk_length = next(iter(lengths.values()))
         #: All demonstrated steps from ``H`` on.
-        self.observations = SharedObservations(self.data, horizon)
+        self.observations = SharedObservations(self.data, chunk_length)
 
     def train(self, name: str, seed: int) -> WarmPriorActor:
         """Train one policy, or load it if the folder holds it with the same recipe.
@@ -161,14 +165,14 @@ class NavigationStudy:
         """
         prior = self.priors[name]
         torch.manual_seed(seed)
-        width = self.data[keys.OBSERVATION].shape[-1] + prior.context_dim(1)
+        width = self.data[keys.OBSERVATION].shape[-1] + MeanObservation.width(prior, 1)
         network = precondition(
             VelocityMLP(1, width, prior.prediction_length, 1, hidden_dim=self.preset.hidden_dim),
             self.data,
             prior,
             observation_steps=1,
         )
-        nfe = self.nfe if prior.max_nfe is None else min(self.nfe, prior.max_nfe)
+        nfe = self.nfe if prior.is_flow else 1
         training = BehaviourCloning(
             WarmPriorActor(network, prior, nfe=nfe),
             self.data,
@@ -197,16 +201,12 @@ class NavigationStudy:
             The rollout, ``[rollouts, decisions]``.
         """
         generator = torch.Generator().manual_seed(seed)
-        previous = actor.sampler.generator, actor.ode.nfe
-        actor.sampler.generator, actor.ode.nfe = generator, nfe or actor.ode.nfe
         transforms = policy_transforms(actor.prior, observation_steps=1)
         env = TransformedEnv(NavigationEnv(batch_size=[self.rollouts]), transforms)
-        policy = HistoryShift(actor, shift, generator=generator) if shift else actor
-        try:
-            with torch.no_grad():
-                return env.rollout(1_000, policy)
-        finally:
-            actor.sampler.generator, actor.ode.nfe = previous
+        player = actor.replace(nfe=nfe or actor.ode.nfe, generator=generator)
+        policy = HistoryShift(player, shift, generator=generator) if shift else player
+        with torch.no_grad():
+            return env.rollout(1_000, policy)
 
     def judge(self, actor: WarmPriorActor, seed: int) -> dict[str, Any]:
         """Play a policy and measure what it did.
@@ -220,11 +220,11 @@ class NavigationStudy:
             ``jerk`` (:class:`~warmprior.diagnostics.Smoothness`), some metrics under history shift
             (``"shifted_..."``) and at one network evaluation (``"one_step_..."``).
         """
-        horizon = actor.prior.chunk_length
+        chunk_length = actor.prior.chunk_length
         rollout = self.play(actor, seed)
         heights = executed_actions(rollout)[0].squeeze(-1)
         smooth = smoothness(rollout)
-        row: dict[str, Any] = asdict(navigation_metrics(heights, horizon))
+        row: dict[str, Any] = asdict(navigation_metrics(heights, chunk_length))
         row |= {"jump_ratio": smooth.jump_ratio, "jerk": smooth.jerk}
         for prefix, options in (("shifted", {"shift": SHIFT}), ("one_step", {"nfe": 1})):
             played = self.play(actor, seed, **options)  # type: ignore[arg-type]
@@ -232,7 +232,7 @@ class NavigationStudy:
                 other = dict.fromkeys(row, float("nan")) | {"collision_rate": 1.0}
             else:
                 heights = executed_actions(played)[0].squeeze(-1)
-                other = asdict(navigation_metrics(heights, horizon))
+                other = asdict(navigation_metrics(heights, chunk_length))
             for name in ("switch_rate", "collision_rate", "distance"):
                 row[f"{prefix}_{name}"] = other[name]
         return row
@@ -252,7 +252,7 @@ class NavigationStudy:
             ``"kappa_forecast"``, the executed curvature at the mean that deployment meets; and
             ``"bound"``, the mean of :func:`~warmprior.diagnostics.branching_bound` where it applies.
         """
-        flows = {name: a for name, a in actors.items() if a.prior.max_nfe is None}
+        flows = {name: a for name, a in actors.items() if a.prior.is_flow}
         windows = {name: self.observations.windows(a.prior) for name, a in flows.items()}
 
         def options() -> dict[str, Any]:
@@ -266,7 +266,7 @@ class NavigationStudy:
             met = self.observations.deployed(actor, generator=earlier)
             forecast = compare_curvature({name: actor}, {name: met}, n_steps, **options())[name]
             results[name]["kappa_forecast"] = forecast["kappa_executed"]
-            if not prior.conditions_network:
+            if prior.is_gaussian:
                 results[name]["bound"] = float(
                     branching_bound(windows[name], prior)["total"].mean()
                 )

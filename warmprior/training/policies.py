@@ -30,7 +30,7 @@ from warmprior.training.behaviour_cloning import (
 from warmprior.training.demonstrations import Demonstrations
 from warmprior.training.presets import Preset
 from warmprior.training.threads import torch_threads
-from warmprior.transforms import Normalizer, policy_transforms
+from warmprior.transforms import MeanObservation, Normalizer, policy_transforms
 
 __all__ = ["Policies"]
 
@@ -98,7 +98,7 @@ class Policies:
         action_dim = self.data["action"].shape[-1]
         network = self.preset.make_network(
             action_dim,
-            self.data["observation"].shape[-1] + prior.context_dim(action_dim),
+            self.data["observation"].shape[-1] + MeanObservation.width(prior, action_dim),
             prior.prediction_length,
         )
         if self.preset.precondition:

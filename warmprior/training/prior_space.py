@@ -20,7 +20,6 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.priors import GaussianPrior
 from warmprior.training.checkpoint import check_identity, load_state, save_state
 from warmprior.training.evaluation import Episode, evaluate, watched
 from warmprior.training.prior_space_agent import PriorSpaceAgent
@@ -190,7 +189,7 @@ class PriorSpaceTraining:
         """Partial execution would put actions into the next mean that the critics do not see."""
         prior = self.decoder.prior
         short = (after[keys.EXECUTED] < prior.chunk_length) & ~after["done"]
-        if short.any() and not isinstance(prior, GaussianPrior):
+        if short.any() and prior.ever_warm:
             raise ValueError(
                 f"the environment executes {int(after[keys.EXECUTED][short].max())} of H = "
                 f"{prior.chunk_length} actions per decision, but the agent's critics judge whole chunks: "

@@ -17,7 +17,7 @@ from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.box_normal import BoxTanhNormal
-from warmprior.modules.decoder import PriorDecoder, moves_source
+from warmprior.modules.decoder import PriorDecoder
 from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
 from warmprior.modules.residual import ResidualDistribution, ResidualSampler
 from warmprior.objectives import DSRLNALoss
@@ -61,15 +61,11 @@ class PriorSpaceAgent:
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
         # By default what is drawn around a mean stays in the box, but not what is drawn around zero.
-        drawn: ResidualDistribution | None = None if moves_source(actor.prior) else "clipped"
+        drawn: ResidualDistribution | None = None if actor.prior.moves_source else "clipped"
         self.warmup = TensorDictSequential(
             ResidualSampler(self.decoder, distribution=drawn), self.decoder
         )
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
-        if (
-            keys.LOC in self.decoder.in_keys
-        ):  # A mean that conditions the policy; the anchor is zero.
-            self.state_keys.append(keys.LOC)
         network = self._make(
             make_prior_space_actor,
             delta=self.decoder.delta,
@@ -87,7 +83,7 @@ class PriorSpaceAgent:
         network: Any = self._network
         return make(
             network.action_dim,
-            network.observation_dim - self._prior.context_dim(network.action_dim),
+            network.observation_dim,
             self._prior.prediction_length,
             network.observation_steps,
             hidden_dim=self.config.hidden_dim,

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.decoder import moves_source
 
 __all__ = ["PriorSpaceConfig"]
 
@@ -103,4 +102,4 @@ class PriorSpaceConfig:
         """``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
         if self.delta is not None:
             return self.delta
-        return 0.5 if moves_source(actor.prior) else 1.5
+        return 0.5 if actor.prior.moves_source else 1.5

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
-from warmprior.modules.decoder import moves_source, visible_priors
+from warmprior.modules.decoder import visible_priors
 from warmprior.modules.prior import Prior
 
 __all__ = ["PriorAnchor"]
@@ -86,7 +86,7 @@ class PriorAnchor(Transform):
         if cold not in (None, "noise", "zero"):
             raise ValueError(f"cold must be 'noise' or 'zero', got {cold!r}")
         self.prior = prior
-        self.follows_mean = moves_source(prior)
+        self.follows_mean = prior.moves_source
         self.cold = cold or ("noise" if self.follows_mean else "zero")
         self.seed_offset = seed_offset
         self.loc_key, self.warm_key = unravel_key(loc_key), unravel_key(warm_key)

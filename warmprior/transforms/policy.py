@@ -7,6 +7,7 @@ from torchrl.envs.transforms import Compose
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
+from warmprior.transforms.mean_observation import MeanObservation
 from warmprior.transforms.normalize import Normalizer
 from warmprior.transforms.stack import ObservationStack
 
@@ -24,8 +25,9 @@ def policy_transforms(
     """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
 
     In this order: normalisation of observations and denormalisation of actions, a stack of the last
-    ``To`` observations (the first one repeated at the start), :class:`ChunkStep`, and
-    :class:`ActionHistory`. It works around a single environment, and inside or outside of batched ones.
+    ``To`` observations (the first one repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`,
+    and :class:`MeanObservation` where the prior conditions the network. It works around a single
+    environment, and inside or outside of batched ones.
 
     Args:
         prior: the policy's source distribution.
@@ -54,4 +56,5 @@ def policy_transforms(
             gamma=gamma,
         ),
         ActionHistory(prior),
+        *([MeanObservation()] if prior.conditions_network else []),
     )

@@ -9,12 +9,13 @@ from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
 from warmprior.modules.prior import Prior
+from warmprior.transforms.mean_observation import MeanObservation
 
-__all__ = ["ActionWindow", "window_replay_buffer"]
+__all__ = ["ActionWindow", "window_replay_buffer", "window_transforms"]
 
 
 class ActionWindow(Transform):
@@ -87,13 +88,15 @@ class ActionWindow(Transform):
         self.observation_key = observation_key
         observation, action, episode = _checked(data, observation_key, action_key, episode_key)
         start, end = _episode_borders(episode)
-        horizon = prior.chunk_length
+        chunk_length = prior.chunk_length
         for name, value in {
             "observation": observation,
             "action": action,
             "start": start,
             "end": end,
-            "action_offsets": torch.arange(-horizon, prior.prediction_length, device=start.device),
+            "action_offsets": torch.arange(
+                -chunk_length, prior.prediction_length, device=start.device
+            ),
             "observation_offsets": torch.arange(1 - observation_steps, 1, device=start.device),
         }.items():
             self.register_buffer(name, value, persistent=False)
@@ -111,11 +114,11 @@ class ActionWindow(Transform):
         index = frame + self.action_offsets
         valid = (index >= start) & (index <= end)
         action = self.action[index.clamp(start, end)]
-        horizon = self.prior.chunk_length
-        history_valid = valid[:, :horizon]
-        target = action[:, horizon:]
+        chunk_length = self.prior.chunk_length
+        history_valid = valid[:, :chunk_length]
+        target = action[:, chunk_length:]
         # Outside the episode the gather repeats its first action, which belongs to the target: zero it.
-        history = action[:, :horizon] * history_valid.unsqueeze(-1)
+        history = action[:, :chunk_length] * history_valid.unsqueeze(-1)
         loc, warm = self.prior.training_mean(history, history_valid, target)
         warm = self.prior.withhold(warm, self.generator)
         recent = (frame + self.observation_offsets).clamp_min(start)
@@ -123,7 +126,7 @@ class ActionWindow(Transform):
         for key, value in (
             (self.observation_key, self.observation[recent]),
             (keys.CHUNK, target),
-            (keys.IS_PAD, ~valid[:, horizon:]),
+            (keys.IS_PAD, ~valid[:, chunk_length:]),
             (keys.LOC, loc),
             (keys.WARM, warm),
         ):
@@ -164,6 +167,32 @@ def _episode_borders(episode: Tensor) -> tuple[Tensor, Tensor]:
     return first.repeat_interleave(lengths), last.repeat_interleave(lengths)
 
 
+def window_transforms(
+    data: TensorDictBase,
+    prior: Prior,
+    *,
+    observation_steps: int = 2,
+    generator: torch.Generator | None = None,
+) -> Compose:
+    """What makes of step numbers the windows that a policy of the prior reads.
+
+    :class:`ActionWindow`, and :class:`MeanObservation` where the prior conditions the network: the
+    counterpart of :func:`~warmprior.policy_transforms` on the side of the data.
+
+    Args:
+        data: contiguous normalised steps, see :class:`ActionWindow`.
+        prior: the source distribution.
+
+    Keyword Args:
+        observation_steps: ``To``.
+        generator: see :class:`ActionWindow`.
+    """
+    return Compose(
+        ActionWindow(data, prior, observation_steps=observation_steps, generator=generator),
+        *([MeanObservation()] if prior.conditions_network else []),
+    )
+
+
 def window_replay_buffer(
     data: TensorDictBase,
     prior: Prior,
@@ -198,14 +227,16 @@ def window_replay_buffer(
         >>> batch["vla_action", "chunk"].shape, batch["observation"].shape
         (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
     """
-    window = ActionWindow(data, prior, observation_steps=observation_steps, generator=generator)
-    frames = torch.arange(len(data), device=window.start.device)
+    windows = window_transforms(
+        data, prior, observation_steps=observation_steps, generator=generator
+    )
+    frames = torch.arange(len(data), device=windows[0].start.device)
     return TensorDictReplayBuffer(
         # The sampler draws on the storage's device, where the generator has to be too.
         storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
         sampler=RandomSampler() if sampler is None else sampler,
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
-        transform=window,
+        transform=windows,
         generator=generator,
     )

@@ -1,0 +1,194 @@
+"""What a prior of one's own gets without further work: identity, options, copies, training."""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from warmprior import (
+    FlowMatchingLoss,
+    GaussianPrior,
+    PastPrior,
+    PreviewPrior,
+    Prior,
+    PriorDecoder,
+    VelocityMLP,
+    WarmPriorActor,
+    window_replay_buffer,
+)
+from warmprior.diagnostics import prior_color, prior_label
+from warmprior.training import BehaviourCloning, TrainingConfig
+
+D_A, D_O, H, TO = 2, 3, 4, 2
+
+
+class Anchor(PastPrior):
+    """A source around a fixed multiple of the past, with arguments of its own."""
+
+    name = "anchor-of-the-tests"
+
+    def __init__(self, chunk_length, *, gain, offsets=(0.0,), **options):
+        super().__init__(chunk_length, **options)
+        self.scale = gain
+
+    def sample(self, loc, warm, generator=None):
+        return super().sample(self.scale * loc, warm, generator)
+
+
+class Learned(PastPrior, nn.Module):
+    """A source whose shift is trained with the network."""
+
+    name = "learned-of-the-tests"
+    label = "Learned"
+    color = "#123456"
+
+    def __init__(self, chunk_length, *, action_dim=D_A):
+        nn.Module.__init__(self)
+        super().__init__(chunk_length)
+        self.shift = nn.Parameter(torch.zeros(action_dim))
+
+    def sample(self, loc, warm, generator=None):
+        return super().sample(loc + self.shift, warm, generator)
+
+
+class Reversed(GaussianPrior):
+    """Pairs the sources of a batch the other way round."""
+
+    name = "reversed-of-the-tests"
+
+    def couple(self, a0, a1, generator=None):
+        return a0.flip(0), a1
+
+
+def data(steps=60):
+    generator = torch.Generator().manual_seed(0)
+    return TensorDict(
+        {
+            "observation": torch.randn(steps, D_O, generator=generator),
+            "action": torch.rand(steps, D_A, generator=generator),
+            "episode": torch.arange(steps) // 20,
+        },
+        [steps],
+    )
+
+
+def actor_for(prior, **options):
+    torch.manual_seed(1)
+    network = VelocityMLP(D_A, D_O, prior.prediction_length, TO, hidden_dim=8)
+    return WarmPriorActor(network, prior, **options)
+
+
+def test_arguments_of_its_own_are_part_of_its_configuration():
+    prior = Anchor(H, gain=0.5, offsets=(1.0, 2.0), sigma=0.3)
+    config = json.loads(json.dumps(prior.config()))
+    assert config == {
+        "name": "anchor-of-the-tests",
+        "chunk_length": H,
+        "gain": 0.5,
+        "offsets": [1.0, 2.0],
+        "sigma": 0.3,
+    }
+    again = Prior.from_config(config)
+    assert type(again) is Anchor and again.config() == config and again.scale == 0.5
+    assert repr(again) == f"Anchor(chunk_length={H}, gain=0.5, offsets=[1.0, 2.0], sigma=0.3)"
+
+
+def test_the_same_prior_has_one_configuration():
+    assert PastPrior(H).config() == PastPrior(H, sigma=0.5, cold_probability=0).config()
+
+
+@pytest.mark.parametrize(
+    "twin", [copy.copy, copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))]
+)
+@pytest.mark.parametrize("prior", [Anchor(H, gain=2.0), Learned(H), PreviewPrior(H, sigma=0.1)])
+def test_copies_keep_everything(twin, prior):
+    other = twin(prior)
+    assert type(other) is type(prior) and other.config() == prior.config()
+    loc, warm = torch.ones(3, prior.prediction_length, D_A), torch.ones(3, 1, 1, dtype=torch.bool)
+    draws = [p.sample(loc, warm, torch.Generator().manual_seed(2)) for p in (prior, other)]
+    assert torch.equal(*draws)
+
+
+def test_what_cannot_be_saved_is_told_before_anything_is_trained(tmp_path):
+    prior = Anchor(H, gain=torch.ones(2))
+    with pytest.raises(TypeError, match="Anchor has an argument that cannot be saved"):
+        BehaviourCloning(actor_for(prior), data(), TrainingConfig(iterations=20), tmp_path)
+
+
+def test_a_taken_name_is_refused():
+    with pytest.raises(ValueError, match=r"a prior named 'past' exists already .*PastPrior"):
+
+        class Mine(GaussianPrior):
+            name = "past"
+
+    assert Prior.find("past") is PastPrior
+
+
+def test_found_by_name_or_place():
+    place = f"{__name__}:Anchor"
+    assert Prior.find("anchor-of-the-tests") is Anchor
+    assert Prior.find(place) is Anchor
+    for wrong in ("nothing", "no.such.module:Anchor", f"{__name__}:Missing", f"{__name__}:data"):
+        with pytest.raises(ValueError, match="prior"):
+            Prior.find(wrong)
+    # A file may name a prior, but never a place to import.
+    with pytest.raises(ValueError, match="unknown prior"):
+        Prior.from_config({"name": place, "chunk_length": H})
+
+
+def test_how_it_looks_in_figures():
+    assert (prior_label(Learned.name), prior_color(Learned.name)) == ("Learned", "#123456")
+    assert prior_label(Anchor.name) == Anchor.name
+    assert prior_color(Anchor.name).startswith("#")
+    assert (prior_label("of a file"), prior_color("of a file")) == ("of a file", None)
+
+
+def test_the_coupling_reaches_the_loss():
+    prior, generator = Reversed(H), torch.Generator().manual_seed(3)
+    actor, batch = actor_for(prior), window_replay_buffer(data(), prior, batch_size=16).sample()
+    loss = FlowMatchingLoss(actor, generator=torch.Generator().manual_seed(3))(batch)
+    target = batch["vla_action", "chunk"]
+    a0 = torch.randn(target.shape, generator=generator).flip(0)
+    t = torch.rand(16, generator=generator)
+    a_t = a0 + t[:, None, None] * (target - a0)
+    error = actor.network(t, a_t, batch["observation"]) - (target - a0)
+    expected = error.square()[~batch["action_is_pad"]].mean()
+    torch.testing.assert_close(loss["loss_flow_matching"], expected)
+    assert GaussianPrior(H).is_gaussian and not prior.is_gaussian
+
+
+def test_a_learned_prior_trains_saves_resumes_and_freezes(tmp_path):
+    def training(folder, iterations=6):
+        config = TrainingConfig(iterations=iterations, batch_size=8, checkpoints=1, save_every=3)
+        return BehaviourCloning(actor_for(Learned(H)), data(), config, folder, observation_steps=TO)
+
+    whole = training(tmp_path / "whole")
+    whole.run(None)
+    shift = whole.actor.prior.shift
+    assert (shift != 0).all()
+    halves = training(tmp_path / "halves")
+
+    def interrupt(iteration):
+        if iteration == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        halves.run(None, interrupt)
+    resumed = training(tmp_path / "halves")
+    resumed.run(None)
+    assert torch.equal(resumed.actor.prior.shift, shift)
+    path = whole.policy_path(6)
+    loaded = WarmPriorActor.from_pretrained(path)
+    averaged = loaded.prior.shift
+    assert (averaged != 0).all() and not torch.equal(averaged, shift)  # the average of the steps
+    decoder = PriorDecoder(loaded, delta=0.5)
+    assert not list(decoder.parameters())
+    with torch.no_grad():
+        averaged.add_(1.0)
+    assert not torch.equal(decoder.prior.shift, averaged)

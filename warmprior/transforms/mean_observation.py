@@ -1,0 +1,102 @@
+"""The prior's mean as a part of the observation, for networks that are conditioned on it."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Composite, Unbounded
+from torchrl.envs.transforms import Transform
+
+from warmprior import keys
+from warmprior.modules.prior import Prior
+
+__all__ = ["MeanObservation"]
+
+
+class MeanObservation(Transform):
+    """Writes the observation extended by the prior's mean, in environments and replay buffers alike.
+
+    The mean (zero on cold positions) is flattened, followed by 1 if anything is warm and else 0, and
+    repeated over the observation steps. :func:`~warmprior.policy_transforms` and
+    :func:`~warmprior.window_replay_buffer` append it for priors that ask for it
+    (:attr:`Prior.conditions_network`), and their :class:`~warmprior.WarmPriorActor` reads what it writes.
+    In an environment it comes after :class:`~warmprior.ActionHistory`.
+
+    Keyword Args:
+        observation_key: the observation, ``[*B, To, d_o]``.
+        loc_key: the mean, ``[*B, P, d_a]``, normalised action space.
+        warm_key: the warm mask, bool ``[*B, P, 1]``.
+        out_key: key written, ``[*B, To, d_o + P * d_a + 1]``.
+
+    Raises:
+        KeyError: if an input key is missing.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from warmprior import HistoryPrior, policy_transforms
+        >>> prior = HistoryPrior(2)
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(prior, observation_steps=1))
+        >>> seen = env.rollout(2)["prior", "observation"]  # 3 observations, 2 actions, whether warm
+        >>> seen.shape, seen[:, 0, -1].tolist()
+        (torch.Size([2, 1, 6]), [0.0, 1.0])
+        >>> 3 + MeanObservation.width(prior, action_dim=1)
+        6
+    """
+
+    def __init__(
+        self,
+        *,
+        observation_key: NestedKey = keys.OBSERVATION,
+        loc_key: NestedKey = keys.LOC,
+        warm_key: NestedKey = keys.WARM,
+        out_key: NestedKey = keys.CONDITIONED,
+    ) -> None:
+        read = [unravel_key(key) for key in (observation_key, loc_key, warm_key)]
+        super().__init__(in_keys=read, out_keys=[unravel_key(out_key)])
+
+    @staticmethod
+    def width(prior: Prior, action_dim: int) -> int:
+        """By how much a policy's observation is wider than the environment's: ``P * d_a + 1``, or 0.
+
+        Args:
+            prior: the policy's.
+            action_dim: ``d_a``.
+        """
+        return prior.prediction_length * action_dim + 1 if prior.conditions_network else 0
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the extended observation."""
+        found = [tensordict.get(key, None) for key in self.in_keys]
+        missing = [key for key, value in zip(self.in_keys, found, strict=True) if value is None]
+        if missing:
+            raise KeyError(
+                f"MeanObservation needs the keys {self.in_keys}; missing: {missing}. In an environment "
+                "append it after ActionHistory"
+            )
+        return tensordict.set(self.out_keys[0], _extended(*found))
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self.forward(tensordict_reset)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the extended observation."""
+        observation, loc, _ = (observation_spec[key] for key in self.in_keys)
+        shape = (*observation.shape[:-1], observation.shape[-1] + loc.shape[-2:].numel() + 1)
+        observation_spec[self.out_keys[0]] = Unbounded(
+            shape, dtype=observation.dtype, device=observation.device
+        )
+        return observation_spec
+
+
+def _extended(observation: Tensor, loc: Tensor, warm: Tensor) -> Tensor:
+    mean = torch.where(warm, loc, 0.0).flatten(-2)
+    context = torch.cat([mean, warm.any(-2).to(mean)], dim=-1).unsqueeze(-2)
+    context = context.expand(*observation.shape[:-1], context.shape[-1])
+    return torch.cat([observation, context.to(observation.dtype)], dim=-1)
