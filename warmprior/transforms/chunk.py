@@ -9,9 +9,10 @@ from tensordict import TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs.transforms import Transform, TransformedEnv
+from torchrl.envs.transforms import Transform
 
 from warmprior import keys
+from warmprior.transforms.inner_step import InnerStep, rows_where, set_aside
 
 __all__ = ["ChunkStep"]
 
@@ -85,6 +86,8 @@ class ChunkStep(Transform):
         self.action_key = unravel_key(action_key)
         self.chunk_key = unravel_key(chunk_key)
         self.executed_key = unravel_key(executed_key)
+        self._input: TensorDictBase | None = None
+        self._inner: tuple[Any, InnerStep, NestedKey] | None = None
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         # The wrapped environment's own step executes the first action; _step runs the others.
@@ -95,57 +98,70 @@ class ChunkStep(Transform):
                 f"ChunkStep expects a chunk [*B, {self.prediction_length}, d_a] at "
                 f"{self.chunk_key}, found {found}"
             )
+        # Inverse transforms of the environment below may change it before _step gets it.
+        self._input = tensordict.copy()
+        if "_step" in tensordict:
+            set_aside(tensordict, self._inner_step()[0].observed)
         return tensordict.set(self.action_key, chunk[..., 0, :])
 
-    def _keys_of_parent(self) -> tuple[Any, NestedKey, NestedKey]:
+    def _inner_step(self) -> tuple[InnerStep, NestedKey]:
+        """How to step what this transform wraps, and the key of its reward."""
         parent = self.parent
-        if parent is None:
-            raise RuntimeError("ChunkStep only steps environments: append it to a TransformedEnv")
-        if len(parent.reward_keys) != 1 or unravel_key("done") not in parent.done_keys:
-            raise RuntimeError(
-                "ChunkStep needs one reward and a root 'done', the environment has "
-                f"rewards {parent.reward_keys} and done keys {parent.done_keys}"
-            )
-        return parent, parent.reward_keys[0], "done"
+        if self._inner is None or self._inner[0] is not parent:
+            # TorchRL builds another parent whenever the transforms change.
+            inner = InnerStep(self)
+            rewards, dones = parent.reward_keys, parent.done_keys
+            if len(rewards) != 1 or "done" not in dones:
+                raise RuntimeError(
+                    "ChunkStep needs one reward and a root 'done', the environment has "
+                    f"rewards {rewards} and done keys {dones}"
+                )
+            self._inner = (parent, inner, rewards[0])
+        return self._inner[1:]
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        parent, reward_key, done_key = self._keys_of_parent()
-        chunk = tensordict.get(self.chunk_key)
-        reward: Tensor = next_tensordict.get(reward_key)
-        done: Tensor = next_tensordict.get(done_key)
-        asked = tensordict.get("_step", None)
+        step, reward_key = self._inner_step()
+        batch = next_tensordict.batch_size
+        current, self._input = self._input, None
+        if current is None:
+            raise RuntimeError("ChunkStep._step was called without ChunkStep.inv: use env.step")
+        chunk = current.get(self.chunk_key)
+        preset = current.pop("next", None)
+        current.pop("_step", None)
         # Which environments go on; None for all of them, the usual case, which needs no masks.
-        alive = None if asked is None else asked.view(done.shape)
-        steps = torch.ones_like(done, dtype=torch.int64) if alive is None else alive.long()
+        alive: Tensor | None = tensordict.get("_step", None)
+        if alive is not None:
+            alive = alive.view(batch)
+            next_tensordict = rows_where(alive, next_tensordict, current)
+        reward: Tensor = next_tensordict.get(reward_key)
+        steps = torch.ones(batch, dtype=torch.int64, device=chunk.device)
+        steps = steps if alive is None else alive.long()
         discount = self.gamma
-        current = tensordict.copy()
         for i in range(1, self.execute):
+            done = next_tensordict.get("done")
             if done.any():
-                alive = ~done if alive is None else alive & ~done
+                running = ~done.view(batch)
+                alive = running if alive is None else alive & running
             if alive is not None and not alive.any():
                 break
             _advance(current, next_tensordict, reward_key)
             current.set(self.action_key, chunk[..., i, :])
+            result = step(current, alive)
+            earned = result.get(reward_key)
             if alive is None:
-                # What EnvBase.step adds to TransformedEnv._step are checks: the outer step makes them.
-                next_tensordict = (
-                    parent._step(current)
-                    if isinstance(parent, TransformedEnv)
-                    else parent.step(current.copy()).get("next")
-                )
-                reward = torch.add(reward, next_tensordict.get(reward_key), alpha=discount)
+                next_tensordict = result
                 steps += 1
             else:
-                # A partial step: batched environments leave the finished ones alone.
-                current.set("_step", alive.view(current.shape))
-                out = parent.step(current.copy()).get("next")
-                reward = reward + torch.where(alive, out.get(reward_key), 0.0) * discount
+                earned = torch.where(expand_as_right(alive, earned), earned, 0.0)
+                next_tensordict = rows_where(alive, result, next_tensordict)
                 steps += alive
-                next_tensordict = _update_where(alive, next_tensordict, out)
+            reward = torch.add(reward, earned, alpha=discount)
             discount *= self.gamma
-            done = next_tensordict.get(done_key)
+        if preset is not None:
+            # A policy may preset other keys under "next", which the inner steps do not return.
+            next_tensordict.update(preset.exclude(*next_tensordict.keys(True, True)))
         next_tensordict.set(reward_key, reward)
-        return next_tensordict.set(self.executed_key, steps)
+        return next_tensordict.set(self.executed_key, steps.unsqueeze(-1))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -189,19 +205,3 @@ def _advance(
             current.set(key, value)
         else:
             mine.update(value)
-
-
-def _update_where(mask: Tensor, old: TensorDictBase, new: TensorDictBase) -> TensorDictBase:
-    """``old`` with the rows of ``new`` where ``mask`` holds, for the keys that the step produced.
-
-    A policy may have preset other keys under "next"; the inner steps do not return those.
-    """
-    result = old.copy()
-    mask = mask.view(old.shape)
-    for key in new.keys(True, True):
-        previous = old.get(key, None)
-        value = new.get(key)
-        if previous is not None:
-            value = torch.where(expand_as_right(mask, value), value, previous)
-        result.set(key, value)
-    return result
