@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, is_tensor_collection
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, TensorSpec, Unbounded
@@ -122,17 +122,19 @@ class ChunkStep(Transform):
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         step, reward_key = self._inner_step()
         batch = next_tensordict.batch_size
-        current, self._input = self._input, None
-        if current is None:
+        before, self._input = self._input, None
+        if before is None:
             raise RuntimeError("ChunkStep._step was called without ChunkStep.inv: use env.step")
-        chunk = current.get(self.chunk_key)
+        chunk = before.get(self.chunk_key)
+        # A plain dictionary: a tensordict's checks would be made at every control step.
+        current = dict(before.items())
         preset = current.pop("next", None)
         current.pop("_step", None)
         # Which environments go on; None for all of them, the usual case, which needs no masks.
         alive: Tensor | None = tensordict.get("_step", None)
         if alive is not None:
             alive = alive.view(batch)
-            next_tensordict = rows_where(alive, next_tensordict, current)
+            next_tensordict = rows_where(alive, next_tensordict, before)
         reward: Tensor = next_tensordict.get(reward_key)
         steps = torch.ones(batch, dtype=torch.int64, device=chunk.device)
         steps = steps if alive is None else alive.long()
@@ -145,8 +147,8 @@ class ChunkStep(Transform):
             if alive is not None and not alive.any():
                 break
             _advance(current, next_tensordict, reward_key)
-            current.set(self.action_key, chunk[..., i, :])
-            result = step(current, alive)
+            inputs = TensorDict(current, batch_size=batch, device=next_tensordict.device)
+            result = step(inputs.set(self.action_key, chunk[..., i, :]), alive)
             earned = result.get(reward_key)
             if alive is None:
                 next_tensordict = result
@@ -194,14 +196,12 @@ class ChunkStep(Transform):
 
 
 def _advance(
-    current: TensorDictBase, next_tensordict: TensorDictBase, reward_key: NestedKey
+    current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey
 ) -> None:
     """As ``step_mdp``, in place and without its generality: it runs at every control step."""
     for key, value in next_tensordict.items():
-        if key == reward_key:
-            continue
-        mine = current.get(key, None) if is_tensor_collection(value) else None
-        if mine is None:
-            current.set(key, value)
-        else:
-            mine.update(value)
+        mine = current.get(key) if is_tensor_collection(value) else None
+        if mine is not None:
+            value = mine.copy().update(value)
+        if key != reward_key:
+            current[key] = value

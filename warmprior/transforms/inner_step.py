@@ -48,27 +48,42 @@ class InnerStep:
         self.observed = [
             key for key in self.base.observation_spec.keys(True, True) if key not in states
         ]
-        self._done_spec = self.base.full_done_spec
+        done_spec = self.base.full_done_spec
+        self._done_spec, self._dones = done_spec, list(done_spec.items(True, True))
+        inverse = [k for t in before for k in (*t.in_keys_inv, *t.out_keys_inv)]
+        self._branches = {key[0] for key in (*inverse, *self.observed) if isinstance(key, tuple)}
 
     def __call__(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
         """What the step leads to.
 
         Args:
-            tensordict: the step's input, ``[*B]``; left as it is.
+            tensordict: the step's input, ``[*B]``. Entries are added at its root; nested ones stay as they
+                are.
             rows: which environments are stepped, bool ``[*B]``; all of them by default. What is returned
                 for the others means nothing.
         """
-        inputs = tensordict.copy()
+        for branch in self._branches:
+            if branch in tensordict:
+                tensordict.set(branch, tensordict.get(branch).copy())
         if rows is not None and self.base.batch_locked:
-            inputs.set("_step", rows)
-            set_aside(inputs, self.observed)
+            tensordict.set("_step", rows)
+            set_aside(tensordict, self.observed)
         for transform in reversed(self.transforms):
-            inputs = transform._inv_call(inputs)
-        result = self.base._step(inputs)
-        self.base._complete_done(self._done_spec, result)
+            tensordict = transform._inv_call(tensordict)
+        result = self.base._step(tensordict)
+        if not self._has_dones(result):
+            self.base._complete_done(self._done_spec, result)
         for transform in self.transforms:
-            result = transform._step(inputs, result)
+            result = transform._step(tensordict, result)
         return result
+
+    def _has_dones(self, result: TensorDictBase) -> bool:
+        """Whether no flag is left to complete; most environments give all, and completing is slow."""
+        values = (result.get(key, None) for key, _ in self._dones)
+        return all(
+            value is not None and value.shape == spec.shape
+            for value, (_, spec) in zip(values, self._dones, strict=True)
+        )
 
 
 def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None:
