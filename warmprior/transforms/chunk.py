@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
 from warmprior import keys
@@ -43,9 +43,10 @@ class ChunkStep(Transform):
         executed_key: where ``k`` is written, int64 ``[*B, 1]``.
 
     Raises:
-        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``.
-        RuntimeError: (on the first step) if the environment has several rewards, done flags or
-            resets itself.
+        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, or (in an environment) an
+            action is not one vector.
+        KeyError: (in an environment) if there is no such action.
+        RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``.
 
     Examples:
         >>> import torch
@@ -136,9 +137,10 @@ class ChunkStep(Transform):
             alive = alive.view(batch)
             next_tensordict = rows_where(alive, next_tensordict, before)
         reward: Tensor = next_tensordict.get(reward_key)
+        if not reward.is_floating_point():
+            reward = reward.to(torch.get_default_dtype())
         steps = torch.ones(batch, dtype=torch.int64, device=chunk.device)
         steps = steps if alive is None else alive.long()
-        discount = self.gamma
         for i in range(1, self.execute):
             done = next_tensordict.get("done")
             if done.any():
@@ -154,11 +156,10 @@ class ChunkStep(Transform):
                 next_tensordict = result
                 steps += 1
             else:
-                earned = torch.where(expand_as_right(alive, earned), earned, 0.0)
+                earned = torch.where(expand_as_right(alive, earned), earned, 0)
                 next_tensordict = rows_where(alive, result, next_tensordict)
                 steps += alive
-            reward = torch.add(reward, earned, alpha=discount)
-            discount *= self.gamma
+            reward = torch.add(reward, earned, alpha=self.gamma**i)
         if preset is not None:
             # A policy may preset other keys under "next", which the inner steps do not return.
             next_tensordict.update(preset.exclude(*next_tensordict.keys(True, True)))
@@ -178,14 +179,46 @@ class ChunkStep(Transform):
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the action by a chunk of ``P`` actions."""
-        leaf = input_spec["full_action_spec", self.action_key]
-        ndim = input_spec.ndim
+        actions, ndim = input_spec["full_action_spec"], input_spec.ndim
+        if self.action_key not in actions.keys(True, True):
+            raise KeyError(
+                f"ChunkStep found no action {self.action_key!r}, only {list(actions.keys(True, True))}: name "
+                "it with action_key"
+            )
+        leaf = actions[self.action_key]
+        if leaf.ndim != ndim + 1:
+            raise ValueError(
+                "ChunkStep takes environments whose action is one vector [*B, d_a], but "
+                f"{self.action_key!r} has shape {tuple(leaf.shape)} for the batch size "
+                f"{tuple(input_spec.shape)}: make it a vector before, for instance with FlattenAction or "
+                "UnsqueezeTransform"
+            )
         leaf = leaf.unsqueeze(ndim)
         leaf = leaf.expand(*leaf.shape[:ndim], self.prediction_length, *leaf.shape[ndim + 1 :])
-        actions = input_spec["full_action_spec"]
         actions[self.chunk_key] = leaf.clone()
         del actions[self.action_key]
         return input_spec
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+        """The discounted sum of up to ``execute`` rewards."""
+        for key, leaf in list(reward_spec.items(True, True)):
+            dtype = leaf.dtype if leaf.dtype.is_floating_point else torch.get_default_dtype()
+            options = {"shape": leaf.shape, "dtype": dtype, "device": leaf.device}
+            if isinstance(leaf, Bounded):
+                low, high = leaf.space.low.to(dtype), leaf.space.high.to(dtype)
+                # An episode may end after any number of steps.
+                lows, highs = self._returns(low), self._returns(high)
+                reward_spec[key] = Bounded(lows.amin(0), highs.amax(0), **options)
+            else:
+                reward_spec[key] = Unbounded(**options)
+        return reward_spec
+
+    def _returns(self, reward: Tensor) -> Tensor:
+        """Sums of 1, 2, ... of the same reward, rounded as :meth:`_step` does."""
+        sums = [reward]
+        for i in range(1, self.execute):
+            sums.append(torch.add(sums[-1], reward, alpha=self.gamma**i))
+        return torch.stack(sums)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the number of executed steps."""
