@@ -10,9 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import Composite, LazyTensorStorage, TensorDictReplayBuffer, Unbounded
+from torchrl.data import (
+    Bounded,
+    Categorical,
+    Composite,
+    LazyTensorStorage,
+    TensorDictReplayBuffer,
+    Unbounded,
+)
 from torchrl.envs import (
     Compose,
+    EnvBase,
     InitTracker,
     RewardSum,
     SerialEnv,
@@ -226,3 +234,86 @@ def test_collector_fills_a_replay_buffer():
     )
     assert (sample["prior", "warm"].all(1).squeeze(-1) == (start >= 3)).all()
     collector.shutdown()
+
+
+class VectorEnv(EnvBase):
+    """The toy for a batch at once, with rewards of any spec and shape; ignores which rows are asked."""
+
+    def __init__(self, reward_spec, done_after=(7, 4), reward=1.0, action_shape=(ACTION_DIM,)):
+        super().__init__(batch_size=[len(done_after)])
+        self.ends = torch.tensor(done_after)[:, None]
+        self.reward = reward
+        self.observation_spec = Composite(
+            count=Unbounded((2, 1), dtype=torch.int64), shape=self.batch_size
+        )
+        self.state_spec = self.observation_spec.clone()
+        self.action_spec = Bounded(-1, 1, (2, *action_shape))
+        self.reward_spec = reward_spec
+        self.done_spec = Composite(
+            {
+                key: Categorical(2, dtype=torch.bool, shape=(2, 1))
+                for key in ("done", "terminated", "truncated")
+            },
+            shape=self.batch_size,
+        )
+
+    def _reset(self, tensordict=None, **kwargs):
+        count = torch.zeros(2, 1, dtype=torch.int64)
+        return TensorDict({"count": count}, [2]).update(self.full_done_spec.zero())
+
+    def _set_seed(self, seed):
+        """Nothing is random."""
+
+    def _step(self, tensordict):
+        count = tensordict["count"] + 1
+        done = count >= self.ends
+        spec = self.full_reward_spec["reward"]
+        reward = torch.full(spec.shape, self.reward, dtype=spec.dtype)
+        out = TensorDict({"count": count, "done": done, "terminated": done, "reward": reward}, [2])
+        return out.set("truncated", torch.zeros_like(done))
+
+
+@pytest.mark.parametrize("gamma", [1.0, 0.9, 0.0])
+@pytest.mark.parametrize(
+    ("low", "high", "reward"), [(0.0, 1.0, 1.0), (-1.0, 0.0, -1.0), (-2.0, -1.0, -1.0)]
+)
+def test_reward_spec_is_that_of_the_sum(low, high, reward, gamma):
+    base = VectorEnv(Bounded(low, high, (2, 1)), reward=reward)
+    env = TransformedEnv(base, ChunkStep(3, gamma=gamma))
+    check_env_specs(env)
+    total = 1 + gamma + gamma**2
+    space = env.full_reward_spec["reward"].space
+    torch.testing.assert_close(space.low, torch.full((2, 1), min(low, low * total)))
+    torch.testing.assert_close(space.high, torch.full((2, 1), max(high, high * total)))
+    found = env.rollout(2)["next", "reward"]
+    torch.testing.assert_close(found[:, 0], torch.full((2, 1), reward * total))
+    torch.testing.assert_close(found[1, 1], torch.full((1,), reward))
+    # The bounds that the wrapped environment gave are its own still.
+    assert (base.full_reward_spec["reward"].space.high == high).all()
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [Unbounded((2,)), Bounded(0, 1, (2,)), Unbounded((2, 1), dtype=torch.int64), Unbounded((2, 3))],
+)
+def test_rewards_of_any_shape_and_dtype(spec):
+    """One per environment, several (a multi-objective reward), and whole numbers."""
+    env = TransformedEnv(VectorEnv(spec), ChunkStep(3, gamma=0.5))
+    check_env_specs(env)
+    rollout = env.rollout(2)
+    assert rollout["next", "reward"].dtype == torch.float32
+    expected = torch.tensor([[1.75, 1.75], [1.75, 1.0]])
+    expected = expected.view(2, 2, *(1 for _ in spec.shape[1:])).expand(2, 2, *spec.shape[1:])
+    assert torch.equal(rollout["next", "reward"], expected)
+    assert rollout["next", "executed_steps"].squeeze(-1).tolist() == [[3, 3], [3, 1]]
+
+
+@pytest.mark.parametrize("shape", [(), (3, 2)])
+def test_actions_that_are_no_vector_are_refused(shape):
+    with pytest.raises(ValueError, match=r"one vector \[\*B, d_a\], but 'action' has shape \(2"):
+        TransformedEnv(VectorEnv(Unbounded((2, 1)), action_shape=shape), ChunkStep(3)).rollout(1)
+
+
+def test_an_action_of_another_name():
+    with pytest.raises(KeyError, match=r"no action 'move', only \['action'\]"):
+        TransformedEnv(CountingEnv(), ChunkStep(3, action_key="move")).rollout(1)

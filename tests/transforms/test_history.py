@@ -213,3 +213,26 @@ def test_a_user_s_prior_from_window_to_environment():
                 )
     finally:
         del Prior._registry["momentum-for-this-test"]
+
+
+@pytest.mark.parametrize("prior_class", PRIORS)
+@pytest.mark.parametrize("execute", [2, 3])
+def test_rows_that_rest_keep_their_mean(prior_class, execute):
+    """Outside of workers a partial step comes with chunks for all rows; those that rest execute none."""
+    prior = prior_class(3)
+    base = SerialEnv(2, partial(CountingEnv, 30))
+    env = TransformedEnv(base, Compose(chunk_step(prior, execute=execute), ActionHistory(prior)))
+    policy = random_policy(prior)
+    data = env.reset()
+    for _ in range(2):
+        data = env.step_mdp(env.step(policy(data)))
+    before = data["prior"].clone()
+    stepped = env.step(policy(data).set("_step", torch.tensor([True, False])))
+    after = stepped["next", "prior"]
+    for key in ("loc", "warm", "elapsed"):
+        assert torch.equal(after[key][1], before[key][1]), key
+    assert after["elapsed"].flatten().tolist() == [3 * execute, 2 * execute]
+    # The row that was stepped goes on as in a step of both.
+    whole = env.step(stepped.exclude("next", "_step").clone())["next", "prior"]
+    assert torch.equal(after["loc"][0], whole["loc"][0])
+    assert torch.equal(after["warm"][0], whole["warm"][0])

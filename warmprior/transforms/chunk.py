@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, is_tensor_collection
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
-from torchrl.envs.transforms import Transform, TransformedEnv
+from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.envs.transforms import Transform
 
 from warmprior import keys
+from warmprior.transforms.inner_step import InnerStep, rows_where, set_aside
 
 __all__ = ["ChunkStep"]
 
@@ -42,9 +43,10 @@ class ChunkStep(Transform):
         executed_key: where ``k`` is written, int64 ``[*B, 1]``.
 
     Raises:
-        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``.
-        RuntimeError: (on the first step) if the environment has several rewards, done flags or
-            resets itself.
+        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, or (in an environment) an
+            action is not one vector.
+        KeyError: (in an environment) if there is no such action.
+        RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``.
 
     Examples:
         >>> import torch
@@ -85,6 +87,8 @@ class ChunkStep(Transform):
         self.action_key = unravel_key(action_key)
         self.chunk_key = unravel_key(chunk_key)
         self.executed_key = unravel_key(executed_key)
+        self._input: TensorDictBase | None = None
+        self._inner: tuple[Any, InnerStep, NestedKey] | None = None
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         # The wrapped environment's own step executes the first action; _step runs the others.
@@ -95,57 +99,72 @@ class ChunkStep(Transform):
                 f"ChunkStep expects a chunk [*B, {self.prediction_length}, d_a] at "
                 f"{self.chunk_key}, found {found}"
             )
+        # Inverse transforms of the environment below may change it before _step gets it.
+        self._input = tensordict.copy()
+        if "_step" in tensordict:
+            set_aside(tensordict, self._inner_step()[0].observed)
         return tensordict.set(self.action_key, chunk[..., 0, :])
 
-    def _keys_of_parent(self) -> tuple[Any, NestedKey, NestedKey]:
+    def _inner_step(self) -> tuple[InnerStep, NestedKey]:
+        """How to step what this transform wraps, and the key of its reward."""
         parent = self.parent
-        if parent is None:
-            raise RuntimeError("ChunkStep only steps environments: append it to a TransformedEnv")
-        if len(parent.reward_keys) != 1 or unravel_key("done") not in parent.done_keys:
-            raise RuntimeError(
-                "ChunkStep needs one reward and a root 'done', the environment has "
-                f"rewards {parent.reward_keys} and done keys {parent.done_keys}"
-            )
-        return parent, parent.reward_keys[0], "done"
+        if self._inner is None or self._inner[0] is not parent:
+            # TorchRL builds another parent whenever the transforms change.
+            inner = InnerStep(self)
+            rewards, dones = parent.reward_keys, parent.done_keys
+            if len(rewards) != 1 or "done" not in dones:
+                raise RuntimeError(
+                    "ChunkStep needs one reward and a root 'done', the environment has "
+                    f"rewards {rewards} and done keys {dones}"
+                )
+            self._inner = (parent, inner, rewards[0])
+        return self._inner[1:]
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        parent, reward_key, done_key = self._keys_of_parent()
-        chunk = tensordict.get(self.chunk_key)
-        reward: Tensor = next_tensordict.get(reward_key)
-        done: Tensor = next_tensordict.get(done_key)
-        asked = tensordict.get("_step", None)
+        step, reward_key = self._inner_step()
+        batch = next_tensordict.batch_size
+        before, self._input = self._input, None
+        if before is None:
+            raise RuntimeError("ChunkStep._step was called without ChunkStep.inv: use env.step")
+        chunk = before.get(self.chunk_key)
+        # A plain dictionary: a tensordict's checks would be made at every control step.
+        current = dict(before.items())
+        preset = current.pop("next", None)
+        current.pop("_step", None)
         # Which environments go on; None for all of them, the usual case, which needs no masks.
-        alive = None if asked is None else asked.view(done.shape)
-        steps = torch.ones_like(done, dtype=torch.int64) if alive is None else alive.long()
-        discount = self.gamma
-        current = tensordict.copy()
+        alive: Tensor | None = tensordict.get("_step", None)
+        if alive is not None:
+            alive = alive.view(batch)
+            next_tensordict = rows_where(alive, next_tensordict, before)
+        reward: Tensor = next_tensordict.get(reward_key)
+        if not reward.is_floating_point():
+            reward = reward.to(torch.get_default_dtype())
+        steps = torch.ones(batch, dtype=torch.int64, device=chunk.device)
+        steps = steps if alive is None else alive.long()
         for i in range(1, self.execute):
+            done = next_tensordict.get("done")
             if done.any():
-                alive = ~done if alive is None else alive & ~done
+                running = ~done.view(batch)
+                alive = running if alive is None else alive & running
             if alive is not None and not alive.any():
                 break
             _advance(current, next_tensordict, reward_key)
-            current.set(self.action_key, chunk[..., i, :])
+            inputs = TensorDict(current, batch_size=batch, device=next_tensordict.device)
+            result = step(inputs.set(self.action_key, chunk[..., i, :]), alive)
+            earned = result.get(reward_key)
             if alive is None:
-                # What EnvBase.step adds to TransformedEnv._step are checks: the outer step makes them.
-                next_tensordict = (
-                    parent._step(current)
-                    if isinstance(parent, TransformedEnv)
-                    else parent.step(current.copy()).get("next")
-                )
-                reward = torch.add(reward, next_tensordict.get(reward_key), alpha=discount)
+                next_tensordict = result
                 steps += 1
             else:
-                # A partial step: batched environments leave the finished ones alone.
-                current.set("_step", alive.view(current.shape))
-                out = parent.step(current.copy()).get("next")
-                reward = reward + torch.where(alive, out.get(reward_key), 0.0) * discount
+                earned = torch.where(expand_as_right(alive, earned), earned, 0)
+                next_tensordict = rows_where(alive, result, next_tensordict)
                 steps += alive
-                next_tensordict = _update_where(alive, next_tensordict, out)
-            discount *= self.gamma
-            done = next_tensordict.get(done_key)
+            reward = torch.add(reward, earned, alpha=self.gamma**i)
+        if preset is not None:
+            # A policy may preset other keys under "next", which the inner steps do not return.
+            next_tensordict.update(preset.exclude(*next_tensordict.keys(True, True)))
         next_tensordict.set(reward_key, reward)
-        return next_tensordict.set(self.executed_key, steps)
+        return next_tensordict.set(self.executed_key, steps.unsqueeze(-1))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -160,14 +179,46 @@ class ChunkStep(Transform):
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the action by a chunk of ``P`` actions."""
-        leaf = input_spec["full_action_spec", self.action_key]
-        ndim = input_spec.ndim
+        actions, ndim = input_spec["full_action_spec"], input_spec.ndim
+        if self.action_key not in actions.keys(True, True):
+            raise KeyError(
+                f"ChunkStep found no action {self.action_key!r}, only {list(actions.keys(True, True))}: name "
+                "it with action_key"
+            )
+        leaf = actions[self.action_key]
+        if leaf.ndim != ndim + 1:
+            raise ValueError(
+                "ChunkStep takes environments whose action is one vector [*B, d_a], but "
+                f"{self.action_key!r} has shape {tuple(leaf.shape)} for the batch size "
+                f"{tuple(input_spec.shape)}: make it a vector before, for instance with FlattenAction or "
+                "UnsqueezeTransform"
+            )
         leaf = leaf.unsqueeze(ndim)
         leaf = leaf.expand(*leaf.shape[:ndim], self.prediction_length, *leaf.shape[ndim + 1 :])
-        actions = input_spec["full_action_spec"]
         actions[self.chunk_key] = leaf.clone()
         del actions[self.action_key]
         return input_spec
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+        """The discounted sum of up to ``execute`` rewards."""
+        for key, leaf in list(reward_spec.items(True, True)):
+            dtype = leaf.dtype if leaf.dtype.is_floating_point else torch.get_default_dtype()
+            options = {"shape": leaf.shape, "dtype": dtype, "device": leaf.device}
+            if isinstance(leaf, Bounded):
+                low, high = leaf.space.low.to(dtype), leaf.space.high.to(dtype)
+                # An episode may end after any number of steps.
+                lows, highs = self._returns(low), self._returns(high)
+                reward_spec[key] = Bounded(lows.amin(0), highs.amax(0), **options)
+            else:
+                reward_spec[key] = Unbounded(**options)
+        return reward_spec
+
+    def _returns(self, reward: Tensor) -> Tensor:
+        """Sums of 1, 2, ... of the same reward, rounded as :meth:`_step` does."""
+        sums = [reward]
+        for i in range(1, self.execute):
+            sums.append(torch.add(sums[-1], reward, alpha=self.gamma**i))
+        return torch.stack(sums)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the number of executed steps."""
@@ -178,30 +229,12 @@ class ChunkStep(Transform):
 
 
 def _advance(
-    current: TensorDictBase, next_tensordict: TensorDictBase, reward_key: NestedKey
+    current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey
 ) -> None:
     """As ``step_mdp``, in place and without its generality: it runs at every control step."""
     for key, value in next_tensordict.items():
-        if key == reward_key:
-            continue
-        mine = current.get(key, None) if is_tensor_collection(value) else None
-        if mine is None:
-            current.set(key, value)
-        else:
-            mine.update(value)
-
-
-def _update_where(mask: Tensor, old: TensorDictBase, new: TensorDictBase) -> TensorDictBase:
-    """``old`` with the rows of ``new`` where ``mask`` holds, for the keys that the step produced.
-
-    A policy may have preset other keys under "next"; the inner steps do not return those.
-    """
-    result = old.copy()
-    mask = mask.view(old.shape)
-    for key in new.keys(True, True):
-        previous = old.get(key, None)
-        value = new.get(key)
-        if previous is not None:
-            value = torch.where(expand_as_right(mask, value), value, previous)
-        result.set(key, value)
-    return result
+        mine = current.get(key) if is_tensor_collection(value) else None
+        if mine is not None:
+            value = mine.copy().update(value)
+        if key != reward_key:
+            current[key] = value

@@ -82,10 +82,15 @@ class ActionHistory(Transform):
                 f"ActionHistory found no {self.executed_key!r} after the step: append it after "
                 "ChunkStep"
             )
+        before = tensordict.get(self.loc_key)
         elapsed = tensordict.get(self.elapsed_key) + executed
-        loc, warm = self.prior.next_mean(
-            tensordict.get(self.loc_key), tensordict.get(self.chunk_key), executed, elapsed
-        )
+        loc, warm = self.prior.next_mean(before, tensordict.get(self.chunk_key), executed, elapsed)
+        rows = tensordict.get("_step", None)
+        if rows is not None:
+            # A partial step: the others were not asked, and what lies in their chunk was not executed.
+            rows = rows.view(*next_tensordict.batch_size, 1, 1)
+            loc = torch.where(rows, loc, before)
+            warm = torch.where(rows, warm, tensordict.get(self.warm_key))
         next_tensordict.set(self.loc_key, loc)
         next_tensordict.set(self.warm_key, warm)
         return next_tensordict.set(self.elapsed_key, elapsed)

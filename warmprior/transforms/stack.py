@@ -10,10 +10,9 @@ from torchrl.data import Composite
 from torchrl.envs.transforms import Transform
 
 from warmprior import keys
+from warmprior.transforms.inner_step import KEPT, set_aside
 
 __all__ = ["ObservationStack"]
-
-_KEPT = "_observation_stack"
 
 
 class ObservationStack(Transform):
@@ -52,32 +51,30 @@ class ObservationStack(Transform):
         self.observation_key = unravel_key(observation_key)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # In a partial step a batched environment fills the rows that it skips from the input, and
-        # fails or broadcasts if these have another shape than its own observations.
         if "_step" in tensordict:
-            stack = self._stack(tensordict)
-            tensordict.set(_KEPT, stack)
-            tensordict.set(self.observation_key, stack[..., -1, :])
+            set_aside(tensordict, [self.observation_key])
         return tensordict
 
     def _stack(self, tensordict: TensorDictBase) -> Tensor:
-        stack = tensordict.get(self.observation_key, None)
-        if stack is None:
-            raise KeyError(
-                f"ObservationStack needs the current {self.observation_key!r} to append to: step with "
-                "what reset or step_mdp returned"
-            )
-        return stack
+        for place in (tensordict, tensordict.get(KEPT, None)):
+            stack = None if place is None else place.get(self.observation_key, None)
+            if stack is not None:
+                return stack
+        raise KeyError(
+            f"ObservationStack needs the current {self.observation_key!r} to append to: step with "
+            "what reset or step_mdp returned"
+        )
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         newest = next_tensordict.get(self.observation_key).unsqueeze(-2)
-        kept = tensordict.get(_KEPT, None)
-        if self.steps > 1:
-            stack = self._stack(tensordict) if kept is None else kept
-            newest = torch.cat([stack[..., 1:, :], newest], dim=-2)
         asked = tensordict.get("_step", None)
-        if kept is not None and asked is not None:
-            newest = torch.where(expand_as_right(asked.view(tensordict.shape), kept), newest, kept)
+        if self.steps > 1 or asked is not None:
+            stack = self._stack(tensordict)
+            newest = torch.cat([stack[..., 1:, :], newest], dim=-2)
+            if asked is not None:
+                newest = torch.where(
+                    expand_as_right(asked.view(stack.shape[:-2]), stack), newest, stack
+                )
         return next_tensordict.set(self.observation_key, newest)
 
     def _reset(

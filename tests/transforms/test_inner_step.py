@@ -1,0 +1,192 @@
+"""Steps inside a chunk: the container's own transforms, and rows that a partial step leaves out."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from torchrl.data import Bounded, Unbounded
+from torchrl.envs import (
+    CatFrames,
+    Compose,
+    DoubleToFloat,
+    ParallelEnv,
+    SerialEnv,
+    StepCounter,
+    ToTensorImage,
+    Transform,
+    TransformedEnv,
+)
+from torchrl.envs.transforms import VecNormV2
+from torchrl.envs.utils import check_env_specs
+from torchrl.record import VideoRecorder
+
+from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
+from warmprior import ChunkStep, ObservationStack
+from warmprior.transforms.inner_step import InnerStep
+
+H = 3
+LENGTHS = (7, 4)
+
+
+class SensorsEnv(CountingEnv):
+    """The toy with a camera, ``"pixels"`` uint8 [2, 4, 3], and a float64 sensor, both the step."""
+
+    def __init__(self, length=7):
+        super().__init__(length)
+        self.observation_spec["pixels"] = Bounded(0, 255, (2, 4, 3), dtype=torch.uint8)
+        self.observation_spec["sensor"] = Unbounded((2,), dtype=torch.float64)
+
+    def _sense(self, out):
+        out["pixels"] = torch.full((2, 4, 3), 10 * self.t, dtype=torch.uint8)
+        out["sensor"] = torch.full((2,), 1 / (3 + self.t), dtype=torch.float64)
+        return out
+
+    def _reset(self, tensordict=None, **kwargs):
+        return self._sense(super()._reset(tensordict))
+
+    def _step(self, tensordict):
+        return self._sense(super()._step(tensordict))
+
+
+CHANGES = {
+    "dtype": partial(DoubleToFloat, in_keys=["sensor"]),
+    "shape": partial(CatFrames, 2, dim=-1, in_keys=["sensor"]),
+    "both": partial(ToTensorImage, in_keys=["pixels"]),
+    "stack": partial(ObservationStack, 2),
+}
+
+
+def half(data):
+    return torch.full((*data.batch_size, H, ACTION_DIM), 0.5)
+
+
+def outside(batched, *transforms, lengths=LENGTHS):
+    base = batched(len(lengths), [partial(SensorsEnv, n) for n in lengths])
+    return TransformedEnv(base, Compose(*transforms))
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("buffers", [True, False])
+@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
+def test_rows_end_inside_their_chunks_after_any_change_of_observations(kind, buffers, change):
+    """What workers with the transforms inside give, where no row is ever left out."""
+    batched = partial(kind, use_buffers=buffers)
+    if kind is ParallelEnv:
+        batched = partial(batched, mp_start_method="fork")
+
+    def one(length):
+        transforms = Compose(StepCounter(), CHANGES[change](), ChunkStep(H))
+        return TransformedEnv(SensorsEnv(length), transforms)
+
+    found = []
+    for env in (
+        outside(batched, StepCounter(), CHANGES[change](), ChunkStep(H)),
+        SerialEnv(len(LENGTHS), [partial(one, n) for n in LENGTHS]),
+    ):
+        try:
+            check_env_specs(env)
+            env.reset()  # the toy counts its resets
+            found.append(env.rollout(6, ChunkPolicy(half), break_when_any_done=False))
+        finally:
+            env.close(raise_if_closed=False)
+    ours, theirs = found
+    assert set(ours.keys(True, True)) == set(theirs.keys(True, True))
+    for key in ours.keys(True, True):
+        one, two = ours[key], theirs[key]
+        if key in ("observation", ("next", "observation")):
+            one, two = one.clone(), two.clone()
+            one[..., 1], two[..., 1] = 0, 0  # the episode's number
+        assert one.dtype == two.dtype
+        assert torch.equal(one, two), key
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_row_that_rests_keeps_everything(change):
+    env = outside(SerialEnv, StepCounter(), CHANGES[change](), ChunkStep(H), lengths=(20, 20))
+    data = env.step_mdp(env.step(env.rand_action(env.reset())))
+    before = data.clone()
+    data = env.step(env.rand_action(data).set("_step", torch.tensor([False, True])))
+    after = env.step_mdp(data)
+    observations = list(env.observation_spec.keys(True, True))
+    for key in observations:
+        if key != "executed_steps":
+            assert torch.equal(after[key][0], before[key][0]), key
+    assert after["step_count"].flatten().tolist() == [H, 2 * H]
+    assert after["observation"].reshape(2, -1)[:, -4].tolist() == [H, 2 * H]
+    assert after["executed_steps"].flatten().tolist() == [0, H]
+    assert set(data["next"].keys()) == set(env.fake_tensordict()["next"].keys())
+
+
+@pytest.mark.parametrize("nested", [False, True])
+def test_statistics_see_every_control_step_once(nested):
+    """Running statistics in the container, against the same steps one at a time."""
+    chunked, plain = (VecNormV2(in_keys=["sensor"], decay=0.9) for _ in range(2))
+    rest = (StepCounter(), ChunkStep(H))
+    rest = (Compose(*rest),) if nested else rest
+    env = TransformedEnv(SensorsEnv(12), Compose(chunked, *rest))
+    single = TransformedEnv(SensorsEnv(12), Compose(plain))
+    env.rollout(2)
+    single.rollout(2 * H)
+    for name, value in plain.state_dict().items():
+        torch.testing.assert_close(chunked.state_dict()[name], value)
+
+
+def test_every_control_step_is_filmed_and_no_frame_is_kept_after_the_dump():
+    class Videos:
+        def __init__(self):
+            self.lengths = []
+
+        def log_video(self, name, video, **kwargs):
+            self.lengths.append(video.shape[1])
+
+    logger = Videos()
+    recorder = VideoRecorder(logger, "film", skip=1, make_grid=False)
+    env = TransformedEnv(SensorsEnv(20), Compose(recorder, ChunkStep(H)))
+    for decisions in (2, 3):
+        env.rollout(decisions)
+        recorder.dump()
+        assert not env.transform[0].obs
+    assert logger.lengths == [1 + 2 * H, 1 + 3 * H]
+
+
+def test_transforms_that_change_afterwards():
+    env = TransformedEnv(SensorsEnv(20), Compose(StepCounter(), ChunkStep(H)))
+    env.rollout(2)
+    env.transform.insert(0, DoubleToFloat(in_keys=["sensor"]))
+    rollout = env.rollout(2)
+    assert rollout["next", "sensor"].dtype == torch.float32
+    assert rollout["next", "step_count"].flatten().tolist() == [H, 2 * H]
+
+
+def test_inverse_transforms_leave_the_input_as_it_is():
+    """A state that a transform rescales on its way in must not be rescaled once per action."""
+
+    class Halve(Transform):
+        def __init__(self):
+            super().__init__(in_keys_inv=["gain"], out_keys_inv=["gain"])
+
+        def _inv_apply_transform(self, state):
+            return state / 2
+
+    class GainEnv(CountingEnv):
+        def __init__(self):
+            super().__init__(9)
+            self.state_spec["gain"] = Unbounded((1,))
+            self.seen = []
+
+        def _step(self, tensordict):
+            self.seen.append(tensordict["gain"].item())
+            return super()._step(tensordict)
+
+    base = GainEnv()
+    env = TransformedEnv(base, Compose(Halve(), ChunkStep(H)))
+    data = env.reset().set("gain", torch.ones(1))
+    env.step(env.rand_action(data).set("gain", torch.ones(1)))
+    assert base.seen == [0.5] * H
+
+
+def test_outside_an_environment():
+    with pytest.raises(RuntimeError, match="ChunkStep only steps environments: append it"):
+        InnerStep(ChunkStep(H))

@@ -1,0 +1,131 @@
+"""A step of the environment below a transform, through the transforms that its container already holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, expand_as_right
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Compose, Transform, TransformedEnv
+
+__all__ = ["InnerStep", "rows_where", "set_aside"]
+
+KEPT = "_kept"
+"""Where :func:`set_aside` puts observations, at the root of a step's input."""
+
+
+class InnerStep:
+    """Steps the environment that a transform sees below itself.
+
+    ``Transform.parent`` is that environment too, but around *copies* of the transforms: what they count,
+    record or estimate would be lost to the container's own. This one runs the container's own.
+
+    Args:
+        transform: one of an environment's transforms.
+
+    Raises:
+        RuntimeError: if ``transform`` is in no environment.
+    """
+
+    def __init__(self, transform: Transform) -> None:
+        before: list[Transform] = []
+        child, container = transform, _container(transform)
+        while isinstance(container, Compose):
+            siblings = list(container.transforms)
+            position = next(i for i, sibling in enumerate(siblings) if sibling is child)
+            before = siblings[:position] + before
+            child, container = container, _container(container)
+        if not isinstance(container, TransformedEnv):
+            raise RuntimeError(
+                f"{type(transform).__name__} only steps environments: append it to a TransformedEnv"
+            )
+        self.base: EnvBase = container.base_env
+        self.transforms = before
+        states = set(self.base.state_spec.keys(True, True))
+        self.observed = [
+            key for key in self.base.observation_spec.keys(True, True) if key not in states
+        ]
+        done_spec = self.base.full_done_spec
+        self._done_spec, self._dones = done_spec, list(done_spec.items(True, True))
+        inverse = [k for t in before for k in (*t.in_keys_inv, *t.out_keys_inv)]
+        self._branches = {key[0] for key in (*inverse, *self.observed) if isinstance(key, tuple)}
+
+    def __call__(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
+        """What the step leads to.
+
+        Args:
+            tensordict: the step's input, ``[*B]``. Entries are added at its root; nested ones stay as they
+                are.
+            rows: which environments are stepped, bool ``[*B]``; all of them by default. What is returned
+                for the others means nothing.
+        """
+        for branch in self._branches:
+            if branch in tensordict:
+                tensordict.set(branch, tensordict.get(branch).copy())
+        if rows is not None and self.base.batch_locked:
+            tensordict.set("_step", rows)
+            set_aside(tensordict, self.observed)
+        for transform in reversed(self.transforms):
+            tensordict = transform._inv_call(tensordict)
+        result = self.base._step(tensordict)
+        if not self._has_dones(result):
+            self.base._complete_done(self._done_spec, result)
+        for transform in self.transforms:
+            result = transform._step(tensordict, result)
+        return result
+
+    def _has_dones(self, result: TensorDictBase) -> bool:
+        """Whether no flag is left to complete; most environments give all, and completing is slow."""
+        values = (result.get(key, None) for key, _ in self._dones)
+        return all(
+            value is not None and value.shape == spec.shape
+            for value, (_, spec) in zip(values, self._dones, strict=True)
+        )
+
+
+def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None:
+    """Keep observations from a batched environment that takes a partial step.
+
+    For the rows that it leaves out it returns what it finds in the step's input, and fails, or casts
+    silently, if a transform gave that another shape or dtype than the environment's own. Whoever needs
+    the observations finds them under :data:`KEPT`.
+
+    Args:
+        tensordict: the input of a partial step, changed in place.
+        observed: keys of the environment's observations, without those that it needs as state.
+    """
+    kept = tensordict.get(KEPT, None)
+    if kept is None:
+        kept = tensordict.empty()
+        tensordict.set(KEPT, kept)
+    for key in observed:
+        value = tensordict.get(key, None)
+        if value is not None:
+            kept.set(key, value)
+            tensordict.del_(key)
+
+
+def rows_where(mask: Tensor, new: TensorDictBase, old: TensorDictBase) -> TensorDictBase:
+    """``new``, but with the rows of ``old`` where ``mask`` does not hold and ``old`` has the key.
+
+    Args:
+        mask: bool ``[*B]``.
+        new: ``[*B]``.
+        old: ``[*B]``.
+    """
+    result = new.copy()
+    for key in new.keys(True, True):
+        previous = old.get(key, None)
+        if previous is not None:
+            value = new.get(key)
+            result.set(key, torch.where(expand_as_right(mask, value), value, previous))
+    return result
+
+
+def _container(transform: Transform) -> EnvBase | Compose | None:
+    # TorchRL's own `container` skips to the environment, but what comes before is listed on the way.
+    reference = transform.__dict__.get("_container")
+    return None if reference is None else reference()
