@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +12,19 @@ from typing import Any
 
 from torch import Tensor
 
-__all__ = ["check_writable", "load_file", "save_file", "write_atomic"]
+__all__ = [
+    "as_json",
+    "check_regular",
+    "check_writable",
+    "file_digest",
+    "load_file",
+    "read_json",
+    "save_file",
+    "tensor_shapes",
+    "write_atomic",
+]
+
+JSON_BYTES = 2**28  # the largest results file is a hundredth of that
 
 
 def save_file(
@@ -18,14 +32,22 @@ def save_file(
 ) -> None:
     """Write a safetensors file. (Imported here: ``import warmprior`` does not need the package.)
 
+    Tensors that share memory, such as tied weights, are written once each.
+
     Raises:
         OSError: if the file cannot be written.
     """
     from safetensors import SafetensorError
     from safetensors.torch import save_file as save
 
+    own: dict[str, Tensor] = {}
+    seen: set[int] = set()
+    for name, value in tensors.items():
+        memory = value.untyped_storage().data_ptr()
+        own[name] = value.clone() if memory in seen else value.contiguous()
+        seen.add(memory)
     try:
-        save(tensors, path, metadata)
+        save(own, path, metadata)
     except SafetensorError as error:
         raise OSError(str(error)) from error
 
@@ -35,6 +57,57 @@ def load_file(path: Path) -> dict[str, Any]:
     from safetensors.torch import load_file as load
 
     return load(path)
+
+
+def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
+    """Read the names and shapes of the tensors of a safetensors file, and none of them."""
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        names = list(file.keys())
+        return {name: tuple(file.get_slice(name).get_shape()) for name in names}
+
+
+def check_regular(path: Path) -> None:
+    """Whether a path that exists can be opened: a pipe or a device may never answer.
+
+    Raises:
+        ValueError: if it is not a regular file.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path} is not a regular file; remove it, or choose another folder")
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's content."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def as_json(value: Any) -> Any:
+    """What is read back after writing a value as JSON: tuples become lists, keys text.
+
+    Raises:
+        TypeError: if JSON cannot hold the value.
+    """
+    return json.loads(json.dumps(value))
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        ValueError: if it is no regular file or no JSON text, naming it.
+    """
+    check_regular(path)
+    if path.stat().st_size > JSON_BYTES:
+        raise ValueError(
+            f"{path} is not valid JSON of this library: it has {path.stat().st_size} bytes"
+        )
+    try:
+        return json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:  # text that is not UTF-8 included
+        raise ValueError(f"{path} is not valid JSON: {error}") from error
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:

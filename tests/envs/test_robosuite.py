@@ -206,10 +206,22 @@ def test_environment_outside_the_table():
     env_args = task_env_args("lift")
     env_args["env_name"] = "Door"
     env = RobosuiteEnv(env_args=env_args)
-    assert env.horizon is None
+    assert env.horizon == 1000  # robosuite's own
     assert env.rollout(2)["observation"].shape[-1] > 9
     with pytest.raises(ValueError, match=r"no environment 'Coffee_D0'.*import that package first"):
         RobosuiteEnv(env_args={**env_args, "env_name": "Coffee_D0"})
+
+
+def test_environment_outside_the_table_has_the_files_time_limit():
+    """Without one an evaluation would wait for a success that may never come."""
+    env_args = task_env_args("lift")
+    env_args["env_name"] = "Door"
+    env_args["env_kwargs"]["horizon"] = 3
+    assert RobosuiteEnv(env_args=env_args).rollout(10).shape == (3,)
+    assert RobosuiteEnv(env_args=env_args, horizon=2).rollout(10).shape == (2,)
+    env_args["env_kwargs"]["horizon"] = "long"
+    with pytest.raises(ValueError, match="horizon must be a number of steps, got 'long'"):
+        RobosuiteEnv(env_args=env_args)
 
 
 def test_wrapper_keeps_the_environments_own_time_limit():

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from warmprior._extras import require
+from warmprior.data.hdf5_members import DatasetError, member, names, reading
 from warmprior.data.tasks import TASKS, TaskSpec
 
 if TYPE_CHECKING:
@@ -25,12 +26,9 @@ if TYPE_CHECKING:
 __all__ = ["DatasetError", "RobomimicIndex", "open_robomimic", "read_index", "read_rows"]
 
 BLOCK = 4096  # rows read at once: a bound on temporary memory, whatever the length of a demo
+LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
-
-
-class DatasetError(ValueError):
-    """A demonstration file is not what it should be; the message says where and what to do."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +92,11 @@ def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
             "It may have been cut short: copy or download it again."
         ) from error
     with file:
-        if "data" not in file:
-            found = ", ".join(sorted(file)) or "nothing"
+        data = member(file, "data", "group")
+        if data is None:
+            found = ", ".join(names(file)) or "nothing"
             raise DatasetError(f"{path}: no group 'data' (found {found}): not a robomimic file")
-        if len(file["data"]) == 0:
+        if not names(data):
             raise DatasetError(f"{path}: the group 'data' holds no demos: record or copy some")
         yield file
 
@@ -108,40 +107,66 @@ def _number(path: Path, name: str) -> int:
     return int(name[5:])
 
 
+def _mask(file: h5py.File, path: Path, filter_key: str, demos: int) -> set[str]:
+    group = member(file, "mask", "group")
+    known = [] if group is None else names(group)
+    entries = None if group is None else member(group, filter_key, "dataset")
+    if entries is None:
+        known_keys = f"choose one of {', '.join(known)}" if known else "this file has none"
+        raise DatasetError(f"{path}: unknown filter key {filter_key!r}; {known_keys}")
+    what = f"{path}: mask/{filter_key}"
+    if entries.shape is None or len(entries.shape) != 1 or entries.dtype.kind not in "SO":
+        raise DatasetError(
+            f"{what} has shape {entries.shape} and type {entries.dtype}; a mask is a list of the names "
+            "of demos. Choose another filter key or rebuild the mask."
+        )
+    if len(entries) > demos:
+        raise DatasetError(
+            f"{what} has {len(entries)} names, but data holds {demos} demos; rebuild the mask"
+        )
+    with reading(file, f"mask/{filter_key}"):
+        return {entry.decode() for entry in entries[()]}
+
+
 def _selected(file: h5py.File, path: Path, filter_key: str | None) -> tuple[str, ...]:
-    present = set(file["data"])
-    names = present
+    present = set(names(file["data"]))
+    selected = present
     if filter_key is not None:
-        masks = sorted(file["mask"]) if "mask" in file else []
-        if filter_key not in masks:
-            known = f"choose one of {', '.join(masks)}" if masks else "this file has none"
-            raise DatasetError(f"{path}: unknown filter key {filter_key!r}; {known}")
-        names = {entry.decode() for entry in file["mask"][filter_key][()]}
-        absent = sorted(names - present)
-        if absent or not names:
+        selected = _mask(file, path, filter_key, len(present))
+        absent = sorted(selected - present)
+        if absent or not selected:
             what = f"demos that data does not hold: {', '.join(absent)}" if absent else "no demos"
             raise DatasetError(
                 f"{path}: mask/{filter_key} names {what}. "
                 "Choose another filter key or rebuild the mask."
             )
     # Numbers are not zero padded: demo_10 comes after demo_9.
-    return tuple(sorted(names, key=lambda name: _number(path, name)))
+    return tuple(sorted(selected, key=lambda name: _number(path, name)))
 
 
 def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
-    text = file["data"].attrs.get("env_args")
+    what = f"{path}: data.attrs['env_args']"
+    with reading(file, "data.attrs['env_args']"):
+        text = file["data"].attrs.get("env_args")
     if text is None:
         raise DatasetError(
             f"{path}: the group 'data' has no attribute env_args, which names the environment; "
             "copy it from the file this one was made from"
         )
+    if not isinstance(text, str | bytes):
+        raise DatasetError(f"{what} is not text; copy it from the file this one was made from")
     try:
         parsed = json.loads(text)
-    except ValueError as error:
-        raise DatasetError(f"{path}: data.attrs['env_args'] is not JSON ({error})") from error
-    if not (isinstance(parsed, dict) and {"env_name", "env_kwargs"} <= parsed.keys()):
-        raise DatasetError(f"{path}: data.attrs['env_args'] lacks env_name or env_kwargs")
+    except (ValueError, RecursionError) as error:  # not UTF-8 included
+        raise DatasetError(f"{what} is not JSON ({error})") from error
+    for key, kind in (("env_name", str), ("env_kwargs", dict)):
+        if not (isinstance(parsed, dict) and isinstance(parsed.get(key), kind)):
+            raise DatasetError(f"{what} lacks {key}, or it is not a {kind.__name__}")
     return parsed
+
+
+def _demo(file: h5py.File, name: str) -> h5py.Group:
+    return member(file["data"], name, "group")
 
 
 def _default_keys(path: Path, available: Sequence[str]) -> tuple[str, ...]:
@@ -159,20 +184,22 @@ def _default_keys(path: Path, available: Sequence[str]) -> tuple[str, ...]:
 def _widths(path: Path, demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]:
     """Return the steps of a demo and the width of each key, after checking that they agree."""
     name = demo.name[1:]
-    if "obs" not in demo:
+    if member(demo, "obs", "group") is None:
         raise DatasetError(
             f"{path}: {name} has no group 'obs'. Raw files (demo_v15.hdf5) have no observations: "
             "use the low_dim file, or add them with robomimic's dataset_states_to_obs.py."
         )
     steps, widths = 0, {}
     for key in ("actions", "rewards", *keys):
-        if key not in demo:
+        dataset = member(demo, key, "dataset")
+        if dataset is None:
             group = demo["obs"] if key.startswith("obs/") else demo
             raise DatasetError(
-                f"{path}: {name} has no {key!r}; {group.name[1:]} has {', '.join(sorted(group))}. "
+                f"{path}: {name} has no {key!r}; {group.name[1:]} has {', '.join(names(group))}. "
                 "Choose other keys or rebuild the file."
             )
-        shape, kind = demo[key].shape, demo[key].dtype.kind
+        shape: tuple[int, ...] = dataset.shape or ()
+        kind = dataset.dtype.kind
         steps = shape[0] if key == "actions" and shape else steps
         if steps == 0:
             raise DatasetError(f"{path}: {name} has no steps (actions {shape}). {_LEAVE_OUT}")
@@ -182,7 +209,7 @@ def _widths(path: Path, demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dic
             )
         if len(shape) > 2 or kind not in "fiub":
             raise DatasetError(
-                f"{path}: {name}/{key} has shape {shape} and type {demo[key].dtype}; only vectors "
+                f"{path}: {name}/{key} has shape {shape} and type {dataset.dtype}; only vectors "
                 "of numbers can be used. Leave the key out of observation_keys."
             )
         widths[key] = 1 if len(shape) == 1 else shape[1]
@@ -236,8 +263,9 @@ def read_index(
         demos = _selected(file, path, filter_key)
         env_args = _env_args(file, path)
         task = next((t for t in TASKS.values() if t.env_name == env_args["env_name"]), None)
-        first = file["data"][demos[0]]
-        available = tuple(sorted(first["obs"])) if "obs" in first else ()
+        first = _demo(file, demos[0])
+        observations = member(first, "obs", "group")
+        available = () if observations is None else tuple(names(observations))
         if observation_keys is not None:
             keys = tuple(observation_keys)
             if not keys:
@@ -245,8 +273,10 @@ def read_index(
         else:
             keys = task.low_dim_keys if task else _default_keys(path, available)
         wanted = [f"obs/{key}" for key in keys]
-        if poses and "actions" in first:
-            for arm in range(first["actions"].shape[-1] // 7):
+        if poses:
+            actions = member(first, "actions", "dataset")
+            width = actions.shape[-1] if actions is not None and actions.shape else 0
+            for arm in range(min(width // 7, 2)):
                 wanted += [f"obs/robot{arm}_eef_pos", f"obs/robot{arm}_eef_quat"]
         required: dict[str, int] = {}
         if task is not None:
@@ -256,7 +286,7 @@ def read_index(
         lengths: list[int] = []
         reference: dict[str, int] = {}
         for name in demos:
-            demo = file["data"][name]
+            demo = _demo(file, name)
             steps, widths = _widths(path, demo, wanted)
             _check_widths(path, demo, widths, required, env_args["env_name"])
             reference = reference or widths
@@ -286,23 +316,25 @@ def read_rows(file: h5py.File, demo: str, key: str, out: np.ndarray, first: int 
         first: the row of the demo that goes to the first row of ``out``.
 
     Raises:
-        DatasetError: if a value is not finite in the type of ``out``, or the file cannot be read.
+        DatasetError: if a value is not finite in the type of ``out`` or greater than
+            :data:`LARGEST`, or the file cannot be read.
     """
     name = f"data/{demo}/{key}"
-    dataset = file[name]
+    dataset = member(file, name, "dataset")
+    if dataset is None:
+        raise DatasetError(f"{file.filename}: there is no {name}")
     for start in range(0, len(out), BLOCK):
         rows = out[start : start + BLOCK]
-        try:
+        with reading(file, name):
             block = dataset[first + start : first + start + len(rows)]
-        except OSError as error:
-            raise DatasetError(
-                f"{file.filename}: {name} cannot be read ({error}); copy or download the file again"
-            ) from error
         with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
             rows[...] = block.reshape(rows.shape)
-        finite = np.isfinite(rows).all(-1)
-        if not finite.all():
+        usable = (np.abs(rows) <= LARGEST).all(-1)  # NaN is not
+        if not usable.all():
+            worst = int(np.argmin(usable))
+            finite = np.isfinite(rows[worst]).all()
+            what = f"a value beyond {LARGEST:.0e}" if finite else "NaN or infinity"
             raise DatasetError(
-                f"{file.filename}: {name} (shape {dataset.shape}) has NaN or infinity in row "
-                f"{first + start + int(np.argmin(finite))}. {_LEAVE_OUT}"
+                f"{file.filename}: {name} (shape {dataset.shape}) has {what} in row "
+                f"{first + start + worst}. {_LEAVE_OUT}"
             )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +14,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 
+from warmprior._memory import available_memory
 from warmprior.data.download import download_robomimic
 from warmprior.data.hdf5 import (
     BLOCK,
@@ -28,6 +30,8 @@ from warmprior.data.tasks import TASKS, TaskSpec
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION
 
 __all__ = ["RobomimicExperienceReplay"]
+
+UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
 
 
 def _locate(dataset: str | Path, style: str, download: bool, root: str | Path | None) -> Path:
@@ -59,6 +63,14 @@ def _allocate(
     data = TensorDict(batch_size=[steps])
     for key, (dtype, width) in widths.items():
         data.set(key, torch.zeros((), dtype=dtype).expand(steps, *width))
+    needed = sum(value.numel() * value.element_size() for value in data.values(True, True))
+    available = available_memory()
+    if storage == "memory" and available is not None and needed > available:
+        raise DatasetError(
+            f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but "
+            f"{available / 1e9:.1f} GB are free: use storage='memmap', or choose fewer demos with "
+            "filter_key"
+        )
     return data.memmap_like(scratch_dir) if storage == "memmap" else torch.empty_like(data)
 
 
@@ -73,7 +85,16 @@ def _read_absolute(
         for arm in range(arms):
             position, quaternion = (f"obs/robot{arm}_eef_{what}" for what in ("pos", "quat"))
             read_rows(file, demo, position, positions[:, 3 * arm : 3 * arm + 3], first)
-            read_rows(file, demo, quaternion, quaternions[:, 4 * arm : 4 * arm + 4], first)
+            turns = quaternions[:, 4 * arm : 4 * arm + 4]
+            read_rows(file, demo, quaternion, turns, first)
+            off = np.abs(np.linalg.norm(turns, axis=-1) - 1)
+            if off.max() > UNIT_TOLERANCE:
+                worst = int(off.argmax())
+                raise DatasetError(
+                    f"{file.filename}: data/{demo}/{quaternion} is no rotation in row {first + worst}: "
+                    f"the quaternion {turns[worst].tolist()} does not have length 1. Rebuild or remove "
+                    "the demo, or leave it out with a mask."
+                )
         rows[...] = to_absolute(
             torch.from_numpy(deltas),
             torch.from_numpy(positions),
@@ -109,6 +130,19 @@ def _fill(index: RobomimicIndex, data: TensorDictBase, absolute: bool) -> None:
         flag = data["next", key]
         flag.zero_()
         flag[last] = value
+
+
+@contextmanager
+def _understanding(path: Path) -> Iterator[None]:
+    """Name the file whose ``env_args`` are not understood."""
+    try:
+        yield
+    except Exception as error:  # whatever their unexpected structure leads to
+        reason = str(error) if isinstance(error, ValueError) else repr(error)
+        raise DatasetError(
+            f"{path}: data.attrs['env_args'] describes no environment as these actions need it: "
+            f"{reason}"
+        ) from error
 
 
 class RobomimicExperienceReplay(TensorDictReplayBuffer):
@@ -196,8 +230,10 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
             poses=absolute_actions,
         )
         action_dim = index.action_dim
+        with _understanding(path):
+            self._env_args = modernize_env_args(index.env_args, absolute=absolute_actions)
+            arms = len(delta_conventions(index.env_args)[1]) if absolute_actions else 0
         if absolute_actions:
-            arms = len(delta_conventions(index.env_args)[1])
             if action_dim != 7 * arms:
                 raise DatasetError(
                     f"{path}: actions have {action_dim} columns, but env_args names {arms} robot(s) "
@@ -207,7 +243,6 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
         data = _allocate(index, action_dim, storage, scratch_dir)
         _fill(index, data, absolute_actions)
         self._index = index
-        self._env_args = modernize_env_args(index.env_args, absolute=absolute_actions)
         super().__init__(
             storage=TensorStorage(data if storage == "memmap" else data.to(device)),
             writer=ImmutableDatasetWriter(),

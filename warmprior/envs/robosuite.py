@@ -168,7 +168,14 @@ class RobosuiteWrapper(_EnvWrapper):
             raise TypeError("RobosuiteWrapper needs a robosuite environment: RobosuiteWrapper(env)")
 
     def _build_env(self, env: Any) -> Any:  # type: ignore[override]
-        if self.horizon is None and not env.ignore_done:
+        if self.horizon is None:
+            # Even if the environment itself would go on (``ignore_done``): without a limit an evaluation
+            # waits for a success that may never come.
+            if not isinstance(env.horizon, int) or env.horizon < 1:
+                raise ValueError(
+                    f"the environment's horizon must be a number of steps, got {env.horizon!r}; give "
+                    "one with horizon="
+                )
             self.horizon = env.horizon
         return env
 
@@ -253,8 +260,8 @@ class RobosuiteEnv(RobosuiteWrapper):
         env_args: instead of ``task``: the parsed ``data.attrs["env_args"]`` of a robomimic or
             MimicGen file of any version.
         style: ``"ph"`` or ``"mh"``, the data whose time limit applies.
-        horizon: time limit in control steps; ``None`` for the task's (without a limit if
-            ``env_args`` names an environment that is not in the table).
+        horizon: time limit in control steps; ``None`` for the task's, or for an environment that is
+            not in the table that of ``env_args["env_kwargs"]``, or else robosuite's own.
         control_loop: as for the wrapper.
         from_pixels: as for the wrapper.
         camera: ``None`` for the task's first.
@@ -332,4 +339,4 @@ class RobosuiteEnv(RobosuiteWrapper):
         """The constructor has checked them."""
 
     def _build_env(self, env_args: Mapping[str, Any]) -> Any:  # type: ignore[override]
-        return make_simulator(env_args)
+        return super()._build_env(make_simulator(env_args))

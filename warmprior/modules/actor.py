@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,10 +13,21 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 
 from warmprior import keys
-from warmprior._files import load_file, save_file, write_atomic
+from warmprior._files import (
+    as_json,
+    check_regular,
+    file_digest,
+    load_file,
+    read_json,
+    save_file,
+    tensor_shapes,
+    write_atomic,
+)
+from warmprior.modules.blueprint import BlueprintError, blueprint
+from warmprior.modules.compiled import uncompiled, without_compilation
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.ode import ODEActor, Solver
 from warmprior.modules.prior import Prior
@@ -153,26 +166,24 @@ class WarmPriorActor(TensorDictModuleBase):
         }
         return type(self)(**(mine | changes))
 
-    def save_pretrained(self, directory: str | Path) -> None:
-        """Write ``config.json`` and ``model.safetensors``.
-
-        Args:
-            directory: created if needed.
+    def config(self) -> dict[str, Any]:
+        """JSON-serialisable description of everything but the weights.
 
         Raises:
-            OSError: if the folder cannot be written to.
-            TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed).
+            TypeError: if the network is not a :class:`VelocityNetwork`, or an option of the network, the
+                prior or the normaliser cannot be written as JSON.
         """
-        if not isinstance(self.network, VelocityNetwork):
+        network = uncompiled(self.network)
+        if not isinstance(network, VelocityNetwork):
             raise TypeError(
-                f"cannot save {type(self.network).__name__}: only VelocityNetwork subclasses carry the "
+                f"cannot save {type(network).__name__}: only VelocityNetwork subclasses carry the "
                 "configuration that from_pretrained needs"
             )
         config = {
             "format": FORMAT,
             "warmprior": version("warmprior"),
             "prior": self.prior.config(),
-            "network": self.network.config(),
+            "network": network.config(),
             "actor": {
                 "nfe": self.ode.nfe,
                 "solver": self.ode.solver,
@@ -181,10 +192,60 @@ class WarmPriorActor(TensorDictModuleBase):
             },
             "normalizer": None if self.normalizer is None else self.normalizer.config(),
         }
+        try:
+            return as_json(config)
+        except TypeError as error:
+            raise TypeError(
+                f"cannot save {self.prior}, {type(network).__name__} and the normaliser: {error}. Use plain "
+                "numbers and text for options, and plain names for the normaliser's keys."
+            ) from error
+
+    def check_saveable(self) -> None:
+        """Whether :meth:`from_pretrained` could load what :meth:`save_pretrained` would write.
+
+        For before a training: its policies would be lost otherwise.
+
+        Raises:
+            TypeError: if there is no :meth:`config`.
+            ValueError: if a policy built from it has other tensors than this one.
+        """
+        self._saveable()
+
+    def _saveable(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
+        """The configuration and the tensors, after checking that they belong together."""
+        config = self.config()
+        tensors = without_compilation(self.state_dict())
+        mine = {name: value.shape for name, value in tensors.items()}
+        try:
+            built = self._blueprint(config, mine)
+            problem = built and _difference(built, tensors)
+        except Exception as error:
+            problem = str(error)
+        if problem:
+            raise ValueError(
+                f"a saved {type(self.network).__name__} could not be loaded again: {problem}. Its "
+                "constructor has to build, from the options in its config(), what is to be saved."
+            )
+        return config, tensors
+
+    def save_pretrained(self, directory: str | Path) -> None:
+        """Write ``config.json`` and ``model.safetensors``.
+
+        The configuration holds a digest of both, by which :meth:`from_pretrained` notices any change.
+
+        Args:
+            directory: created if needed.
+
+        Raises:
+            OSError: if the folder cannot be written to.
+            TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed).
+            ValueError: if the policy could not be loaded again, see :meth:`check_saveable`.
+        """
+        config, tensors = self._saveable()
         directory = Path(directory)
-        text = json.dumps(config, indent=2) + "\n"
-        tensors = {name: value.contiguous() for name, value in self.state_dict().items()}
-        write_atomic(directory / "model.safetensors", lambda path: save_file(tensors, path))
+        weights = directory / "model.safetensors"
+        write_atomic(weights, lambda path: save_file(tensors, path))
+        text = json.dumps(config | {"sha256": _digest(config, weights)}, indent=2) + "\n"
         write_atomic(directory / "config.json", lambda path: path.write_text(text))
 
     @classmethod
@@ -211,51 +272,111 @@ class WarmPriorActor(TensorDictModuleBase):
             ValueError: if the files are damaged, of another format version, do not fit each other, or
                 belong to a policy with another prior.
         """
-        from warmprior.transforms.normalize import Normalizer
-
         directory = Path(directory)
-        config = _read_config(directory / "config.json")
-        if prior is not None and prior.config() != config["prior"]:
-            raise ValueError(
-                f"the policy at {directory} was trained with {Prior.from_config(config['prior'])}, not "
-                f"with {prior}"
-            )
-        try:
-            options: dict[str, Any] = dict(config["actor"])
-            key = options.pop("observation_key")
-            normalizer = config["normalizer"]
-            actor = cls(
-                VelocityNetwork.from_config(config["network"]),
-                Prior.from_config(config["prior"]),
-                normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
-                generator=generator,
-                observation_key=key if isinstance(key, str) else tuple(key),
-                **options,
-            )
-        except (AttributeError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"{directory / 'config.json'} is damaged or of another version: {error!r}"
-            ) from error
-        weights = directory / "model.safetensors"
+        path, weights = directory / "config.json", directory / "model.safetensors"
+        config = _read_config(path)
         if not weights.exists():
             raise FileNotFoundError(f"no policy weights at {weights}")
+        check_regular(weights)
         try:
-            actor.load_state_dict(load_file(weights))
-        except Exception as error:
+            shapes = tensor_shapes(weights)
+            built = cls._blueprint(config, shapes)
+            misfit = built and _difference(built, shapes)
+        except Exception as error:  # the format's own, that of a blueprint, or a failing disk
+            misfit = str(error)
+        if misfit:
             raise ValueError(
-                f"{weights} does not fit {directory / 'config.json'}: it is damaged or belongs to "
-                f"another network ({error})"
-            ) from error
+                f"{weights} does not fit {path}: it is damaged or belongs to another network ({misfit})"
+            )
+        if config.get("sha256") is not None and config["sha256"] != _digest(config, weights):
+            raise ValueError(
+                f"{weights} or {path} is damaged or was changed since the policy was saved: copy the "
+                "folder again. To change a setting, pass it to the call, or save the policy anew."
+            )
+        try:
+            actor = cls._from_config(config)
+        except (
+            Exception
+        ) as error:  # whatever options of another version, or no options at all, lead to
+            reason = str(error) if type(error) is ValueError else repr(error)
+            raise ValueError(f"{path} is damaged or of another version: {reason}") from error
+        if prior is not None and as_json(prior.config()) != config["prior"]:
+            raise ValueError(
+                f"the policy at {directory} was trained with {actor.prior}, not with {prior}"
+            )
+        tensors = load_file(weights)
+        problem = _difference(actor.state_dict(), tensors) or _bad_value(actor, tensors)
+        if problem:
+            raise ValueError(f"{weights}: {problem}. It is damaged: copy the policy again.")
+        actor.load_state_dict(tensors)
+        actor.sampler.generator = generator
         return actor.to(device).eval()
+
+    @classmethod
+    def _from_config(cls, config: dict[str, Any]) -> WarmPriorActor:
+        """An actor with fresh weights."""
+        from warmprior.transforms.normalize import Normalizer
+
+        options: dict[str, Any] = dict(config["actor"])
+        key = options.pop("observation_key")
+        normalizer = config["normalizer"]
+        return cls(
+            VelocityNetwork.from_config(config["network"]),
+            Prior.from_config(config["prior"]),
+            normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
+            observation_key=key if isinstance(key, str) else tuple(key),
+            **options,
+        )
+
+    @classmethod
+    def _blueprint(
+        cls, config: dict[str, Any], shapes: Mapping[str, tuple[int, ...]]
+    ) -> dict[str, Tensor] | None:
+        """What an actor of a configuration holds; ``None`` if only building it can tell."""
+        try:
+            return blueprint(lambda: cls._from_config(config), shapes)
+        except BlueprintError:
+            raise
+        except Exception:  # a wrong option, or a network that needs values to be built
+            return None
+
+
+def _difference(built: Mapping[str, Tensor], given: Mapping[str, Any]) -> str | None:
+    """How the tensors, or shapes alone, that are given differ from those of a built actor."""
+    for name in sorted(built.keys() ^ given.keys()):
+        return f"{name} is {'missing' if name in built else 'not part of the network'}"
+    for name, value in built.items():
+        other = given[name]
+        if tuple(value.shape) != tuple(getattr(other, "shape", other)):
+            return f"{name} has shape {tuple(getattr(other, 'shape', other))}, not {tuple(value.shape)}"
+        if isinstance(other, Tensor) and value.dtype != other.dtype:
+            return f"{name} has type {other.dtype}, not {value.dtype}"
+    return None
+
+
+def _bad_value(actor: WarmPriorActor, tensors: Mapping[str, Tensor]) -> str | None:
+    """What no training saves among the values for an actor, if anything."""
+    trained = dict(actor.named_parameters())
+    for name, value in tensors.items():
+        # A network's own buffers may be infinite, as masks are.
+        statistic = name.startswith("normalizer.")
+        if value.isnan().any() or ((name in trained or statistic) and value.isinf().any()):
+            return f"{name} holds NaN or infinity"
+        if statistic and name.endswith("_scale") and not (value > 0).all():
+            return f"{name} holds a scale that is not positive"
+    return None
+
+
+def _digest(config: dict[str, Any], weights: Path) -> str:
+    """Digest of a configuration and of the file of weights that belongs to it."""
+    text = json.dumps({k: v for k, v in config.items() if k != "sha256"}, sort_keys=True)
+    return hashlib.sha256((text + file_digest(weights)).encode()).hexdigest()
 
 
 def _read_config(path: Path) -> dict[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"no policy at {path.parent}: {path.name} is missing")
-    try:
-        config = json.loads(path.read_text())
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is not valid JSON: {error}") from error
+    config = read_json(path)
     found = config.get("format") if isinstance(config, dict) else None
     if found != FORMAT:
         raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Literal
 
 import torch
@@ -18,6 +19,9 @@ __all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "integrate"]
 
 DEFAULT_NFE = 9
 """Network evaluations per chunk where nothing else is asked for."""
+
+MAX_NFE = 10_000
+"""No chunk is worth more: it would take minutes, and more look like a process that hangs."""
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 
@@ -49,10 +53,10 @@ def _steps(nfe: int, solver: str) -> int:
     if solver not in SOLVERS:
         raise ValueError(f"unknown solver {solver!r}; choose one of {', '.join(SOLVERS)}")
     stages = len(SOLVERS[solver].b)
-    if nfe < 1 or nfe % stages:
+    if not isinstance(nfe, Integral) or not 0 < nfe <= MAX_NFE or nfe % stages:
         raise ValueError(
-            f"nfe is the number of network evaluations: it must be a positive multiple of {stages} "
-            f"for the {solver} solver, got {nfe}"
+            f"nfe is the number of network evaluations: it must be at most {MAX_NFE} and a "
+            f"positive multiple of {stages} for the {solver} solver, got {nfe!r}"
         )
     return nfe // stages
 
@@ -167,7 +171,7 @@ class ODEActor(TensorDictModuleBase):
         self.max_nfe = max_nfe
         self.solver = solver
         self.check_nfe(nfe)
-        if clip is not None and clip <= 0:
+        if clip is not None and not clip > 0:
             raise ValueError(f"clip must be > 0 or None, got {clip}")
         self.network = network
         self.nfe = nfe

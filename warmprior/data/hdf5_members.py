@@ -1,0 +1,158 @@
+"""Opening what an HDF5 file holds itself: no other file, nothing that was never written.
+
+An HDF5 file can name other files of the machine as its contents, and declare more than it stores;
+HDF5 reads the former as data and the rest of the latter as zeros. Everything the readers use is opened
+by :func:`member`, which refuses both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from math import ceil, prod
+from typing import TYPE_CHECKING, Literal
+
+from warmprior._extras import require
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["DatasetError", "member", "names", "reading"]
+
+CHUNK_BYTES = 2**28  # HDF5 unpacks whole chunks, however few rows are asked for
+_MAX_SOFT_LINKS = 16
+
+
+class DatasetError(ValueError):
+    """A demonstration file is not what it should be; the message says where and what to do."""
+
+
+@contextmanager
+def reading(parent: h5py.Group, name: str) -> Iterator[None]:
+    """Name the file and the object in whatever goes wrong while HDF5 reads it.
+
+    Args:
+        parent: the group that holds the object.
+        name: its path below ``parent``.
+
+    Raises:
+        DatasetError: for any error inside.
+    """
+    try:
+        yield
+    except DatasetError:
+        raise
+    except (
+        Exception
+    ) as error:  # HDF5's errors share no base class: OSError, RuntimeError, KeyError...
+        raise DatasetError(
+            f"{parent.file.filename}: {_full(parent, name)} cannot be read ({error}); copy or "
+            "download the file again"
+        ) from error
+
+
+def names(group: h5py.Group) -> list[str]:
+    """The names in a group, sorted."""
+    with reading(group, ""):
+        return sorted(group)
+
+
+def member(
+    parent: h5py.Group, name: str, kind: Literal["group", "dataset"]
+) -> h5py.Group | h5py.Dataset | None:
+    """Open a group or dataset that the file itself holds.
+
+    Args:
+        parent: where to start.
+        name: path below it.
+        kind: what it has to be.
+
+    Returns:
+        The object, or ``None`` if there is none.
+
+    Raises:
+        DatasetError: if it is of another kind, lies in another file, or was declared without being
+            written.
+    """
+    with reading(parent, name):
+        found = _follow(parent, name, _MAX_SOFT_LINKS)
+        if found is None:
+            return None
+        is_group = isinstance(found, require("h5py", "sim").Group)
+        if is_group != (kind == "group"):
+            what, wanted = ("a group", "dataset") if is_group else ("a dataset", "group")
+            raise DatasetError(
+                f"{parent.file.filename}: {_full(parent, name)} is {what} where a {wanted} belongs; "
+                "rebuild the file"
+            )
+        if not is_group:
+            _check_stored(found)
+        return found
+
+
+def _full(parent: h5py.Group, name: str) -> str:
+    return f"{parent.name}/{name}".strip("/") or "/"
+
+
+def _follow(node: h5py.Group, name: str, soft_links: int) -> h5py.Group | h5py.Dataset | None:
+    # Link by link, by the low-level calls: h5py's own, ``in`` included, would open the other file.
+    h5py = require("h5py", "sim")
+    path = node.file.filename
+    for part in name.strip("/").split("/"):
+        if not isinstance(node, h5py.Group):
+            raise DatasetError(
+                f"{path}: {_full(node, '')} is a dataset where a group belongs; rebuild the file"
+            )
+        links, key = node.id.links, part.encode(errors="surrogateescape")
+        if not links.exists(key):
+            return None
+        kind = links.get_info(key).type
+        if kind == h5py.h5l.TYPE_HARD:
+            node = node[part]
+        elif kind == h5py.h5l.TYPE_SOFT:
+            if soft_links == 0:
+                raise DatasetError(f"{path}: {_full(node, part)} leads through too many links")
+            target = links.get_val(key).decode(errors="surrogateescape")
+            start = node.file if target.startswith("/") else node
+            node = _follow(start, target, soft_links - 1)
+            if node is None:
+                return None
+        else:
+            where = (
+                links.get_val(key)[0].decode(errors="replace")
+                if kind == h5py.h5l.TYPE_EXTERNAL
+                else ""
+            )
+            raise DatasetError(
+                f"{path}: {_full(node, part)} is a link to another file {where}, which is not read: "
+                "copy the data into this file"
+            )
+    return node
+
+
+def _check_stored(dataset: h5py.Dataset) -> None:
+    """Whether a dataset's values are all in this file, and can be read within bounds."""
+    what = f"{dataset.file.filename}: {dataset.name[1:]}"
+    if dataset.is_virtual or dataset.external:
+        how = "is a virtual dataset over" if dataset.is_virtual else "stores its values in"
+        raise DatasetError(
+            f"{what} {how} another file, which is not read: copy the data into this file"
+        )
+    if not dataset.size:
+        return
+    if dataset.chunks is None:
+        complete = dataset.id.get_storage_size() >= dataset.size * dataset.dtype.itemsize
+    else:
+        chunk = prod(dataset.chunks) * dataset.dtype.itemsize
+        if chunk > CHUNK_BYTES:
+            raise DatasetError(
+                f"{what} has shape {dataset.shape} in chunks of {chunk:.1e} bytes, which would have to "
+                "be unpacked whole: write it in smaller ones (h5repack -l CHUNK=...)"
+            )
+        needed = prod(ceil(n / c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
+        complete = dataset.id.get_num_chunks() >= needed
+    if not complete:
+        raise DatasetError(
+            f"{what} has shape {dataset.shape}, but some of its values were never written: the recording "
+            "was cut short. Rebuild or remove the demo, or leave it out with a mask."
+        )

@@ -1,0 +1,27 @@
+"""Networks wrapped by :func:`torch.compile`, whose names and configuration are those of what is inside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor, nn
+
+__all__ = ["uncompiled", "without_compilation"]
+
+_PREFIX = "_orig_mod."
+
+
+def uncompiled(module: nn.Module) -> nn.Module:
+    """The module inside of what :func:`torch.compile` returns; any other as it is."""
+    return getattr(module, _PREFIX[:-1], module)
+
+
+def without_compilation(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """A state dict under the names that it would have had nothing been compiled.
+
+    Examples:
+        >>> import torch
+        >>> list(without_compilation({"net._orig_mod.weight": torch.zeros(1)}))
+        ['net.weight']
+    """
+    return {name.replace(_PREFIX, ""): value for name, value in tensors.items()}
