@@ -10,13 +10,8 @@ from typing import Any
 import _experiment as experiment
 
 from warmprior import Prior
-from warmprior.training import (
-    NAVIGATION_PRESETS,
-    PRESETS,
-    NavigationPreset,
-    Preset,
-    PriorSpaceConfig,
-)
+from warmprior.rl import PriorSpaceConfig
+from warmprior.training import NAVIGATION_PRESETS, PRESETS, NavigationPreset, Preset
 
 
 @dataclass(frozen=True)

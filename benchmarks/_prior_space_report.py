@@ -7,7 +7,7 @@ from typing import Any
 
 from warmprior.diagnostics import Row, plot_reinforcement, plot_success, summarize_seeds
 from warmprior.diagnostics.reinforcement_plots import agent_label
-from warmprior.training import PriorSpaceConfig, PriorSpaceTraining
+from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 
 
 def summarize(seed: int, config: PriorSpaceConfig, training: PriorSpaceTraining) -> dict[str, Any]:

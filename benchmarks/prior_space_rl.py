@@ -34,12 +34,8 @@ from warmprior.data import get_task
 from warmprior.data.tasks import EVALUATION_SEED
 from warmprior.diagnostics import write_results
 from warmprior.envs import GoalNavigationEnv
-from warmprior.training import (
-    PRESETS,
-    NavigationStudy,
-    PriorSpaceTraining,
-    parallel_env,
-)
+from warmprior.rl import PriorSpaceTraining
+from warmprior.training import PRESETS, NavigationStudy, parallel_env
 from warmprior.training.policies import Policies
 from warmprior.training.threads import torch_threads
 from warmprior.transforms import policy_transforms

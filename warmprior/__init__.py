@@ -1,15 +1,14 @@
 """WarmPrior: temporally grounded source distributions for flow-matching policies, in TorchRL.
 
-The public names of :mod:`warmprior.modules`, :mod:`warmprior.transforms` and
-:mod:`warmprior.objectives` are available here. :mod:`warmprior.data`, :mod:`warmprior.envs`,
-:mod:`warmprior.training` and :mod:`warmprior.diagnostics` are imported by name; parts of them need
-the extra ``warmprior[sim]``.
+The public names of :mod:`warmprior.modules`, :mod:`warmprior.transforms`,
+:mod:`warmprior.objectives` and :mod:`warmprior.rl` are available here. :mod:`warmprior.data`,
+:mod:`warmprior.envs`, :mod:`warmprior.training` and :mod:`warmprior.diagnostics` are imported by
+name; parts of them need the extra ``warmprior[sim]``.
 """
 
 from importlib.metadata import version
 
 from warmprior.modules import (
-    BoxTanhNormal,
     ChiTransformer,
     GaussianPrior,
     HistoryPrior,
@@ -21,20 +20,26 @@ from warmprior.modules import (
     PreconditionedNetwork,
     PreviewPrior,
     Prior,
-    PriorDecoder,
     PriorSampler,
     RegressionPrior,
-    ResidualSampler,
     SourceMoments,
     TrigonometricInterpolant,
     VelocityMLP,
     VelocityNetwork,
     WarmPriorActor,
     integrate,
+)
+from warmprior.objectives import FlowMatchingLoss
+from warmprior.rl import (
+    BoxTanhNormal,
+    DSRLNALoss,
+    PriorAnchor,
+    PriorDecoder,
+    PriorSpace,
+    ResidualSampler,
     make_prior_space_actor,
     make_prior_space_critic,
 )
-from warmprior.objectives import DSRLNALoss, FlowMatchingLoss
 from warmprior.transforms import (
     ActionHistory,
     ActionWindow,
@@ -42,8 +47,6 @@ from warmprior.transforms import (
     MeanObservation,
     Normalizer,
     ObservationStack,
-    PriorAnchor,
-    PriorSpace,
     policy_transforms,
     window_replay_buffer,
     window_transforms,

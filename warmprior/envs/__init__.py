@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from warmprior.envs.description import environment_description, environment_of
 from warmprior.envs.navigation1d import (
     NavigationEnv,
     NavigationMetrics,
@@ -21,6 +22,8 @@ __all__ = [
     "NavigationMetrics",
     "RobosuiteEnv",
     "RobosuiteWrapper",
+    "environment_description",
+    "environment_of",
     "navigation_collides",
     "navigation_demonstrations",
     "navigation_heights",

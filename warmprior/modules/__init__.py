@@ -2,9 +2,7 @@
 
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.baselines import HistoryPrior, RegressionPrior
-from warmprior.modules.box_normal import BoxTanhNormal
 from warmprior.modules.chi_transformer import ChiTransformer
-from warmprior.modules.decoder import PriorDecoder
 from warmprior.modules.interpolant import (
     Interpolant,
     LinearInterpolant,
@@ -16,13 +14,10 @@ from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 from warmprior.modules.ode import ODEActor, integrate
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
-from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
 from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
-from warmprior.modules.residual import ResidualSampler
 from warmprior.modules.sampler import PriorSampler
 
 __all__ = [
-    "BoxTanhNormal",
     "ChiTransformer",
     "GaussianPrior",
     "HistoryPrior",
@@ -34,10 +29,8 @@ __all__ = [
     "PreconditionedNetwork",
     "PreviewPrior",
     "Prior",
-    "PriorDecoder",
     "PriorSampler",
     "RegressionPrior",
-    "ResidualSampler",
     "SourceMoments",
     "TimestepEmbedding",
     "TrigonometricInterpolant",
@@ -45,6 +38,4 @@ __all__ = [
     "VelocityNetwork",
     "WarmPriorActor",
     "integrate",
-    "make_prior_space_actor",
-    "make_prior_space_critic",
 ]

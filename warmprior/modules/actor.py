@@ -61,6 +61,8 @@ class WarmPriorActor(TensorDictModuleBase):
         clip: see :class:`ODEActor`.
         normalizer: the normaliser of the data, kept here so that it is saved with the policy; its
             :meth:`~warmprior.Normalizer.env_transforms` go next to the base environment.
+        environment: description of the environment that the policy was made for, as JSON holds it; kept
+            here so that it is saved with the policy (``python -m warmprior evaluate FOLDER``).
         generator: source of randomness of the sampler; per call: ``actor(data, generator=...)``.
         observation_key: key of the observation, ``[*B, To, d_o]``. ``"observation"`` by default, or what
             :class:`~warmprior.MeanObservation` makes of it (:attr:`Prior.conditions_network`).
@@ -93,6 +95,7 @@ class WarmPriorActor(TensorDictModuleBase):
         solver: Solver = "euler",
         clip: float | None = None,
         normalizer: Normalizer | None = None,
+        environment: Mapping[str, Any] | None = None,
         generator: torch.Generator | None = None,
         observation_key: NestedKey | None = None,
         path_key: NestedKey | None = None,
@@ -117,6 +120,7 @@ class WarmPriorActor(TensorDictModuleBase):
             path_key=path_key,
         )
         self.normalizer = normalizer
+        self.environment = environment
         self.in_keys = [observation_key, *self.sampler.in_keys]
         self.out_keys = [*self.sampler.out_keys, *self.ode.out_keys]
 
@@ -160,6 +164,7 @@ class WarmPriorActor(TensorDictModuleBase):
             "solver": self.ode.solver,
             "clip": self.ode.clip,
             "normalizer": self.normalizer,
+            "environment": self.environment,
             "generator": self.sampler.generator,
             "observation_key": self.in_keys[0],
             "path_key": self.ode.path_key,
@@ -191,6 +196,7 @@ class WarmPriorActor(TensorDictModuleBase):
                 "observation_key": self.in_keys[0],
             },
             "normalizer": None if self.normalizer is None else self.normalizer.config(),
+            "environment": self.environment,
         }
         try:
             return as_json(config)
@@ -324,6 +330,7 @@ class WarmPriorActor(TensorDictModuleBase):
             VelocityNetwork.from_config(config["network"]),
             Prior.from_config(config["prior"]),
             normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
+            environment=config.get("environment"),
             observation_key=key if isinstance(key, str) else tuple(key),
             **options,
         )

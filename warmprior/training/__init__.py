@@ -15,10 +15,8 @@ from warmprior.training.navigation1d import (
 )
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.presets import PRESETS, Preset
-from warmprior.training.prior_space import PriorSpaceTraining
-from warmprior.training.prior_space_config import PriorSpaceConfig
-from warmprior.training.replay_segments import ReplaySegments
 from warmprior.training.training_config import TrainingConfig
+from warmprior.training.video import record_video
 from warmprior.training.workers import WorkerError
 
 __all__ = [
@@ -30,9 +28,6 @@ __all__ = [
     "NavigationPreset",
     "NavigationStudy",
     "Preset",
-    "PriorSpaceConfig",
-    "PriorSpaceTraining",
-    "ReplaySegments",
     "TrainingConfig",
     "WorkerError",
     "ema_of",
@@ -43,5 +38,6 @@ __all__ = [
     "play_episode",
     "precondition",
     "record_filmstrip",
+    "record_video",
     "warmup_cosine",
 ]

@@ -19,6 +19,7 @@ from torchrl.record.loggers import get_logger
 from warmprior._files import check_writable
 from warmprior.data import RobomimicExperienceReplay
 from warmprior.envs import RobosuiteEnv
+from warmprior.envs.description import environment_description
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.training.behaviour_cloning import (
@@ -76,6 +77,9 @@ class Policies:
         self.make_env = partial(
             RobosuiteEnv, env_args=dataset.env_args, style=self.demonstrations.style
         )
+        self._environment = environment_description(
+            dataset.env_args, self.demonstrations.style, self.preset.observation_steps
+        )
 
     def facts(self) -> dict[str, Any]:
         """What ``results.json`` tells about the demonstrations."""
@@ -108,7 +112,10 @@ class Policies:
         normalizer = copy.deepcopy(self.normalizer)
         # The normalised demonstrations span [-1, 1]: what leaves it is executed, and remembered, at
         # the bound.
-        return WarmPriorActor(network, prior, normalizer=normalizer, clip=1.0).to(self.device)
+        actor = WarmPriorActor(
+            network, prior, normalizer=normalizer, clip=1.0, environment=self._environment
+        )
+        return actor.to(self.device)
 
     def folder(self, prior: Prior, seed: int) -> Path:
         """Where a policy lies, or will lie."""

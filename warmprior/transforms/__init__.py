@@ -1,12 +1,10 @@
 """Transforms of replay buffers and environments."""
 
-from warmprior.transforms.anchor import PriorAnchor
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.mean_observation import MeanObservation
 from warmprior.transforms.normalize import Normalizer
 from warmprior.transforms.policy import policy_transforms
-from warmprior.transforms.prior_space import PriorSpace
 from warmprior.transforms.stack import ObservationStack
 from warmprior.transforms.window import ActionWindow, window_replay_buffer, window_transforms
 
@@ -17,8 +15,6 @@ __all__ = [
     "MeanObservation",
     "Normalizer",
     "ObservationStack",
-    "PriorAnchor",
-    "PriorSpace",
     "policy_transforms",
     "window_replay_buffer",
     "window_transforms",

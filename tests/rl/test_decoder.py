@@ -204,11 +204,6 @@ def test_no_box(delta):
         PriorDecoder(make_actor(PastPrior(H)), delta=delta)
 
 
-def test_the_official_box():
-    assert PriorDecoder(make_actor(GaussianPrior(H)), delta=1.5, unscaled_box=True).delta == 1.0
-    assert PriorDecoder(make_actor(GaussianPrior(H)), delta=1.5).delta == 1.5
-
-
 def test_regression_has_no_source_space():
     with pytest.raises(ValueError, match=r"RegressionPrior.* starts at a single point"):
         PriorDecoder(make_actor(RegressionPrior(H)), delta=0.5)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.training.prior_space_parts import (
+from tests.rl.training_parts import (
     ALGORITHMS,
     LENGTHS,
     H,
@@ -19,7 +19,7 @@ from warmprior import (
     PreviewPrior,
     keys,
 )
-from warmprior.training import PriorSpaceTraining
+from warmprior.rl import PriorSpaceTraining
 
 pytest.importorskip("tqdm")
 
@@ -158,7 +158,7 @@ def test_the_agent_sees_a_mean_that_conditions_the_policy(tmp_path, algorithm):
     data = training.buffer[:][:1].clone()
     residuals = []
     for mean in (0.0, 1.0):
-        data[keys.LOC] = torch.full_like(data[keys.LOC], mean)
+        data[keys.CONDITIONED][..., -1 - H : -1] = mean
         torch.manual_seed(0)
         residuals.append(training.agent.policy(data)[keys.DELTA].clone())
     assert not data[keys.ANCHOR].isnan().any() and not torch.equal(*residuals)

@@ -6,7 +6,7 @@ import math
 import re
 from pathlib import Path
 
-PAGE = Path(__file__).parents[1] / "docs" / "prior_space_rl.md"
+PAGE = Path(__file__).parents[2] / "docs" / "prior_space_rl.md"
 
 
 def test_example_runs(capsys):

@@ -17,7 +17,7 @@ from warmprior import (
     WarmPriorActor,
     policy_transforms,
 )
-from warmprior.training import PriorSpaceConfig, PriorSpaceTraining
+from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 
 H = 3
 LENGTHS = (5, 7)

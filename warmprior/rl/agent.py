@@ -16,14 +16,14 @@ from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.box_normal import BoxTanhNormal
-from warmprior.modules.decoder import PriorDecoder
-from warmprior.modules.prior_space import make_prior_space_actor, make_prior_space_critic
-from warmprior.modules.residual import ResidualDistribution, ResidualSampler
-from warmprior.objectives import DSRLNALoss
-from warmprior.objectives._prior_space import check_finite
+from warmprior.rl.box_normal import BoxTanhNormal
+from warmprior.rl.config import PriorSpaceConfig
+from warmprior.rl.decoder import PriorDecoder
+from warmprior.rl.dsrl import DSRLNALoss
+from warmprior.rl.loss import check_finite
+from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
+from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
-from warmprior.training.prior_space_config import PriorSpaceConfig
 
 __all__ = ["PriorSpaceAgent"]
 
@@ -49,7 +49,7 @@ class PriorSpaceAgent:
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.training import PriorSpaceConfig
+        >>> from warmprior.rl import PriorSpaceConfig
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4), nfe=1)
         >>> agent = PriorSpaceAgent(actor, PriorSpaceConfig(hidden_dim=8))
         >>> agent.decoder.delta, type(agent.loss).__name__

@@ -14,8 +14,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
-from warmprior.modules.decoder import visible_priors
 from warmprior.modules.prior import Prior
+from warmprior.rl.decoder import visible_priors
 
 __all__ = ["PriorAnchor"]
 

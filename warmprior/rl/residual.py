@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from warmprior.modules.decoder import PriorDecoder
+from warmprior.rl.decoder import PriorDecoder
 
 __all__ = ["ResidualSampler"]
 

@@ -14,9 +14,9 @@ from torch import Tensor
 from torchrl.objectives.utils import _vmap_func
 
 from warmprior import keys
-from warmprior.modules.decoder import PriorDecoder
-from warmprior.modules.residual import ResidualDistribution, ResidualSampler
-from warmprior.objectives._prior_space import PriorSpaceLoss, check_counts, check_networks
+from warmprior.rl.decoder import PriorDecoder
+from warmprior.rl.loss import PriorSpaceLoss, check_counts, check_networks
+from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 
 __all__ = ["DSRLNALoss"]
 
@@ -67,8 +67,7 @@ class DSRLNALoss(PriorSpaceLoss):
             anew, or a list.
         noise_qvalue_network: :math:`Q^W`, which reads ``decoder.delta_key``; the same.
         decoder: the frozen policy. It is not among the loss's submodules: ``parameters()``,
-            ``state_dict()`` and target updates never see it; ``loss.to(device)`` moves it along. For the
-            official implementation's unscaled box see its ``unscaled_box``.
+            ``state_dict()`` and target updates never see it; ``loss.to(device)`` moves it along.
 
     Keyword Args:
         num_qvalue_nets: critics of each kind.

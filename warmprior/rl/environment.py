@@ -11,7 +11,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.envs.transforms import Transform
 
 from warmprior import keys
-from warmprior.modules.decoder import PriorDecoder
+from warmprior.rl.decoder import PriorDecoder
 
 __all__ = ["PriorSpace"]
 

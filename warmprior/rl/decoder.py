@@ -51,8 +51,6 @@ class PriorDecoder(TensorDictModuleBase):
         delta: half the side of the agent's box, in units of the normalised action space. The paper uses
             0.5 around a warm mean and 1.5 around zero.
         nfe: network evaluations per chunk; the actor's own by default.
-        unscaled_box: ignore ``delta`` and use the box [-1, 1], as the official implementation of
-            DSRL-NA does by mistake (its ``action_magnitude`` reaches the SAC variant only).
         differentiable: let gradients flow from the chunk to the residual. The network stays frozen.
         anchor_key: centre of the box, ``[*B, P, d_a]``.
         delta_key: the residual, ``[*B, P, d_a]``.
@@ -83,7 +81,6 @@ class PriorDecoder(TensorDictModuleBase):
         *,
         delta: float,
         nfe: int | None = None,
-        unscaled_box: bool = False,
         differentiable: bool = False,
         anchor_key: NestedKey = keys.ANCHOR,
         delta_key: NestedKey = keys.DELTA,
@@ -96,7 +93,7 @@ class PriorDecoder(TensorDictModuleBase):
                 f"{actor.prior} starts at a single point and its field means nothing elsewhere: there is "
                 "no source space to act in"
             )
-        self.delta = 1.0 if unscaled_box else float(delta)
+        self.delta = float(delta)
         self.differentiable = differentiable
         self.ode = copy.deepcopy(actor.ode)
         self.nfe = self.ode.nfe if nfe is None else nfe

@@ -20,11 +20,11 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.rl.agent import PriorSpaceAgent
+from warmprior.rl.config import PriorSpaceConfig
+from warmprior.rl.replay_segments import ReplaySegments
 from warmprior.training.checkpoint import check_identity, load_state, save_state
 from warmprior.training.evaluation import Episode, evaluate, watched
-from warmprior.training.prior_space_agent import PriorSpaceAgent
-from warmprior.training.prior_space_config import PriorSpaceConfig
-from warmprior.training.replay_segments import ReplaySegments
 
 __all__ = ["PriorSpaceTraining"]
 

@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 
-from tests.objectives.dsrl_parts import GAMMA, H, N, batch, build, make_decoder
+from tests.rl.dsrl_parts import GAMMA, H, N, batch, build
 from warmprior import (
     GaussianPrior,
     PastPrior,
@@ -243,7 +243,6 @@ def test_official_defaults():
     assert loss.distillation.distribution == "normal" and loss.distillation.sigma == 1.0
     assert float(loss.log_alpha) == 0.0 and float(loss.target_entropy) == 0.0
     assert len(loss.qvalue_network_params["module", "net", "0", "weight"]) == 2
-    unscaled = make_decoder(GaussianPrior(H), delta=1.5, unscaled_box=True)
-    actor = build(GaussianPrior(H), decoder=unscaled).get_stateful_net("actor_network")
-    assert float(actor.spec[keys.DELTA].high.max()) == 1.0
+    actor = loss.get_stateful_net("actor_network")
+    assert float(actor.spec[keys.DELTA].high.max()) == 1.5
     assert build(PastPrior(H)).distillation.distribution == "clipped"

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torchrl.envs import SerialEnv, TransformedEnv
 
-from tests.training.prior_space_parts import (
+from tests.rl.training_parts import (
     ALGORITHMS,
     EVALUATION_SEED,
     H,
@@ -21,7 +21,8 @@ from tests.training.prior_space_parts import (
     make_training,
 )
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, PriorAnchor, policy_transforms
-from warmprior.training import PriorSpaceConfig, PriorSpaceTraining, parallel_env
+from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
+from warmprior.training import parallel_env
 
 pytest.importorskip("tqdm")
 

@@ -10,7 +10,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import TransformedEnv
 from torchrl.objectives import HardUpdate, SoftUpdate, ValueEstimators
 
-from tests.objectives.dsrl_parts import D_A, D_O, GAMMA, TO, H, batch, build, make_decoder
+from tests.rl.dsrl_parts import D_A, D_O, GAMMA, TO, H, batch, build, make_decoder
 from warmprior import (
     DSRLNALoss,
     GaussianPrior,

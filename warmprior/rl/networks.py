@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
-from warmprior.modules.decoder import check_delta
+from warmprior.rl.decoder import check_delta
 
 __all__ = ["make_prior_space_actor", "make_prior_space_critic"]
 

@@ -17,8 +17,8 @@ from torchrl.objectives.common import LossModule
 from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import dispatch_value_estimator
 
-from warmprior.modules.box_normal import BoxTanhNormal
-from warmprior.modules.decoder import PriorDecoder
+from warmprior.rl.box_normal import BoxTanhNormal
+from warmprior.rl.decoder import PriorDecoder
 
 __all__ = ["PriorSpaceLoss", "check_counts", "check_finite", "check_networks"]
 

@@ -11,7 +11,7 @@ import torch
 from hypothesis import given, settings
 from tensordict import TensorDict
 
-from warmprior.training import ReplaySegments
+from warmprior.rl import ReplaySegments
 
 DTYPES = [torch.float32, torch.float64, torch.int64, torch.bool]
 
@@ -104,7 +104,7 @@ def test_a_write_that_fails_loses_nothing(tmp_path, monkeypatch):
         raise OSError("no space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("warmprior.training.replay_segments.save_file", full_disk)
+        patch.setattr("warmprior.rl.replay_segments.save_file", full_disk)
         with pytest.raises(OSError, match="no space left"):
             segments.write()
     assert segments.committed == 0 and segments.load() is None and not list(tmp_path.iterdir())

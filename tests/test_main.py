@@ -1,0 +1,98 @@
+"""``python -m warmprior``: saved policies without their data."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import pytest
+
+from tests.data.synthetic import write_robomimic_file
+from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from warmprior.__main__ import main
+
+pytest.importorskip("robosuite")
+from warmprior.envs import RobosuiteEnv, rendering_backend
+from warmprior.training import PRESETS, TrainingConfig, play_episode
+from warmprior.training.demonstrations import Demonstrations
+from warmprior.training.policies import Policies
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """A policy of a few steps, whose demonstrations are gone; and one of its episodes."""
+    folder = tmp_path_factory.mktemp("saved")
+    path = folder / "lift.hdf5"
+    write_robomimic_file(path, lengths=(30, 40), task="lift")
+    preset = replace(
+        PRESETS["quick"],
+        training=TrainingConfig(iterations=3, batch_size=8, checkpoints=1),
+        network_options={"hidden_dim": 16},
+    )
+    demonstrations = Demonstrations(path, "file", "ph")
+    policies = Policies(demonstrations, preset, folder / "policies", folder / "logs", logger="none")
+    prior = PastPrior(8)
+    actor = policies.policy(prior, 0)
+    env = policies.make_env()
+    env = env.append_transform(policies.transforms(prior)())
+    episode = play_episode(actor, env, 10_000_000, nfe=1)
+    env.close()
+    kept = folder / "kept"
+    shutil.copytree(policies.path(prior, 0), kept)
+    path.unlink()
+    shutil.rmtree(policies.directory)
+    return kept, episode
+
+
+def test_evaluate_plays_the_same_episodes(saved, capsys):
+    folder, episode = saved
+    assert main(["evaluate", str(folder), "--episodes", "1", "--nfe", "1"]) == 0
+    told = capsys.readouterr().out
+    assert f"{int(episode.success)} of 1 episodes solved" in told
+    assert f" {episode.steps} control steps on average" in told
+
+
+@pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
+def test_video_has_a_frame_per_control_step(saved, tmp_path, capsys):
+    av = pytest.importorskip("av")
+    folder, episode = saved
+    film = tmp_path / "films" / "out.mp4"
+    argv = ["evaluate", str(folder), "--episodes", "1", "--nfe", "1", "--video", str(film)]
+    assert main(argv) == 0
+    with av.open(str(film)) as container:
+        frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        assert container.streams.video[0].average_rate == 20
+    assert len(frames) == episode.steps + 1
+    # The arm moves, and neighbours look alike.
+    far = abs(frames[0].astype(int) - frames[-1]).mean()
+    assert far > abs(frames[0].astype(int) - frames[1]).mean()
+
+
+def test_info(saved, capsys):
+    assert main(["info", str(saved[0])]) == 0
+    told = capsys.readouterr().out
+    assert "PastPrior(chunk_length=8" in told and "Lift" in told and "VelocityMLP" in told
+
+
+def test_what_a_user_can_mend_is_told_in_one_line(saved, tmp_path, capsys):
+    bare = tmp_path / "bare"
+    network = VelocityMLP(7, 19, 8, hidden_dim=8)
+    WarmPriorActor(network, PastPrior(8)).save_pretrained(bare)
+    for argv, message in (
+        (["evaluate", str(tmp_path / "missing")], "no policy at"),
+        (["evaluate", str(bare)], "keeps no description of a robosuite environment"),
+        (["evaluate", str(saved[0]), "--nfe", "0"], "nfe"),
+        (["evaluate", str(saved[0]), "--episodes", "0"], "episodes must be at least 1"),
+        (["evaluate", str(saved[0]), "--prior", "no.such:Prior"], "no prior at no.such:Prior"),
+        (["info", str(tmp_path / "missing")], "no policy at"),
+    ):
+        assert main(argv) == 2
+        told = capsys.readouterr().err
+        assert message in told and told.startswith("warmprior: error: ") and told.count("\n") == 1
+
+
+def test_demonstrations(tmp_path, capsys):
+    path = tmp_path / "lift.hdf5"
+    assert main(["demonstrations", "lift", "--n", "1", "--out", str(path)]) == 0
+    assert capsys.readouterr().out.strip().endswith("lift.hdf5") and path.is_file()
+    assert RobosuiteEnv("lift").task.name == "lift"

@@ -1,0 +1,134 @@
+"""Saved policies from the command line: ``python -m warmprior evaluate FOLDER --episodes 50 --nfe 1``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.prior import Prior
+
+
+def _policy(args: argparse.Namespace) -> WarmPriorActor:
+    for place in args.prior:
+        Prior.find(place)  # imported, it can be loaded by its name
+    return WarmPriorActor.from_pretrained(args.folder)
+
+
+def info(args: argparse.Namespace) -> None:
+    """Tell what a saved policy is."""
+    actor = _policy(args)
+    config, count = actor.config(), sum(p.numel() for p in actor.parameters())
+    environment = (config["environment"] or {}).get("robosuite", {}).get("env_args", {})
+    for name, value in {
+        "prior": actor.prior,
+        "network": f"{config['network']} ({count:,} parameters)",
+        "sampler": config["actor"],
+        "normaliser": "kept" if actor.normalizer is not None else "none",
+        "environment": environment.get("env_name", "not kept"),
+        "written by": f"warmprior {config['warmprior']}, format {config['format']}",
+    }.items():
+        print(f"{name:12} {value}")
+
+
+def evaluate(args: argparse.Namespace) -> None:
+    """Play episodes with a saved policy; no dataset is needed."""
+    from warmprior.diagnostics.statistics import success_posterior
+    from warmprior.envs.description import environment_of
+    from warmprior.training.evaluation import evaluate as play
+    from warmprior.training.video import record_video
+
+    actor = _policy(args)
+    nfe = actor.ode.nfe if args.nfe is None else args.nfe
+    actor.ode.check_nfe(nfe)
+    env = environment_of(actor)
+    episodes = play(
+        actor,
+        env,
+        episodes=args.episodes,
+        first_seed=args.first_seed,
+        nfe=nfe,
+        policy_seed=args.policy_seed,
+        description=f"NFE {nfe}",
+    )
+    env.close()
+    wins = sum(episode.success for episode in episodes)
+    low, high = success_posterior(wins, len(episodes)).interval(0.95)
+    steps = sum(episode.steps for episode in episodes) / len(episodes)
+    print(
+        f"{wins} of {len(episodes)} episodes solved ({100 * wins / len(episodes):.1f}%; 95% of the posterior "
+        f"between {100 * low:.1f}% and {100 * high:.1f}%), {steps:.0f} control steps on average"
+    )
+    if args.video is not None:
+        outcome = record_video(
+            actor, args.video, seed=args.first_seed, nfe=nfe, policy_seed=args.policy_seed
+        )
+        print(f"{args.video}: episode {args.first_seed}, {'' if outcome else 'not '}solved")
+
+
+def demonstrations(args: argparse.Namespace) -> None:
+    """Generate scripted demonstrations."""
+    from warmprior.data import generate_demonstrations
+
+    print(generate_demonstrations(args.task, args.data, args.n, path=args.out))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """The commands and their options."""
+    parser = argparse.ArgumentParser(prog="python -m warmprior", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+
+    def command(run: Callable[[argparse.Namespace], None]) -> Callable[..., Any]:
+        added = commands.add_parser(run.__name__, help=run.__doc__, description=run.__doc__)
+        added.set_defaults(run=run)
+        return added.add_argument
+
+    for run in (info, evaluate):
+        add = command(run)
+        add("folder", type=Path, help="written by save_pretrained, such as .../policy_010000")
+        add(
+            "--prior",
+            nargs="+",
+            default=[],
+            metavar="MODULE:CLASS",
+            help="where to import a prior of your own from",
+        )
+    from warmprior.data.tasks import EVALUATION_SEED, TASKS
+
+    add("--episodes", type=int, default=50, help="how many (%(default)s)")
+    add("--nfe", type=int, help="network evaluations per chunk (default: the policy's)")
+    add("--first-seed", type=int, default=EVALUATION_SEED, help="of the simulator (%(default)s)")
+    add("--policy-seed", type=int, default=0, help="of the source samples (%(default)s)")
+    add("--video", type=Path, help="MP4 of the first episode; needs EGL or OSMesa, and PyAV")
+
+    add = command(demonstrations)
+    add("task", choices=[name for name, task in TASKS.items() if task.scripted])
+    add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (%(default)s)")
+    add("--n", type=int, default=200, help="how many (%(default)s)")
+    add("--out", type=Path, help="HDF5 file (default: in the cache)")
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run a command; what a user can mend is told in one line.
+
+    Args:
+        argv: the command line, without the program.
+
+    Returns:
+        The exit code.
+    """
+    args = make_parser().parse_args(argv)
+    try:
+        args.run(args)
+    except (ValueError, KeyError, OSError, ImportError, FloatingPointError, RuntimeError) as error:
+        print(f"warmprior: error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

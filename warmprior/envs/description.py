@@ -1,0 +1,59 @@
+"""What a saved policy remembers of its environment, and the environment made from it again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from torchrl.envs import TransformedEnv
+
+from warmprior.envs.robosuite import RobosuiteEnv
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.transforms.policy import policy_transforms
+
+__all__ = ["environment_description", "environment_of"]
+
+
+def environment_description(
+    env_args: Mapping[str, Any], style: str, observation_steps: int
+) -> dict[str, Any]:
+    """What :func:`environment_of` needs, for :class:`~warmprior.WarmPriorActor` to keep.
+
+    Args:
+        env_args: see :class:`RobosuiteEnv`.
+        style: likewise.
+        observation_steps: ``To``.
+    """
+    return {
+        "robosuite": {"env_args": dict(env_args), "style": style},
+        "observation_steps": observation_steps,
+    }
+
+
+def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
+    """The environment that a policy was made for, with the policy's own transforms.
+
+    Args:
+        actor: a policy, such as one that was loaded.
+        options: further ones of :class:`RobosuiteEnv`.
+
+    Raises:
+        ValueError: if the policy keeps no description of one.
+
+    Examples:
+        >>> actor = WarmPriorActor.from_pretrained("policy_010000")  # doctest: +SKIP
+        >>> environment_of(actor).rollout(10, actor)["next", "success"].any()  # doctest: +SKIP
+        tensor(True)
+    """
+    description = actor.environment
+    if not description or set(description) != {"robosuite", "observation_steps"}:
+        raise ValueError(
+            f"the policy keeps no description of a robosuite environment, but {description}: build the "
+            "environment yourself, with policy_transforms(actor.prior, normalizer=actor.normalizer)"
+        )
+    transforms = policy_transforms(
+        actor.prior,
+        normalizer=actor.normalizer,
+        observation_steps=description["observation_steps"],
+    )
+    return TransformedEnv(RobosuiteEnv(**description["robosuite"], **options), transforms)
