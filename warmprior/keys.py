@@ -23,6 +23,7 @@ constant                key                                    shape and dtype
 :data:`DECODED_CHUNK`   ``("decoded", "chunk")``               ``[*B, P, d_a]`` float
 :data:`IS_PAD`          ``"action_is_pad"``                    ``[*B, P]`` bool
 :data:`EXECUTED`        ``"executed_steps"``                   ``[*B, 1]`` int64
+:data:`SUCCESS`         ``"success"``                          ``[*B, 1]`` bool
 :data:`EPISODE`         ``"episode"``                          ``[N]`` int64, data only
 :data:`FRAME`           ``"frame"``                            ``[N]`` int64, data only
 ======================  =====================================  ==================================
@@ -53,3 +54,4 @@ IS_PAD = ACTION_IS_PAD_KEY
 EXECUTED = "executed_steps"
 EPISODE = "episode"
 FRAME = "frame"
+SUCCESS = "success"

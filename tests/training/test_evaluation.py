@@ -16,8 +16,8 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
-from torchrl.data import Categorical
-from torchrl.envs import TransformedEnv
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
 from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
@@ -409,3 +409,90 @@ def test_decisions_hold_what_was_executed():
         assert done[-1] and not done[:-1].any()
         # Different decisions saw different observations and drew different noise.
         assert len(episode.decisions["vla_action", "chunk"].unique(dim=0)) == len(executed)
+
+
+class LateFailure(PlainEnv):
+    """Solved at the second step of every third seed, but not at those after it; and goes on."""
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        solved = (self.t == 2) & (self.seed_ % 3 == 0)
+        return out.set("success", torch.tensor([solved]))
+
+
+def batched(kind, make_env, num_envs, transforms_inside=False):
+    prior = PastPrior(H)
+    options = {"mp_start_method": "fork"} if kind is ParallelEnv else {}
+    if transforms_inside:
+        return kind(num_envs, partial(single, make_env, prior), **options)
+    return TransformedEnv(kind(num_envs, make_env, **options), policy_transforms(prior))
+
+
+@pytest.mark.parametrize("inside", [False, True])
+@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
+def test_any_batched_environment_plays_every_seed_once(kind, inside, tmp_path):
+    log = tmp_path / "resets"
+    env = batched(kind, partial(PlainEnv, log=log), 3, inside)
+    try:
+        actor = actor_for()
+        for first, episodes in ((40, 7), (5, 2)):
+            before = len(log.read_text().split()) if log.exists() else 0
+            result = evaluate(actor, env, episodes=episodes, first_seed=first)
+            assert result == expected(first, episodes)
+            assert set(range(first, first + episodes)) <= actor.network.seen
+            played = [int(line) for line in log.read_text().split()][before:]
+            assert set(range(first, first + episodes)) <= set(played)
+    finally:
+        env.close(raise_if_closed=False)
+
+
+@pytest.mark.parametrize("form", ["partial", "nested", "keywords"])
+def test_offsets_of_one_s_own_are_refused(form):
+    make_env, options = partial(SeededEnv, seed_offset=2), {}
+    if form == "nested":
+        make_env = partial(single, make_env)
+    if form == "keywords":
+        make_env, options = SeededEnv, {"create_env_kwargs": {"seed_offset": 2}}
+    env = SerialEnv(2, make_env, **options)
+    if form != "nested":
+        env = TransformedEnv(env, policy_transforms(PastPrior(H)))
+    with pytest.raises(ValueError, match="seed_offset does not play the seed that it is given"):
+        evaluate(actor_for(), env, episodes=3, first_seed=7)
+
+
+def test_rows_without_seeds_of_their_own_are_refused():
+    class Rows(EnvBase):
+        def __init__(self):
+            super().__init__(batch_size=[2])
+            flag = Categorical(2, dtype=torch.bool, shape=(2, 1))
+            specs = {"observation": Unbounded((2, 4)), "success": flag}
+            self.observation_spec = Composite(specs, shape=[2])
+            self.action_spec, self.reward_spec = Bounded(-1, 1, (2, 2)), Unbounded((2, 1))
+
+        def _reset(self, tensordict=None, **kwargs):
+            return self.observation_spec.zero()
+
+        def _step(self, tensordict):
+            raise AssertionError("nothing may be played")
+
+        def _set_seed(self, seed):
+            """Nothing is random."""
+
+    env = TransformedEnv(Rows(), policy_transforms(PastPrior(H)))
+    with pytest.raises(ValueError, match=r"Rows plays 2 episodes at once.*strided_seeds = True"):
+        evaluate(actor_for(), env, episodes=2, first_seed=0)
+
+
+def test_environments_that_cannot_be_judged():
+    with pytest.raises(KeyError, match="does not tell 'success'"):
+        evaluate(actor_for(), single(CountingEnv), episodes=1, first_seed=0)
+    with pytest.raises(KeyError, match="give it the policy's transforms"):
+        evaluate(actor_for(), PlainEnv(), episodes=1, first_seed=0)
+
+
+@pytest.mark.parametrize("place", ["single", "outside", "inside"])
+def test_a_success_counts_at_any_step(place):
+    """Where episodes go on after a success, it may be lost before their end, even inside a chunk."""
+    inside = place == "inside"
+    env = single(LateFailure) if place == "single" else batched(SerialEnv, LateFailure, 2, inside)
+    assert evaluate(actor_for(), env, episodes=6, first_seed=0) == expected(0, 6)

@@ -317,3 +317,38 @@ def test_actions_that_are_no_vector_are_refused(shape):
 def test_an_action_of_another_name():
     with pytest.raises(KeyError, match=r"no action 'move', only \['action'\]"):
         TransformedEnv(CountingEnv(), ChunkStep(3, action_key="move")).rollout(1)
+
+
+@pytest.mark.parametrize("place", ["single", "outside"])
+def test_an_event_at_any_executed_step_is_one_of_the_chunk(place):
+    class Events(CountingEnv):
+        def __init__(self, length=7):
+            super().__init__(length)
+            flag = Categorical(2, dtype=torch.bool, shape=(1,))
+            self.observation_spec["success"], self.observation_spec["bell"] = flag, flag.clone()
+
+        def _flags(self, out):
+            out["success"] = torch.tensor([self.t in (2, 7)])
+            out["bell"] = torch.tensor([self.t == 4])
+            return out
+
+        def _reset(self, tensordict=None, **kwargs):
+            return self._flags(super()._reset(tensordict))
+
+        def _step(self, tensordict):
+            return self._flags(super()._step(tensordict))
+
+    base = Events() if place == "single" else SerialEnv(2, [partial(Events, n) for n in (7, 4)])
+    env = TransformedEnv(base, ChunkStep(3))
+    check_env_specs(env)
+    rollout = env.rollout(3, ones(3), break_when_any_done=False)
+    rows = rollout[None] if place == "single" else rollout
+    assert rows["next", "success"][0].flatten().tolist() == [True, False, True]
+    assert rows["next", "bell"][0].flatten().tolist() == [False, False, False]  # its last step's
+    if place == "outside":  # the third decision is the second episode's first
+        assert rows["next", "success"][1].flatten().tolist() == [True, False, True]
+        assert rows["next", "bell"][1].flatten().tolist() == [False, True, False]
+    both = TransformedEnv(Events(), ChunkStep(3, event_keys=["bell", "absent"]))
+    rollout = both.rollout(3, ones(3))
+    assert rollout["next", "bell"].flatten().tolist() == [False, True, False]
+    assert rollout["next", "success"].flatten().tolist() == [False, False, True]

@@ -14,7 +14,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase, ParallelEnv, TransformedEnv
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 from tqdm import tqdm
 
@@ -32,7 +32,7 @@ class Episode:
 
     Attributes:
         seed: simulator seed of the reset.
-        success: whether the task was solved.
+        success: whether the task was solved at any step.
         steps: control steps executed.
         decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, and under ``"next"``
             ``"executed_steps"`` and ``"done"``. Episodes concatenated along ``D`` are a rollout for
@@ -50,6 +50,12 @@ def _transformed(
 ) -> EnvBase:
     end_with_parent()
     return TransformedEnv(make_env(), make_transforms())
+
+
+class _StridedEnv(ParallelEnv):
+    """Its workers number their own episodes, see :func:`parallel_env`."""
+
+    strided_seeds = True
 
 
 def parallel_env(
@@ -81,15 +87,19 @@ def parallel_env(
     ]
     # Without shared buffers the parent sleeps while workers simulate; with them it polls and would
     # take a core from the workers.
-    return ParallelEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
+    return _StridedEnv(num_envs, workers, mp_start_method=start_method(), use_buffers=False)
+
+
+def _base_of(env: EnvBase) -> EnvBase:
+    while isinstance(env, TransformedEnv):
+        env = env.base_env
+    return env
 
 
 @contextmanager
 def watched(env: EnvBase) -> Iterator[None]:
     """Turn the death of a worker into an error: TorchRL alone would wait for it for hours."""
-    base = env
-    while isinstance(base, TransformedEnv):
-        base = base.base_env
+    base = _base_of(env)
     if isinstance(base, ParallelEnv) and base.is_closed:
         base.start()
     workers = list(base._workers) if isinstance(base, ParallelEnv) else []
@@ -193,6 +203,7 @@ def play_episode(
 
     Raises:
         ValueError: if the environment has batch dimensions, or a seed is negative.
+        KeyError: if it does not tell ``"success"``, or lacks the policy's transforms.
 
     Examples:
         >>> env = TransformedEnv(RobosuiteEnv("lift"), policy_transforms(prior))  # doctest: +SKIP
@@ -201,12 +212,14 @@ def play_episode(
     """
     if env.batch_size:
         raise ValueError(f"play_episode needs a single environment, got {env.batch_size}")
+    _check_keys(env)
     policy.eval()
     device = _device(policy)
     home = env.device or torch.device("cpu")
     options = {} if nfe is None else {"nfe": nfe}
     chunks: list[Tensor] = []
     executed: list[Tensor] = []
+    success = False
     with episode_noise(policy, seed, policy_seed):
         env.set_seed(seed)
         data = env.reset()
@@ -214,8 +227,10 @@ def play_episode(
             data = env.step(policy(data.to(device), **options).to(home))
             chunks.append(data[keys.CHUNK].cpu())
             executed.append(data["next", keys.EXECUTED].cpu())
+            success |= bool(data["next", keys.SUCCESS])
             if data["next", "done"].all():
-                return _outcome(data["next"], seed, _decisions(chunks, executed))
+                steps = int(data["next", keys.ELAPSED])
+                return Episode(seed, success, steps, _decisions(chunks, executed))
             data = env.step_mdp(data)
 
 
@@ -235,8 +250,12 @@ def evaluate(
         policy: a :class:`~warmprior.WarmPriorActor`, or any module that writes chunks, such as an agent
             followed by a :class:`~warmprior.PriorDecoder`; set to evaluation mode.
         env: an environment with the policy's transforms. A single one plays the episodes one after
-            another, see :func:`play_episode`. A batched one ``[n]``, such as :func:`parallel_env`, plays
-            ``n`` at a time, and the noise that an episode meets depends on ``n``.
+            another, see :func:`play_episode`. A batched one ``[n]`` plays ``n`` at a time, and the noise that
+            an episode meets depends on ``n``: that of :func:`parallel_env`, any ``SerialEnv`` or
+            ``ParallelEnv`` (each of whose environments is seeded by itself, and has to start the same
+            episode after every ``set_seed(seed)``), or one whose class says ``strided_seeds = True``: after
+            ``set_seed(seed, static_seed=True)`` its row ``i`` plays the episodes ``seed + i``,
+            ``seed + i + n``, ...
 
     Keyword Args:
         episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
@@ -252,7 +271,9 @@ def evaluate(
         result.
 
     Raises:
-        ValueError: if ``episodes < 1``, or the environment has several batch dimensions.
+        ValueError: if ``episodes < 1``, or the environment has several batch dimensions, cannot play the
+            episodes of given seeds in its rows, or adds an offset to them.
+        KeyError: if it does not tell ``"success"``, or lacks the policy's transforms.
         WorkerError: if a worker process dies, a ``RuntimeError``.
     """
     if episodes < 1:
@@ -288,35 +309,89 @@ def _play_batched(
     report: Callable[[Episode], None],
 ) -> None:
     num_envs = env.batch_size[0]
+    _check_keys(env)
     policy.eval()
     device = _device(policy)
+    home = env.device or torch.device("cpu")
     options = {} if nfe is None else {"nfe": nfe}
     played = [0] * num_envs
+    success = [False] * num_envs
     chunks: list[list[Tensor]] = [[] for _ in played]
     executed: list[list[Tensor]] = [[] for _ in played]
     # The simulators need the cores; a policy's call is small, and its idle threads would spin.
     with torch_threads(1), watched(env), _drawing(policy, policy_seed, device):
         env.set_seed(seeds.start, static_seed=True)
+        seed_row = _row_seeding(env)
+        for i in range(min(num_envs, len(seeds))):
+            seed_row(i, seeds[i])
         data = env.reset()
         while sum(played) < len(seeds):
             # A worker whose episodes are all played rests; its episode numbers are i + n * played.
             active = torch.tensor([i + num_envs * played[i] < len(seeds) for i in range(num_envs)])
             if not active.all():
-                data.set("_step", active)
-            data = env.step(policy(data.to(device), **options).to("cpu"))
-            done = data["next", "done"].flatten() & active
-            chunk, steps = data[keys.CHUNK], data["next", keys.EXECUTED]
+                data.set("_step", active.to(home))
+            data = env.step(policy(data.to(device), **options).to(home))
+            told = data["next"].select("done", keys.SUCCESS, keys.EXECUTED, keys.ELAPSED).cpu()
+            done = told["done"].flatten() & active
+            chunk = data[keys.CHUNK].cpu()
             for i in active.nonzero().flatten().tolist():
                 chunks[i].append(chunk[i])
-                executed[i].append(steps[i])
+                executed[i].append(told[keys.EXECUTED][i])
+                success[i] |= bool(told[keys.SUCCESS][i])
             for i in done.nonzero().flatten().tolist():
+                episode = i + num_envs * played[i]
                 decisions = _decisions(chunks[i], executed[i])
-                report(_outcome(data["next"][i], seeds[i + num_envs * played[i]], decisions))
-                chunks[i], executed[i] = [], []
+                report(Episode(seeds[episode], success[i], int(told[keys.ELAPSED][i]), decisions))
+                chunks[i], executed[i], success[i] = [], [], False
                 played[i] += 1
+                if episode + num_envs < len(seeds):
+                    seed_row(i, seeds[episode + num_envs])
             data = env.step_mdp(data)
             if done.any() and sum(played) < len(seeds):
-                data = env.reset(data.set("_reset", done.unsqueeze(-1)))
+                data = env.reset(data.set("_reset", done.to(home).unsqueeze(-1)))
+
+
+def _row_seeding(env: EnvBase) -> Callable[[int, int], None]:
+    """What to call with a row and the seed of its next episode, before that is reset."""
+    base = _base_of(env)
+    if getattr(type(base), "strided_seeds", False):
+        return lambda row, seed: None
+    if not isinstance(base, (SerialEnv, ParallelEnv)):
+        raise ValueError(
+            f"{type(base).__name__} plays {env.batch_size[0]} episodes at once, and nothing tells which "
+            "seed a row plays: evaluate a single one, or several in a SerialEnv, a ParallelEnv or "
+            "warmprior.training.parallel_env. If its row i plays the seeds seed + i, seed + i + n, ... "
+            "after set_seed(seed, static_seed=True), let its class say strided_seeds = True"
+        )
+
+    for make_env, options in zip(base.create_env_fn, base.create_env_kwargs, strict=True):
+        if _has_offset(make_env) or options.get("seed_offset"):
+            raise ValueError(
+                "an environment built with a seed_offset does not play the seed that it is given: leave it "
+                "out, or build all of them by warmprior.training.parallel_env"
+            )
+    rows = [base[row] for row in range(env.batch_size[0])]
+    return lambda row, seed: rows[row].set_seed(seed, static_seed=True)
+
+
+def _has_offset(make_env: object) -> bool:
+    # Workers cannot be asked: one that lacks the attribute dies.
+    if not isinstance(make_env, partial):
+        return False
+    return bool(make_env.keywords.get("seed_offset")) or any(
+        _has_offset(inner) for inner in (make_env.func, *make_env.args, *make_env.keywords.values())
+    )
+
+
+def _check_keys(env: EnvBase) -> None:
+    known = env.observation_spec.keys(True, True)
+    if keys.SUCCESS not in known:
+        raise KeyError(f"the environment does not tell {keys.SUCCESS!r}, bool [*B, 1]")
+    if keys.EXECUTED not in known or keys.ELAPSED not in known:
+        raise KeyError(
+            f"the environment lacks {keys.EXECUTED!r} or {keys.ELAPSED!r}: give it the policy's transforms, "
+            "see warmprior.policy_transforms"
+        )
 
 
 def _device(policy: TensorDictModuleBase) -> torch.device:
@@ -335,7 +410,3 @@ def _decisions(chunks: list[Tensor], executed: list[Tensor]) -> TensorDict:
         },
         batch_size=[len(chunks)],
     )
-
-
-def _outcome(data: TensorDictBase, seed: int, decisions: TensorDictBase) -> Episode:
-    return Episode(seed, bool(data["success"]), int(data[keys.ELAPSED]), decisions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -23,7 +24,8 @@ class ChunkStep(Transform):
     One outer step executes the first ``execute`` actions of a chunk ``[*B, P, d_a]``, stopping each
     sub-environment at its own episode end. The reward is the discounted sum
     :math:`\sum_{i<k} \gamma^i r_i` over the ``k`` executed steps, ``k`` itself is written to
-    ``("next", "executed_steps")``, and everything else is that of the last executed step. Unlike
+    ``("next", "executed_steps")``, a success at any of them is one of the chunk (see ``event_keys``), and
+    everything else is that of the last executed step. Unlike
     :class:`~torchrl.envs.transforms.MultiAction` it keeps the last reward of an episode that ends
     inside a chunk and has fixed shapes, so that it works inside and outside batched environments.
 
@@ -41,6 +43,8 @@ class ChunkStep(Transform):
         action_key: the single action that the wrapped environment takes.
         chunk_key: the chunk, ``[*B, P, d_a]``.
         executed_key: where ``k`` is written, int64 ``[*B, 1]``.
+        event_keys: flags, bool, that hold after a chunk if they held after any of its executed steps;
+            those that the environment does not write are passed over.
 
     Raises:
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, or (in an environment) an
@@ -70,6 +74,7 @@ class ChunkStep(Transform):
         action_key: NestedKey = keys.ACTION,
         chunk_key: NestedKey = keys.CHUNK,
         executed_key: NestedKey = keys.EXECUTED,
+        event_keys: Sequence[NestedKey] = (keys.SUCCESS,),
     ) -> None:
         super().__init__(in_keys_inv=[action_key], out_keys_inv=[chunk_key])
         execute = chunk_length if execute is None else execute
@@ -87,6 +92,7 @@ class ChunkStep(Transform):
         self.action_key = unravel_key(action_key)
         self.chunk_key = unravel_key(chunk_key)
         self.executed_key = unravel_key(executed_key)
+        self.event_keys = [unravel_key(key) for key in event_keys]
         self._input: TensorDictBase | None = None
         self._inner: tuple[Any, InnerStep, NestedKey] | None = None
 
@@ -141,6 +147,8 @@ class ChunkStep(Transform):
             reward = reward.to(torch.get_default_dtype())
         steps = torch.ones(batch, dtype=torch.int64, device=chunk.device)
         steps = steps if alive is None else alive.long()
+        events = {key: next_tensordict.get(key, None) for key in self.event_keys}
+        events = {key: value for key, value in events.items() if value is not None}
         for i in range(1, self.execute):
             done = next_tensordict.get("done")
             if done.any():
@@ -159,11 +167,15 @@ class ChunkStep(Transform):
                 earned = torch.where(expand_as_right(alive, earned), earned, 0)
                 next_tensordict = rows_where(alive, result, next_tensordict)
                 steps += alive
+            for key in events:
+                events[key] = events[key] | next_tensordict.get(key)
             reward = torch.add(reward, earned, alpha=self.gamma**i)
         if preset is not None:
             # A policy may preset other keys under "next", which the inner steps do not return.
             next_tensordict.update(preset.exclude(*next_tensordict.keys(True, True)))
         next_tensordict.set(reward_key, reward)
+        for key, value in events.items():
+            next_tensordict.set(key, value)
         return next_tensordict.set(self.executed_key, steps.unsqueeze(-1))
 
     def _reset(
