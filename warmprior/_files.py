@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
-from collections.abc import Callable
+import platform
+import tempfile
+import time
+import uuid
+import warnings
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +22,7 @@ __all__ = [
     "as_json",
     "check_regular",
     "check_writable",
+    "exclusive",
     "file_digest",
     "load_file",
     "read_json",
@@ -122,9 +129,12 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     Raises:
         OSError: if the file cannot be written, naming ``path``.
     """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # Unique among the threads, processes and machines that may write the same file.
+    owner = f"{os.getpid()}.{uuid.uuid4().hex}.{platform.node()}"
+    temporary = path.with_name(f".{path.name}.{owner}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_stale(path)
         write(temporary)
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
@@ -135,6 +145,32 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
         ) from error
     finally:
         _remove(temporary)
+
+
+def _remove_stale(path: Path) -> None:
+    """Remove what killed processes left of earlier attempts to write a file."""
+    start, end = f".{path.name}.", ".tmp"
+    for old in path.parent.iterdir():
+        if not (old.name.startswith(start) and old.name.endswith(end)):
+            continue
+        process, _, node = old.name[len(start) : -len(end)].partition(".")
+        if not process.isdecimal():
+            continue  # of a file whose name begins like this one's
+        # Elsewhere only age tells: no write takes a day.
+        here = node.partition(".")[2] == platform.node()
+        with contextlib.suppress(OSError):
+            if (here and not _runs(int(process))) or time.time() - old.stat().st_mtime > 86_400:
+                old.unlink()
+
+
+def _runs(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:
+        pass  # another user's
+    return True
 
 
 def _remove(path: Path) -> None:
@@ -149,6 +185,43 @@ def check_writable(directory: Path) -> None:
     Raises:
         OSError: if not, naming the folder.
     """
-    probe = directory / ".write-test"
-    write_atomic(probe, lambda temporary: temporary.write_text("ok"))
-    probe.unlink()
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        # Without a name, where the system can: others may be trying the same folder.
+        with tempfile.TemporaryFile(dir=directory) as probe:
+            probe.write(b"ok")
+            os.fsync(probe.fileno())
+    except OSError as error:
+        raise OSError(
+            f"cannot write to {directory}: {error}. Free some space or choose another output folder."
+        ) from error
+
+
+@contextlib.contextmanager
+def exclusive(directory: Path) -> Iterator[None]:
+    """Keep other processes that ask for the same out of a folder; it is created if needed.
+
+    The lock lies on the folder itself: it leaves no file, and ends with the process however that ends.
+    Where the file system has no locks there is none.
+
+    Raises:
+        BlockingIOError: if another process is in there.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    folder = os.open(directory, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BlockingIOError(
+                f"{directory} is in use by another process: wait until that has ended, or choose another "
+                "folder"
+            ) from None
+        except OSError as error:
+            warnings.warn(
+                f"{directory} cannot be locked ({error}): let one process at a time use it",
+                stacklevel=3,
+            )
+        yield
+    finally:
+        os.close(folder)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import replace
 
@@ -121,3 +122,62 @@ def test_figures_are_written(tmp_path):
     plot_filmstrip(frames, ["0", "8"], tmp_path / "c.png", title="t")
     for name in "abc":
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"successes": 99, "episodes": 2}, "99 successes in 2 episodes"),
+        ({"successes": -1}, "successes"),
+        ({"episodes": 0, "successes": 0}, "episodes"),
+        ({"episodes": 10.0}, "episodes"),
+        ({"episodes": True, "successes": 1}, "episodes"),
+        ({"successes": "5"}, "successes"),
+        ({"task": 3}, "task"),
+        ({"nfe": 0}, "nfe"),
+        ({"chunk": 0}, "chunk"),
+        ({"sigma": -1.0}, "sigma"),
+        ({"sigma": None}, "sigma"),
+        ({"seed": -1}, "seed"),
+        ({"mean_steps": float("nan")}, "mean_steps"),
+        ({"source_leak": "high"}, "source_leak"),
+        ({"inner_jump": -0.5}, "inner_jump"),
+        ({"success_rate": 0.9}, "success_rate"),
+        ({"success_rate": None}, "success_rate"),
+        ({"unknown": 1}, "unknown"),
+    ],
+    ids=str,
+)
+def test_rows_that_cannot_have_been_measured(tmp_path, change, said):
+    results = filled(tmp_path)
+    stored = json.loads(results.path.read_text())
+    stored["rows"][2] |= change
+    if {"successes", "episodes"} & change.keys():
+        row = stored["rows"][2]
+        with contextlib.suppress(TypeError, ZeroDivisionError):
+            row["success_rate"] = row["successes"] / row["episodes"]
+    results.path.write_text(json.dumps(stored))
+    with pytest.raises(ValueError, match=rf"(?s)results\.json.*row 2.*{said}"):
+        Results(results.path, META, resume=True)
+
+
+def test_rows_that_contradict_each_other(tmp_path):
+    results = filled(tmp_path)
+    stored = json.loads(results.path.read_text())
+    stored["rows"].append(dict(stored["rows"][2]))  # the same once more does no harm
+    results.path.write_text(json.dumps(stored))
+    assert Results(results.path, META, resume=True).rows == results.rows
+    stored["rows"][-1] |= {"successes": 9, "success_rate": 0.9}
+    results.path.write_text(json.dumps(stored))
+    with pytest.raises(ValueError, match=r"results\.json.*row 18 contradicts row 2"):
+        Results(results.path, META, resume=True)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[" * 100_000, "[]", "null", '{"rows": 3, "meta": {}}'], ids=range(5)
+)
+def test_a_file_that_is_no_results(tmp_path, text):
+    path = tmp_path / "results.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"results\.json"):
+        Results(path, META, resume=True)

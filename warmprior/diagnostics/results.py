@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from warmprior._files import write_atomic
+from warmprior._files import as_json, read_json, write_atomic
 from warmprior.diagnostics._figure import prior_label
 from warmprior.diagnostics.paper import paper_success
 from warmprior.diagnostics.source_leak import INNER_STEP_BOUND, LEAK_BOUND
@@ -121,19 +121,17 @@ class Results:
         #: Further lists of rows to save beside these, by name.
         self.extra: dict[str, list[dict[str, Any]]] = {}
         if resume and self.path.exists():
+            stored = read_json(self.path)
             try:
-                stored = json.loads(self.path.read_text())
-                for row in stored["rows"]:
-                    del row["success_rate"]
-                    self.rows.append(Row(**row))
                 theirs = {key: stored["meta"][key] for key in identity}
-                self.meta = meta | {"wall_time_s": stored["meta"].get("wall_time_s", 0.0)}
-            except (json.JSONDecodeError, KeyError, TypeError) as error:
+                self.meta = meta | {"wall_time_s": float(stored["meta"].get("wall_time_s", 0.0))}
+                self.rows = _read_rows(stored["rows"])
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                reason = str(error) if type(error) is ValueError else repr(error)
                 raise ValueError(
-                    f"{self.path} is not a results file of this version: {error!r}"
+                    f"{self.path} is not a results file of this version: {reason}"
                 ) from error
-            # Through JSON, as the stored values went: tuples become lists.
-            mine = json.loads(json.dumps({key: meta[key] for key in identity}))
+            mine = as_json({key: meta[key] for key in identity})  # as the stored values went
             for key in identity:
                 if theirs[key] != mine[key]:
                     raise ValueError(
@@ -160,6 +158,52 @@ class Results:
     def save(self) -> None:
         """Write the file atomically."""
         write_results(self.path, self.meta, (row.record() for row in self.rows), **self.extra)
+
+
+def _read_rows(records: list[dict[str, Any]]) -> list[Row]:
+    """Rows as they are stored, after checking that they can have been measured.
+
+    Raises:
+        ValueError: naming the row and the entry, from 0 on.
+    """
+    rows: list[Row] = []
+    for i, record in enumerate(records):
+        try:
+            rest = dict(record)
+            rate = rest.pop("success_rate")
+            row = Row(**rest)
+            _check(row, rate)
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"row {i}: {error}") from error
+        same = next((j for j, other in enumerate(rows) if other.cell == row.cell), None)
+        if same is None:
+            rows.append(row)
+        elif row != rows[same]:
+            raise ValueError(f"row {i} contradicts row {same}; remove the wrong one")
+    return rows
+
+
+_LEAST = {"chunk": 1, "nfe": 1, "seed": 0, "checkpoint": 0, "episodes": 1, "successes": 0}
+_OPTIONAL = ("boundary_jump", "inner_jump", "source_leak", "inner_step_ratio")
+
+
+def _check(row: Row, rate: Any) -> None:
+    def number(value: Any) -> bool:
+        return isinstance(value, int | float) and math.isfinite(value) and value >= 0
+
+    wrong = [name for name in ("task", "data", "prior") if not isinstance(getattr(row, name), str)]
+    for name, least in _LEAST.items():
+        value = getattr(row, name)
+        wrong += [] if type(value) is int and value >= least else [name]
+    for name in ("sigma", "mean_steps", *_OPTIONAL):
+        value = getattr(row, name)
+        wrong += [] if number(value) or (value is None and name in _OPTIONAL) else [name]
+    if wrong:
+        raise ValueError(f"{wrong[0]} cannot be {getattr(row, wrong[0])!r}")
+    if row.successes > row.episodes:
+        raise ValueError(f"{row.successes} successes in {row.episodes} episodes")
+    if not number(rate) or not math.isclose(rate, row.success_rate):
+        raise ValueError(f"its success_rate is {rate!r}, not {row.success_rate}")
 
 
 def write_results(

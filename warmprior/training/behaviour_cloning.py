@@ -16,8 +16,10 @@ from torch import nn
 from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
+from warmprior._files import exclusive
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.compiled import uncompiled
 from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
@@ -28,8 +30,10 @@ from warmprior.training.checkpoint import (
     load_state,
     module_tensors,
     named,
+    restore_module,
     restore_optimizer,
     restore_rng,
+    restoring,
     rng_tensors,
     save_state,
     select,
@@ -96,7 +100,9 @@ class BehaviourCloning:
         compile: compile the velocity network with :func:`torch.compile`.
 
     Raises:
-        ValueError: if the folder's state belongs to another recipe, prior, network or dataset.
+        ValueError: if the folder's state is damaged or belongs to another recipe, prior, network or
+            dataset, or the policy could not be loaded again (:meth:`WarmPriorActor.check_saveable`).
+        TypeError: if the policy cannot be saved.
     """
 
     def __init__(
@@ -111,6 +117,7 @@ class BehaviourCloning:
         resume: bool = True,
         compile: bool = False,
     ) -> None:
+        actor.check_saveable()  # before hours are spent on what would be lost
         self.actor = actor
         self.config = config
         self.directory = Path(directory)
@@ -153,8 +160,9 @@ class BehaviourCloning:
             "format": STATE_FORMAT,
         }
         torch.manual_seed(config.seed)
-        if resume and self.state_path.exists():
-            self._restore()
+        self._resume = resume
+        self._restored: float | None = None  # when the state that was restored had been written
+        self._restore()
         if compile:
             self.loss_module.velocity_network.compile()
 
@@ -196,9 +204,19 @@ class BehaviourCloning:
         Raises:
             FloatingPointError: if the loss becomes NaN or infinite; the last saved state and all
                 kept policies stay.
+            BlockingIOError: if another process trains in the folder.
         """
+        if self.iteration == self.config.iterations and self._is_kept():
+            return
+        with exclusive(self.directory):
+            self._restore()  # what another process did since this object was built
+            self._run(description, progress)
+
+    def _run(self, description: str | None, progress: Callable[[int], object] | None) -> None:
         config = self.config
         keep = set(config.checkpoint_iterations)
+        if self.iteration in keep and not self._is_kept():
+            self._averaged_actor().save_pretrained(self.policy_path(self.iteration))
         save_every = config.save_every or max(1, config.iterations // config.checkpoints // 10)
         self.actor.train()
         bar = tqdm(
@@ -229,6 +247,15 @@ class BehaviourCloning:
                     self._averaged_actor().save_pretrained(self.policy_path(i))
                 if saves:
                     self._save()
+
+    def _is_kept(self) -> bool:
+        """Whether the policy of this iteration is on disk and whole."""
+        try:
+            with torch.random.fork_rng([]):  # a loaded policy was built with random weights before
+                WarmPriorActor.from_pretrained(self.policy_path(self.iteration))
+        except (OSError, ValueError):
+            return False
+        return True
 
     def _check_finite(self) -> None:
         # Before every save and not only before logs: a saved NaN could not be resumed from.
@@ -282,32 +309,52 @@ class BehaviourCloning:
             "iteration": self.iteration,
             "losses": self.losses,
             "schedule": schedule,
+            "optimizer": sorted(select("optimizer", tensors)),
         }
         save_state(self.state_path, tensors, facts)
+        self._restored = self.state_path.stat().st_mtime
 
     def _restore(self) -> None:
+        """Continue from the folder's state, if there is one that is not continued already."""
+        if not self._resume or not self.state_path.exists():
+            return
+        written = self.state_path.stat().st_mtime
+        if written == self._restored:
+            return
         tensors, facts = load_state(self.state_path)
-        check_identity(self.state_path, facts["identity"], self.identity)
-        try:
-            self.trained.load_state_dict(select("trained", tensors))
-            self.ema.load_state_dict(select("ema", tensors))
-        except RuntimeError as error:
-            raise ValueError(
-                f"{self.state_path} does not fit the network; its code has changed since: {error}. "
-                "Remove the folder to train again."
-            ) from error
-        restore_optimizer(self.optimizer, select("optimizer", tensors))
-        self.iteration = facts["iteration"]
-        self.losses = [(int(i), float(loss)) for i, loss in facts["losses"]]
-        # The factors are functions and not saved; a restored schedule keeps its own.
-        kept = [None for _ in self.optimizer.param_groups]
-        self.schedule.load_state_dict(facts["schedule"] | {"lr_lambdas": kept})
-        for group, rate in zip(
-            self.optimizer.param_groups, self.schedule.get_last_lr(), strict=True
-        ):
+        check_identity(self.state_path, facts.get("identity"), self.identity)
+        with restoring(self.state_path):
+            self._load(tensors, facts)
+        self._restored = written
+
+    def _load(self, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
+        iteration = facts["iteration"]
+        if type(iteration) is not int or not 0 < iteration <= self.config.iterations:
+            raise ValueError(f"it is of iteration {iteration!r} of {self.config.iterations}")
+        rates = [
+            base * factor(iteration)
+            for base, factor in zip(self.schedule.base_lrs, self.schedule.lr_lambdas, strict=True)
+        ]
+        schedule = {"last_epoch": iteration, "_last_lr": rates}
+        if any(facts["schedule"][name] != value for name, value in schedule.items()):
+            raise ValueError(f"its schedule is not that of iteration {iteration}")
+        optimizer = select("optimizer", tensors)
+        # States written before the names were have none.
+        if not optimizer or sorted(optimizer) != facts.get("optimizer", sorted(optimizer)):
+            raise ValueError("it lacks entries of the optimiser")
+        losses = [(int(i), float(loss)) for i, loss in facts["losses"]]
+        numbers = [torch.tensor([loss for _, loss in losses]), tensors["running"]]
+        if not all(bool(torch.isfinite(v).all()) for v in (*numbers, *optimizer.values())):
+            raise ValueError("a loss or an entry of the optimiser is NaN or infinite")
+        restore_module(self.trained, select("trained", tensors))
+        restore_module(self.ema, select("ema", tensors))
+        restore_optimizer(self.optimizer, optimizer)
+        self.schedule.load_state_dict(self.schedule.state_dict() | schedule)
+        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
         self._running = list(tensors["running"].to(self.generator.device))
         restore_rng(self.generator, select("rng", tensors))
+        self.iteration, self.losses = iteration, losses
 
 
 def policy_path(directory: Path, iteration: int) -> Path:
@@ -316,13 +363,13 @@ def policy_path(directory: Path, iteration: int) -> Path:
 
 
 def _network_identity(network: nn.Module) -> Any:
-    config, state = getattr(network, "config", None), network.state_dict()
-    if not callable(config):
-        return {name: list(value.shape) for name, value in state.items()}
+    network = uncompiled(network)
+    state = network.state_dict()
     # What is not trained, such as moments, is part of what a network is.
-    trained = {name for name, _ in network.named_parameters()}
+    trained = {name for name, _ in network.named_parameters(remove_duplicate=False)}
     fixed = {name: value.tolist() for name, value in state.items() if name not in trained}
     digest = hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
+    config: Any = network.config
     return {**config(), "buffers": digest}
 
 

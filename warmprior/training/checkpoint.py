@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from warmprior._files import save_file, write_atomic
+from warmprior._files import as_json, check_regular, save_file, write_atomic
+from warmprior.modules.compiled import without_compilation
 
 __all__ = ["load_state", "restore_optimizer", "save_state", "snapshot_optimizer"]
 
@@ -24,8 +27,10 @@ def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, An
         tensors: named tensors.
         facts: anything else, stored as JSON in the file's header.
     """
-    metadata = {"facts": json.dumps(facts)}
+    stored = as_json(facts)
     cpu = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
+    # One entry: the format keeps no order of several, and equal states have equal files.
+    metadata = {"facts": json.dumps(stored | {"sha256": _digest(stored, cpu)})}
     write_atomic(path, lambda temporary: save_file(cpu, temporary, metadata=metadata))
 
 
@@ -35,23 +40,57 @@ def load_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     Raises:
         ValueError: if the file is damaged or was written by something else.
     """
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
+    check_regular(path)
     try:
         with safe_open(path, framework="pt") as file:
-            facts = json.loads((file.metadata() or {})["facts"])
-            return {name: file.get_tensor(name) for name in file.keys()}, facts  # noqa: SIM118
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
-        raise ValueError(f"{path} is not a readable training state: {error}") from error
+            facts = dict(json.loads((file.metadata() or {})["facts"]))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        # States written before there was a digest have none.
+        if facts.pop("sha256", None) not in (None, _digest(facts, tensors)):
+            raise ValueError("its content has changed since it was written")
+    except Exception as error:  # the format's own errors, those of JSON, or a failing disk
+        raise ValueError(
+            f"{path} is not a readable training state: {error}. Remove it to train again."
+        ) from error
+    return tensors, facts
 
 
-def check_identity(path: Path, theirs: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
+def _digest(facts: Any, tensors: Mapping[str, Tensor]) -> str:
+    digest = hashlib.sha256(json.dumps(facts).encode())
+    for name in sorted(tensors):
+        value = tensors[name]
+        digest.update(f"{name} {value.dtype} {list(value.shape)}".encode())
+        digest.update(value.reshape(-1).view(torch.uint8).numpy())
+    return digest.hexdigest()
+
+
+@contextmanager
+def restoring(path: Path) -> Iterator[None]:
+    """Name the state in whatever its entries lead to when they are not as they were saved.
+
+    Raises:
+        ValueError: for any error inside.
+    """
+    try:
+        yield
+    except Exception as error:
+        reason = str(error) if isinstance(error, ValueError) else repr(error)
+        raise ValueError(
+            f"{path} is damaged, or the code has changed since: {reason}. Remove the folder to train "
+            "again."
+        ) from error
+
+
+def check_identity(path: Path, theirs: Any, mine: Mapping[str, Any]) -> None:
     """Whether a stored state belongs to the training that wants to continue it.
 
     Raises:
         ValueError: naming the first part that differs.
     """
-    for part, value in mine.items():
+    theirs = theirs if isinstance(theirs, dict) else {}
+    for part, value in as_json(mine).items():
         if theirs.get(part) != value:
             raise ValueError(
                 f"{path} belongs to another {part}: it has {theirs.get(part)}, this run has {value}. Use "
@@ -66,10 +105,17 @@ def snapshot_optimizer(optimizer: Optimizer) -> dict[str, Tensor]:
 
 
 def restore_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Load :func:`snapshot_optimizer`'s tensors into an optimiser of the same parameters."""
+    """Load :func:`snapshot_optimizer`'s tensors into an optimiser of the same parameters.
+
+    Raises:
+        ValueError: if an entry has another shape than its parameter.
+    """
+    parameters = [p for group in optimizer.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
         index, name = key.split(".", 1)
+        if value.ndim and value.shape != parameters[int(index)].shape:
+            raise ValueError(f"the optimiser's {key} has shape {tuple(value.shape)}")
         state.setdefault(int(index), {})[name] = value
     optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
 
@@ -86,8 +132,31 @@ def select(prefix: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def module_tensors(module: nn.Module) -> dict[str, Tensor]:
-    """A module's state dict without aliases of the live parameters' autograd history."""
-    return {name: value.detach() for name, value in module.state_dict().items()}
+    """A module's state dict without aliases of the live parameters' autograd history.
+
+    Under the plain names, so that what was trained compiled goes on uncompiled and the reverse.
+    """
+    return {n: value.detach() for n, value in without_compilation(module.state_dict()).items()}
+
+
+def restore_module(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
+    """Load what :func:`module_tensors` gave.
+
+    Raises:
+        RuntimeError: if names or shapes differ.
+        ValueError: if a trained value is NaN or infinite.
+    """
+    own = module_tensors(module)
+    trained = without_compilation(dict(module.named_parameters(remove_duplicate=False)))
+    for name in own.keys() & tensors.keys():
+        value = tensors[name]
+        # A network's own buffers may be infinite, as masks are.
+        if value.isnan().any() or (name in trained and value.isinf().any()):
+            raise ValueError(f"{name} holds NaN or infinity")
+        if value.dtype != own[name].dtype:
+            raise ValueError(f"{name} has type {value.dtype}, not {own[name].dtype}")
+    plain = dict(zip(own, module.state_dict(), strict=True))
+    module.load_state_dict({plain.get(name, name): value for name, value in tensors.items()})
 
 
 def rng_tensors(generator: torch.Generator) -> dict[str, Tensor]:

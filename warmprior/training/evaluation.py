@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
+from typing import Any
 
 import numpy as np
 import torch
@@ -24,6 +25,9 @@ from warmprior.training.threads import torch_threads
 from warmprior.training.workers import end_with_parent, start_method, worker_died
 
 __all__ = ["Episode", "evaluate", "parallel_env", "play_episode"]
+
+Act = Callable[[TensorDictBase], TensorDictBase]
+"""Writes the next chunk."""
 
 
 @dataclass(frozen=True)
@@ -146,33 +150,35 @@ def watched(env: EnvBase) -> Iterator[None]:
 
 
 @contextmanager
-def _drawing(policy: TensorDictModuleBase, seed: int, device: torch.device) -> Iterator[None]:
-    """Let a policy draw from a seed, and leave all other draws as they were."""
+def _acting(policy: TensorDictModuleBase, seed: int, nfe: int | None) -> Iterator[Act]:
+    """A policy that draws from a seed, while all other draws stay as they were."""
+    options: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
+    device = _device(policy)
     if isinstance(policy, WarmPriorActor):
-        previous = policy.sampler.generator
-        policy.sampler.generator = torch.Generator(device).manual_seed(seed)
-        try:
-            yield
-        finally:
-            policy.sampler.generator = previous
+        yield partial(policy, generator=torch.Generator(device).manual_seed(seed), **options)
         return
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
-        yield
+        yield partial(policy, **options)
 
 
 @contextmanager
-def episode_noise(policy: TensorDictModuleBase, seed: int, policy_seed: int) -> Iterator[None]:
-    """Let a policy draw the noise that belongs to an episode, see :func:`play_episode`.
+def acting_in_episode(
+    policy: TensorDictModuleBase, seed: int, *, nfe: int | None = None, policy_seed: int = 0
+) -> Iterator[Act]:
+    """A policy with the noise that belongs to an episode, see :func:`play_episode`.
 
     Args:
         policy: as for :func:`evaluate`.
         seed: of the environment, at least 0.
+
+    Keyword Args:
+        nfe: as for :func:`evaluate`.
         policy_seed: of the policy's random draws, at least 0.
     """
     noise_seed = np.random.SeedSequence((policy_seed, seed)).generate_state(1, np.uint64)
-    with torch_threads(1), _drawing(policy, int(noise_seed[0]), _device(policy)):
-        yield
+    with torch_threads(1), _acting(policy, int(noise_seed[0]), nfe) as act:
+        yield act
 
 
 @torch.no_grad()
@@ -216,15 +222,14 @@ def play_episode(
     policy.eval()
     device = _device(policy)
     home = env.device or torch.device("cpu")
-    options = {} if nfe is None else {"nfe": nfe}
     chunks: list[Tensor] = []
     executed: list[Tensor] = []
     success = False
-    with episode_noise(policy, seed, policy_seed):
+    with acting_in_episode(policy, seed, nfe=nfe, policy_seed=policy_seed) as act:
         env.set_seed(seed)
         data = env.reset()
         while True:
-            data = env.step(policy(data.to(device), **options).to(home))
+            data = env.step(act(data.to(device)).to(home))
             chunks.append(data[keys.CHUNK].cpu())
             executed.append(data["next", keys.EXECUTED].cpu())
             success |= bool(data["next", keys.SUCCESS])
@@ -313,13 +318,12 @@ def _play_batched(
     policy.eval()
     device = _device(policy)
     home = env.device or torch.device("cpu")
-    options = {} if nfe is None else {"nfe": nfe}
     played = [0] * num_envs
     success = [False] * num_envs
     chunks: list[list[Tensor]] = [[] for _ in played]
     executed: list[list[Tensor]] = [[] for _ in played]
     # The simulators need the cores; a policy's call is small, and its idle threads would spin.
-    with torch_threads(1), watched(env), _drawing(policy, policy_seed, device):
+    with torch_threads(1), watched(env), _acting(policy, policy_seed, nfe) as act:
         env.set_seed(seeds.start, static_seed=True)
         seed_row = _row_seeding(env)
         for i in range(min(num_envs, len(seeds))):
@@ -330,7 +334,7 @@ def _play_batched(
             active = torch.tensor([i + num_envs * played[i] < len(seeds) for i in range(num_envs)])
             if not active.all():
                 data.set("_step", active.to(home))
-            data = env.step(policy(data.to(device), **options).to(home))
+            data = env.step(act(data.to(device)).to(home))
             told = data["next"].select("done", keys.SUCCESS, keys.EXECUTED, keys.ELAPSED).cpu()
             done = told["done"].flatten() & active
             chunk = data[keys.CHUNK].cpu()

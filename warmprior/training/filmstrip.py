@@ -12,7 +12,7 @@ from torchrl.envs.transforms import Compose
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.training.evaluation import episode_noise
+from warmprior.training.evaluation import acting_in_episode
 
 __all__ = ["Filmstrip", "record_filmstrip"]
 
@@ -67,7 +67,7 @@ def record_filmstrip(
     loop = env.base_env.loop
     states, steps = [], []
     try:
-        with episode_noise(actor, seed, policy_seed):
+        with acting_in_episode(actor, seed, nfe=nfe, policy_seed=policy_seed) as act:
             env.set_seed(seed)
             data = env.reset()
             while True:
@@ -75,7 +75,7 @@ def record_filmstrip(
                 steps.append(int(data[keys.ELAPSED]))
                 if bool(data["done"].any()):
                     break
-                data = env.step_mdp(env.step(actor(data.to(device), nfe=nfe).to("cpu")))
+                data = env.step_mdp(env.step(act(data.to(device)).to("cpu")))
         # Rendering is slow, and only now is it known which states are evenly spaced.
         chosen = np.unique(np.linspace(0, len(states) - 1, frames).round().astype(int))
         pictures = []

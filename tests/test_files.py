@@ -1,0 +1,102 @@
+"""Files: many writers at once, what killed ones leave, and folders in use."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import pytest
+
+from warmprior._files import check_writable, exclusive, read_json, write_atomic
+
+FORK = multiprocessing.get_context("fork")
+
+
+def test_many_may_check_one_folder_at_once(tmp_path):
+    with ThreadPoolExecutor(16) as threads:
+        list(threads.map(lambda _: check_writable(tmp_path / "out"), range(300)))
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=rf"cannot write to {tmp_path}/file"):
+        check_writable(tmp_path / "file")
+
+
+def test_many_may_write_one_file_at_once(tmp_path):
+    path = tmp_path / "file"
+
+    def write(text, temporary):
+        temporary.write_text(text[: len(text) // 2])
+        time.sleep(0.001)
+        with temporary.open("a") as file:
+            file.write(text[len(text) // 2 :])
+
+    texts = [str(i) * 1000 for i in range(10)]
+    with ThreadPoolExecutor(10) as threads:
+        list(threads.map(lambda text: write_atomic(path, partial(write, text)), texts))
+    assert path.read_text() in texts and list(tmp_path.iterdir()) == [path]
+
+
+def _killed_while_writing(path):
+    def write(temporary):
+        temporary.write_text("half")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    write_atomic(path, write)
+
+
+def _hold(folder, pipe):
+    with exclusive(folder):
+        pipe.send("in")
+        time.sleep(300)
+
+
+def test_what_a_killed_process_left_is_removed_by_the_next(tmp_path):
+    path, other = tmp_path / "results", tmp_path / "results.json"
+    for each in (path, other):
+        process = FORK.Process(target=_killed_while_writing, args=(each,))
+        process.start()
+        process.join(30)
+    assert len(list(tmp_path.iterdir())) == 2
+    write_atomic(path, lambda temporary: temporary.write_text("whole"))
+    assert sum(name.startswith(".results.json.") for name in os.listdir(tmp_path)) == 1
+    assert len(list(tmp_path.iterdir())) == 2
+    write_atomic(other, lambda temporary: temporary.write_text("whole"))
+    assert sorted(tmp_path.iterdir()) == [path, other]
+
+
+def test_only_what_is_old_is_removed_of_another_machine(tmp_path):
+    path = tmp_path / "file"
+    young, old = (tmp_path / f".file.1.{name}.elsewhere.org.tmp" for name in ("a", "b"))
+    young.write_text("")
+    old.write_text("")
+    os.utime(old, (time.time() - 100_000,) * 2)
+    write_atomic(path, lambda temporary: temporary.write_text("whole"))
+    assert sorted(tmp_path.iterdir()) == sorted([young, path])
+
+
+def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):
+    ours, theirs = FORK.Pipe()
+    process = FORK.Process(target=_hold, args=(tmp_path, theirs))
+    process.start()
+    assert ours.poll(30) and ours.recv() == "in"
+    with pytest.raises(BlockingIOError, match="in use by another process"), exclusive(tmp_path):
+        pass
+    process.kill()
+    process.join(30)
+    with exclusive(tmp_path):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"[" * 100_000, b'"\xff"'], ids=range(4))
+def test_no_json(tmp_path, content):
+    (tmp_path / "file").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"{tmp_path}/file is not valid JSON"):
+        read_json(tmp_path / "file")
