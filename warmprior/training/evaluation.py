@@ -155,11 +155,12 @@ def _acting(policy: TensorDictModuleBase, seed: int, nfe: int | None) -> Iterato
     options: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
     device = _device(policy)
     if isinstance(policy, WarmPriorActor):
-        yield partial(policy, generator=torch.Generator(device).manual_seed(seed), **options)
+        options["generator"] = torch.Generator(device).manual_seed(seed)
+        yield lambda data: policy(data, **options)
         return
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
-        yield partial(policy, **options)
+        yield lambda data: policy(data, **options)
 
 
 @contextmanager
