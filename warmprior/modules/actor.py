@@ -28,6 +28,8 @@ __all__ = ["WarmPriorActor"]
 FORMAT = 3
 """Version of the layout that :meth:`WarmPriorActor.save_pretrained` writes."""
 
+_SAVED_KEYS = ("observation_key", "loc_key", "warm_key", "chunk_key")
+
 
 class WarmPriorActor(TensorDictModuleBase):
     """Flow-matching policy with a choice of source: ``(observation, loc, warm) -> (noise, chunk)``.
@@ -49,7 +51,10 @@ class WarmPriorActor(TensorDictModuleBase):
         normalizer: the normaliser of the data, kept here so that it is saved with the policy; its
             :meth:`~warmprior.Normalizer.env_transforms` go next to the base environment.
         generator: source of randomness of the sampler.
-        observation_key: key of the observation, ``[*B, To, d_o]``.
+        observation_key: key of the observation, ``[*B, To, d_o]``, or of several, nested under it.
+        loc_key: key of the mean, ``[*B, P, d_a]``.
+        warm_key: key of the warm mask, bool ``[*B, P, 1]``.
+        chunk_key: key of the chunk, ``[*B, P, d_a]``.
         path_key: if given, the integration path is written there.
 
     Raises:
@@ -81,6 +86,9 @@ class WarmPriorActor(TensorDictModuleBase):
         normalizer: Normalizer | None = None,
         generator: torch.Generator | None = None,
         observation_key: NestedKey = keys.OBSERVATION,
+        loc_key: NestedKey = keys.LOC,
+        warm_key: NestedKey = keys.WARM,
+        chunk_key: NestedKey = keys.CHUNK,
         path_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
@@ -90,14 +98,17 @@ class WarmPriorActor(TensorDictModuleBase):
                 f"the network was built for prediction_length={built_for}, but {prior} needs "
                 f"{prior.prediction_length}"
             )
-        self.sampler = PriorSampler(prior, generator=generator)
+        self.sampler = PriorSampler(prior, loc_key=loc_key, warm_key=warm_key, generator=generator)
         self.ode = ODEActor(
             network,
             prior=prior,
             nfe=nfe,
             solver=solver,
             clip=clip,
+            loc_key=loc_key,
+            warm_key=warm_key,
             observation_key=observation_key,
+            chunk_key=chunk_key,
             path_key=path_key,
         )
         self.normalizer = normalizer
@@ -108,6 +119,11 @@ class WarmPriorActor(TensorDictModuleBase):
     def prior(self) -> Prior:
         """The source distribution."""
         return self.sampler.prior
+
+    @property
+    def chunk_key(self) -> NestedKey:
+        """Key of the chunk."""
+        return self.ode.out_keys[0]
 
     @property
     def network(self) -> nn.Module:
@@ -142,7 +158,7 @@ class WarmPriorActor(TensorDictModuleBase):
                 "nfe": self.ode.nfe,
                 "solver": self.ode.solver,
                 "clip": self.ode.clip,
-                "observation_key": self.in_keys[0],
+                **dict(zip(_SAVED_KEYS, (*self.in_keys, self.chunk_key), strict=True)),
             },
             "normalizer": None if self.normalizer is None else self.normalizer.config(),
         }
@@ -187,14 +203,15 @@ class WarmPriorActor(TensorDictModuleBase):
             )
         try:
             options: dict[str, Any] = dict(config["actor"])
-            key = options.pop("observation_key")
+            for name in _SAVED_KEYS:
+                if isinstance(options.get(name), list):  # JSON's form of a nested key
+                    options[name] = tuple(options[name])
             normalizer = config["normalizer"]
             actor = cls(
                 VelocityNetwork.from_config(config["network"]),
                 Prior.from_config(config["prior"]),
                 normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
                 generator=generator,
-                observation_key=key if isinstance(key, str) else tuple(key),
                 **options,
             )
         except (AttributeError, KeyError, TypeError) as error:

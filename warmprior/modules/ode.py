@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior import keys
+from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.prior import Prior
 
 __all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "integrate"]
@@ -117,7 +118,8 @@ class ODEActor(TensorDictModuleBase):
     """Transports the source to an action chunk: ``(noise, observation) -> chunk``.
 
     Args:
-        network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``.
+        network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``. An
+            observation of several entries, nested under its key, arrives as a tensordict ``[B]``.
 
     Keyword Args:
         prior: the source distribution, for priors that limit ``nfe`` or whose mean the network sees
@@ -208,12 +210,10 @@ class ODEActor(TensorDictModuleBase):
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
         if missing:
             raise KeyError(f"ODEActor needs the keys {self.in_keys}; missing: {missing}")
-        if self.prior is not None and mean:
-            observation = self.prior.extend_observation(observation, *mean)
         batch = a0.shape[:-2]
-        observation = observation.reshape(-1, *observation.shape[len(batch) :])
+        observation = network_observation(self.prior, observation, mean, batch)
         path_or_chunk = integrate(
-            lambda t, a: self.network(t, a, observation),
+            velocity_field(self.network, observation),
             a0.reshape(-1, *a0.shape[-2:]),
             nfe=nfe,
             solver=self.solver,
