@@ -188,8 +188,8 @@ def test_an_episode_depends_on_its_seeds_alone():
 
 def test_the_noise_of_an_episode_is_that_of_the_documented_seed():
     actor = actor_for(GaussianPrior(H))
-    actor.forward = lambda data, nfe=None: data.set(
-        ("vla_action", "chunk"), actor.sampler(data)["prior", "noise"]
+    actor.forward = lambda data, generator: data.set(
+        ("vla_action", "chunk"), actor.sampler(data, generator)["prior", "noise"]
     )
     first = {}
     for seeds in ((0, 7), (7, 0), (1, 7), (0, 8), (2**32, 7)):

@@ -41,6 +41,8 @@ __all__ = ["WarmPriorActor"]
 FORMAT = 3
 """Version of the layout that :meth:`WarmPriorActor.save_pretrained` writes."""
 
+_SAVED_KEYS = ("observation_key", "loc_key", "warm_key", "chunk_key")
+
 
 class WarmPriorActor(TensorDictModuleBase):
     """Flow-matching policy with a choice of source: ``(observation, loc, warm) -> (noise, chunk)``.
@@ -64,8 +66,12 @@ class WarmPriorActor(TensorDictModuleBase):
         environment: description of the environment that the policy was made for, as JSON holds it; kept
             here so that it is saved with the policy (``python -m warmprior evaluate FOLDER``).
         generator: source of randomness of the sampler; per call: ``actor(data, generator=...)``.
-        observation_key: key of the observation, ``[*B, To, d_o]``. ``"observation"`` by default, or what
-            :class:`~warmprior.MeanObservation` makes of it (:attr:`Prior.conditions_network`).
+        observation_key: key of the observation, ``[*B, To, d_o]``, or of several, nested under it.
+            ``"observation"`` by default, or what :class:`~warmprior.MeanObservation` makes of it
+            (:attr:`Prior.conditions_network`).
+        loc_key: key of the mean, ``[*B, P, d_a]``.
+        warm_key: key of the warm mask, bool ``[*B, P, 1]``.
+        chunk_key: key of the chunk, ``[*B, P, d_a]``.
         path_key: if given, the integration path is written there.
 
     Raises:
@@ -98,6 +104,9 @@ class WarmPriorActor(TensorDictModuleBase):
         environment: Mapping[str, Any] | None = None,
         generator: torch.Generator | None = None,
         observation_key: NestedKey | None = None,
+        loc_key: NestedKey = keys.LOC,
+        warm_key: NestedKey = keys.WARM,
+        chunk_key: NestedKey = keys.CHUNK,
         path_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
@@ -109,7 +118,7 @@ class WarmPriorActor(TensorDictModuleBase):
                 f"the network was built for prediction_length={built_for}, but {prior} needs "
                 f"{prior.prediction_length}"
             )
-        self.sampler = PriorSampler(prior, generator=generator)
+        self.sampler = PriorSampler(prior, loc_key=loc_key, warm_key=warm_key, generator=generator)
         self.ode = ODEActor(
             network,
             nfe=nfe,
@@ -117,6 +126,7 @@ class WarmPriorActor(TensorDictModuleBase):
             solver=solver,
             clip=clip,
             observation_key=observation_key,
+            chunk_key=chunk_key,
             path_key=path_key,
         )
         self.normalizer = normalizer
@@ -128,6 +138,11 @@ class WarmPriorActor(TensorDictModuleBase):
     def prior(self) -> Prior:
         """The source distribution."""
         return self.sampler.prior
+
+    @property
+    def chunk_key(self) -> NestedKey:
+        """Key of the chunk."""
+        return self.ode.out_keys[0]
 
     @property
     def network(self) -> nn.Module:
@@ -166,10 +181,14 @@ class WarmPriorActor(TensorDictModuleBase):
             "normalizer": self.normalizer,
             "environment": self.environment,
             "generator": self.sampler.generator,
-            "observation_key": self.in_keys[0],
+            **self._keys(),
             "path_key": self.ode.path_key,
         }
         return type(self)(**(mine | changes))
+
+    def _keys(self) -> dict[str, NestedKey]:
+        """The constructor's keys."""
+        return dict(zip(_SAVED_KEYS, (*self.in_keys, self.chunk_key), strict=True))
 
     def config(self) -> dict[str, Any]:
         """JSON-serialisable description of everything but the weights.
@@ -193,7 +212,7 @@ class WarmPriorActor(TensorDictModuleBase):
                 "nfe": self.ode.nfe,
                 "solver": self.ode.solver,
                 "clip": self.ode.clip,
-                "observation_key": self.in_keys[0],
+                **self._keys(),
             },
             "normalizer": None if self.normalizer is None else self.normalizer.config(),
             "environment": self.environment,
@@ -324,14 +343,15 @@ class WarmPriorActor(TensorDictModuleBase):
         from warmprior.transforms.normalize import Normalizer
 
         options: dict[str, Any] = dict(config["actor"])
-        key = options.pop("observation_key")
+        for name in _SAVED_KEYS:
+            if isinstance(options.get(name), list):  # JSON's form of a nested key
+                options[name] = tuple(options[name])
         normalizer = config["normalizer"]
         return cls(
             VelocityNetwork.from_config(config["network"]),
             Prior.from_config(config["prior"]),
             normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
             environment=config.get("environment"),
-            observation_key=key if isinstance(key, str) else tuple(key),
             **options,
         )
 

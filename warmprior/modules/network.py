@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-__all__ = ["TimestepEmbedding", "VelocityNetwork"]
+__all__ = ["TimestepEmbedding", "VelocityNetwork", "network_observation", "velocity_field"]
 
 
 class VelocityNetwork(nn.Module):
@@ -58,12 +60,11 @@ class VelocityNetwork(nn.Module):
         super().__init_subclass__(**kwargs)
         VelocityNetwork._registry[cls.__name__] = cls
 
-    def check_shapes(self, a: Tensor, observation: Tensor) -> None:
-        """Compare the inputs with what the network was built for.
+    def check_chunk(self, a: Tensor) -> None:
+        """Compare a chunk with what the network was built for.
 
         Args:
             a: ``[B, P, d_a]``.
-            observation: ``[B, To, d_o]``.
 
         Raises:
             ValueError: naming the expected and the given shape.
@@ -74,12 +75,30 @@ class VelocityNetwork(nn.Module):
                 f"{type(self).__name__} was built for chunks [B, P, d_a] with (P, d_a) = {expected}, "
                 f"got {tuple(a.shape)}"
             )
+
+    def check_shapes(self, a: Tensor, observation: Tensor | TensorDictBase) -> None:
+        """Compare the inputs with what the network was built for.
+
+        Args:
+            a: ``[B, P, d_a]``.
+            observation: ``[B, To, d_o]``.
+
+        Raises:
+            ValueError: naming the expected and the given shape.
+        """
+        self.check_chunk(a)
         expected = (self.observation_steps, self.observation_dim)
-        if tuple(observation.shape[1:]) != expected:
+        built = (
+            f"{type(self).__name__} was built for observations [B, To, d_o] with "
+            f"(To, d_o) = {expected}"
+        )
+        if isinstance(observation, TensorDictBase):
+            entries = sorted(map(str, observation.keys(True, True)))
             raise ValueError(
-                f"{type(self).__name__} was built for observations [B, To, d_o] with "
-                f"(To, d_o) = {expected}, got {tuple(observation.shape)}"
+                f"{built}, got the entries {entries}: write a network that encodes them"
             )
+        if tuple(observation.shape[1:]) != expected:
+            raise ValueError(f"{built}, got {tuple(observation.shape)}")
 
     def config(self) -> dict[str, Any]:
         """JSON-serialisable class name and constructor arguments."""
@@ -117,6 +136,48 @@ class VelocityNetwork(nn.Module):
             {"params": decay, "weight_decay": weight_decay},
             {"params": no_decay, "weight_decay": 0.0},
         ]
+
+
+def velocity_field(
+    network: nn.Module, observation: Tensor | TensorDictBase
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """A network's velocity ``(t, a) -> v`` at observations, in the precision of ``a``.
+
+    The network computes in its own precision (that of its first parameter): float64 demonstrations and
+    environments, and bfloat16 networks, need no casts elsewhere, and the path is integrated, and its error
+    measured, in the precision of the actions.
+
+    Args:
+        network: ``(t [B], a_t [B, P, d_a], observation) -> [B, P, d_a]``.
+        observation: ``[B, To, *]``, or a tensordict of such entries; whole numbers, such as pixels, are
+            left as they are.
+    """
+    dtype = next((p.dtype for p in network.parameters() if p.is_floating_point()), None)
+    if dtype is None:
+        return lambda t, a: network(t, a, observation)
+
+    def cast(value: Tensor) -> Tensor:
+        return value.to(dtype) if value.is_floating_point() else value
+
+    if isinstance(observation, TensorDictBase):
+        several = observation.apply(cast)
+        return lambda t, a: network(t.to(dtype), a.to(dtype), several).to(a.dtype)
+    observation = cast(observation)
+    return lambda t, a: network(t.to(dtype), a.to(dtype), observation).to(a.dtype)
+
+
+def network_observation(
+    observation: Tensor | TensorDictBase, batch: torch.Size
+) -> Tensor | TensorDictBase:
+    """The observation with the one batch dimension that a network gets.
+
+    Args:
+        observation: ``[*B, To, *]``, or a tensordict ``[*B]`` of such entries.
+        batch: ``*B``.
+    """
+    if isinstance(observation, TensorDictBase):
+        return observation.reshape(batch.numel()) if batch else observation.unsqueeze(0)
+    return observation.reshape(-1, *observation.shape[len(batch) :])
 
 
 class TimestepEmbedding(nn.Module):

@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior import keys
+from warmprior.modules.network import network_observation, velocity_field
 
 __all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "integrate"]
 
@@ -120,7 +121,8 @@ class ODEActor(TensorDictModuleBase):
     """Transports the source to an action chunk: ``(noise, observation) -> chunk``.
 
     Args:
-        network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``.
+        network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``. An
+            observation of several entries, nested under its key, arrives as a tensordict ``[B]``.
 
     Keyword Args:
         nfe: number of network evaluations per chunk; per call: ``actor(data, nfe=3)``. 9 by default, or
@@ -202,9 +204,9 @@ class ODEActor(TensorDictModuleBase):
         if missing:
             raise KeyError(f"ODEActor needs the keys {self.in_keys}; missing: {missing}")
         batch = a0.shape[:-2]
-        observation = observation.reshape(-1, *observation.shape[len(batch) :])
+        observation = network_observation(observation, batch)
         path_or_chunk = integrate(
-            lambda t, a: self.network(t, a, observation),
+            velocity_field(self.network, observation),
             a0.reshape(-1, *a0.shape[-2:]),
             nfe=nfe,
             solver=self.solver,

@@ -250,7 +250,7 @@ class PreconditionedNetwork(VelocityNetwork):
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
         """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
-        self.check_shapes(a, observation)
+        self.check_chunk(a)
         alpha, beta, d_alpha, d_beta = self.interpolant.coefficients(t[:, None, None])
         moments = self.moments
         m0, m1, c = moments.source_mean, moments.target_mean, moments.covariance

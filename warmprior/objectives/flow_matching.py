@@ -14,6 +14,7 @@ from torchrl.objectives.common import LossModule
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
+from warmprior.modules.network import network_observation, velocity_field
 
 __all__ = ["FlowMatchingLoss"]
 
@@ -41,7 +42,8 @@ class FlowMatchingLoss(LossModule):
     .. note::
         Keys read (all renameable by :meth:`set_keys`): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool
         ``[*B, P]`` (True = padded; optional), ``loc`` ``[*B, P, d_a]``, ``warm`` bool ``[*B, P, 1]``
-        and ``observation`` ``[*B, To, d_o]``.
+        and ``observation`` ``[*B, To, d_o]``; by default those of the actor. Batches of any device are
+        moved to the network's, where the generator has to be.
 
     Raises:
         ValueError: for an unknown ``reduction``, a curved path with a prior whose field is used for
@@ -108,7 +110,8 @@ class FlowMatchingLoss(LossModule):
             )
         self.reduction = reduction
         self.generator = actor_network.sampler.generator if generator is None else generator
-        self.set_keys(observation=actor_network.in_keys[0])
+        observation, loc, warm = actor_network.in_keys
+        self.set_keys(observation=observation, loc=loc, warm=warm, chunk=actor_network.chunk_key)
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         self._in_keys = None
@@ -156,24 +159,26 @@ class FlowMatchingLoss(LossModule):
         ]
         if missing:
             raise KeyError(f"FlowMatchingLoss needs the keys {list(needed)}; missing: {missing}")
+        weight = next(iter(self.velocity_network_params.values(True, True)), a1)
+        device = weight.device
+        a1, loc, warm, observation = (v.to(device) for v in (a1, loc, warm, observation))
         batch = a1.shape[:-2]
         a0 = self.prior.sample(loc, warm, self.generator)
         a0, a1 = self.prior.couple(a0, a1, self.generator)
         t = a1.new_zeros(batch)
         if self.prior.is_flow:
             t = torch.rand(batch, generator=self.generator, device=a1.device, dtype=a1.dtype)
+        observation = network_observation(observation, batch)
         a_t, velocity = self.interpolant(a0, a1, t)
         with self.velocity_network_params.to_module(
             self.velocity_network, preserve_module_state=False
         ):
-            predicted = self.velocity_network(
-                t.reshape(-1),
-                a_t.reshape(-1, *a1.shape[-2:]),
-                observation.reshape(-1, *observation.shape[len(batch) :]),
-            )
+            field = velocity_field(self.velocity_network, observation)
+            predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:]))
         error = (predicted.reshape(a1.shape) - velocity).square()
         pad = tensordict.get(k.pad_mask, None)
         if pad is not None:
+            pad = pad.to(device)
             error = error.masked_fill(pad.unsqueeze(-1), 0.0)
         if self.reduction == "none":
             return TensorDict({self.out_keys[0]: error}, batch_size=[])

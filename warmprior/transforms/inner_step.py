@@ -104,7 +104,8 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
     for key in observed:
         value = tensordict.get(key, None)
         if value is not None:
-            kept.set(key, value)
+            # Entries nested under the key may have been set aside before.
+            kept.update(tensordict.select(key))
             tensordict.del_(key)
 
 

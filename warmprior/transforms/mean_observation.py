@@ -32,6 +32,7 @@ class MeanObservation(Transform):
 
     Raises:
         KeyError: if an input key is missing.
+        ValueError: if the observation is no vector.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -75,7 +76,16 @@ class MeanObservation(Transform):
                 f"MeanObservation needs the keys {self.in_keys}; missing: {missing}. In an environment "
                 "append it after ActionHistory"
             )
+        self._check_vector(found[0])
         return tensordict.set(self.out_keys[0], _extended(*found))
+
+    def _check_vector(self, observation: object) -> None:
+        if isinstance(observation, (TensorDictBase, Composite)):
+            raise ValueError(
+                f"MeanObservation appends its mean to an observation vector [*B, To, d_o], but "
+                f"{self.in_keys[0]!r} has the entries {sorted(map(str, observation.keys(True, True)))}: "
+                "concatenate them before"
+            )
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
@@ -88,11 +98,22 @@ class MeanObservation(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the extended observation."""
         observation, loc, _ = (observation_spec[key] for key in self.in_keys)
+        self._check_vector(observation)
         shape = (*observation.shape[:-1], observation.shape[-1] + loc.shape[-2:].numel() + 1)
         observation_spec[self.out_keys[0]] = Unbounded(
             shape, dtype=observation.dtype, device=observation.device
         )
         return observation_spec
+
+
+def mean_observation(prior: Prior, **renamed: NestedKey) -> list[MeanObservation]:
+    """The transform, where the prior asks for it; and nothing otherwise.
+
+    Args:
+        prior: the source distribution.
+        renamed: keys of :class:`MeanObservation`.
+    """
+    return [MeanObservation(**renamed)] if prior.conditions_network else []
 
 
 def _extended(observation: Tensor, loc: Tensor, warm: Tensor) -> Tensor:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
 
@@ -23,7 +25,7 @@ class Normalizer(nn.Module):
     devices.
 
     Args:
-        low: minimum per key, each ``[d]``, raw units.
+        low: minimum per key (or nested key, a tuple), each ``[d]``, raw units.
         high: maximum per key, each ``[d]``, raw units.
 
     Raises:
@@ -41,10 +43,11 @@ class Normalizer(nn.Module):
         True
     """
 
-    def __init__(self, low: dict[str, Tensor], high: dict[str, Tensor]) -> None:
+    def __init__(self, low: dict[NestedKey, Tensor], high: dict[NestedKey, Tensor]) -> None:
         super().__init__()
         if low.keys() != high.keys():
-            raise ValueError(f"low has the keys {sorted(low)}, high has {sorted(high)}")
+            one, two = (sorted(map(str, value)) for value in (low, high))
+            raise ValueError(f"low has the keys {one}, high has {two}")
         self.keys = list(low)
         for key in self.keys:
             if low[key].shape != high[key].shape:
@@ -55,12 +58,12 @@ class Normalizer(nn.Module):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
             loc, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
             constant = half <= 1e-5 * loc.abs().clamp_min(1.0)
-            self.register_buffer(f"{key}_loc", loc)
-            self.register_buffer(f"{key}_scale", torch.where(constant, 1.0, half))
+            self.register_buffer(_name(key, "loc"), loc)
+            self.register_buffer(_name(key, "scale"), torch.where(constant, 1.0, half))
 
     @classmethod
     def fit(
-        cls, data: TensorDictBase, keys: tuple[str, ...] = (keys.OBSERVATION, keys.ACTION)
+        cls, data: TensorDictBase, keys: tuple[NestedKey, ...] = (keys.OBSERVATION, keys.ACTION)
     ) -> Normalizer:
         """Take the minimum and maximum over all steps of a dataset.
 
@@ -82,13 +85,13 @@ class Normalizer(nn.Module):
             {key: data[key].amax(0).clone() for key in keys},
         )
 
-    def loc(self, key: str) -> Tensor:
+    def loc(self, key: NestedKey) -> Tensor:
         """Middle of the range of ``key``, ``[d]``, raw units."""
-        return self.get_buffer(f"{key}_loc")
+        return self.get_buffer(_name(key, "loc"))
 
-    def scale(self, key: str) -> Tensor:
+    def scale(self, key: NestedKey) -> Tensor:
         """Half the range of ``key`` (1 where it is constant), ``[d]``, raw units."""
-        return self.get_buffer(f"{key}_scale")
+        return self.get_buffer(_name(key, "scale"))
 
     def normalize(self, data: TensorDictBase) -> TensorDictBase:
         """Raw to normalised, for the keys that are present; a shallow copy."""
@@ -126,14 +129,30 @@ class Normalizer(nn.Module):
         return transforms
 
     def config(self) -> dict[str, Any]:
-        """JSON-serialisable widths; the values themselves are buffers."""
-        return {"widths": {key: list(self.loc(key).shape) for key in self.keys}}
+        """JSON-serialisable widths, nested as the keys are; the values themselves are buffers."""
+        widths: dict[str, Any] = {}
+        for key in self.keys:
+            *branches, leaf = (key,) if isinstance(key, str) else key
+            place = widths
+            for branch in branches:
+                place = place.setdefault(branch, {})
+            place[leaf] = list(self.loc(key).shape)
+        return {"widths": widths}
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Normalizer:
         """An unfitted normaliser of :meth:`config`'s keys and widths, to load buffers into."""
-        widths = config["widths"]
-        return cls(
-            {key: torch.zeros(shape) for key, shape in widths.items()},
-            {key: torch.zeros(shape) for key, shape in widths.items()},
-        )
+        zero = {key: torch.zeros(shape) for key, shape in _leaves(config["widths"])}
+        return cls(zero, zero)
+
+
+def _name(key: NestedKey, part: str) -> str:
+    return f"{key if isinstance(key, str) else '/'.join(key)}_{part}"
+
+
+def _leaves(widths: dict[str, Any], *branch: str) -> Iterator[tuple[NestedKey, list[int]]]:
+    for name, value in widths.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, *branch, name)
+        else:
+            yield (*branch, name) if branch else name, value

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from tensordict.utils import NestedKey
 from torchrl.envs.transforms import Compose
 
+from warmprior import keys
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
-from warmprior.transforms.mean_observation import MeanObservation
+from warmprior.transforms.mean_observation import mean_observation
 from warmprior.transforms.normalize import Normalizer
 from warmprior.transforms.stack import ObservationStack
 
@@ -21,6 +23,11 @@ def policy_transforms(
     observation_steps: int = 2,
     execute: int | None = None,
     gamma: float = 1.0,
+    observation_key: NestedKey = keys.OBSERVATION,
+    action_key: NestedKey = keys.ACTION,
+    chunk_key: NestedKey = keys.CHUNK,
+    loc_key: NestedKey = keys.LOC,
+    warm_key: NestedKey = keys.WARM,
 ) -> Compose:
     """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
 
@@ -37,6 +44,11 @@ def policy_transforms(
         observation_steps: ``To``.
         execute: actions executed per decision; all ``H`` by default.
         gamma: discount per control step inside a chunk.
+        observation_key: as for :class:`~warmprior.WarmPriorActor`, also for the following.
+        action_key: the single action that the environment takes.
+        chunk_key: the chunk.
+        loc_key: the mean of the source.
+        warm_key: where it counts.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -48,13 +60,17 @@ def policy_transforms(
     per_step = [] if normalizer is None else normalizer.env_transforms()
     return Compose(
         *per_step,
-        ObservationStack(observation_steps),
+        ObservationStack(observation_steps, observation_key=observation_key),
         ChunkStep(
             prior.chunk_length,
             execute=execute,
             prediction_length=prior.prediction_length,
             gamma=gamma,
+            action_key=action_key,
+            chunk_key=chunk_key,
         ),
-        ActionHistory(prior),
-        *([MeanObservation()] if prior.conditions_network else []),
+        ActionHistory(prior, chunk_key=chunk_key, loc_key=loc_key, warm_key=warm_key),
+        *mean_observation(
+            prior, observation_key=observation_key, loc_key=loc_key, warm_key=warm_key
+        ),
     )

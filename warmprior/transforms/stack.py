@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
@@ -18,7 +20,8 @@ __all__ = ["ObservationStack"]
 class ObservationStack(Transform):
     """Replaces the observation ``[*B, d_o]`` by the last ``To`` of them, ``[*B, To, d_o]``.
 
-    After a reset the first observation is repeated. Unlike
+    Images ``[*B, C, H, W]`` become ``[*B, To, C, H, W]``, and so does every entry of a nested observation:
+    as in the windows of :class:`ActionWindow`. After a reset the first observation is repeated. Unlike
     :class:`~torchrl.envs.transforms.CatFrames` it keeps no buffer: the older observations are taken
     from the step's own tensordict, so that it is right wherever a tensordict is, in and outside of
     batched environments and when only some sub-environments reset or step.
@@ -27,11 +30,12 @@ class ObservationStack(Transform):
         steps: ``To``.
 
     Keyword Args:
-        observation_key: key of the observation, in and out.
+        observation_key: key of the observation, in and out; or of several, nested under it.
 
     Raises:
         ValueError: if ``steps < 1``.
-        KeyError: (on a step) if the tensordict does not hold the current stack.
+        KeyError: if the environment has no such observation, or (on a step) the tensordict does not hold
+            the current stack.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -55,43 +59,80 @@ class ObservationStack(Transform):
             set_aside(tensordict, [self.observation_key])
         return tensordict
 
-    def _stack(self, tensordict: TensorDictBase) -> Tensor:
-        for place in (tensordict, tensordict.get(KEPT, None)):
-            stack = None if place is None else place.get(self.observation_key, None)
-            if stack is not None:
-                return stack
-        raise KeyError(
-            f"ObservationStack needs the current {self.observation_key!r} to append to: step with "
-            "what reset or step_mdp returned"
-        )
+    def _stack(self, tensordict: TensorDictBase) -> Tensor | TensorDictBase:
+        kept = tensordict.get(KEPT, None)
+        place = tensordict if kept is None else tensordict.copy().update(kept)
+        stack = place.get(self.observation_key, None)
+        if stack is None:
+            raise KeyError(
+                f"ObservationStack needs the current {self.observation_key!r} to append to: step with "
+                "what reset or step_mdp returned"
+            )
+        return stack
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        newest = next_tensordict.get(self.observation_key).unsqueeze(-2)
-        asked = tensordict.get("_step", None)
-        if self.steps > 1 or asked is not None:
-            stack = self._stack(tensordict)
-            newest = torch.cat([stack[..., 1:, :], newest], dim=-2)
-            if asked is not None:
-                newest = torch.where(
-                    expand_as_right(asked.view(stack.shape[:-2]), stack), newest, stack
-                )
-        return next_tensordict.set(self.observation_key, newest)
+        time = next_tensordict.ndim
+        newest = next_tensordict.get(self.observation_key)
+        rows = tensordict.get("_step", None)
+        if self.steps == 1 and rows is None:
+            stack = _each(lambda new: new.unsqueeze(time), newest)
+            return next_tensordict.set(self.observation_key, stack)
+
+        def append(new: Tensor, old: Tensor) -> Tensor:
+            recent = old.narrow(time, 1, self.steps - 1)
+            stack = torch.cat([recent, new.unsqueeze(time)], dim=time)
+            if rows is None:
+                return stack
+            return torch.where(expand_as_right(rows.view(next_tensordict.shape), old), stack, old)
+
+        return next_tensordict.set(
+            self.observation_key, _each(append, newest, self._stack(tensordict))
+        )
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        first = tensordict_reset.get(self.observation_key).unsqueeze(-2)
+        self._check_key(tensordict_reset)
+        time = tensordict_reset.ndim
         # Rows that were not reset keep their stack: TorchRL merges only the others.
-        stack = first.expand(*first.shape[:-2], self.steps, first.shape[-1]).clone()
+        stack = _each(
+            lambda first: torch.stack([first] * self.steps, dim=time),
+            tensordict_reset.get(self.observation_key),
+        )
         return tensordict_reset.set(self.observation_key, stack)
+
+    def _check_key(self, observations: TensorDictBase | Composite) -> None:
+        if self.observation_key not in observations.keys(True):
+            raise KeyError(
+                f"ObservationStack found no {self.observation_key!r}, only "
+                f"{list(observations.keys(True, True))}: name the observation with observation_key"
+            )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Outside environments the transform does nothing: windows are stacked already."""
         return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Insert the stack's dimension before the last one."""
-        leaf = observation_spec[self.observation_key].unsqueeze(-2)
-        shape = (*leaf.shape[:-2], self.steps, leaf.shape[-1])
-        observation_spec[self.observation_key] = leaf.expand(shape).clone()
+        """Insert the stack's dimension after those of the batch."""
+        self._check_key(observation_spec)
+        time = observation_spec.ndim
+        spec = observation_spec[self.observation_key]
+        leaves = spec.items(True, True) if isinstance(spec, Composite) else [((), spec)]
+        for key, leaf in list(leaves):
+            shape = (*leaf.shape[:time], self.steps, *leaf.shape[time:])
+            stack = leaf.unsqueeze(time).expand(shape).clone()
+            observation_spec[
+                unravel_key((self.observation_key, key)) if key else self.observation_key
+            ] = stack
         return observation_spec
+
+
+def _each(
+    function: Callable[..., Tensor],
+    value: Tensor | TensorDictBase,
+    *others: Tensor | TensorDictBase,
+) -> Tensor | TensorDictBase:
+    """Apply a function to an observation, or to every entry of one that has several."""
+    if isinstance(value, TensorDictBase):
+        return value.apply(function, *others)
+    return function(value, *others)

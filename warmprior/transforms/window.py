@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer, TensorStorage
 from torchrl.data.replay_buffers.samplers import Sampler
@@ -13,7 +13,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
 from warmprior.modules.prior import Prior
-from warmprior.transforms.mean_observation import MeanObservation
+from warmprior.transforms.mean_observation import mean_observation
 
 __all__ = ["ActionWindow", "window_replay_buffer", "window_transforms"]
 
@@ -29,6 +29,7 @@ class ActionWindow(Transform):
     Args:
         data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
             ``"action"`` ``[N, d_a]`` and ``"episode"`` ``[N]``; in memory, memory-mapped or on a GPU.
+            An observation may be an image ``[N, C, H, W]``, or several entries nested under its key.
         prior: the source distribution.
 
     Keyword Args:
@@ -39,11 +40,15 @@ class ActionWindow(Transform):
         observation_key: key of the observation, in ``data`` and in windows.
         action_key: key of the action in ``data``.
         episode_key: key of the episode number in ``data``.
+        chunk_key: where the target is written, ``[*B, P, d_a]``.
+        pad_key: where the mask of padding is written, bool ``[*B, P]``.
+        loc_key: where the mean is written, ``[*B, P, d_a]``.
+        warm_key: where its mask is written, bool ``[*B, P, 1]``.
 
     Raises:
         KeyError: if ``data`` lacks a key.
-        ValueError: if ``data`` is empty or not flat, an entry holds NaN or Inf, or an episode is not
-            contiguous.
+        ValueError: if ``data`` is empty or not flat, an action is not one vector, an entry holds NaN or Inf,
+            or an episode is not contiguous.
 
     Examples:
         >>> import torch
@@ -78,19 +83,24 @@ class ActionWindow(Transform):
         observation_key: NestedKey = keys.OBSERVATION,
         action_key: NestedKey = keys.ACTION,
         episode_key: NestedKey = keys.EPISODE,
+        chunk_key: NestedKey = keys.CHUNK,
+        pad_key: NestedKey = keys.IS_PAD,
+        loc_key: NestedKey = keys.LOC,
+        warm_key: NestedKey = keys.WARM,
     ) -> None:
-        super().__init__(in_keys=[frame_key], out_keys=[observation_key, keys.CHUNK])
+        out_keys = [observation_key, chunk_key, pad_key, loc_key, warm_key]
+        super().__init__(in_keys=[frame_key], out_keys=out_keys)
         if observation_steps < 1:
             raise ValueError(f"observation_steps must be at least 1, got {observation_steps}")
         self.prior = prior
         self.generator = generator
         self.frame_key = frame_key
-        self.observation_key = observation_key
-        observation, action, episode = _checked(data, observation_key, action_key, episode_key)
+        observations, action, episode = _checked(data, observation_key, action_key, episode_key)
+        self._observations = {f"observation_{i}": key for i, key in enumerate(observations)}
         start, end = _episode_borders(episode)
         chunk_length = prior.chunk_length
         for name, value in {
-            "observation": observation,
+            **dict(zip(self._observations, observations.values(), strict=True)),
             "action": action,
             "start": start,
             "end": end,
@@ -123,20 +133,17 @@ class ActionWindow(Transform):
         warm = self.prior.withhold(warm, self.generator)
         recent = (frame + self.observation_offsets).clamp_min(start)
         batch = tensordict.batch_size
-        for key, value in (
-            (self.observation_key, self.observation[recent]),
-            (keys.CHUNK, target),
-            (keys.IS_PAD, ~valid[:, chunk_length:]),
-            (keys.LOC, loc),
-            (keys.WARM, warm),
-        ):
+        written = ((key, getattr(self, name)[recent]) for name, key in self._observations.items())
+        values = (target, ~valid[:, chunk_length:], loc, warm)
+        for key, value in (*written, *zip(self.out_keys[1:], values, strict=True)):
             tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
         return tensordict
 
 
 def _checked(
     data: TensorDictBase, observation_key: NestedKey, action_key: NestedKey, episode_key: NestedKey
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[dict[NestedKey, Tensor], Tensor, Tensor]:
+    """The entries of the observation, the action and the episode numbers."""
     entries = []
     for key in (observation_key, action_key, episode_key):
         value = data.get(key, None)
@@ -146,13 +153,38 @@ def _checked(
     observation, action, episode = entries
     if data.ndim != 1 or not len(data):
         raise ValueError(f"the data must be flat steps [N] with N > 0, got {tuple(data.shape)}")
-    for key, value in ((observation_key, observation), (action_key, action)):
-        finite = torch.isfinite(value).flatten(1).all(1)
+    if action.ndim != 2:
+        raise ValueError(
+            f"an action is one vector, {action_key!r} [N, d_a], got {tuple(action.shape)}: flatten it"
+        )
+    observations = {observation_key: observation}
+    if is_tensor_collection(observation):
+        nested = observation.items(True, True)
+        observations = {unravel_key((observation_key, key)): value for key, value in nested}
+    for key, value in (*observations.items(), (action_key, action)):
+        check_finite(key, value)
+    return observations, action, episode.flatten()
+
+
+def check_finite(key: NestedKey, value: Tensor, memory: int = 2**24) -> None:
+    """Whether an entry of a dataset is free of NaN and infinity.
+
+    Args:
+        key: its name.
+        value: ``[N, *]``, memory-mapped perhaps, and larger than the memory.
+        memory: how many numbers are looked at in one go.
+
+    Raises:
+        ValueError: naming the first bad step.
+    """
+    if not value.is_floating_point():
+        return
+    steps = max(1, memory * len(value) // max(1, value.numel()))
+    for first in range(0, len(value), steps):
+        finite = torch.isfinite(value[first : first + steps]).flatten(1).all(1)
         if not finite.all():
-            raise ValueError(
-                f"{key!r} holds NaN or Inf, first at step {int((~finite).nonzero()[0])}"
-            )
-    return observation, action, episode.flatten()
+            bad = first + int((~finite).nonzero()[0])
+            raise ValueError(f"{key!r} holds NaN or Inf, first at step {bad}")
 
 
 def _episode_borders(episode: Tensor) -> tuple[Tensor, Tensor]:
@@ -173,10 +205,11 @@ def window_transforms(
     *,
     observation_steps: int = 2,
     generator: torch.Generator | None = None,
+    **renamed: NestedKey,
 ) -> Compose:
     """What makes of step numbers the windows that a policy of the prior reads.
 
-    :class:`ActionWindow`, and :class:`MeanObservation` where the prior conditions the network: the
+    :class:`ActionWindow`, and :class:`~warmprior.MeanObservation` where the prior conditions the network: the
     counterpart of :func:`~warmprior.policy_transforms` on the side of the data.
 
     Args:
@@ -186,10 +219,14 @@ def window_transforms(
     Keyword Args:
         observation_steps: ``To``.
         generator: see :class:`ActionWindow`.
+        renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
     """
+    window = ActionWindow(
+        data, prior, observation_steps=observation_steps, generator=generator, **renamed
+    )
+    read = ("observation_key", "loc_key", "warm_key")
     return Compose(
-        ActionWindow(data, prior, observation_steps=observation_steps, generator=generator),
-        *([MeanObservation()] if prior.conditions_network else []),
+        window, *mean_observation(prior, **{k: renamed[k] for k in read if k in renamed})
     )
 
 
@@ -201,6 +238,7 @@ def window_replay_buffer(
     observation_steps: int = 2,
     sampler: Sampler | None = None,
     generator: torch.Generator | None = None,
+    **renamed: NestedKey,
 ) -> TensorDictReplayBuffer:
     """A replay buffer that samples training windows from demonstrations.
 
@@ -216,6 +254,7 @@ def window_replay_buffer(
         observation_steps: ``To``.
         sampler: ``RandomSampler()`` by default; ``SamplerWithoutReplacement()`` for epochs.
         generator: source of randomness of sampler and prior; PyTorch's global one by default.
+        renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
 
     Examples:
         >>> import torch
@@ -228,12 +267,15 @@ def window_replay_buffer(
         (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
     """
     windows = window_transforms(
-        data, prior, observation_steps=observation_steps, generator=generator
+        data, prior, observation_steps=observation_steps, generator=generator, **renamed
     )
-    frames = torch.arange(len(data), device=windows[0].start.device)
+    window = windows[0]
+    frames = torch.arange(len(data), device=window.start.device)
     return TensorDictReplayBuffer(
         # The sampler draws on the storage's device, where the generator has to be too.
-        storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
+        storage=TensorStorage(
+            TensorDict({window.frame_key: frames}, [len(data)]), device=frames.device
+        ),
         sampler=RandomSampler() if sampler is None else sampler,
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,

@@ -1,0 +1,258 @@
+"""Images, several observations and other names: windows and environments give an actor the same."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import nn
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import Compose, ParallelEnv, RenameTransform, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.toy_env import ACTION_DIM, CountingEnv
+from warmprior import (
+    ActionWindow,
+    FlowMatchingLoss,
+    HistoryPrior,
+    Normalizer,
+    ObservationStack,
+    PastPrior,
+    PreconditionedNetwork,
+    VelocityMLP,
+    VelocityNetwork,
+    WarmPriorActor,
+    policy_transforms,
+    window_replay_buffer,
+)
+
+H, TO = 3, 2
+LENGTHS = (7, 4)
+PLACES = ("single", "serial-outside", "serial-inside", "parallel-outside", "parallel-inside")
+IMAGE = (3, 2, 8)
+
+
+class CameraEnv(CountingEnv):
+    """The toy with an image of its step beside its state: flat, alone, or nested."""
+
+    def __init__(self, length=7, layout="nested"):
+        super().__init__(length)
+        self.layout = layout
+        state, image = Unbounded((4,)), Bounded(0, 255, IMAGE, dtype=torch.uint8)
+        self.observation_spec = {
+            "image": Composite(observation=image),
+            "nested": Composite(observation=Composite(state=state, pixels=image)),
+            "named": Composite(sensors=Composite(low=Composite(joints=state))),
+        }[layout]
+
+    def _arrange(self, out):
+        state = out.pop("observation")
+        state[1] = 0  # the episode's number
+        image = torch.full(IMAGE, 20 * self.t, dtype=torch.uint8)
+        if self.layout == "image":
+            return out.set("observation", image)
+        if self.layout == "nested":
+            return out.set("observation", TensorDict({"state": state, "pixels": image}, []))
+        return out.set(("sensors", "low", "joints"), state)
+
+    def _reset(self, tensordict=None, **kwargs):
+        return self._arrange(super()._reset(tensordict))
+
+    def _step(self, tensordict):
+        return self._arrange(super()._step(tensordict))
+
+
+NAMES = {
+    "image": {},
+    "nested": {},
+    "named": {
+        "observation_key": ("sensors", "low", "joints"),
+        "loc_key": ("source", "mean"),
+        "warm_key": "known",
+        "chunk_key": "plan",
+    },
+}
+
+
+class Encoder(VelocityNetwork):
+    """Takes any observation; its velocity tells all of it."""
+
+    def __init__(self, action_dim, observation_dim, prediction_length, observation_steps):
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+        self.weight = nn.Parameter(torch.tensor(0.125))
+
+    def forward(self, t, a, observation):
+        self.check_chunk(a)
+        entries = [observation]
+        if isinstance(observation, TensorDictBase):
+            entries = [observation["state"], observation["pixels"]]
+        code = sum(
+            (entry.to(a.dtype).flatten(2).mean(-1) @ torch.tensor([1.0, 3.0]))[:, None, None]
+            for entry in entries
+        )
+        return self.weight * code / 100 - 0.1 * a
+
+
+def build(place, layout, prior):
+    transforms = partial(policy_transforms, prior, observation_steps=TO, **NAMES[layout])
+
+    def one(length):
+        return TransformedEnv(CameraEnv(length, layout), transforms())
+
+    batched = SerialEnv if "serial" in place else partial(ParallelEnv, mp_start_method="fork")
+    if place == "single":
+        return one(LENGTHS[0])
+    if place.endswith("inside"):
+        return batched(len(LENGTHS), [partial(one, n) for n in LENGTHS])
+    base = batched(len(LENGTHS), [partial(CameraEnv, n, layout) for n in LENGTHS])
+    return TransformedEnv(base, transforms())
+
+
+def replay(layout, chunks, length):
+    """Demonstrations: the control steps of an episode in which these chunks were executed."""
+    env, rows = CameraEnv(length, layout), []
+    data = env.reset()
+    for action in chunks.flatten(0, 1)[:length]:
+        rows.append(data.exclude("done", "terminated", "truncated").set("action", action))
+        data = env.step_mdp(env.step(data.set("action", action)))
+    data = torch.stack([row.select(*env.observation_keys, "action") for row in rows])
+    return data.set("episode", torch.zeros(length, dtype=torch.int64))
+
+
+@pytest.mark.parametrize("layout", NAMES)
+@pytest.mark.parametrize("place", PLACES)
+def test_a_decision_in_the_environment_is_a_window_of_its_recording(place, layout, tmp_path):
+    """What the actor met when it decided, in shape, dtype and value, is what it is trained on."""
+    prior, names = PastPrior(H), NAMES[layout]
+    torch.manual_seed(0)
+    actor = WarmPriorActor(Encoder(ACTION_DIM, 4, H, TO), prior, nfe=2, clip=1.0, **names)
+    actor.save_pretrained(tmp_path)
+    actor = WarmPriorActor.from_pretrained(tmp_path)
+    chunk_key = names.get("chunk_key", ("vla_action", "chunk"))
+    env = build(place, layout, prior)
+    try:
+        check_env_specs(env)
+        with torch.no_grad():
+            rollout = env.rollout(6, actor, break_when_any_done=False)
+    finally:
+        env.close(raise_if_closed=False)
+    rollout = rollout[None] if place == "single" else rollout
+    loss = FlowMatchingLoss(actor)
+    assert loss.tensor_keys.chunk == chunk_key
+    observation_key = names.get("observation_key", "observation")
+    for row, length in zip(rollout, LENGTHS, strict=False):
+        decisions = -(-length // H)
+        row = row[:decisions]
+        data = replay(layout, row[chunk_key], length)
+        window = ActionWindow(data, prior, observation_steps=TO, **names)
+        frames = torch.arange(decisions) * H
+        windows = window(TensorDict({"frame": frames}, [decisions]))
+        wanted = [*actor.in_keys[1:]]
+        seen = row[observation_key]
+        wanted += (
+            [(observation_key, name) for name in ("state", "pixels")]
+            if isinstance(seen, TensorDictBase)
+            else [observation_key]
+        )
+        for key in wanted:
+            assert windows[key].dtype == row[key].dtype
+            assert torch.equal(windows[key], row[key]), key
+        counted = ~windows["action_is_pad"]
+        assert torch.equal(windows[chunk_key][counted], row[chunk_key][counted])
+        loss.generator = torch.Generator().manual_seed(1)
+        first = loss(windows)["loss_flow_matching"]
+        first.backward()
+        loss.generator.manual_seed(1)
+        row["action_is_pad"] = windows["action_is_pad"]
+        assert torch.equal(loss(row)["loss_flow_matching"], first)
+
+
+@pytest.mark.parametrize("batch", [(), (3,)])
+def test_images_are_stacked_after_the_batch(batch):
+    env = CameraEnv(layout="image")
+    if batch:
+        env = SerialEnv(3, partial(CameraEnv, layout="image"))
+    env = TransformedEnv(env, ObservationStack(TO))
+    check_env_specs(env)
+    assert env.reset()["observation"].shape == (*batch, TO, *IMAGE)
+    data = TensorDict(
+        {
+            "observation": torch.zeros(9, *IMAGE, dtype=torch.uint8),
+            "action": torch.zeros(9, 2),
+            "episode": torch.zeros(9, dtype=torch.int64),
+        },
+        [9],
+    )
+    sample = window_replay_buffer(data, PastPrior(H), batch_size=3).sample()
+    assert sample["observation"].shape == (3, TO, *IMAGE)
+
+
+def test_entries_of_the_root_brought_together():
+    """As of a simulator that knows no nesting."""
+    rename = RenameTransform(["observation"], [("both", "state")])
+    env = TransformedEnv(
+        CountingEnv(), Compose(rename, policy_transforms(PastPrior(H), observation_key="both"))
+    )
+    check_env_specs(env)
+    assert env.rollout(2)["both", "state"].shape == (2, TO, 4)
+
+
+@pytest.mark.parametrize("preconditioned", [False, True])
+def test_networks_of_vectors_say_so(preconditioned):
+    network = VelocityMLP(ACTION_DIM, 4, H, TO, hidden_dim=8)
+    network = PreconditionedNetwork(network) if preconditioned else network
+    env = build("single", "nested", PastPrior(H))
+    with pytest.raises(ValueError, match=r"\[B, To, d_o\].*got the entries \['pixels', 'state'\]"):
+        env.rollout(1, WarmPriorActor(network, PastPrior(H)))
+
+
+def test_a_preconditioned_network_may_take_several():
+    network = PreconditionedNetwork(Encoder(ACTION_DIM, 4, H, TO))
+    rollout = build("single", "nested", PastPrior(H)).rollout(
+        2, WarmPriorActor(network, PastPrior(H))
+    )
+    assert rollout["vla_action", "chunk"].isfinite().all()
+
+
+def test_a_mean_cannot_be_appended_to_several():
+    prior = HistoryPrior(H)
+    actor = WarmPriorActor(Encoder(ACTION_DIM, 4, H, TO), prior, nfe=1)
+    with pytest.raises(ValueError, match=r"appends its mean to an observation vector"):
+        build("single", "nested", prior).rollout(1, actor)
+
+
+def test_an_observation_of_another_name():
+    env = TransformedEnv(CameraEnv(layout="named"), ObservationStack(2))
+    for look in (env.reset, lambda: env.observation_spec):
+        with pytest.raises(KeyError, match=r"found no 'observation', only .*'sensors', 'low'"):
+            look()
+
+
+def test_nested_entries_are_normalised_on_both_sides():
+    data = replay("nested", torch.rand(3, H, ACTION_DIM) * 2 - 1, 7)
+    keys = (("observation", "state"), "action")
+    normalizer = Normalizer.fit(data, keys)
+    again = Normalizer.from_config(normalizer.config())
+    again.load_state_dict(normalizer.state_dict())
+    normal = again.normalize(data)
+    state = data["observation", "state"]
+    low, high = state.amin(0), state.amax(0)
+    varies = high > low
+    expected = (2 * (state - low) / (high - low) - 1)[:, varies]
+    torch.testing.assert_close(normal["observation", "state"][:, varies], expected)
+    assert torch.equal(data["observation", "state"], state)  # untouched
+    assert torch.equal(normal["observation", "pixels"], data["observation", "pixels"])
+    env = TransformedEnv(CameraEnv(), policy_transforms(PastPrior(H), normalizer=again))
+    check_env_specs(env)
+    first = env.reset()["observation", "state"][-1]
+    torch.testing.assert_close(first, normal["observation", "state"][0])
+
+
+@pytest.mark.parametrize("shape", [(9,), (9, 2, 2)])
+def test_windows_refuse_actions_that_are_no_vector(shape):
+    data = TensorDict({"observation": torch.zeros(9, 3), "action": torch.zeros(shape)}, [9])
+    data["episode"] = torch.zeros(9, dtype=torch.int64)
+    with pytest.raises(ValueError, match=r"one vector, 'action' \[N, d_a\], got \(9"):
+        ActionWindow(data, PastPrior(H))
