@@ -185,7 +185,9 @@ def test_only_regular_files_are_opened(tmp_path, name):
     assert f"{name} is not a regular file" in str(errors[0])
 
 
-@pytest.mark.parametrize("content", [b"[" * 100_000, b'{"format": "\xff"}', b"\x00" * 100])
+@pytest.mark.parametrize(
+    "content", [b"[" * 100_000, b'{"format": "\xff"}', b"\x00" * 100], ids=range(3)
+)
 def test_a_configuration_that_is_no_text(tmp_path, content):
     saved(tmp_path)
     (tmp_path / "config.json").write_bytes(content)
