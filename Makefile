@@ -34,7 +34,7 @@ lint: install
 	$(BIN)/mypy warmprior
 
 fuzz: install
-	$(BIN)/python -m tests.fuzz $(ARGS)
+	$(BIN)/python -W ignore -m tests.fuzz $(ARGS)
 
 docs: install
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build
