@@ -4,7 +4,7 @@ BIN := .venv/bin
 ARGS ?=
 EXTRAS := sim,lerobot,docs,dev
 
-.PHONY: install benchmark throughput test test-slow lint docs clean
+.PHONY: install benchmark throughput test test-slow lint fuzz docs clean
 
 install: .venv/installed
 
@@ -32,6 +32,9 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy warmprior
+
+fuzz: install
+	$(BIN)/python -W ignore -m tests.fuzz $(ARGS)
 
 docs: install
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build

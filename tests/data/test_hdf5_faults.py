@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 
@@ -248,3 +249,29 @@ def test_env_args_that_describe_no_environment(tmp_path, change, absolute):
         return  # nothing asks for them
     with pytest.raises(DatasetError, match=r"file\.hdf5: data\.attrs\['env_args'\]"):
         RobomimicExperienceReplay(path, absolute_actions=absolute)
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch, named):
+    """Before anything is written: writing to a map without space kills the process."""
+    path, _ = square_file
+    taken = []
+    take = os.posix_fallocate
+
+    def count(file, start, length):
+        taken.append(length)
+        take(file, start, length)
+
+    options = {"storage": "memmap", "scratch_dir": tmp_path / "maps" if named else None}
+    monkeypatch.setattr(os, "posix_fallocate", count)
+    data = RobomimicExperienceReplay(path, **options).data
+    sizes = [v.numel() * v.element_size() for v in data.values(True, True)]
+    assert sorted(taken) == sorted(sizes)
+
+    def full(file, start, length):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    monkeypatch.setattr("warmprior.data.robomimic.read_rows", lambda *a: pytest.fail("was filled"))
+    with pytest.raises(OSError, match=r"(maps|temporary files): cannot take .*scratch_dir"):
+        RobomimicExperienceReplay(path, **options)

@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Future
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +20,7 @@ pytest.importorskip("h5py")
 
 import h5py
 
+from tests.training.test_evaluation import ended
 from warmprior.data.scripted import episode as episode_module
 from warmprior.data.scripted import generate as generate_module
 from warmprior.data.scripted import generate_demonstrations
@@ -265,3 +272,42 @@ def test_success_rate(task, style, count, least):
     loop = expert_loop(task)
     successes = sum(run_episode(loop, task, style, seed).success for seed in range(count))
     assert successes / count >= least
+
+
+GENERATING = """
+import sys, multiprocessing
+from warmprior.data.scripted import generate
+generate.expert_loop = lambda task: None
+def hang(*args):
+    import time
+    time.sleep(300)
+generate.run_episode = hang
+with generate._players("lift", "ph", 0, 2) as play:
+    for seed in range(4):
+        play(seed)
+    print(*(process.pid for process in multiprocessing.active_children()), flush=True)
+    play(4).result()
+"""
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_workers_end_with_whoever_generates(sent):
+    process = subprocess.Popen(
+        [sys.executable, "-c", GENERATING],
+        cwd=Path(__file__).parents[2],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    pids = [int(word) for word in process.stdout.readline().split()]
+    time.sleep(1.0)
+    process.send_signal(sent)
+    started = time.monotonic()
+    process.wait(30)
+    while not all(ended(pid) for pid in pids) and time.monotonic() < started + 10:
+        time.sleep(0.05)
+    survivors = [pid for pid in pids if not ended(pid)]
+    for pid in survivors:
+        os.kill(pid, signal.SIGKILL)
+    assert len(pids) == 2 and not survivors
+    assert time.monotonic() - started < 20  # and not the 300 of an episode

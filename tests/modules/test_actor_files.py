@@ -14,7 +14,14 @@ import torch
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
-from warmprior import ChiTransformer, Normalizer, PastPrior, VelocityMLP, WarmPriorActor
+from warmprior import (
+    ChiTransformer,
+    Normalizer,
+    PastPrior,
+    PreconditionedNetwork,
+    VelocityMLP,
+    WarmPriorActor,
+)
 
 ACTION = "normalizer.action_scale"
 
@@ -27,6 +34,12 @@ def saved(folder, network=None):
     actor = WarmPriorActor(network, prior, nfe=2, normalizer=Normalizer.fit(data))
     actor.save_pretrained(folder)
     return actor
+
+
+class Masked(VelocityMLP):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.register_buffer("mask", torch.tensor([0.0, float("-inf")]))
 
 
 def resign(folder):
@@ -87,6 +100,16 @@ def test_weights_that_no_training_saves(tmp_path, name, value):
 
     change_weights(tmp_path, change)
     with pytest.raises(ValueError, match=rf"model\.safetensors: {name}"):
+        WarmPriorActor.from_pretrained(tmp_path)
+
+
+def test_infinite_moments_are_refused_and_an_infinite_mask_is_not(tmp_path):
+    saved(tmp_path / "masked", Masked(2, 5, 3, 2, hidden_dim=16))
+    WarmPriorActor.from_pretrained(tmp_path / "masked")
+    saved(tmp_path, PreconditionedNetwork(VelocityMLP(2, 5, 3, 2, hidden_dim=16)))
+    name = "ode.network.moments.covariance"
+    change_weights(tmp_path, lambda t: t | {name: torch.full_like(t[name], float("inf"))})
+    with pytest.raises(ValueError, match=rf"model\.safetensors: {name} holds NaN or infinity"):
         WarmPriorActor.from_pretrained(tmp_path)
 
 
@@ -185,7 +208,9 @@ def test_only_regular_files_are_opened(tmp_path, name):
     assert f"{name} is not a regular file" in str(errors[0])
 
 
-@pytest.mark.parametrize("content", [b"[" * 100_000, b'{"format": "\xff"}', b"\x00" * 100])
+@pytest.mark.parametrize(
+    "content", [b"[" * 100_000, b'{"format": "\xff"}', b"\x00" * 100], ids=range(3)
+)
 def test_a_configuration_that_is_no_text(tmp_path, content):
     saved(tmp_path)
     (tmp_path / "config.json").write_bytes(content)

@@ -112,6 +112,16 @@ def test_an_error_of_a_job_arrives_as_itself_and_ends_the_others():
     assert time.monotonic() - started < 60
 
 
+def test_an_error_does_not_lose_what_others_have_finished():
+    with pytest.raises(FloatingPointError), WorkerPool(2, None) as pool:
+        pool.submit(partial(fail, FloatingPointError("the loss became nan")))
+        pool.submit(partial(sleep_and_tell, 0.0))
+        time.sleep(2.0)  # both have ended when the parent looks
+        ((_, pid),) = pool.wait(60)
+        assert pid in pool._executor._processes
+        pool.wait(60)
+
+
 def test_an_error_of_the_parent_ends_its_workers():
     started = time.monotonic()
     with pytest.raises(KeyboardInterrupt), WorkerPool(2, None) as pool:

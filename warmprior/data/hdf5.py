@@ -166,7 +166,12 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
 
 
 def _demo(file: h5py.File, name: str) -> h5py.Group:
-    return member(file["data"], name, "group")
+    demo = member(file["data"], name, "group")
+    if demo is None:  # listed, but not to be found: its index is damaged
+        raise DatasetError(
+            f"{file.filename}: data/{name} cannot be read; copy or download the file again"
+        )
+    return demo
 
 
 def _default_keys(path: Path, available: Sequence[str]) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -71,7 +72,30 @@ def _allocate(
             f"{available / 1e9:.1f} GB are free: use storage='memmap', or choose fewer demos with "
             "filter_key"
         )
-    return data.memmap_like(scratch_dir) if storage == "memmap" else torch.empty_like(data)
+    if storage == "memory":
+        return torch.empty_like(data)
+    data = data.memmap_like(scratch_dir)
+    try:
+        for value in data.values(True, True):
+            _reserve(value)
+    except OSError as error:
+        raise OSError(
+            f"{scratch_dir or 'the folder of temporary files'}: cannot take {needed / 1e9:.3g} GB for "
+            f"{index.path} ({error}). Free some space or choose another scratch_dir."
+        ) from error
+    return data
+
+
+def _reserve(mapped: Any) -> None:
+    """Take the space of a memory map: writing to one without it kills the process (SIGBUS)."""
+    if not hasattr(os, "posix_fallocate"):
+        return
+    handler = getattr(mapped, "_handler", None)  # of a file without a name
+    file = os.open(mapped.filename, os.O_RDWR) if handler is None else os.dup(handler.fd)
+    try:
+        os.posix_fallocate(file, 0, max(1, mapped.numel() * mapped.element_size()))
+    finally:
+        os.close(file)
 
 
 def _read_absolute(
@@ -186,7 +210,7 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
         DatasetError: if the file is not as it should be; says which demo and key.
         ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
             of a controller without pose deltas.
-        OSError: if a download fails.
+        OSError: if a download fails, or there is no space for memory maps.
         ImportError: if h5py, or for a download huggingface_hub, is not installed.
 
     Examples:

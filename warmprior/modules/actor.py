@@ -383,12 +383,12 @@ def _difference(built: Mapping[str, Tensor], given: Mapping[str, Any]) -> str | 
 
 def _bad_value(actor: WarmPriorActor, tensors: Mapping[str, Tensor]) -> str | None:
     """What no training saves among the values for an actor, if anything."""
-    trained = dict(actor.named_parameters())
-    for name, value in tensors.items():
-        # A network's own buffers may be infinite, as masks are.
-        statistic = name.startswith("normalizer.")
-        if value.isnan().any() or ((name in trained or statistic) and value.isinf().any()):
+    for name, built in actor.state_dict().items():
+        value = tensors[name]
+        # Infinite where it was built so, as a mask is.
+        if (value.isnan() | (value.isinf() & ~built.isinf())).any():
             return f"{name} holds NaN or infinity"
+        statistic = name.startswith("normalizer.")
         if statistic and name.endswith("_scale") and not (value > 0).all():
             return f"{name} holds a scale that is not positive"
     return None

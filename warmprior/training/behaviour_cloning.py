@@ -342,7 +342,9 @@ class BehaviourCloning:
         # States written before the names were have none.
         if not optimizer or sorted(optimizer) != facts.get("optimizer", sorted(optimizer)):
             raise ValueError("it lacks entries of the optimiser")
-        losses = [(int(i), float(loss)) for i, loss in facts["losses"]]
+        losses = [(i, float(loss)) for i, loss in facts["losses"]]
+        if not all(type(i) is int and 0 < i <= iteration for i, _ in losses):
+            raise ValueError(f"it has losses of iterations other than 1 to {iteration}")
         numbers = [torch.tensor([loss for _, loss in losses]), tensors["running"]]
         if not all(bool(torch.isfinite(v).all()) for v in (*numbers, *optimizer.values())):
             raise ValueError("a loss or an entry of the optimiser is NaN or infinite")

@@ -7,7 +7,6 @@ import os
 import pickle
 import signal
 import threading
-import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -17,6 +16,8 @@ from typing import Any, Self
 
 import torch
 from tqdm import tqdm
+
+from warmprior._processes import end_with_parent
 
 __all__ = ["WorkerError", "WorkerPool", "available_cores", "end_with_parent", "start_method"]
 
@@ -46,24 +47,6 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
-
-
-def end_with_parent() -> None:
-    """Let this process end when the one that started it dies, however abruptly.
-
-    A killed process cannot tell its workers to stop, and they would wait for hours: its ends of their
-    pipes stay open in whatever else it forked later. The main process is left alone.
-    """
-    if multiprocessing.parent_process() is None:
-        return
-    parent = os.getppid()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)  # nobody is left to be told, and the environment may be in the middle of a step
-
-    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 
 
 class WorkerPool[State]:
@@ -132,14 +115,16 @@ class WorkerPool[State]:
             timeout: in seconds; without limit by default.
 
         Returns:
-            ``[(job, result), ...]`` of the jobs that ended; none after ``timeout``.
+            ``[(job, result), ...]`` of the jobs that ended well; none after ``timeout``.
 
         Raises:
-            Exception: whatever a job raised.
+            Exception: whatever a job raised, once the results of all that ended before are given.
             BrokenProcessPool: if a worker died; a ``WorkerError`` once the context is left.
         """
         done, _ = wait(self._running, timeout, FIRST_COMPLETED)
-        return [(self._running.pop(future), pickle.loads(future.result())) for future in done]
+        # An error ends the work of whoever waits: what others have finished must not be lost with it.
+        finished = [future for future in done if future.exception() is None] or list(done)
+        return [(self._running.pop(future), pickle.loads(future.result())) for future in finished]
 
     def __enter__(self) -> Self:
         return self

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import signal
 import sys
 import warnings
 from collections import deque
@@ -16,6 +17,7 @@ from typing import Any
 from torchrl._utils import logger
 
 from warmprior._extras import require
+from warmprior._processes import end_with_parent
 from warmprior.data.scripted.episode import (
     PLANS,
     Episode,
@@ -196,6 +198,10 @@ def _players(task: str, style: str, image_size: int, workers: int) -> Iterator[_
 
     try:
         yield play_there
+    except BaseException:  # Ctrl-C included: nobody waits for episodes that are under way
+        for process in list((pool._processes or {}).values()):
+            process.kill()
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -218,6 +224,9 @@ _player: _Player | None = None
 
 def _start_worker(task: str, style: str, image_size: int) -> None:
     global _player
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent ends its workers
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    end_with_parent()
     _player = _Player(task, style, image_size)
 
 

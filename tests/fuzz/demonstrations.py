@@ -1,0 +1,229 @@
+"""Demonstration files, damaged."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import torch
+
+from tests.data.synthetic import env_args_15, write_robomimic_file
+from tests.fuzz.raw import damage, odd_json
+from tests.fuzz.sandbox import Outcome
+from warmprior.data import RobomimicExperienceReplay, modernize_env_args
+
+NAME = "demonstration files"
+KEYS = ("actions", "rewards", "obs/object", "obs/robot0_eef_pos", "obs/robot0_eef_quat")
+
+
+def make(folder: Path) -> None:
+    """Write the whole files: contiguous, and in compressed chunks with checksums."""
+    write_robomimic_file(folder / "plain.hdf5", masks={"train": [0, 2]})
+    write_robomimic_file(folder / "packed.hdf5", masks={"train": [0, 2]})
+    with h5py.File(folder / "packed.hdf5", "a") as file:
+        for demo in file["data"].values():
+            for key in (*KEYS, "obs/robot0_gripper_qpos"):
+                values = demo[key][()]
+                del demo[key]
+                demo.create_dataset(
+                    key,
+                    data=values,
+                    chunks=(4, *values.shape[1:]),
+                    compression="gzip",
+                    fletcher32=True,
+                )
+
+
+# --- what HDF5 allows, and no recording holds: each has to be refused
+def _external_storage(file, name, folder, rng):
+    shape = file[name].shape
+    (folder / "other").write_bytes(bytes(8 * int(np.prod(shape))))
+    _new(
+        file,
+        name,
+        shape=shape,
+        dtype="f8",
+        external=[(str(folder / "other"), 0, h5py.h5f.UNLIMITED)],
+    )
+
+
+def _external_link(file, name, folder, rng):
+    shape = file[name].shape
+    with h5py.File(folder / "other.hdf5", "w") as other:
+        other["x"] = np.zeros(shape)
+    del file[name]
+    file[name] = h5py.ExternalLink(str(folder / "other.hdf5"), "x")
+
+
+def _virtual(file, name, folder, rng):
+    shape = file[name].shape
+    del file[name]
+    layout = h5py.VirtualLayout(shape, "f8")
+    layout[:] = h5py.VirtualSource(str(folder / "absent.hdf5"), "x", shape)
+    file.create_virtual_dataset(name, layout)
+
+
+def _never_written(file, name, folder, rng):
+    chunks = (2, *file[name].shape[1:]) if rng.random() < 0.5 else None
+    _new(file, name, shape=file[name].shape, dtype="f8", chunks=chunks)
+
+
+def _many_rows(file, name, folder, rng):
+    shape = (10 ** int(rng.integers(6, 12)), *file[name].shape[1:])
+    _new(file, name, shape=shape, dtype="f8", chunks=(1024, *shape[1:]), compression="gzip")
+
+
+def _all_with_many_rows(file, name, folder, rng):
+    rows = 10 ** int(rng.integers(6, 10))
+    demo = file["data/demo_0"]
+    for key in (*KEYS, "obs/robot0_gripper_qpos"):
+        shape = (rows, *demo[key].shape[1:])
+        _new(demo, key, shape=shape, dtype="f8", chunks=(1024, *shape[1:]), compression="gzip")
+
+
+def _huge_chunk(file, name, folder, rng):
+    shape = file[name].shape
+    chunks = (int(rng.integers(40_000_000, 60_000_000)), *shape[1:])
+    chunks = (min(chunks[0], 2**32 // 8 // int(np.prod(shape[1:], initial=1)) - 1), *shape[1:])
+    _new(file, name, shape=shape, dtype="f8", chunks=chunks, maxshape=(None, *shape[1:]))
+
+
+def _group(file, name, folder, rng):
+    del file[name]
+    file.create_group(name)
+
+
+def _empty(file, name, folder, rng):
+    del file[name]
+    file[name] = h5py.Empty("f8")
+
+
+def _another_type(file, name, folder, rng):
+    dtype = ["S3", "c16", [("a", "f8")], h5py.string_dtype()][int(rng.integers(4))]
+    _new(file, name, shape=file[name].shape, dtype=dtype)
+
+
+def _another_shape(file, name, folder, rng):
+    shape = list(file[name].shape)
+    shape[0] += int(rng.choice([-1, 1, 1000]))
+    values = np.zeros([*shape, *([2] * int(rng.integers(2)))])
+    del file[name]
+    file[name] = values
+
+
+def _missing(file, name, folder, rng):
+    del file[name]
+
+
+def _bad_value(file, name, folder, rng):
+    file[name][0, ...] = rng.choice([np.nan, np.inf, -np.inf, 1e38, -1e38, 1e300])
+
+
+def _loop(file, name, folder, rng):
+    del file[name]
+    file[name] = h5py.SoftLink("/" + name)
+
+
+REFUSED = (
+    *(_external_storage, _external_link, _virtual, _never_written, _many_rows, _huge_chunk),
+    *(
+        _all_with_many_rows,
+        _group,
+        _empty,
+        _another_type,
+        _another_shape,
+        _missing,
+        _bad_value,
+        _loop,
+    ),
+)
+
+
+def _new(file, name, **options):
+    del file[name]
+    file.create_dataset(name, **options)
+
+
+def _odd_env_args(file, rng):
+    meta = env_args_15("square")
+    how = odd_json(meta, rng)
+    file["data"].attrs["env_args"] = json.dumps(meta)
+    return how
+
+
+def _odd_mask(file, rng):
+    del file["mask/train"]
+    values = [np.zeros((2, 2)), np.arange(2), h5py.Empty("S4"), np.array([b"\xff"]), 3.0]
+    file["mask/train"] = values[int(rng.integers(len(values)))]
+
+
+def mutate(folder: Path, rng: np.random.Generator) -> tuple[str, Callable[[], Outcome], str]:
+    """Damage one of the files; returns how, the load to attempt, and what its error has to name."""
+    whole = folder / str(rng.choice(["plain.hdf5", "packed.hdf5"]))
+    path = folder / "case.hdf5"
+    path.write_bytes(whole.read_bytes())
+    must_refuse, masked = False, bool(rng.random() < 0.3)
+    kind = rng.random()
+    if kind < 0.5:
+        how = damage(path, rng)
+    else:
+        with h5py.File(path, "a") as file:
+            if kind < 0.6:
+                how = "env_args " + _odd_env_args(file, rng)
+            elif kind < 0.65:
+                how, must_refuse, masked = "mask", True, True
+                _odd_mask(file, rng)
+            else:
+                change = REFUSED[int(rng.integers(len(REFUSED)))]
+                name = f"data/demo_{rng.choice([0, 2])}/{rng.choice(KEYS)}"
+                how, must_refuse = f"{change.__name__[1:]} {name}", True
+                change(file, name, folder, rng)
+    options = {
+        "filter_key": "train" if masked else None,
+        "absolute_actions": bool(rng.random() < 0.3),
+    }
+
+    def load() -> Outcome:
+        replay = RobomimicExperienceReplay(path, **options)
+        if must_refuse:
+            return Outcome("silent", "was read")
+        expected = RobomimicExperienceReplay(whole, **options)
+        same = replay.data.shape == expected.data.shape and bool(
+            (replay.data == expected.data).all()
+        )
+        if same and replay.env_args == expected.env_args:
+            return Outcome("equal")
+        # HDF5 keeps no checksum of plain values: then the file must say so to any reader.
+        return (
+            Outcome("as stored")
+            if _says_so(path, replay, options)
+            else Outcome("silent", "differs")
+        )
+
+    return how, load, str(path)
+
+
+def _says_so(path: Path, replay: RobomimicExperienceReplay, options: dict) -> bool:
+    """Whether h5py alone reads the same."""
+    with h5py.File(path) as file:
+        demos = sorted(file["data"], key=lambda name: int(name[5:]))
+        if options["filter_key"]:
+            demos = [demo for demo in demos if demo.encode() in set(file["mask/train"][()])]
+        values = [
+            np.concatenate(
+                [file[f"data/{demo}/obs/{key}"][()] for key in replay.observation_keys], -1
+            )
+            for demo in demos
+        ]
+        actions = np.concatenate([file[f"data/{demo}/actions"][()] for demo in demos])
+        rewards = np.concatenate([file[f"data/{demo}/rewards"][()].reshape(-1) for demo in demos])
+        meta = json.loads(file["data"].attrs["env_args"])
+    data = replay.data
+    pairs = [(data["observation"], np.concatenate(values)), (data["next", "reward"][:, 0], rewards)]
+    if not options["absolute_actions"]:
+        pairs.append((data["action"], actions))
+    equal = all(torch.equal(mine, torch.from_numpy(theirs).float()) for mine, theirs in pairs)
+    return equal and replay.env_args == modernize_env_args(meta, options["absolute_actions"])

@@ -1,0 +1,87 @@
+"""One load in a process of its own: what came of it, how long it took and how much memory."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+import resource
+import select
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+LIMIT_SECONDS = 20.0
+LIMIT_BYTES = 2 * 2**30
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of one case.
+
+    Attributes:
+        kind: ``"equal"``, ``"as stored"``, ``"refused"`` or a failure: ``"silent"``, ``"unclear"``,
+            ``"hang"``, ``"memory"`` or ``"crash"``.
+        detail: the error, or what differed.
+    """
+
+    kind: str
+    detail: str = ""
+
+    @property
+    def failed(self) -> bool:
+        return self.kind not in ("equal", "as stored", "refused")
+
+
+def attempt(load: Callable[[], Outcome], names: str) -> Outcome:
+    """Load in a fork of this process.
+
+    Args:
+        load: judges what it loaded; whatever it raises is judged here.
+        names: what a clear error contains: the path of the damaged folder or file.
+    """
+    ours, theirs = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(ours)
+        outcome = _judge(load, names)
+        with contextlib.suppress(OSError):
+            os.write(theirs, pickle.dumps((outcome.kind, outcome.detail[:600])))
+        os._exit(0)
+    os.close(theirs)
+    ready, _, _ = select.select([ours], [], [], LIMIT_SECONDS)
+    answer = os.read(ours, 65_536) if ready else b""
+    os.close(ours)
+    if not ready:
+        os.kill(child, signal.SIGKILL)
+    _, status, usage = os.wait4(child, 0)
+    if not ready:
+        return Outcome("hang", f"no answer within {LIMIT_SECONDS:.0f} s")
+    if not answer:
+        return Outcome("crash", f"ended with status {status}")
+    outcome = Outcome(*pickle.loads(answer))
+    if 1024 * usage.ru_maxrss > LIMIT_BYTES:
+        return Outcome("memory", f"{usage.ru_maxrss / 2**20:.1f} GiB, then {outcome}")
+    return outcome
+
+
+def _judge(load: Callable[[], Outcome], names: str) -> Outcome:
+    # Twice the limit beyond what is mapped already: what asks for more is refused by the system.
+    with open("/proc/self/statm") as file:
+        mapped = int(file.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + 2 * LIMIT_BYTES,) * 2)
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 1)
+    os.dup2(null, 2)
+    started = time.monotonic()
+    try:
+        return load()
+    except (ValueError, OSError) as error:
+        text = f"{type(error).__name__}: {error}"
+        clear = names in str(error) and len(text) < 4000
+        return Outcome("refused" if clear else "unclear", text)
+    except BaseException as error:
+        return Outcome(
+            "unclear", f"{type(error).__name__}: {error} ({time.monotonic() - started:.1f} s)"
+        )
