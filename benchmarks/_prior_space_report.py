@@ -5,7 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from warmprior.diagnostics import Row, plot_reinforcement, plot_success, summarize_seeds
+from warmprior.diagnostics import (
+    Row,
+    markdown_table,
+    plot_reinforcement,
+    plot_success,
+    summarize_seeds,
+)
 from warmprior.diagnostics.reinforcement_plots import agent_label
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 
@@ -31,10 +37,9 @@ def summarize(seed: int, config: PriorSpaceConfig, training: PriorSpaceTraining)
 
 def make_table(rows: list[dict[str, Any]]) -> str:
     """Success before and after, mean and standard deviation over seeds."""
-    lines = [
-        "| agent | delta | control steps | frozen policy (%) | greedy agent (%) | stochastic agent (%) |",
-        "|" + "---|" * 6,
-    ]
+    head = ["agent", "delta", "control steps"]
+    head += ["frozen policy (%)", "greedy agent (%)", "stochastic agent (%)"]
+    lines = []
     for algorithm, prior in dict.fromkeys((row["algorithm"], row["prior"]) for row in rows):
         group = [row for row in rows if (row["algorithm"], row["prior"]) == (algorithm, prior)]
         cells = []
@@ -44,8 +49,8 @@ def make_table(rows: list[dict[str, Any]]) -> str:
             cells.append(f"{100 * summary.mean:.1f}{spread}")
         label = agent_label(algorithm, prior, len(group))
         steps = max(row["environment_steps"] for row in group)
-        lines.append(f"| {label} | {group[0]['delta']:g} | {steps} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append([label, f"{group[0]['delta']:g}", str(steps), *cells])
+    return markdown_table(head, lines)
 
 
 def draw(rows: list[dict[str, Any]], out: Path, curve: Any, title: str, warmup: int) -> None:

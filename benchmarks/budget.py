@@ -25,6 +25,7 @@ from warmprior._files import check_writable, write_atomic
 from warmprior.diagnostics import (
     SharedObservations,
     action_error,
+    markdown_table,
     plot_budget,
     prior_label,
     summarize_cell,
@@ -102,8 +103,7 @@ def make_table(rows: Sequence[Row], errors: Errors, top_k: int) -> str:
     budgets = sorted({row.checkpoint for row in rows})
     columns = list(dict.fromkeys((row.nfe, row.prior) for row in rows))
     columns.sort(key=lambda column: -column[0])
-    head = "".join(f" NFE {nfe}: {prior_label(prior)} |" for nfe, prior in columns)
-    lines = [f"| iterations |{head}", "|" + "---|" * (1 + len(columns))]
+    lines = []
     for iterations in budgets:
         cells = []
         for nfe, prior in columns:
@@ -113,14 +113,15 @@ def make_table(rows: Sequence[Row], errors: Errors, top_k: int) -> str:
                 if (row.checkpoint, row.nfe, row.prior) == (iterations, nfe, prior)
             ]
             error = torch.tensor(errors[prior, iterations, nfe]).mean().item()
-            cells.append(f" {100 * summarize_cell(cell, top_k).mean:.1f} ({error:.4f}) |")
-        lines.append(f"| {iterations} |" + "".join(cells))
+            cells.append(f"{100 * summarize_cell(cell, top_k).mean:.1f} ({error:.4f})")
+        lines.append([str(iterations), *cells])
     note = (
         "Success in percent; in parentheses the mean squared error of the executed actions on held-out "
         "demonstrations, given the mean of the training, in squared normalised action units. The error "
         "prefers the average of what could be done, and grows with NFE where the data leave a choice."
     )
-    return "\n".join([*lines, "", note]) + "\n"
+    head = ["iterations", *(f"NFE {nfe}: {prior_label(prior)}" for nfe, prior in columns)]
+    return markdown_table(head, lines, [note])
 
 
 def rows_of(errors: Mapping[tuple[str, int, int], list[float]]) -> list[dict[str, Any]]:

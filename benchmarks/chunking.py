@@ -19,6 +19,7 @@ from warmprior import Prior
 from warmprior._files import write_atomic
 from warmprior.diagnostics import (
     Row,
+    markdown_table,
     plot_chunk_lengths,
     plot_success,
     plot_success_bars,
@@ -50,14 +51,10 @@ def make_priors(args: argparse.Namespace) -> list[Prior]:
 def make_table(rows: Sequence[Row], chunks: Sequence[int], nfes: Sequence[int], top_k: int) -> str:
     columns = list(dict.fromkeys((row.nfe, row.prior) for row in rows))
     columns.sort(key=lambda column: list(nfes).index(column[0]))
-    lines = [
-        "| success (%) | "
-        + " | ".join(f"NFE {nfe}: {prior_label(n)}" for nfe, n in columns)
-        + " |",
-        "|" + "---|" * (len(columns) + 1),
-    ]
+    head = [f"NFE {nfe}: {prior_label(name)}" for nfe, name in columns]
     last = max(row.checkpoint for row in rows)
-    jumps = [lines[0].replace("success (%)", "jump at boundaries"), lines[1]]
+    successes: list[list[str]] = []
+    jumps: list[list[str]] = []
     for chunk in chunks:
         success, jump = [], []
         for nfe, name in columns:
@@ -68,13 +65,14 @@ def make_table(rows: Sequence[Row], chunks: Sequence[int], nfes: Sequence[int], 
             known = [row.boundary_jump for row in cell if row.checkpoint == last]
             known = [value for value in known if value is not None]
             jump.append(f"{sum(known) / len(known):.3f}" if known else "-")
-        lines.append(f"| H = {chunk} | " + " | ".join(success) + " |")
-        jumps.append(f"| H = {chunk} | " + " | ".join(jump) + " |")
+        successes.append([f"H = {chunk}", *success])
+        jumps.append([f"H = {chunk}", *jump])
     note = (
         "Jump: mean distance between the last action of a chunk and the first of the next, in "
         "normalised action units, of the last checkpoints."
     )
-    return "\n".join([*lines, "", *jumps, "", note]) + "\n"
+    first = markdown_table(["success (%)", *head], successes)
+    return f"{first}\n{markdown_table(['jump at boundaries', *head], jumps, [note])}"
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -28,6 +28,7 @@ from warmprior._files import check_writable, write_atomic
 from warmprior.diagnostics import (
     executed_actions,
     flow_paths,
+    markdown_table,
     plot_flow_paths,
     plot_navigation,
     summarize_seeds,
@@ -114,7 +115,7 @@ def run_seed(study: NavigationStudy, seed: int) -> tuple[list[dict[str, Any]], d
 
 
 def table(rows: list[dict[str, Any]], names: Sequence[str]) -> str:
-    lines = ["| policy | " + " | ".join(COLUMNS) + " |", "|" + "---|" * (len(COLUMNS) + 1)]
+    lines = []
     for name in names:
         cells = []
         for column in COLUMNS.values():
@@ -127,8 +128,8 @@ def table(rows: list[dict[str, Any]], names: Sequence[str]) -> str:
             spread = "" if summary.seeds == 1 else f" ± {summary.std:.3f}"
             lost = len(values) - len(known)
             cells.append(f"{summary.mean:.3f}{spread}" + (f" ({lost} not finite)" if lost else ""))
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        lines.append([name, *cells])
+    return markdown_table(["policy", *COLUMNS], lines)
 
 
 def panel_title(prior: Prior) -> str:

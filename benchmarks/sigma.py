@@ -22,6 +22,7 @@ from warmprior._files import write_atomic
 from warmprior.diagnostics import (
     Row,
     SharedObservations,
+    markdown_table,
     plot_sigma,
     straightness,
     summarize_cell,
@@ -91,11 +92,9 @@ def make_table(
 ) -> str:
     seeds = {row["seed"] for row in curvatures}
     pooled = None if None in seeds else 0
-    lines = [
-        "| source | sigma | success (%) | curvature, training mean | deployed mean "
-        "| per squared mean velocity | bound, training mean | deployed mean |",
-        "|" + "---|" * 8,
-    ]
+    head = ["source", "sigma", "success (%)", "curvature, training mean", "deployed mean"]
+    head += ["per squared mean velocity", "bound, training mean", "deployed mean"]
+    lines = []
     for prior in priors:
         cell = [row for row in rows if (row.prior, row.sigma) == (prior.name, prior.sigma)]
         summary = summarize_cell(cell, top_k)
@@ -114,13 +113,12 @@ def make_table(
             f"{trained['bound']:.2f}",
             f"{deployed['bound']:.2f}",
         ]
-        lines.append(f"| {prior.label} | {prior.sigma:g} | " + " | ".join(values) + " |")
-    lines += [
-        "",
+        lines.append([prior.label, f"{prior.sigma:g}", *values])
+    note = (
         "- Curvature (relative to the Gaussian source) and bound (in squared normalised action units) are "
-        "those of the executed positions. nan: the policy predicts no motion.",
-    ]
-    return "\n".join(lines) + "\n"
+        "those of the executed positions. nan: the policy predicts no motion."
+    )
+    return markdown_table(head, lines, [note])
 
 
 def main(argv: list[str] | None = None) -> int:

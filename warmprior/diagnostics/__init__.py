@@ -44,6 +44,7 @@ from warmprior.diagnostics.study_plots import (
     plot_sigma,
     plot_success_bars,
 )
+from warmprior.diagnostics.table import markdown_table
 
 __all__ = [
     "HistoryShift",
@@ -65,6 +66,7 @@ __all__ = [
     "executed_actions",
     "flow_paths",
     "forecast_mean",
+    "markdown_table",
     "paper_success",
     "plot_budget",
     "plot_chunk_lengths",

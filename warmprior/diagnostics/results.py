@@ -19,6 +19,7 @@ from warmprior.diagnostics.statistics import (
     summarize_seeds,
     top_k_mean,
 )
+from warmprior.diagnostics.table import markdown_table
 
 __all__ = [
     "Results",
@@ -314,22 +315,18 @@ def success_table(
         measured.append(_cell(summary, base, best))
     name = f"{first.task.replace('_', '-').title()}-{first.data.upper()}"
     source = meta["data_source"]
-    lines = [
-        "| " + " | ".join(head) + " |",
-        "|" + "---|" * len(head),
-        f"| {name}, measured ({source} data) | " + " | ".join(measured) + " |",
-    ]
+    lines = [[f"{name}, measured ({source} data)", *measured]]
     reported = [_paper_cell(first, prior, nfe) for nfe, prior in columns]
     if any(cell != "-" for cell in reported):
-        lines.append(f"| {name}, paper (official data) | " + " | ".join(reported) + " |")
+        lines.append([f"{name}, paper (official data)", *reported])
     for name, field, bound in (
         ("spread over draws of the source / data's", "source_leak", LEAK_BOUND),
         ("step inside chunks / data's", "inner_step_ratio", INNER_STEP_BOUND),
     ):
         cells = [_bounded(results.rows, prior, nfe, field, bound) for nfe, prior in columns]
         if any(cell != "-" for cell in cells):
-            lines.append(f"| {name} (bound {bound:g}) | " + " | ".join(cells) + " |")
-    return "\n".join([*lines, "", *_notes(results, summaries, top_k)]) + "\n"
+            lines.append([f"{name} (bound {bound:g})", *cells])
+    return markdown_table(head, lines, _notes(results, summaries, top_k))
 
 
 def _bounded(rows: Sequence[Row], prior: str, nfe: int, field: str, bound: float) -> str:

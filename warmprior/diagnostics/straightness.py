@@ -17,6 +17,7 @@ from warmprior.diagnostics.curvature import curvature
 from warmprior.diagnostics.held_out import SharedObservations
 from warmprior.diagnostics.paper import PAPER_CURVATURE
 from warmprior.diagnostics.statistics import bootstrap_ratio
+from warmprior.diagnostics.table import markdown_table
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 
@@ -170,10 +171,7 @@ def curvature_table(rows: Sequence[dict[str, Any]], *, task: str, data: str, sou
     names = list(dict.fromkeys(row["policy"] for row in chosen))
     labels = [prior_label(row["policy"]) for row in map(_first(chosen), names)]
     title = f"{task.replace('_', '-').title()}-{data.upper()}"
-    lines = [
-        "| curvature relative to the first column | " + " | ".join(labels) + " |",
-        "|" + "---|" * (len(names) + 1),
-    ]
+    lines: list[list[str]] = []
     told = {
         "ratio": "whole prediction",
         "ratio_executed": "executed H",
@@ -185,24 +183,23 @@ def curvature_table(rows: Sequence[dict[str, Any]], *, task: str, data: str, sou
             if not any(row["mean"] == mean for row in chosen):
                 continue
             cells = [_cell(chosen, name, mean, ratio) for name in names]
-            lines.append(f"| {title}, {what}, {mean} mean | " + " | ".join(cells) + " |")
+            lines.append([f"{title}, {what}, {mean} mean", *cells])
     paper = PAPER_CURVATURE.get((task, data))
     if paper is not None and chosen[0]["prior"] == "gaussian" and chosen[0]["chunk"] == 8:
         values = {"gaussian": 1.0, **paper}
         shown = [row["prior"] for row in map(_first(chosen), names)]
         cells = [f"{values[prior]:.3f}" if prior in values else "-" for prior in shown]
-        lines.append(f"| {title}, paper (official data) | " + " | ".join(cells) + " |")
+        lines.append([f"{title}, paper (official data)", *cells])
     count = chosen[0]["observations"]
     several = f", averaged over {len(seeds) - 1} training seeds" if None in seeds else ", one seed"
-    lines += [
-        "",
+    notes = [
         f"- {count} observations of {source}{several}; in brackets 95% bootstrap intervals over episodes.",
         "- Deployed mean: made from the policy's own prediction one decision earlier. The paper does not "
         "say which mean it uses, nor whether it counts a prediction of 2H whole.",
         "- Curvature shrinks with the length of the transport; divided by the squared mean velocity it "
         "does not.",
     ]
-    return "\n".join(lines) + "\n"
+    return markdown_table(["curvature relative to the first column", *labels], lines, notes)
 
 
 def _first(rows: Sequence[dict[str, Any]]) -> Any:
