@@ -138,8 +138,27 @@ def test_workers_with_one_seed_differ_by_offset():
     assert not torch.equal(first, second)
 
 
-def test_global_generator_is_not_used():
-    env = build("single", PastPrior(H))
+@pytest.mark.parametrize("batched", [partial(ParallelEnv, mp_start_method="fork"), SerialEnv])
+def test_unseeded_environments_differ(batched):
+    """Forked workers begin with one state of PyTorch's generator."""
+    env = batched(2, [partial(single, PastPrior(H), n) for n in LENGTHS])
+    try:
+        first, second = env.reset()["prior", "anchor"]
+        assert not torch.equal(first, second)
+    finally:
+        env.close()
+
+
+def test_an_unseeded_anchor_follows_the_global_generator():
+    anchors = []
+    for _ in range(2):
+        torch.manual_seed(4)
+        anchors.append(build("single", PastPrior(H)).reset()["prior", "anchor"])
+    assert torch.equal(*anchors)
+
+
+def test_global_generator_is_not_used_after_a_seed():
+    env = build("single", PastPrior(H), seed=0)
     torch.manual_seed(0)
     state = torch.get_rng_state()
     env.reset()

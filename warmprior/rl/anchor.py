@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import random
 import weakref
 from typing import Any, Literal, Self
@@ -48,7 +49,9 @@ class PriorAnchor(Transform):
         cold: ``"noise"`` draws the prior's own cold source, N(0, I); ``"zero"`` puts zero. By default
             noise for priors with a mean and zero for the others (:class:`~warmprior.GaussianPrior`,
             :class:`~warmprior.HistoryPrior`), which gives vanilla DSRL: :math:`a_0 = \Delta`.
-        seed: of the noise until ``env.set_seed`` is called.
+        seed: of the noise until ``env.set_seed`` is called. By default it is drawn from PyTorch's global
+            generator with the first noise, and differs between the workers of a batched environment,
+            whose generators are alike.
         seed_offset: mixed with the seed.
         loc_key: the mean, ``[*B, P, d_a]``.
         warm_key: its mask, bool ``[*B, P, 1]``.
@@ -76,7 +79,7 @@ class PriorAnchor(Transform):
         prior: Prior,
         *,
         cold: Literal["noise", "zero"] | None = None,
-        seed: int = 0,
+        seed: int | None = None,
         seed_offset: int = 0,
         loc_key: NestedKey = keys.LOC,
         warm_key: NestedKey = keys.WARM,
@@ -92,14 +95,17 @@ class PriorAnchor(Transform):
         self.loc_key, self.warm_key = unravel_key(loc_key), unravel_key(warm_key)
         self.anchor_key = unravel_key(anchor_key)
         self.generator = torch.Generator()
-        self.set_seed(seed)
+        self._seeded = seed is not None
+        if seed is not None:
+            self.set_seed(seed)
 
-    def set_seed(self, seed: int) -> None:
+    def set_seed(self, seed: int | str) -> None:
         """Start the noise again from a seed; ``env.set_seed`` calls it.
 
         Args:
-            seed: any integer; mixed with ``seed_offset``.
+            seed: anything that has one text; mixed with ``seed_offset``.
         """
+        self._seeded = True
         self.generator.manual_seed(random.Random(f"{seed}/{self.seed_offset}").getrandbits(62))
 
     def clone(self) -> Self:
@@ -131,6 +137,9 @@ class PriorAnchor(Transform):
                 f"{self.prior.prediction_length} actions: ActionHistory must carry the same prior"
             )
         if self.cold == "noise":
+            if not self._seeded:
+                drawn = int(torch.randint(2**62, ()))
+                self.set_seed(f"{drawn}/{multiprocessing.current_process().name}")
             # Drawn on the CPU: one seed gives one noise on every device.
             zero = torch.zeros(loc.shape, dtype=loc.dtype)
             nothing = torch.zeros(warm.shape, dtype=torch.bool)
