@@ -19,7 +19,8 @@ import torch
 
 from warmprior import Prior, WarmPriorActor
 from warmprior._files import check_writable, write_atomic
-from warmprior.data import TASKS, download_robomimic, generate_demonstrations, get_task
+from warmprior.data import download_robomimic, generate_demonstrations
+from warmprior.envs import TASKS, get_task
 from warmprior.training import PRESETS, Preset
 from warmprior.training.comparison import Comparison
 from warmprior.training.demonstrations import Demonstrations

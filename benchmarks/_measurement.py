@@ -12,9 +12,9 @@ import torch
 
 from warmprior.data import RobomimicExperienceReplay
 from warmprior.diagnostics import SharedObservations
+from warmprior.modules import Normalizer
 from warmprior.training.demonstrations import Demonstrations
 from warmprior.training.policies import task_of
-from warmprior.transforms import Normalizer
 
 
 def add_observation_options(parser: argparse.ArgumentParser, *, observations: int) -> None:

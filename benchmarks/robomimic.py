@@ -16,10 +16,10 @@ import _experiment as experiment
 
 from warmprior import Prior
 from warmprior._files import write_atomic
-from warmprior.data.tasks import EVALUATION_SEED
 from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
 from warmprior.diagnostics.results import success_table
 from warmprior.envs import rendering_backend
+from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.training.comparison import Comparison
 from warmprior.training.filmstrip import record_filmstrip
 

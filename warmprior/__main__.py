@@ -96,7 +96,7 @@ def make_parser() -> argparse.ArgumentParser:
             metavar="MODULE:CLASS",
             help="where to import a prior of your own from",
         )
-    from warmprior.data.tasks import EVALUATION_SEED, TASKS
+    from warmprior.envs.tasks import EVALUATION_SEED, TASKS
 
     add("--episodes", type=int, default=50, help="how many (%(default)s)")
     add("--nfe", type=int, help="network evaluations per chunk (default: the policy's)")

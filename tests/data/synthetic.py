@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from warmprior.data.tasks import get_task
+from warmprior.envs.tasks import get_task
 
 OSC_14 = {
     "type": "OSC_POSE",

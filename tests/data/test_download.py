@@ -10,7 +10,7 @@ import pytest
 from tests.data.synthetic import write_robomimic_file
 from warmprior.data.download import REPOSITORIES, download_robomimic
 from warmprior.data.robomimic import RobomimicExperienceReplay
-from warmprior.data.tasks import TASKS
+from warmprior.envs.tasks import TASKS
 
 pytest.importorskip("huggingface_hub")
 

@@ -8,7 +8,7 @@ import pytest
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from warmprior.data.hdf5 import DatasetError, open_robomimic, read_index, read_rows
-from warmprior.data.tasks import TASKS
+from warmprior.envs.tasks import TASKS
 
 
 @pytest.mark.parametrize("task", TASKS)

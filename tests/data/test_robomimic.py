@@ -13,15 +13,9 @@ from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 from torchrl.envs.transforms import RenameTransform
 
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
-from warmprior.data import (
-    DatasetError,
-    RobomimicExperienceReplay,
-    absolute_actions,
-    absolute_to_env_action,
-    generate_demonstrations,
-    modernize_env_args,
-)
-from warmprior.data.tasks import TASKS
+from warmprior.data import DatasetError, RobomimicExperienceReplay, generate_demonstrations
+from warmprior.envs import absolute_actions, absolute_to_env_action, modernize_env_args
+from warmprior.envs.tasks import TASKS
 
 
 def _state(demo, task):

@@ -27,9 +27,9 @@ from warmprior.data.scripted import generate_demonstrations
 from warmprior.data.scripted.episode import Episode, expert_loop, operator_of, run_episode
 from warmprior.data.scripted.geometry import nearest_yaw, rotation_matrix, rotation_vector
 from warmprior.data.scripted.writer import write_robomimic
-from warmprior.data.tasks import EVALUATION_SEED, TASKS
 from warmprior.envs import rendering_backend
 from warmprior.envs._simulator import make_simulator
+from warmprior.envs.tasks import EVALUATION_SEED, TASKS
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("robosuite")
 
-from warmprior.data.tasks import TASKS
 from warmprior.envs._simulator import make_simulator, task_env_args
 from warmprior.envs.control_loop import ControlLoop, StepLoop
+from warmprior.envs.tasks import TASKS
 
 TOLERANCE = 1e-9  # radians, over ten control steps
 

@@ -19,10 +19,10 @@ from torchrl.envs.utils import check_env_specs
 from warmprior.data.scripted.episode import PLANS
 from warmprior.data.scripted.motion import ArmRunner
 from warmprior.data.scripted.operators import SKILLED, Demonstrator
-from warmprior.data.tasks import TASKS
 from warmprior.envs import RobosuiteEnv, RobosuiteWrapper, rendering_backend
 from warmprior.envs import rendering as rendering_module
 from warmprior.envs._simulator import make_simulator, task_env_args
+from warmprior.envs.tasks import TASKS
 
 make_lift = partial(RobosuiteEnv, "lift", horizon=15)
 

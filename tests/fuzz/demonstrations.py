@@ -13,7 +13,8 @@ import torch
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from tests.fuzz.raw import damage, odd_json
 from tests.fuzz.sandbox import Outcome
-from warmprior.data import RobomimicExperienceReplay, modernize_env_args
+from warmprior.data import RobomimicExperienceReplay
+from warmprior.envs import modernize_env_args
 
 NAME = "demonstration files"
 KEYS = ("actions", "rewards", "obs/object", "obs/robot0_eef_pos", "obs/robot0_eef_quat")

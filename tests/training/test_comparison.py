@@ -20,8 +20,8 @@ from tests.data.synthetic import write_robomimic_file
 from tests.training.cloning_parts import same
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior._files import load_file
-from warmprior.data.tasks import EVALUATION_SEED
 from warmprior.diagnostics import SharedObservations, source_leak
+from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.training import PRESETS, TrainingConfig, WorkerError, workers
 from warmprior.training.comparison import Comparison
 from warmprior.training.demonstrations import Demonstrations

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from warmprior._extras import require
 from warmprior.data.hdf5 import open_robomimic
-from warmprior.data.tasks import TASKS
+from warmprior.envs.tasks import TASKS
 
 __all__ = ["REPOSITORIES", "download_robomimic"]
 

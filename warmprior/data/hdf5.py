@@ -18,7 +18,7 @@ import numpy as np
 
 from warmprior._extras import require
 from warmprior.data.hdf5_members import DatasetError, member, names, reading
-from warmprior.data.tasks import TASKS, TaskSpec
+from warmprior.envs.tasks import TASKS, TaskSpec
 
 if TYPE_CHECKING:
     import h5py
@@ -44,7 +44,7 @@ class RobomimicIndex:
         available_keys: every observation of the first demo.
         action_dim: the width of ``actions``.
         env_args: the parsed ``env_args`` as the file has them.
-        task: the task of :data:`warmprior.data.TASKS` that uses this environment, or ``None``.
+        task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
     """
 
     path: Path

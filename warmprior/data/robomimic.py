@@ -25,9 +25,9 @@ from warmprior.data.hdf5 import (
     read_index,
     read_rows,
 )
-from warmprior.data.robomimic_env import absolute_actions as to_absolute
-from warmprior.data.robomimic_env import delta_conventions, modernize_env_args
-from warmprior.data.tasks import TASKS, TaskSpec
+from warmprior.envs.env_args import absolute_actions as to_absolute
+from warmprior.envs.env_args import delta_conventions, modernize_env_args
+from warmprior.envs.tasks import TASKS, TaskSpec
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION
 
 __all__ = ["RobomimicExperienceReplay"]
@@ -195,7 +195,7 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
         observation_keys: observations to concatenate; by default those of the task, or for an
             unknown environment the object and every robot's pose and gripper.
         absolute_actions: turn the recorded pose deltas into absolute poses
-            (see :func:`warmprior.data.absolute_actions`); ``d_a`` becomes 10 per arm.
+            (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm.
         storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``.
         scratch_dir: folder of the memory maps; temporary files if ``None``.
         device: device of the tensors; ``"cpu"`` for ``"memmap"``.
@@ -290,13 +290,13 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
     def env_args(self) -> dict[str, Any]:
         """The environment of the data, for robosuite 1.5, fit for the actions as they are stored.
 
-        A copy; see :func:`warmprior.data.modernize_env_args`.
+        A copy; see :func:`warmprior.envs.modernize_env_args`.
         """
         return modernize_env_args(self._env_args)
 
     @property
     def task(self) -> TaskSpec | None:
-        """The task of :data:`warmprior.data.TASKS` recorded here, or ``None`` if it is another."""
+        """The task of :data:`warmprior.envs.TASKS` recorded here, or ``None`` if it is another."""
         return self._index.task
 
     @property

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from warmprior._extras import require
-from warmprior.data.tasks import get_task
+from warmprior.envs.tasks import get_task
 
 __all__ = [
     "action_limits",
@@ -111,7 +111,7 @@ def task_env_args(task: str, image_size: int = 0) -> dict[str, Any]:
     0.5 rad in the world frame, 20 Hz control.
 
     Args:
-        task: a name of :data:`warmprior.data.tasks.TASKS`.
+        task: a name of :data:`warmprior.envs.tasks.TASKS`.
         image_size: side of the camera images in pixels; 0 for none.
 
     Returns:

@@ -13,8 +13,6 @@ from torchrl.envs.common import _EnvWrapper
 from torchrl.envs.utils import _classproperty
 
 from warmprior import keys
-from warmprior.data.tasks import TASKS, TaskSpec, get_task
-from warmprior.data.tasks import low_dim_keys as default_keys
 from warmprior.envs._simulator import (
     action_limits,
     import_robosuite,
@@ -23,6 +21,8 @@ from warmprior.envs._simulator import (
 )
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.rendering import render_camera, rendering_backend
+from warmprior.envs.tasks import TASKS, TaskSpec, get_task
+from warmprior.envs.tasks import low_dim_keys as default_keys
 
 __all__ = ["RobosuiteEnv", "RobosuiteWrapper"]
 
@@ -312,7 +312,7 @@ class RobosuiteEnv(RobosuiteWrapper):
             spec = get_task(str(task))
             env_args = task_env_args(spec.name)
         else:
-            from warmprior.data.robomimic_env import modernize_env_args
+            from warmprior.envs.env_args import modernize_env_args
 
             env_args = modernize_env_args(env_args)
             by_name = {entry.env_name: entry for entry in TASKS.values()}

@@ -11,6 +11,7 @@ from warmprior.modules.interpolant import (
 )
 from warmprior.modules.mlp import VelocityMLP
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
+from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor, integrate
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
@@ -23,6 +24,7 @@ __all__ = [
     "HistoryPrior",
     "Interpolant",
     "LinearInterpolant",
+    "Normalizer",
     "ODEActor",
     "PastPrior",
     "PolynomialInterpolant",

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -29,12 +29,10 @@ from warmprior._files import (
 from warmprior.modules.blueprint import BlueprintError, blueprint
 from warmprior.modules.compiled import uncompiled, without_compilation
 from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor, Solver
 from warmprior.modules.prior import Prior
 from warmprior.modules.sampler import PriorSampler
-
-if TYPE_CHECKING:
-    from warmprior.transforms.normalize import Normalizer
 
 __all__ = ["WarmPriorActor"]
 
@@ -340,8 +338,6 @@ class WarmPriorActor(TensorDictModuleBase):
     @classmethod
     def _from_config(cls, config: dict[str, Any]) -> WarmPriorActor:
         """An actor with fresh weights."""
-        from warmprior.transforms.normalize import Normalizer
-
         options: dict[str, Any] = dict(config["actor"])
         for name in _SAVED_KEYS:
             if isinstance(options.get(name), list):  # JSON's form of a nested key

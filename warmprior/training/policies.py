@@ -20,6 +20,7 @@ from warmprior._files import check_writable
 from warmprior.data import RobomimicExperienceReplay
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.description import environment_description
+from warmprior.modules import Normalizer
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.training.behaviour_cloning import (
@@ -31,7 +32,7 @@ from warmprior.training.behaviour_cloning import (
 from warmprior.training.demonstrations import Demonstrations
 from warmprior.training.presets import Preset
 from warmprior.training.threads import torch_threads
-from warmprior.transforms import MeanObservation, Normalizer, policy_transforms
+from warmprior.transforms import MeanObservation, policy_transforms
 
 __all__ = ["Policies"]
 

@@ -3,7 +3,6 @@
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.mean_observation import MeanObservation
-from warmprior.transforms.normalize import Normalizer
 from warmprior.transforms.policy import policy_transforms
 from warmprior.transforms.stack import ObservationStack
 from warmprior.transforms.window import ActionWindow, window_replay_buffer, window_transforms
@@ -13,7 +12,6 @@ __all__ = [
     "ActionWindow",
     "ChunkStep",
     "MeanObservation",
-    "Normalizer",
     "ObservationStack",
     "policy_transforms",
     "window_replay_buffer",

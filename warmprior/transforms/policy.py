@@ -6,11 +6,11 @@ from tensordict.utils import NestedKey
 from torchrl.envs.transforms import Compose
 
 from warmprior import keys
+from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.mean_observation import mean_observation
-from warmprior.transforms.normalize import Normalizer
 from warmprior.transforms.stack import ObservationStack
 
 __all__ = ["policy_transforms"]

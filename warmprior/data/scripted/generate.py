@@ -27,9 +27,9 @@ from warmprior.data.scripted.episode import (
 )
 from warmprior.data.scripted.operators import OPERATORS
 from warmprior.data.scripted.writer import write_robomimic
-from warmprior.data.tasks import EVALUATION_SEED, get_task
 from warmprior.envs._simulator import import_robosuite, task_env_args
 from warmprior.envs.control_loop import ControlLoop
+from warmprior.envs.tasks import EVALUATION_SEED, get_task
 
 __all__ = ["GENERATOR_VERSION", "SEEDS_PER_FILE", "generate_demonstrations"]
 
@@ -57,7 +57,7 @@ def generate_demonstrations(
     Episode ``k`` plays simulator seed ``seed * 100_000 + k``, and the first ``n`` that succeed are
     kept in that order. In ``mh`` data six operators take turns and contribute equally, as in the
     official files. The content does not depend on the number of workers. All seeds are smaller
-    than :data:`~warmprior.data.tasks.EVALUATION_SEED`.
+    than :data:`~warmprior.envs.tasks.EVALUATION_SEED`.
 
     Args:
         task: ``lift``, ``can``, ``square``, ``stack`` or ``transport``.

@@ -11,13 +11,13 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from tests.data.synthetic import env_args_14, env_args_15
-from warmprior.data.robomimic_env import (
+from warmprior.envs.env_args import (
     absolute_actions,
     absolute_to_env_action,
     delta_conventions,
     modernize_env_args,
 )
-from warmprior.data.rotation import (
+from warmprior.envs.rotation import (
     matrix_to_rotation_6d,
     matrix_to_rotvec,
     quaternion_to_matrix,
