@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
@@ -245,8 +245,7 @@ def _advance(
 ) -> None:
     """As ``step_mdp``, in place and without its generality: it runs at every control step."""
     for key, value in next_tensordict.items():
-        mine = current.get(key) if is_tensor_collection(value) else None
-        if mine is not None:
-            value = mine.copy().update(value)
+        if isinstance(value, TensorDictBase) and key in current:
+            value = current[key].copy().update(value)
         if key != reward_key:
             current[key] = value
