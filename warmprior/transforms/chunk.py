@@ -30,7 +30,14 @@ class ChunkStep(Transform):
     inside a chunk and has fixed shapes, so that it works inside and outside batched environments.
 
     Per-step transforms (``StepCounter``, ``RewardSum``, ``ActionScaling``, ``CatFrames``,
-    ``VideoRecorder``) go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after.
+    ``VideoRecorder``) go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after. All of
+    them run themselves at every control step. In a partial step, rows that rest keep all observations.
+
+    .. note::
+        TorchRL's transforms with memory, such as ``CatFrames`` or ``VecNormV2``, update it in all rows of a
+        batched environment around which they are placed, also in those that a partial step leaves out.
+        Place them inside the workers where rows rest for longer than to their reset;
+        :class:`ObservationStack` has no such memory.
 
     Args:
         chunk_length: ``H``.
