@@ -19,11 +19,13 @@ from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 from warmprior import (
     ActionWindow,
     GaussianPrior,
+    Normalizer,
     PastPrior,
     PreviewPrior,
     Prior,
     window_replay_buffer,
 )
+from warmprior.transforms.window import check_finite
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 
@@ -335,3 +337,33 @@ def test_no_frame():
 def test_bad_observation_steps(steps_):
     with pytest.raises(ValueError, match="observation_steps"):
         ActionWindow(steps([3]), PastPrior(2), observation_steps=steps_)
+
+
+def test_data_larger_than_memory_are_never_copied(tmp_path):
+    """Checks, statistics and samples of a file allocate a fraction of what it holds."""
+    wide = TensorDict(
+        {
+            "observation": torch.empty(20_000, 800),  # 64 MB
+            "action": torch.empty(20_000, 7),
+            "episode": torch.empty(20_000, dtype=torch.int64),
+        },
+        [20_000],
+    ).memmap_like(tmp_path)
+    prior = PastPrior(4)
+    with torch.profiler.profile(
+        activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True
+    ) as profile:
+        Normalizer.fit(wide)
+        window_replay_buffer(wide, prior, batch_size=64).sample()
+    largest = max(event.self_cpu_memory_usage for event in profile.events())
+    assert 0 < largest < 64e6 / 3
+
+
+@pytest.mark.parametrize("bad", [0, 777, 1999])
+def test_bad_values_are_located_in_every_part_of_the_data(bad):
+    value = torch.zeros(2000, 3)
+    check_finite("observation", value, memory=90)
+    value[bad, 2] = float("nan")
+    value[1999, 1] = float("inf")
+    with pytest.raises(ValueError, match=f"'observation' holds NaN or Inf, first at step {bad}$"):
+        check_finite("observation", value, memory=90)

@@ -56,7 +56,9 @@ class Normalizer(nn.Module):
                 )
             if not (torch.isfinite(low[key]).all() and torch.isfinite(high[key]).all()):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
-            loc, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
+            # Of the default precision, whatever the data's: what is normalised then keeps its own.
+            first, last = (value[key].to(torch.get_default_dtype()) for value in (low, high))
+            loc, half = (last + first) / 2, (last - first) / 2
             constant = half <= 1e-5 * loc.abs().clamp_min(1.0)
             self.register_buffer(_name(key, "loc"), loc)
             self.register_buffer(_name(key, "scale"), torch.where(constant, 1.0, half))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
@@ -30,7 +30,14 @@ class ChunkStep(Transform):
     inside a chunk and has fixed shapes, so that it works inside and outside batched environments.
 
     Per-step transforms (``StepCounter``, ``RewardSum``, ``ActionScaling``, ``CatFrames``,
-    ``VideoRecorder``) go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after.
+    ``VideoRecorder``) go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after. All of
+    them run themselves at every control step. In a partial step, rows that rest keep all observations.
+
+    .. note::
+        TorchRL's transforms with memory, such as ``CatFrames`` or ``VecNormV2``, update it in all rows of a
+        batched environment around which they are placed, also in those that a partial step leaves out.
+        Place them inside the workers where rows rest for longer than to their reset;
+        :class:`ObservationStack` has no such memory.
 
     Args:
         chunk_length: ``H``.
@@ -245,8 +252,7 @@ def _advance(
 ) -> None:
     """As ``step_mdp``, in place and without its generality: it runs at every control step."""
     for key, value in next_tensordict.items():
-        mine = current.get(key) if is_tensor_collection(value) else None
-        if mine is not None:
-            value = mine.copy().update(value)
+        if isinstance(value, TensorDictBase) and key in current:
+            value = current[key].copy().update(value)
         if key != reward_key:
             current[key] = value

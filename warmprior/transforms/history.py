@@ -25,7 +25,8 @@ class ActionHistory(Transform):
     =========================  ===========================  ====================================
     key                        shape                        meaning
     =========================  ===========================  ====================================
-    ``("prior", "loc")``       ``[*B, P, d_a]`` float       the mean, normalised action space
+    ``("prior", "loc")``       ``[*B, P, d_a]`` float       the mean, normalised action space, of the
+                                                            action's dtype
     ``("prior", "warm")``      ``[*B, P, 1]`` bool          where the mean counts
     ``("prior", "elapsed")``   ``[*B, 1]`` int64            actions executed since the reset
     =========================  ===========================  ====================================
@@ -73,7 +74,7 @@ class ActionHistory(Transform):
         self.loc_key = unravel_key(loc_key)
         self.warm_key = unravel_key(warm_key)
         self.elapsed_key = unravel_key(elapsed_key)
-        self._action_dim: int | None = None
+        self._chunk: TensorSpec | None = None
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         executed = next_tensordict.get(self.executed_key)
@@ -85,6 +86,7 @@ class ActionHistory(Transform):
         before = tensordict.get(self.loc_key)
         elapsed = tensordict.get(self.elapsed_key) + executed
         loc, warm = self.prior.next_mean(before, tensordict.get(self.chunk_key), executed, elapsed)
+        loc = loc.to(before.dtype)  # a policy may compute in another precision than the environment
         rows = tensordict.get("_step", None)
         if rows is not None:
             # A partial step: the others were not asked, and what lies in their chunk was not executed.
@@ -100,9 +102,8 @@ class ActionHistory(Transform):
     ) -> TensorDictBase:
         # Cold everywhere: TorchRL merges these rows into the sub-environments that were reset only.
         batch, device = tensordict_reset.batch_size, tensordict_reset.device
-        length = self.prior.prediction_length
-        action_dim = self._action_dim or self._check_chunk(self.parent.full_action_spec)
-        loc = torch.zeros(*batch, length, action_dim, device=device)
+        chunk = self._chunk or self._check_chunk(self.parent.full_action_spec)
+        loc = torch.zeros(*batch, *chunk.shape[-2:], dtype=chunk.dtype, device=device)
         tensordict_reset.set(self.loc_key, loc)
         tensordict_reset.set(self.warm_key, torch.zeros_like(loc[..., :1], dtype=torch.bool))
         elapsed = torch.zeros(*batch, 1, dtype=torch.int64, device=device)
@@ -112,13 +113,14 @@ class ActionHistory(Transform):
         """Outside environments the transform does nothing: the keys are already in the data."""
         return tensordict
 
-    def _check_chunk(self, action_spec: TensorSpec) -> int:
+    def _check_chunk(self, action_spec: TensorSpec) -> TensorSpec:
         if self.chunk_key not in action_spec.keys(True, True):
             raise KeyError(
                 f"ActionHistory found no {self.chunk_key} among the actions "
                 f"{list(action_spec.keys(True, True))}: append it after ChunkStep"
             )
-        length, action_dim = action_spec[self.chunk_key].shape[-2:]
+        chunk = action_spec[self.chunk_key]
+        length = chunk.shape[-2]
         if length != self.prior.prediction_length:
             raise ValueError(
                 f"the environment takes chunks of {length} actions, but {self.prior} predicts "
@@ -127,15 +129,17 @@ class ActionHistory(Transform):
                 f"prediction_length={self.prior.prediction_length})"
             )
         # Kept because resets are frequent and TorchRL rebuilds specs on every access.
-        self._action_dim = action_dim
-        return action_dim
+        self._chunk = chunk
+        return chunk
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the mean, the mask and the count."""
-        action_dim = self._check_chunk(self.parent.full_action_spec)
+        chunk = self._check_chunk(self.parent.full_action_spec)
         batch, device = observation_spec.shape, observation_spec.device
-        length = self.prior.prediction_length
-        observation_spec[self.loc_key] = Unbounded((*batch, length, action_dim), device=device)
+        length, action_dim = chunk.shape[-2:]
+        observation_spec[self.loc_key] = Unbounded(
+            (*batch, length, action_dim), dtype=chunk.dtype, device=device
+        )
         observation_spec[self.warm_key] = Categorical(
             2, shape=(*batch, length, 1), dtype=torch.bool, device=device
         )

@@ -49,7 +49,8 @@ class InnerStep:
             key for key in self.base.observation_spec.keys(True, True) if key not in states
         ]
         done_spec = self.base.full_done_spec
-        self._done_spec, self._dones = done_spec, list(done_spec.items(True, True))
+        self._done_spec = done_spec
+        self._done_shapes = [(key, spec.shape) for key, spec in done_spec.items(True, True)]
         inverse = [k for t in before for k in (*t.in_keys_inv, *t.out_keys_inv)]
         self._branches = {key[0] for key in (*inverse, *self.observed) if isinstance(key, tuple)}
 
@@ -71,19 +72,15 @@ class InnerStep:
         for transform in reversed(self.transforms):
             tensordict = transform._inv_call(tensordict)
         result = self.base._step(tensordict)
-        if not self._has_dones(result):
-            self.base._complete_done(self._done_spec, result)
+        for key, shape in self._done_shapes:
+            done = result.get(key, None)
+            if done is None or done.shape != shape:
+                # Only then: most environments give all flags, and completing them is slow.
+                self.base._complete_done(self._done_spec, result)
+                break
         for transform in self.transforms:
             result = transform._step(tensordict, result)
         return result
-
-    def _has_dones(self, result: TensorDictBase) -> bool:
-        """Whether no flag is left to complete; most environments give all, and completing is slow."""
-        values = (result.get(key, None) for key, _ in self._dones)
-        return all(
-            value is not None and value.shape == spec.shape
-            for value, (_, spec) in zip(values, self._dones, strict=True)
-        )
 
 
 def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None:

@@ -166,7 +166,7 @@ def _checked(
     return observations, action, episode.flatten()
 
 
-def check_finite(key: NestedKey, value: Tensor, memory: int = 2**24) -> None:
+def check_finite(key: NestedKey, value: Tensor, memory: int = 2**22) -> None:
     """Whether an entry of a dataset is free of NaN and infinity.
 
     Args:

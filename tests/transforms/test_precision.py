@@ -1,0 +1,117 @@
+"""float64 demonstrations and environments, and networks of another precision than either."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
+from warmprior import (
+    FlowMatchingLoss,
+    Normalizer,
+    PastPrior,
+    PreviewPrior,
+    VelocityMLP,
+    WarmPriorActor,
+    policy_transforms,
+    window_replay_buffer,
+)
+
+H = 3
+
+
+class DoubleEnv(CountingEnv):
+    """The toy in float64, actions too, as most simulators are."""
+
+    def __init__(self, length=7):
+        super().__init__(length)
+        self.observation_spec = Composite(observation=Unbounded((4,), dtype=torch.float64))
+        self.action_spec = Bounded(-1, 1, (ACTION_DIM,), dtype=torch.float64)
+
+    def _observation(self, action):
+        return super()._observation(action).double()
+
+
+def demonstrations(dtype):
+    generator = torch.Generator().manual_seed(0)
+    both = torch.rand(60, 4 + ACTION_DIM, generator=generator, dtype=torch.float64) * 2 - 1
+    observation, action = both.to(dtype).split((4, ACTION_DIM), dim=-1)
+    data = {"observation": observation, "action": action, "episode": torch.arange(60) // 20}
+    return TensorDict(data, [60])
+
+
+def actor_of(prior, dtype):
+    torch.manual_seed(0)
+    network = VelocityMLP(ACTION_DIM, 4, prior.prediction_length, 2, hidden_dim=16)
+    return WarmPriorActor(network, prior, nfe=3, clip=1.0).to(dtype)
+
+
+@pytest.mark.parametrize("network", [torch.float32, torch.bfloat16, torch.float64])
+@pytest.mark.parametrize("data", [torch.float32, torch.float64])
+def test_training_gives_the_loss_of_full_precision(data, network):
+    prior = PastPrior(H)
+    windows = window_replay_buffer(demonstrations(data), prior, batch_size=32).sample()
+    assert windows["vla_action", "chunk"].dtype == data
+    actor = actor_of(prior, network)
+    loss = FlowMatchingLoss(actor, generator=torch.Generator().manual_seed(1))
+    found = loss(windows)["loss_flow_matching"]
+    found.backward()
+    assert found.dtype == data  # and not the network's: errors are summed over the batch
+    assert all(p.grad.dtype == network and p.grad.isfinite().all() for p in loss.parameters())
+    reference = FlowMatchingLoss(
+        actor_of(prior, torch.float64), generator=torch.Generator().manual_seed(1)
+    )
+    exact = reference(windows)["loss_flow_matching"]
+    tolerance = 2e-2 if network == torch.bfloat16 else 1e-5
+    torch.testing.assert_close(found.double(), exact.double(), rtol=tolerance, atol=0)
+
+
+@pytest.mark.parametrize("network", [torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("env_class", [CountingEnv, DoubleEnv])
+@pytest.mark.parametrize("prior_class", [PastPrior, PreviewPrior])
+def test_environments_keep_their_precision(prior_class, env_class, network):
+    prior = prior_class(H)
+    normalizer = Normalizer.fit(demonstrations(torch.float64))
+    base = SerialEnv(2, [partial(env_class, n) for n in (7, 4)])
+    env = TransformedEnv(base, policy_transforms(prior, normalizer=normalizer))
+    check_env_specs(env)
+    rollout = env.rollout(5, actor_of(prior, network), break_when_any_done=False)
+    dtype = torch.float64 if env_class is DoubleEnv else torch.float32
+    for key in ("observation", ("prior", "loc"), ("vla_action", "chunk")):
+        assert rollout[key].dtype == dtype, key
+    warm = rollout["prior", "warm"]
+    assert warm[:, 1:].any() and rollout["vla_action", "chunk"].isfinite().all()
+
+
+def test_a_policy_of_another_precision_than_the_environment():
+    """One that casts nothing itself: the mean keeps the environment's dtype from reset to step."""
+    prior = PastPrior(H)
+    env = TransformedEnv(DoubleEnv(), policy_transforms(prior))
+    policy = ChunkPolicy(lambda data: torch.full((H, ACTION_DIM), 0.5, dtype=torch.float32))
+    rollout = env.rollout(2, policy)
+    assert rollout["prior", "loc"].dtype == torch.float64
+    assert (rollout["prior", "loc"][1] == 0.5).all()
+
+
+def test_normalised_data_keep_their_precision():
+    data = demonstrations(torch.float64)
+    data["pixels"] = torch.randint(0, 256, (60, 3), dtype=torch.uint8)
+    normalizer = Normalizer.fit(data, ("observation", "action", "pixels"))
+    out = normalizer.normalize(data)
+    assert out["observation"].dtype == torch.float64
+    assert out["pixels"].min() >= -1 and out["pixels"].max() <= 1
+    torch.testing.assert_close(out["observation"].amin(0), -torch.ones(4).double())
+
+
+def test_batches_come_to_the_network():
+    """As memory-mapped data to a GPU; "meta" stands for a device that other tensors cannot meet."""
+    prior = PastPrior(H)
+    windows = window_replay_buffer(demonstrations(torch.float32), prior, batch_size=8).sample()
+    loss = FlowMatchingLoss(actor_of(prior, torch.float32).to("meta"))
+    assert loss(windows)["loss_flow_matching"].device.type == "meta"
