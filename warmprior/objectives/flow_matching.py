@@ -161,14 +161,20 @@ class FlowMatchingLoss(LossModule):
         t = self.prior.sample_times(batch, self.generator, a1)
         observation = self.prior.extend_observation(observation, loc, warm)
         a_t, velocity = self.interpolant(a0, a1, t)
+        interrupt: KeyboardInterrupt | None = None
         with self.velocity_network_params.to_module(
             self.velocity_network, preserve_module_state=False
         ):
-            predicted = self.velocity_network(
-                t.reshape(-1),
-                a_t.reshape(-1, *a1.shape[-2:]),
-                observation.reshape(-1, *observation.shape[len(batch) :]),
-            )
+            try:
+                predicted = self.velocity_network(
+                    t.reshape(-1),
+                    a_t.reshape(-1, *a1.shape[-2:]),
+                    observation.reshape(-1, *observation.shape[len(batch) :]),
+                )
+            except KeyboardInterrupt as key:
+                interrupt = key  # leaving the context with it would make a RuntimeError of it
+        if interrupt is not None:
+            raise interrupt
         error = (predicted.reshape(a1.shape) - velocity).square()
         pad = tensordict.get(k.pad_mask, None)
         if pad is not None:
