@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+import time
 from collections import Counter
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -28,6 +29,8 @@ class Hub:
     def __init__(self) -> None:
         self.files: dict[tuple[str, str], tuple[int, bytes]] = {}
         self.missing = "RepoNotFound"
+        self.delay = 0.0
+        self.sent: dict[str, bytes] = {}  # by repository, instead of what is announced
         self.requests: Counter[tuple[str, str]] = Counter()
         hub = self
 
@@ -45,8 +48,11 @@ class Hub:
                     self.end_headers()
                     return
                 announced, content = found
+                digest = hashlib.sha256(content).hexdigest()
+                content = hub.sent.get(repository, content)
+                time.sleep(hub.delay if body else 0.0)
                 self.send_response(200)
-                self.send_header("ETag", f'"{hashlib.sha256(content).hexdigest()}"')
+                self.send_header("ETag", f'"{digest}"')
                 self.send_header("X-Repo-Commit", "a" * 40)
                 self.send_header("X-Linked-Size", str(announced))
                 self.send_header("Content-Length", str(len(content)))
@@ -152,6 +158,44 @@ def test_cut_short_at_the_source_is_refused(hub, content, tmp_path):
         download_robomimic("square", **options)
     hub.put(FIRST, content)
     assert download_robomimic("square", force=True, **options).read_bytes() == content
+
+
+def test_a_refused_file_is_replaced_without_being_told(hub, content, tmp_path):
+    """What an interrupted or broken download left does not stay in the way for ever."""
+    for repository in REPOSITORIES:
+        hub.put(repository, content[:-5000])
+    options = {"root": tmp_path, "endpoint": hub.address}
+    with pytest.raises(OSError, match="not a readable HDF5 file"):
+        download_robomimic("square", **options)
+    hub.put(FIRST, content)
+    assert download_robomimic("square", **options).read_bytes() == content
+
+
+def test_a_damaged_file_of_the_right_size_is_refused(hub, content, tmp_path):
+    damaged = bytearray(content)
+    damaged[-100] ^= 1
+    hub.put(FIRST, content)
+    hub.put(MIRROR, content)
+    hub.sent = {repository: bytes(damaged) for repository in REPOSITORIES}
+    options = {"root": tmp_path, "endpoint": hub.address}
+    with pytest.raises(OSError, match=r"(?s)DatasetError: .*low_dim_v15\.hdf5: .*sha256"):
+        download_robomimic("square", **options)
+    hub.sent = {}
+    path = download_robomimic("square", **options)
+    assert path.read_bytes() == content
+    path.write_bytes(damaged)  # on the disk, afterwards
+    assert download_robomimic("square", **options).read_bytes() == content
+
+
+def test_a_server_that_never_ends_is_left(hub, content, tmp_path, monkeypatch):
+    monkeypatch.setattr("warmprior.data.download.LIMIT_SECONDS", 2.0)
+    hub.put(FIRST, content)
+    hub.put(MIRROR, content)
+    hub.delay = 8.0
+    started = time.monotonic()
+    with pytest.raises(OSError, match=r"TimeoutError: .*2 s"):
+        download_robomimic("square", root=tmp_path, endpoint=hub.address)
+    assert time.monotonic() - started < 6
 
 
 def test_mirror_when_the_first_is_broken(hub, content, tmp_path):

@@ -292,3 +292,29 @@ def test_any_callable_module_and_any_prior():
     loss = FlowMatchingLoss(WarmPriorActor(Exact(), prior))(batch)["loss_flow_matching"]
     del Prior._registry["double-for-this-test"]
     assert loss < 1e-10
+
+
+def test_ctrl_c_in_the_network_is_one():
+    prior = PastPrior(3)
+    network = VelocityMLP(2, 5, 3, 2, hidden_dim=8)
+    loss = FlowMatchingLoss(WarmPriorActor(network, prior))
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    data = TensorDict(
+        {
+            "observation": torch.zeros(4, 2, 5),
+            "vla_action": {"chunk": torch.zeros(4, 3, 2)},
+            "action_is_pad": torch.zeros(4, 3, dtype=torch.bool),
+            "prior": {"loc": torch.zeros(4, 3, 2), "warm": torch.ones(4, 3, 1, dtype=torch.bool)},
+        },
+        [4],
+    )
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    hook = network.register_forward_pre_hook(interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        loss(data)
+    hook.remove()
+    assert loss(data)["loss_flow_matching"].isfinite()
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from warmprior._extras import require
-from warmprior.data.hdf5 import open_robomimic
+from warmprior._files import file_digest
+from warmprior.data.hdf5 import DatasetError, open_robomimic
 from warmprior.envs.tasks import TASKS
 
 __all__ = ["REPOSITORIES", "download_robomimic"]
 
 REPOSITORIES = ("robomimic/robomimic_datasets", "amandlek/robomimic")
 """The hub's dataset repositories that hold the files, in the order of trying."""
+
+LIMIT_SECONDS = 3600.0
+"""For everything that one call fetches, whatever a server does."""
 
 
 def download_robomimic(
@@ -25,7 +34,8 @@ def download_robomimic(
     """Download an official low-dimensional file, unless it is there already.
 
     The file is ``v1.5/{task}/{style}/low_dim_v15.hdf5`` of the first of :data:`REPOSITORIES` that
-    delivers it. It is opened before its path is returned, so a file that was cut short is refused.
+    delivers it. Before its path is returned it is compared with the digest that the hub gives, where
+    the hub can be reached, and opened; a file that fails is fetched once more.
 
     Args:
         task: ``lift``, ``can``, ``square``, ``transport`` or ``tool_hang``.
@@ -60,22 +70,29 @@ def download_robomimic(
     require("h5py", "sim")
     name = f"v1.5/{task}/{style}/low_dim_v15.hdf5"
     failures: list[str] = []
+    deadline = time.monotonic() + LIMIT_SECONDS
     for repository in REPOSITORIES:
+        where = {
+            "repo_id": repository,
+            "filename": name,
+            "repo_type": "dataset",
+            "endpoint": endpoint,
+        }
+
+        def fetch(anew: bool, where: dict[str, Any] = where) -> Path:
+            path = Path(hub.hf_hub_download(**where, local_dir=root, force_download=anew))
+            _check(path, _published_digest(hub, where))
+            return path
+
         # The client's failures share no base class: its own errors, those of the HTTP library
         # underneath, and OSError for a broken connection, a full disk or a short file.
         try:
-            path = Path(
-                hub.hf_hub_download(
-                    repository,
-                    name,
-                    repo_type="dataset",
-                    local_dir=root,
-                    endpoint=endpoint,
-                    force_download=force,
-                )
-            )
-            with open_robomimic(path):
-                return path
+            try:
+                return _until(deadline, partial(fetch, force))
+            except DatasetError:
+                if force:
+                    raise
+                return _until(deadline, partial(fetch, True))
         except Exception as error:
             reason = str(error).strip() or "no message"
             failures.append(f"{repository}: {type(error).__name__}: {reason}")
@@ -86,3 +103,47 @@ def download_robomimic(
         + "\nCheck the connection; force=True replaces a broken local copy, and a file fetched by "
         "other means can be given by its path."
     ) from cause
+
+
+def _check(path: Path, digest: str | None) -> None:
+    if digest is not None and file_digest(path) != digest:
+        raise DatasetError(
+            f"{path}: its sha256 is not the {digest} that the hub publishes: it was damaged on the way "
+            "or on this disk"
+        )
+    with open_robomimic(path):
+        pass
+
+
+def _published_digest(hub: Any, where: dict[str, Any]) -> str | None:
+    """SHA-256 of a file at the hub; ``None`` if the hub cannot be reached or gives another kind."""
+    try:
+        etag = hub.get_hf_file_metadata(hub.hf_hub_url(**where), endpoint=where["endpoint"]).etag
+    except Exception:  # without a connection, what is there has to do
+        return None
+    return etag if etag is not None and len(etag) == 64 else None
+
+
+def _until(deadline: float, call: Callable[[], Path]) -> Path:
+    """Call something that may never end; left behind, it ends with the process.
+
+    Raises:
+        TimeoutError: if it has not returned by the deadline.
+    """
+    result: list[Path] = []
+    failure: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            result.append(call())
+        except BaseException as error:
+            failure.append(error)
+
+    thread = threading.Thread(target=run, name="download", daemon=True)
+    thread.start()
+    thread.join(max(0.0, deadline - time.monotonic()))
+    if failure:
+        raise failure[0]
+    if not result:
+        raise TimeoutError(f"not complete after {LIMIT_SECONDS:.0f} s")
+    return result[0]

@@ -170,11 +170,17 @@ class FlowMatchingLoss(LossModule):
             t = torch.rand(batch, generator=self.generator, device=a1.device, dtype=a1.dtype)
         observation = network_observation(observation, batch)
         a_t, velocity = self.interpolant(a0, a1, t)
+        interrupt: KeyboardInterrupt | None = None
         with self.velocity_network_params.to_module(
             self.velocity_network, preserve_module_state=False
         ):
             field = velocity_field(self.velocity_network, observation)
-            predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:]))
+            try:
+                predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:]))
+            except KeyboardInterrupt as key:
+                interrupt = key  # leaving the context with it would make a RuntimeError of it
+        if interrupt is not None:
+            raise interrupt
         error = (predicted.reshape(a1.shape) - velocity).square()
         pad = tensordict.get(k.pad_mask, None)
         if pad is not None:
