@@ -45,7 +45,7 @@ from warmprior.transforms.window import window_replay_buffer
 
 __all__ = ["BehaviourCloning", "precondition"]
 
-STATE_FORMAT = 3
+STATE_FORMAT = 4
 """Part of every state's identity; raised whenever the same options give other weights."""
 
 
