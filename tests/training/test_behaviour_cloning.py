@@ -12,17 +12,19 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.record.loggers.common import Logger
 
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, same, training, weights
 from warmprior import (
     FlowMatchingLoss,
     Normalizer,
+    PastPrior,
     VelocityMLP,
     WarmPriorActor,
     window_replay_buffer,
 )
-from warmprior.training import TrainingConfig, ema_of, make_optimizer
+from warmprior.training import BehaviourCloning, TrainingConfig, ema_of, make_optimizer
 from warmprior.training.checkpoint import load_state
 
 
@@ -263,3 +265,29 @@ def test_average_starts_at_the_first_update(tmp_path):
         network.embed_chunk.weight.add_(1.0)
     average.update_parameters(network)
     assert torch.equal(average.module.embed_chunk.weight, network.embed_chunk.weight)
+
+
+def test_data_and_actor_may_name_their_keys(tmp_path):
+    """As the standard names: the same weights after the same steps."""
+    losses = []
+    for name in ("observation", ("sensors", "state")):
+        torch.manual_seed(0)
+        actor = WarmPriorActor(
+            VelocityMLP(2, 3, 4, 2, hidden_dim=8), PastPrior(4), observation_key=name
+        )
+        generator = torch.Generator().manual_seed(0)
+        data = TensorDict(
+            {
+                name: torch.randn(30, 3, generator=generator),
+                "action": torch.randn(30, 2, generator=generator),
+                "episode": torch.arange(30) // 10,
+            },
+            [30],
+        )
+        config = TrainingConfig(iterations=4, batch_size=8, checkpoints=1)
+        training = BehaviourCloning(actor, data, config, tmp_path / str(len(losses)))
+        training.run(None)
+        losses.append(training.losses)
+        loaded = WarmPriorActor.from_pretrained(training.policy_path(4))
+        assert loaded.in_keys[0] == name
+    assert losses[0] == losses[1]

@@ -124,12 +124,18 @@ class BehaviourCloning:
         self.logger = logger
         device = data.device or torch.device("cpu")
         self.generator = torch.Generator(device).manual_seed(config.seed)
+        observation_key, loc_key, warm_key = actor.in_keys
+        renamed = {"loc_key": loc_key, "warm_key": warm_key, "chunk_key": actor.chunk_key}
+        if actor.prior.conditions_network:  # what it reads is made of the data's observation
+            observation_key = OBSERVATION
+        renamed["observation_key"] = observation_key
         self.replay_buffer = window_replay_buffer(
             data,
             actor.prior,
             batch_size=config.batch_size,
             observation_steps=observation_steps,
             generator=self.generator,
+            **renamed,
         )
         self.loss_module = FlowMatchingLoss(actor, generator=self.generator)
         #: The network, and the prior where it learns as well.
@@ -155,7 +161,7 @@ class BehaviourCloning:
             "config": asdict(config) | {"betas": list(config.betas)},
             "prior": actor.prior.config(),
             "network": _network_identity(actor.network),
-            "data": _data_digest(data),
+            "data": _data_digest(data.select(observation_key, ACTION, EPISODE)),
             "policy": {"observation_steps": observation_steps, "clip": actor.ode.clip},
             "format": STATE_FORMAT,
         }
@@ -377,6 +383,8 @@ def _network_identity(network: nn.Module) -> Any:
 
 def _data_digest(data: TensorDictBase) -> str:
     digest = hashlib.sha256()
-    for key in (OBSERVATION, ACTION, EPISODE):
-        digest.update(data[key].cpu().contiguous().numpy().tobytes())
+    for key, value in sorted(data.items(True, True), key=lambda item: str(item[0])):
+        digest.update(str(key).encode())
+        for part in value.split(2**16):  # memory-mapped data may be larger than the memory
+            digest.update(part.cpu().contiguous().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]

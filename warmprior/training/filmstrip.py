@@ -65,7 +65,7 @@ def record_filmstrip(
     device = next(actor.parameters()).device
     env = TransformedEnv(make_env(), make_transforms())
     loop = env.base_env.loop
-    states, steps = [], []
+    states, steps, success = [], [], False
     try:
         with acting_in_episode(actor, seed, nfe=nfe, policy_seed=policy_seed) as act:
             env.set_seed(seed)
@@ -73,6 +73,7 @@ def record_filmstrip(
             while True:
                 states.append(loop.state())
                 steps.append(int(data[keys.ELAPSED]))
+                success |= bool(data[keys.SUCCESS])
                 if bool(data["done"].any()):
                     break
                 data = env.step_mdp(env.step(act(data.to(device)).to("cpu")))
@@ -84,4 +85,4 @@ def record_filmstrip(
             pictures.append(env.base_env.render_frame(size=size))
     finally:
         env.close()
-    return Filmstrip(pictures, [steps[i] for i in chosen], bool(data["success"]))
+    return Filmstrip(pictures, [steps[i] for i in chosen], success)
