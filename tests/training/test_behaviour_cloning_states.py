@@ -255,6 +255,13 @@ class Forgetful(VelocityMLP):
         del self._config["hidden_dim"]
 
 
+class Incomplete(VelocityMLP):
+    """Cannot be built from what it tells of itself."""
+
+    def __init__(self, *args, needed, **kwargs):
+        super().__init__(*args, hidden_dim=needed, **kwargs)
+
+
 def _actor(network):
     return actor_for(PastPrior(4), network)
 
@@ -264,6 +271,7 @@ def _actor(network):
     [
         (Plain, TypeError, "cannot save Plain: only VelocityNetwork"),
         (lambda: Forgetful(2, 3, 4, width=16), ValueError, "Forgetful could not be loaded again"),
+        (lambda: Incomplete(2, 3, 4, needed=8), ValueError, "Incomplete could not .*needed"),
         (lambda: VelocityMLP(2, 3, 4, hidden_dim=8).double(), ValueError, "torch.float64"),
     ],
 )

@@ -241,9 +241,12 @@ class WarmPriorActor(TensorDictModuleBase):
         mine = {name: value.shape for name, value in tensors.items()}
         try:
             built = self._blueprint(config, mine)
-            problem = built and _difference(built, tensors)
+            if built is None:
+                with torch.random.fork_rng([]):  # as if nothing had been built
+                    built = self._from_config(config).state_dict()
+            problem = _difference(built, tensors)
         except Exception as error:
-            problem = str(error)
+            problem = repr(error)
         if problem:
             raise ValueError(
                 f"a saved {type(self.network).__name__} could not be loaded again: {problem}. Its "
