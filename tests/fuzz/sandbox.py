@@ -45,9 +45,10 @@ def attempt(load: Callable[[], Outcome], names: str) -> Outcome:
     child = os.fork()
     if child == 0:
         os.close(ours)
+        inherited = _pages()[1]  # counts as its own from the start
         outcome = _judge(load, names)
         with contextlib.suppress(OSError):
-            os.write(theirs, pickle.dumps((outcome.kind, outcome.detail[:600])))
+            os.write(theirs, pickle.dumps((inherited, outcome.kind, outcome.detail[:600])))
         os._exit(0)
     os.close(theirs)
     ready, _, _ = select.select([ours], [], [], LIMIT_SECONDS)
@@ -60,17 +61,26 @@ def attempt(load: Callable[[], Outcome], names: str) -> Outcome:
         return Outcome("hang", f"no answer within {LIMIT_SECONDS:.0f} s")
     if not answer:
         return Outcome("crash", f"ended with status {status}")
-    outcome = Outcome(*pickle.loads(answer))
-    if 1024 * usage.ru_maxrss > LIMIT_BYTES:
-        return Outcome("memory", f"{usage.ru_maxrss / 2**20:.1f} GiB, then {outcome}")
+    inherited, *told = pickle.loads(answer)
+    outcome = Outcome(*told)
+    taken = 1024 * usage.ru_maxrss - inherited
+    if taken > LIMIT_BYTES:
+        return Outcome("memory", f"{taken / 2**30:.1f} GiB, then {outcome}")
     return outcome
+
+
+def _pages() -> tuple[int, int]:
+    """Bytes that this process has mapped, and those of them that are in memory."""
+    with open("/proc/self/statm") as file:
+        mapped, resident = (
+            int(pages) * resource.getpagesize() for pages in file.read().split()[:2]
+        )
+    return mapped, resident
 
 
 def _judge(load: Callable[[], Outcome], names: str) -> Outcome:
     # Twice the limit beyond what is mapped already: what asks for more is refused by the system.
-    with open("/proc/self/statm") as file:
-        mapped = int(file.read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (mapped + 2 * LIMIT_BYTES,) * 2)
+    resource.setrlimit(resource.RLIMIT_AS, (_pages()[0] + 2 * LIMIT_BYTES,) * 2)
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
     os.dup2(null, 2)
