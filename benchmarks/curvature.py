@@ -44,7 +44,7 @@ def make_parser() -> argparse.ArgumentParser:
         "--run",
         type=Path,
         help="folder of a finished run of robomimic.py; only the options below and --out, --device "
-        "go with it",
+        "go with it, and --prior package.module:Class where it compares priors of your own",
     )
     measurement.add_options(parser, observations=2_000)
     add("--coordinate", type=int, default=0, help="of the action, in flow_paths.png (%(default)s)")
@@ -57,6 +57,10 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
         return experiment.parse(make_parser, argv, "curvature-")
     allowed = {"run", "out", "device", "coordinate", "validation", "observations", "steps", "draws"}
     defaults = vars(make_parser().parse_args([]))
+    if all(":" in name for name in args.prior):  # not what to compare, but what to import for it
+        for place in args.prior:
+            Prior.find(place)
+        allowed.add("prior")
     ignored = [k for k, v in vars(args).items() if k not in allowed and v != defaults[k]]
     if ignored:
         told = ", ".join(f"--{key.replace('_', '-')}" for key in ignored)

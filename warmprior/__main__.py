@@ -20,15 +20,16 @@ def _policy(args: argparse.Namespace) -> WarmPriorActor:
 
 def info(args: argparse.Namespace) -> None:
     """Tell what a saved policy is."""
+    from warmprior.envs.description import environment_name
+
     actor = _policy(args)
     config, count = actor.config(), sum(p.numel() for p in actor.parameters())
-    environment = (config["environment"] or {}).get("robosuite", {}).get("env_args", {})
     for name, value in {
         "prior": actor.prior,
         "network": f"{config['network']} ({count:,} parameters)",
         "sampler": config["actor"],
         "normaliser": "kept" if actor.normalizer is not None else "none",
-        "environment": environment.get("env_name", "not kept"),
+        "environment": environment_name(actor) or "not kept",
         "written by": f"warmprior {config['warmprior']}, format {config['format']}",
     }.items():
         print(f"{name:12} {value}")
@@ -39,22 +40,26 @@ def evaluate(args: argparse.Namespace) -> None:
     from warmprior.diagnostics.statistics import success_posterior
     from warmprior.envs.description import environment_of
     from warmprior.training.evaluation import evaluate as play
-    from warmprior.training.video import record_video
+    from warmprior.training.video import check_video, record_video
 
     actor = _policy(args)
     nfe = actor.ode.nfe if args.nfe is None else args.nfe
     actor.ode.check_nfe(nfe)
+    if args.video is not None:  # known now rather than after the episodes
+        check_video(args.video)
     env = environment_of(actor)
-    episodes = play(
-        actor,
-        env,
-        episodes=args.episodes,
-        first_seed=args.first_seed,
-        nfe=nfe,
-        policy_seed=args.policy_seed,
-        description=f"NFE {nfe}",
-    )
-    env.close()
+    try:
+        episodes = play(
+            actor,
+            env,
+            episodes=args.episodes,
+            first_seed=args.first_seed,
+            nfe=nfe,
+            policy_seed=args.policy_seed,
+            description=f"NFE {nfe}",
+        )
+    finally:
+        env.close()
     wins = sum(episode.success for episode in episodes)
     low, high = success_posterior(wins, len(episodes)).interval(0.95)
     steps = sum(episode.steps for episode in episodes) / len(episodes)
@@ -91,10 +96,10 @@ def make_parser() -> argparse.ArgumentParser:
         add("folder", type=Path, help="written by save_pretrained, such as .../policy_010000")
         add(
             "--prior",
-            nargs="+",
+            action="append",
             default=[],
             metavar="MODULE:CLASS",
-            help="where to import a prior of your own from",
+            help="where to import a prior of your own from; may be repeated",
         )
     from warmprior.envs.tasks import EVALUATION_SEED, TASKS
 

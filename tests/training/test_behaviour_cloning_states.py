@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from tests.training.cloning_parts import CONFIG, actor_for, same, training, weights
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.training.checkpoint import load_state, save_state
 
 
@@ -38,7 +38,7 @@ def rewrite(folder, change):
 
 
 def _nan_average(tensors, facts):
-    tensors["ema/module.head.1.weight"].view(-1)[0] = float("nan")
+    tensors["ema/module.network.head.1.weight"].view(-1)[0] = float("nan")
 
 
 def _infinite_moment(tensors, facts):
@@ -281,17 +281,14 @@ def test_what_cannot_be_saved_is_refused_before_training(tmp_path, network, erro
 
 
 @pytest.mark.parametrize("key", [("state", "low"), "reading"])
-def test_a_normaliser_that_cannot_be_saved_is_refused_before_training(tmp_path, key):
-    from warmprior import Normalizer
-
+def test_a_normaliser_of_other_keys_is_kept_with_the_policy(tmp_path, key):
     actor = actor_for()
     limits = {key: torch.ones(3), "action": torch.ones(2)}
     actor.normalizer = Normalizer({k: -v for k, v in limits.items()}, limits)
-    if isinstance(key, tuple):
-        with pytest.raises(TypeError, match="plain names for the normaliser's keys"):
-            training(tmp_path / "run", actor=actor)
-    else:
-        training(tmp_path / "run", actor=actor)
+    cloning = training(tmp_path / "run", actor=actor)
+    cloning.run(None)
+    loaded = WarmPriorActor.from_pretrained(cloning.policy_path(cloning.config.iterations))
+    assert loaded.normalizer.config() == actor.normalizer.config()
 
 
 def _compiled():

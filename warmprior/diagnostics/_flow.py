@@ -56,7 +56,7 @@ def flat_windows(
         ValueError: if the batch is empty, holds NaN or Inf, or belongs to another prediction length.
     """
     observation_key, loc_key, warm_key = policy.in_keys
-    needed = [observation_key, loc_key, warm_key] + ([keys.CHUNK] if target_needed else [])
+    needed = [observation_key, loc_key, warm_key] + ([policy.chunk_key] if target_needed else [])
     missing = [key for key in needed if batch.get(key, None) is None]
     if missing:
         raise KeyError(
@@ -72,9 +72,9 @@ def flat_windows(
         return None if value is None else value.reshape(-1, *value.shape[ndim:]).to(device)
 
     observation, loc, warm = flat(observation_key), flat(loc_key), flat(warm_key)
-    target, pad = flat(keys.CHUNK), flat(keys.IS_PAD)
+    target, pad = flat(policy.chunk_key), flat(keys.IS_PAD)
     assert observation is not None and loc is not None and warm is not None
-    for key, value in ((observation_key, observation), (loc_key, loc), (keys.CHUNK, target)):
+    for key, value in ((observation_key, observation), (loc_key, loc), (policy.chunk_key, target)):
         if value is None:
             continue
         if key != observation_key and value.shape[-2] != prior.prediction_length:
@@ -153,8 +153,8 @@ def predict(
     Raises:
         FloatingPointError: if one is NaN or infinite.
     """
-    parts = rows.clone(recurse=False).set(keys.NOISE, a0).split(split)
-    chunk = torch.cat([policy.ode(part, nfe=nfe).get(keys.CHUNK) for part in parts])
+    parts = rows.clone(recurse=False).set(policy.ode.in_keys[0], a0).split(split)
+    chunk = torch.cat([policy.ode(part, nfe=nfe).get(policy.chunk_key) for part in parts])
     if not torch.isfinite(chunk).all():
         raise FloatingPointError(f"at NFE {nfe} a prediction is NaN or infinite")
     return chunk

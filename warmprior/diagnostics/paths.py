@@ -6,7 +6,6 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from warmprior import keys
 from warmprior.diagnostics._flow import check_flow, evaluation_mode, field_of, flat_windows
 from warmprior.diagnostics.branching import executed_positions
 from warmprior.modules.actor import WarmPriorActor
@@ -113,7 +112,7 @@ def forecast_mean(
             data.get(warm_key),
             policy.sampler.generator if generator is None else generator,
         )
-        chunk = policy.ode(data.set(keys.NOISE, a0), nfe=nfe).get(keys.CHUNK)
+        chunk = policy.ode(data.set(policy.ode.in_keys[0], a0), nfe=nfe).get(policy.chunk_key)
         steps = torch.full((*data.batch_size, 1), k, device=chunk.device)
         # A decision whose own mean is warm lies at least H actions after the reset.
         elapsed = steps + prior.chunk_length * data.get(warm_key).any(-2)

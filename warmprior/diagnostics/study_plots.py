@@ -50,7 +50,7 @@ def plot_sigma(
         title: of the figure.
         paper: add the success rates that the paper reports.
     """
-    warm = [p for p in ("preview", "past") if any(row.prior == p for row in rows)]
+    warm = list(dict.fromkeys(row.prior for row in rows if row.prior != "gaussian"))
     sigmas = sorted({row.sigma for row in rows if row.prior in warm}, reverse=True)
     figure, axes = new_figure(5.2 * len(warm), 4.2, 1, len(warm))
     base = [row for row in rows if row.prior == "gaussian"]
@@ -67,7 +67,7 @@ def plot_sigma(
                 level, color=prior_color("gaussian"), ls="--", lw=1.2, label="Gaussian source"
             )
         if paper:
-            told = PAPER_SIGMA[prior]
+            told = PAPER_SIGMA.get(prior, {})
             x = [i for i, s in enumerate(sigmas) if s in told]
             axis.plot(x, [told[sigmas[i]] for i in x], "*", color="black", ms=10, label="paper")
         right = axis.twinx()

@@ -11,7 +11,7 @@ from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms.policy import policy_transforms
 
-__all__ = ["environment_description", "environment_of"]
+__all__ = ["environment_description", "environment_name", "environment_of"]
 
 
 def environment_description(
@@ -45,8 +45,8 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         >>> environment_of(actor).rollout(10, actor)["next", "success"].any()  # doctest: +SKIP
         tensor(True)
     """
-    description = actor.environment
-    if not description or set(description) != {"robosuite", "observation_steps"}:
+    description: Any = actor.environment
+    if not _describes_robosuite(description):
         raise ValueError(
             f"the policy keeps no description of a robosuite environment, but {description}: build the "
             "environment yourself, with policy_transforms(actor.prior, normalizer=actor.normalizer)"
@@ -57,3 +57,22 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         observation_steps=description["observation_steps"],
     )
     return TransformedEnv(RobosuiteEnv(**description["robosuite"], **options), transforms)
+
+
+def environment_name(actor: WarmPriorActor) -> str | None:
+    """Robosuite's name of the environment that a policy was made for, if it is known."""
+    description: Any = actor.environment
+    if not _describes_robosuite(description):
+        return None
+    return str(description["robosuite"]["env_args"].get("env_name"))
+
+
+def _describes_robosuite(description: Any) -> bool:
+    """Whether it is what :func:`environment_description` gives."""
+    return (
+        isinstance(description, Mapping)
+        and set(description) == {"robosuite", "observation_steps"}
+        and isinstance(description["robosuite"], Mapping)
+        and set(description["robosuite"]) == {"env_args", "style"}
+        and isinstance(description["robosuite"]["env_args"], Mapping)
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import chain
 from typing import Any, ClassVar
 
 import torch
@@ -152,7 +153,8 @@ def velocity_field(
         observation: ``[B, To, *]``, or a tensordict of such entries; whole numbers, such as pixels, are
             left as they are.
     """
-    dtype = next((p.dtype for p in network.parameters() if p.is_floating_point()), None)
+    tensors = chain(network.parameters(), network.buffers())  # a frozen network has buffers alone
+    dtype = next((value.dtype for value in tensors if value.is_floating_point()), None)
     if dtype is None:
         return lambda t, a: network(t, a, observation)
 

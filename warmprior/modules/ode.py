@@ -170,6 +170,9 @@ class ODEActor(TensorDictModuleBase):
         super().__init__()
         if nfe is None:
             nfe = DEFAULT_NFE if max_nfe is None else min(DEFAULT_NFE, max_nfe)
+            if solver in SOLVERS:  # rounded down to what the solver can spend
+                stages = len(SOLVERS[solver].b)
+                nfe = max(nfe - nfe % stages, stages)
         self.max_nfe = max_nfe
         self.solver = solver
         self.check_nfe(nfe)

@@ -161,10 +161,14 @@ class Prior:
             )
         try:
             found = getattr(importlib.import_module(module), attribute)
-        except (ImportError, AttributeError) as error:
+        except (ImportError, AttributeError, TypeError, ValueError) as error:
             raise ValueError(f"there is no prior at {name}: {error}") from error
-        if not (isinstance(found, type) and issubclass(found, Prior) and hasattr(found, "name")):
-            raise ValueError(f"{name} is no subclass of warmprior.Prior with a name")
+        if not (isinstance(found, type) and issubclass(found, Prior)):
+            raise ValueError(f"{name} is no subclass of warmprior.Prior")
+        try:
+            _check_named(found)
+        except TypeError as error:
+            raise ValueError(str(error)) from error
         return found
 
     @staticmethod
@@ -190,7 +194,15 @@ class Prior:
         """
         found = Prior.find(name)
         options: dict[str, Any] = {"sigma": sigma, "cold_probability": cold_probability}
-        return found(chunk_length, **{k: v for k, v in options.items() if found.takes(k)})
+        taken = {key: value for key, value in options.items() if found.takes(key)}
+        try:
+            inspect.signature(found).bind(chunk_length, **taken)
+        except TypeError as error:
+            raise ValueError(
+                f"{found.__name__} cannot be built from chunk_length, sigma and cold_probability alone "
+                f"({error}): give its other arguments defaults, or make a subclass that does"
+            ) from error
+        return found(chunk_length, **taken)
 
     @classmethod
     def takes(cls, argument: str) -> bool:
@@ -333,14 +345,20 @@ class Prior:
         """Name and constructor arguments as JSON holds them; :meth:`from_config` reverses it.
 
         Raises:
-            TypeError: if an argument is nothing that JSON can hold.
+            TypeError: if an argument is nothing that JSON can hold, or the class has no name of its own.
 
         Examples:
             >>> Prior.find("regression")(8).config()
             {'name': 'regression', 'chunk_length': 8}
         """
+        _check_named(type(self))
+        arguments = self._resolved()
+        if "name" in arguments:
+            raise TypeError(
+                f"{type(self).__name__} takes an argument called name: call it otherwise"
+            )
         try:
-            return json.loads(json.dumps({"name": self.name, **self._resolved()}, allow_nan=False))
+            return json.loads(json.dumps({"name": self.name, **arguments}, allow_nan=False))
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"{type(self).__name__} has an argument that cannot be saved ({error}): take numbers, text, "
@@ -375,16 +393,27 @@ class Prior:
             >>> Prior.from_config({"name": "past", "chunk_length": 8}).describe()
             'past, sigma 0.5, H 8'
         """
-        return f"{self.name}, sigma {self.sigma:g}, H {self.chunk_length}"
+        return f"{self.name}, sigma {float(self.sigma):g}, H {self.chunk_length}"
 
     def _resolved(self) -> dict[str, Any]:
-        """The constructor's arguments, with the defaults that were put in for ``None``."""
-        own = ("chunk_length", "sigma", "cold_probability")
-        return {k: getattr(self, k) if k in own else v for k, v in self._arguments.items()}
+        """The constructor's arguments, with the default that was put in for ``None``."""
+        own = {"chunk_length": int, "sigma": float, "cold_probability": float}
+        return {
+            name: own[name](getattr(self, name) if value is None else value)
+            if name in own
+            else value
+            for name, value in self._arguments.items()
+        }
 
     def __repr__(self) -> str:
         told = (f"{key}={value!r}" for key, value in self._resolved().items())
         return f"{type(self).__name__}({', '.join(told)})"
+
+
+def _check_named(cls: type[Prior]) -> None:
+    # Under its parent's name a subclass would be saved, trained and compared as its parent.
+    if "name" not in cls.__dict__:
+        raise TypeError(f"{cls.__name__} has no name of its own: set the class attribute name")
 
 
 def _place(cls: type) -> str:

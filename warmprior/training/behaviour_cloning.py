@@ -159,7 +159,7 @@ class BehaviourCloning:
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
             "config": asdict(config) | {"betas": list(config.betas)},
-            "prior": actor.prior.config(),
+            "prior": actor.prior.config() | _fixed_identity(actor.prior),
             "network": _network_identity(actor.network),
             "data": _data_digest(data.select(observation_key, ACTION, EPISODE)),
             "policy": {"observation_steps": observation_steps, "clip": actor.ode.clip},
@@ -372,13 +372,19 @@ def policy_path(directory: Path, iteration: int) -> Path:
 
 def _network_identity(network: nn.Module) -> Any:
     network = uncompiled(network)
-    state = network.state_dict()
-    # What is not trained, such as moments, is part of what a network is.
-    trained = {name for name, _ in network.named_parameters(remove_duplicate=False)}
+    config: Any = network.config
+    return {**config(), **_fixed_identity(network)}
+
+
+def _fixed_identity(part: object) -> dict[str, str]:
+    """Digest of what is not trained, such as moments: it is part of what a network, or a prior, is."""
+    if not isinstance(part, nn.Module):
+        return {}
+    trained = {name for name, _ in part.named_parameters(remove_duplicate=False)}
+    state = part.state_dict()
     fixed = {name: value.tolist() for name, value in state.items() if name not in trained}
     digest = hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
-    config: Any = network.config
-    return {**config(), "buffers": digest}
+    return {"buffers": digest}
 
 
 def _data_digest(data: TensorDictBase) -> str:

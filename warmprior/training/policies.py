@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import nn
 from torchrl.record.loggers import get_logger
 
 from warmprior._files import check_writable
@@ -100,6 +101,8 @@ class Policies:
     def new_actor(self, prior: Prior, seed: int) -> WarmPriorActor:
         """An untrained policy; its initial weights depend on the seed alone."""
         torch.manual_seed(seed)
+        if isinstance(prior, nn.Module):  # it learns: every policy has its own
+            prior = Prior.from_config(prior.config())
         action_dim = self.data["action"].shape[-1]
         network = self.preset.make_network(
             action_dim,

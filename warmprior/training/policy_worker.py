@@ -109,8 +109,7 @@ class PolicyWorker:
     def _prepare(self, prior: Prior, seed: int, checkpoint: int) -> tuple[WarmPriorActor, EnvBase]:
         if self._simulator is None:
             self._simulator = self.policies.make_env()
-        transforms = self.policies.transforms(prior)()
-        return (
-            self.policies.load(prior, seed, checkpoint),
-            TransformedEnv(self._simulator, transforms),
-        )
+        policy = self.policies.load(prior, seed, checkpoint)
+        # The policy's own prior, which may have learnt.
+        transforms = self.policies.transforms(policy.prior)()
+        return policy, TransformedEnv(self._simulator, transforms)

@@ -8,8 +8,9 @@ from tensordict import TensorDictBase
 from torchrl.envs.transforms import Transform
 
 from warmprior._extras import require
-from warmprior._files import write_atomic
+from warmprior._files import check_writable, write_atomic
 from warmprior.envs.description import environment_of
+from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.evaluation import play_episode
@@ -33,6 +34,23 @@ class _Recorder(Transform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         return self._call(tensordict_reset)
+
+
+def check_video(path: Path) -> None:
+    """Refuse what :func:`record_video` could not write, before anything is played.
+
+    Raises:
+        ImportError: if PyAV is missing.
+        RuntimeError: if nothing on this machine can render.
+        OSError: if the folder cannot be written to.
+    """
+    require("av", "lerobot")
+    if rendering_backend() is None:
+        raise RuntimeError(
+            "cannot render: neither EGL nor OSMesa works here. On Debian or Ubuntu install one of them: "
+            "apt-get install libegl1 (with libegl-mesa0) or apt-get install libosmesa6"
+        )
+    check_writable(path.parent)
 
 
 def record_video(
