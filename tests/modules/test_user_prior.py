@@ -52,9 +52,10 @@ class Learned(PastPrior, nn.Module):
         nn.Module.__init__(self)
         super().__init__(chunk_length)
         self.shift = nn.Parameter(torch.zeros(action_dim))
+        self.register_buffer("offset", torch.zeros(()))
 
     def sample(self, loc, warm, generator=None):
-        return super().sample(loc + self.shift, warm, generator)
+        return super().sample(loc + self.shift + self.offset, warm, generator)
 
 
 class Reversed(GaussianPrior):
@@ -192,3 +193,61 @@ def test_a_learned_prior_trains_saves_resumes_and_freezes(tmp_path):
     with torch.no_grad():
         averaged.add_(1.0)
     assert not torch.equal(decoder.prior.shift, averaged)
+
+
+def test_a_subclass_without_a_name_is_not_taken_for_its_parent(tmp_path):
+    class Unnamed(PastPrior):
+        pass
+
+    with pytest.raises(TypeError, match="Unnamed has no name of its own: set the class attribute"):
+        actor_for(Unnamed(H)).save_pretrained(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_arguments_are_recorded_as_given():
+    class Halved(PastPrior):
+        name = "halved-of-the-tests"
+
+        def __init__(self, chunk_length, *, sigma=1.0):
+            super().__init__(chunk_length, sigma=sigma / 2)
+
+    prior = Halved(H, sigma=0.8)
+    again = Prior.from_config(prior.config())
+    assert prior.sigma == again.sigma == 0.4
+    del Prior._registry["halved-of-the-tests"]
+
+
+def test_what_make_cannot_build_is_told():
+    place = f"{__name__}:Anchor"
+    with pytest.raises(ValueError, match=r"Anchor cannot be built from .* alone \(.*gain"):
+        Prior.make(place, H)
+
+
+def test_a_training_with_other_buffers_is_another(tmp_path):
+    def training(value):
+        prior = Learned(H)
+        prior.offset.fill_(value)
+        config = TrainingConfig(iterations=4, batch_size=8, checkpoints=1, save_every=2)
+        return BehaviourCloning(actor_for(prior), data(), config, tmp_path, observation_steps=TO)
+
+    training(1.0).run(None)
+    training(1.0).run(None)
+    with pytest.raises(ValueError, match="another prior"):
+        training(9.0).run(None)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_a_decoder_has_the_actor_s_precision(dtype):
+    actor = actor_for(PastPrior(H), nfe=1)
+    decoder = PriorDecoder(actor, delta=0.5)
+    batch = TensorDict(
+        {
+            "observation": torch.randn(2, TO, D_O, dtype=dtype),
+            "prior": {
+                "anchor": torch.zeros(2, H, D_A, dtype=dtype),
+                "delta": torch.zeros(2, H, D_A, dtype=dtype),
+            },
+        },
+        [2],
+    )
+    assert decoder(batch)["vla_action", "chunk"].dtype == dtype
