@@ -77,10 +77,11 @@ def draw(comparison: Comparison) -> None:
         return
     for prior in comparison.priors:
         nfe = min(prior.allowed_nfes(comparison.nfes))
+        policy = policies.policy(prior, comparison.seeds[0])
         strip = record_filmstrip(
-            policies.policy(prior, comparison.seeds[0]),
+            policy,
             policies.make_env,
-            policies.transforms(prior),
+            policies.transforms(policy.prior),
             seed=EVALUATION_SEED,
             nfe=nfe,
             policy_seed=comparison.seeds[0],
