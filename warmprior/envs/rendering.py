@@ -17,7 +17,7 @@ import numpy as np
 
 from warmprior._extras import require
 
-__all__ = ["render_camera", "rendering_backend"]
+__all__ = ["render_camera", "rendering_backend", "require_rendering"]
 
 # EGL first: it uses a GPU where there is one. Both render the same pixels in software.
 _BACKENDS = ("egl", "osmesa")
@@ -54,14 +54,24 @@ def rendering_backend() -> str | None:
     return None
 
 
-def _attach_context(sim: Any) -> None:
-    """Give a simulation an off-screen context without disturbing its physics."""
+def require_rendering() -> str:
+    """The backend that renders here.
+
+    Raises:
+        RuntimeError: if none does; the message names the packages to install.
+    """
     backend = rendering_backend()
     if backend is None:
         raise RuntimeError(
             "cannot render: neither EGL nor OSMesa works here. On Debian or Ubuntu install one of "
             "them: apt-get install libegl1 (with libegl-mesa0) or apt-get install libosmesa6"
         )
+    return backend
+
+
+def _attach_context(sim: Any) -> None:
+    """Give a simulation an off-screen context without disturbing its physics."""
+    backend = require_rendering()
     os.environ["MUJOCO_GL"] = os.environ["PYOPENGL_PLATFORM"] = backend
     binding: Any = require("robosuite.utils.binding_utils", "sim")
     # robosuite read the variable when it was imported, which may be before the backend was known.

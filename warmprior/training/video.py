@@ -10,7 +10,7 @@ from torchrl.envs.transforms import Transform
 from warmprior._extras import require
 from warmprior._files import check_writable, write_atomic
 from warmprior.envs.description import environment_of
-from warmprior.envs.rendering import rendering_backend
+from warmprior.envs.rendering import require_rendering
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.evaluation import play_episode
@@ -45,11 +45,7 @@ def check_video(path: Path) -> None:
         OSError: if the folder cannot be written to.
     """
     require("av", "lerobot")
-    if rendering_backend() is None:
-        raise RuntimeError(
-            "cannot render: neither EGL nor OSMesa works here. On Debian or Ubuntu install one of them: "
-            "apt-get install libegl1 (with libegl-mesa0) or apt-get install libosmesa6"
-        )
+    require_rendering()
     check_writable(path.parent)
 
 
