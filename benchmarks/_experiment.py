@@ -18,9 +18,9 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 import torch
 
 from warmprior import Prior, WarmPriorActor
-from warmprior._files import check_writable, write_atomic
 from warmprior.data import download_robomimic, generate_demonstrations
 from warmprior.envs import TASKS, get_task
+from warmprior.io.files import check_writable, write_atomic
 from warmprior.training import PRESETS, Preset
 from warmprior.training.comparison import Comparison
 from warmprior.training.demonstrations import Demonstrations

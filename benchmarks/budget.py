@@ -21,7 +21,6 @@ import _measurement as measurement
 import robomimic
 import torch
 
-from warmprior._files import check_writable, write_atomic
 from warmprior.diagnostics import (
     SharedObservations,
     action_error,
@@ -31,6 +30,7 @@ from warmprior.diagnostics import (
     summarize_cell,
 )
 from warmprior.diagnostics.results import Row, write_results
+from warmprior.io.files import check_writable, write_atomic
 from warmprior.training.comparison import Comparison
 
 Errors = dict[tuple[str, int, int], list[float]]

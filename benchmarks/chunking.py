@@ -16,7 +16,6 @@ from collections.abc import Sequence
 import _experiment as experiment
 
 from warmprior import Prior
-from warmprior._files import write_atomic
 from warmprior.diagnostics import (
     Row,
     markdown_table,
@@ -26,6 +25,7 @@ from warmprior.diagnostics import (
     prior_label,
     summarize_cell,
 )
+from warmprior.io.files import write_atomic
 
 
 def make_parser() -> argparse.ArgumentParser:

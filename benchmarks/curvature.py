@@ -19,7 +19,6 @@ import robomimic
 import torch
 
 from warmprior import Prior, WarmPriorActor
-from warmprior._files import check_writable, write_atomic
 from warmprior.diagnostics import (
     SharedObservations,
     curvature_table,
@@ -29,6 +28,7 @@ from warmprior.diagnostics import (
     straightness,
     write_results,
 )
+from warmprior.io.files import check_writable, write_atomic
 
 SHOWN = 40
 

@@ -24,7 +24,6 @@ import _experiment as experiment
 import torch
 
 from warmprior import Prior
-from warmprior._files import check_writable, write_atomic
 from warmprior.diagnostics import (
     executed_actions,
     flow_paths,
@@ -34,6 +33,7 @@ from warmprior.diagnostics import (
     summarize_seeds,
     write_results,
 )
+from warmprior.io.files import check_writable, write_atomic
 from warmprior.training import (
     NAVIGATION_PRESETS,
     NavigationPreset,

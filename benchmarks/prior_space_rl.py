@@ -29,10 +29,10 @@ from _prior_space_report import draw, make_table, summarize
 from torchrl.envs import EnvBase, TransformedEnv
 
 from warmprior import Prior, PriorAnchor, WarmPriorActor
-from warmprior._files import check_writable, write_atomic
 from warmprior.diagnostics import write_results
 from warmprior.envs import GoalNavigationEnv, get_task
 from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.files import check_writable, write_atomic
 from warmprior.rl import PriorSpaceTraining
 from warmprior.training import PRESETS, NavigationStudy, parallel_env
 from warmprior.training.policies import Policies

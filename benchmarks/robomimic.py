@@ -15,11 +15,11 @@ from collections.abc import Callable
 import _experiment as experiment
 
 from warmprior import Prior
-from warmprior._files import write_atomic
 from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
 from warmprior.diagnostics.results import success_table
 from warmprior.envs import rendering_backend
 from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.files import write_atomic
 from warmprior.training.comparison import Comparison
 from warmprior.training.filmstrip import record_filmstrip
 

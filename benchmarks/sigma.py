@@ -18,7 +18,6 @@ import _experiment as experiment
 import _measurement as measurement
 
 from warmprior import Prior
-from warmprior._files import write_atomic
 from warmprior.diagnostics import (
     Row,
     SharedObservations,
@@ -27,6 +26,7 @@ from warmprior.diagnostics import (
     straightness,
     summarize_cell,
 )
+from warmprior.io.files import write_atomic
 from warmprior.training.comparison import Comparison
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)

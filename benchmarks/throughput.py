@@ -44,7 +44,7 @@ from warmprior import (
 from warmprior.data.scripted.episode import Episode
 from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs import RobosuiteEnv
-from warmprior.envs._simulator import task_env_args
+from warmprior.envs.simulator import task_env_args
 from warmprior.training import BehaviourCloning, TrainingConfig, precondition
 
 D_O, D_A, H, TO, BATCH = 23, 7, 8, 2, 256

@@ -28,7 +28,7 @@ from warmprior.data.scripted.episode import Episode, expert_loop, operator_of, r
 from warmprior.data.scripted.geometry import nearest_yaw, rotation_matrix, rotation_vector
 from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs import rendering_backend
-from warmprior.envs._simulator import make_simulator
+from warmprior.envs.simulator import make_simulator
 from warmprior.envs.tasks import EVALUATION_SEED, TASKS
 
 

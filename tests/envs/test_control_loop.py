@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("robosuite")
 
-from warmprior.envs._simulator import make_simulator, task_env_args
 from warmprior.envs.control_loop import ControlLoop, StepLoop
+from warmprior.envs.simulator import make_simulator, task_env_args
 from warmprior.envs.tasks import TASKS
 
 TOLERANCE = 1e-9  # radians, over ten control steps

@@ -21,7 +21,7 @@ from warmprior.data.scripted.motion import ArmRunner
 from warmprior.data.scripted.operators import SKILLED, Demonstrator
 from warmprior.envs import RobosuiteEnv, RobosuiteWrapper, rendering_backend
 from warmprior.envs import rendering as rendering_module
-from warmprior.envs._simulator import make_simulator, task_env_args
+from warmprior.envs.simulator import make_simulator, task_env_args
 from warmprior.envs.tasks import TASKS
 
 make_lift = partial(RobosuiteEnv, "lift", horizon=15)

@@ -19,9 +19,9 @@ from torchrl.envs import EnvBase
 from tests.data.synthetic import write_robomimic_file
 from tests.training.cloning_parts import same
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
-from warmprior._files import load_file
 from warmprior.diagnostics import SharedObservations, source_leak
 from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.files import load_file
 from warmprior.training import PRESETS, TrainingConfig, WorkerError, workers
 from warmprior.training.comparison import Comparison
 from warmprior.training.demonstrations import Demonstrations

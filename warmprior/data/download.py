@@ -9,10 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from warmprior._extras import require
-from warmprior._files import file_digest
 from warmprior.data.hdf5 import DatasetError, open_robomimic
 from warmprior.envs.tasks import TASKS
+from warmprior.io.extras import require
+from warmprior.io.files import file_digest
 
 __all__ = ["REPOSITORIES", "download_robomimic"]
 

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from warmprior._extras import require
 from warmprior.data.hdf5_members import DatasetError, member, names, reading
 from warmprior.envs.tasks import TASKS, TaskSpec
+from warmprior.io.extras import require
 
 if TYPE_CHECKING:
     import h5py

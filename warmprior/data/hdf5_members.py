@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from math import ceil, prod
 from typing import TYPE_CHECKING, Literal
 
-from warmprior._extras import require
+from warmprior.io.extras import require
 
 if TYPE_CHECKING:
     import h5py

@@ -15,7 +15,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 
-from warmprior._memory import available_memory
 from warmprior.data.download import download_robomimic
 from warmprior.data.hdf5 import (
     BLOCK,
@@ -28,6 +27,7 @@ from warmprior.data.hdf5 import (
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TASKS, TaskSpec
+from warmprior.io.memory import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION
 
 __all__ = ["RobomimicExperienceReplay"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from warmprior._extras import require
+from warmprior.io.extras import require
 from warmprior.modules.prior import Prior
 
 __all__ = ["new_figure", "prior_color", "prior_label"]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 
-from warmprior.diagnostics._flow import allowed_nfes, evaluation_mode, flat_windows, predict
+from warmprior.diagnostics.flow import allowed_nfes, evaluation_mode, flat_windows, predict
 from warmprior.modules.actor import WarmPriorActor
 
 __all__ = ["action_error"]

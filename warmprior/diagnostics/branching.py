@@ -7,7 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics._flow import check_flow, evaluation_mode, field_of, flat_windows
+from warmprior.diagnostics.flow import check_flow, evaluation_mode, field_of, flat_windows
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.prior import Prior

@@ -12,7 +12,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics._flow import (
+from warmprior.diagnostics.branching import branching_cost, executed_positions
+from warmprior.diagnostics.flow import (
     RunningVariance,
     check_flow,
     evaluation_mode,
@@ -20,7 +21,6 @@ from warmprior.diagnostics._flow import (
     flat_windows,
     observed,
 )
-from warmprior.diagnostics.branching import branching_cost, executed_positions
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.ode import integrate

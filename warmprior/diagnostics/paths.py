@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from warmprior.diagnostics._flow import check_flow, evaluation_mode, field_of, flat_windows
 from warmprior.diagnostics.branching import executed_positions
+from warmprior.diagnostics.flow import check_flow, evaluation_mode, field_of, flat_windows
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.ode import integrate
 

@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from warmprior._files import as_json, read_json, write_atomic
 from warmprior.diagnostics._figure import prior_label
 from warmprior.diagnostics.paper import paper_success
 from warmprior.diagnostics.source_leak import INNER_STEP_BOUND, LEAK_BOUND
@@ -20,6 +19,7 @@ from warmprior.diagnostics.statistics import (
     top_k_mean,
 )
 from warmprior.diagnostics.table import markdown_table
+from warmprior.io.files import as_json, read_json, write_atomic
 
 __all__ = [
     "Results",

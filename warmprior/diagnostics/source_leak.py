@@ -11,7 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics._flow import (
+from warmprior.diagnostics.flow import (
     RunningVariance,
     allowed_nfes,
     evaluation_mode,

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from warmprior._extras import require
+from warmprior.io.extras import require
 
 __all__ = [
     "SeedSummary",

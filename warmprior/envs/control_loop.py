@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from warmprior._extras import require
-from warmprior.envs._osc import Arm, check_supported, compiled_torques
-from warmprior.envs._simulator import isolated_numpy_seed
+from warmprior.envs.osc import Arm, check_supported, compiled_torques
+from warmprior.envs.simulator import isolated_numpy_seed
+from warmprior.io.extras import require
 
 __all__ = ["ControlLoop", "StepLoop"]
 
@@ -34,7 +34,7 @@ class StepLoop:
         ValueError: if the environment has no observation of one of these names.
 
     Examples:
-        >>> from warmprior.envs._simulator import make_simulator, task_env_args
+        >>> from warmprior.envs.simulator import make_simulator, task_env_args
         >>> loop = StepLoop(make_simulator(task_env_args("lift")))  # doctest: +SKIP
         >>> loop.reset(seed=3)["object"].shape  # doctest: +SKIP
         (10,)
@@ -178,7 +178,7 @@ class ControlLoop(StepLoop):
         ValueError: if a robot or its controller is of another kind, or an observation is missing.
 
     Examples:
-        >>> from warmprior.envs._simulator import make_simulator, task_env_args
+        >>> from warmprior.envs.simulator import make_simulator, task_env_args
         >>> loop = ControlLoop(make_simulator(task_env_args("lift")))  # doctest: +SKIP
         >>> _ = loop.reset(seed=3)  # doctest: +SKIP
         >>> observations, success = loop.step(np.zeros(7))  # doctest: +SKIP

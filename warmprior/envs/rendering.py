@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from warmprior._extras import require
+from warmprior.io.extras import require
 
 __all__ = ["render_camera", "rendering_backend", "require_rendering"]
 

@@ -13,14 +13,14 @@ from torchrl.envs.common import _EnvWrapper
 from torchrl.envs.utils import _classproperty
 
 from warmprior import keys
-from warmprior.envs._simulator import (
+from warmprior.envs.control_loop import ControlLoop, StepLoop
+from warmprior.envs.rendering import render_camera, rendering_backend
+from warmprior.envs.simulator import (
     action_limits,
     import_robosuite,
     make_simulator,
     task_env_args,
 )
-from warmprior.envs.control_loop import ControlLoop, StepLoop
-from warmprior.envs.rendering import render_camera, rendering_backend
 from warmprior.envs.tasks import TASKS, TaskSpec, get_task
 from warmprior.envs.tasks import low_dim_keys as default_keys
 

@@ -16,7 +16,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior import keys
-from warmprior._files import (
+from warmprior.io.files import (
     as_json,
     check_regular,
     file_digest,

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
-from warmprior._files import load_file, save_file, write_atomic
+from warmprior.io.files import load_file, save_file, write_atomic
 
 __all__ = ["ReplaySegments"]
 

@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
-from warmprior._files import exclusive
+from warmprior.io.files import exclusive
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from warmprior._files import as_json, check_regular, save_file, write_atomic
+from warmprior.io.files import as_json, check_regular, save_file, write_atomic
 from warmprior.modules.compiled import without_compilation
 
 __all__ = ["load_state", "restore_optimizer", "save_state", "snapshot_optimizer"]

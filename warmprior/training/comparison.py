@@ -14,11 +14,11 @@ from typing import Any
 
 import torch
 
-from warmprior._files import check_writable
 from warmprior.diagnostics.results import Results, Row
 from warmprior.diagnostics.smoothness import smoothness
 from warmprior.diagnostics.source_leak import SourceLeak
 from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.files import check_writable
 from warmprior.modules.prior import Prior
 from warmprior.training.evaluation import Episode
 from warmprior.training.policies import Policies

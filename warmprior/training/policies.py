@@ -17,10 +17,10 @@ import torch
 from torch import nn
 from torchrl.record.loggers import get_logger
 
-from warmprior._files import check_writable
 from warmprior.data import RobomimicExperienceReplay
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.description import environment_description
+from warmprior.io.files import check_writable
 from warmprior.modules import Normalizer
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior

@@ -7,11 +7,11 @@ from pathlib import Path
 from tensordict import TensorDictBase
 from torchrl.envs.transforms import Transform
 
-from warmprior._extras import require
-from warmprior._files import check_writable, write_atomic
 from warmprior.envs.description import environment_of
 from warmprior.envs.rendering import require_rendering
 from warmprior.envs.robosuite import RobosuiteEnv
+from warmprior.io.extras import require
+from warmprior.io.files import check_writable, write_atomic
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.evaluation import play_episode
 

@@ -17,7 +17,7 @@ from typing import Any, Self
 import torch
 from tqdm import tqdm
 
-from warmprior._processes import end_with_parent
+from warmprior.io.processes import end_with_parent
 
 __all__ = ["WorkerError", "WorkerPool", "available_cores", "end_with_parent", "start_method"]
 

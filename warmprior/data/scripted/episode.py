@@ -11,9 +11,9 @@ from warmprior.data.scripted.motion import ArmRunner, Plan
 from warmprior.data.scripted.operators import OPERATORS, SKILLED, Demonstrator
 from warmprior.data.scripted.tasks_single import can, lift, square, stack
 from warmprior.data.scripted.transport import transport
-from warmprior.envs._simulator import make_simulator, task_env_args
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.rendering import render_camera
+from warmprior.envs.simulator import make_simulator, task_env_args
 from warmprior.envs.tasks import get_task
 
 __all__ = ["PLANS", "Episode", "expert_loop", "operator_of", "run_episode"]

@@ -16,8 +16,6 @@ from typing import Any
 
 from torchrl._utils import logger
 
-from warmprior._extras import require
-from warmprior._processes import end_with_parent
 from warmprior.data.scripted.episode import (
     PLANS,
     Episode,
@@ -27,9 +25,11 @@ from warmprior.data.scripted.episode import (
 )
 from warmprior.data.scripted.operators import OPERATORS
 from warmprior.data.scripted.writer import write_robomimic
-from warmprior.envs._simulator import import_robosuite, task_env_args
 from warmprior.envs.control_loop import ControlLoop
+from warmprior.envs.simulator import import_robosuite, task_env_args
 from warmprior.envs.tasks import EVALUATION_SEED, get_task
+from warmprior.io.extras import require
+from warmprior.io.processes import end_with_parent
 
 __all__ = ["GENERATOR_VERSION", "SEEDS_PER_FILE", "generate_demonstrations"]
 

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from warmprior._extras import require
 from warmprior.data.scripted.episode import Episode
 from warmprior.data.scripted.operators import LEVELS
+from warmprior.io.extras import require
 
 __all__ = ["write_robomimic"]
 

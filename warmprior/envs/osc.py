@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from warmprior._extras import require
+from warmprior.io.extras import require
 
 __all__ = ["Arm", "check_supported", "compiled_torques"]
 

@@ -11,7 +11,7 @@ from functools import partial
 
 import pytest
 
-from warmprior._files import check_writable, exclusive, read_json, write_atomic
+from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
 
 FORK = multiprocessing.get_context("fork")
 

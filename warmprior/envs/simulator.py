@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from warmprior._extras import require
 from warmprior.envs.tasks import get_task
+from warmprior.io.extras import require
 
 __all__ = [
     "action_limits",

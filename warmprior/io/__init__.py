@@ -1,0 +1,1 @@
+"""Files that are never left damaged, optional packages, and what this machine has."""
