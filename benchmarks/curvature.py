@@ -1,165 +1,166 @@
-"""The paper's Table 2 and Fig. 4: how straight the learned flows are, on held-out observations.
+"""Curvature of the flow (the paper's Table 2 and Fig. 4): how straight each source makes it.
 
-python benchmarks/curvature.py                              # trains what is missing, like robomimic.py
-python benchmarks/curvature.py --run runs/square-ph-quick   # the policies of a finished run
-python benchmarks/curvature.py --run runs/paper --validation square_held_out.hdf5
+python benchmarks/curvature.py --run runs/square-ph-quick     # the policies of a run of robomimic.py
+python benchmarks/curvature.py --data mh --preset cpu         # of these options, trained if they are not yet
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import _experiment as experiment
-import _measurement as measurement
-import robomimic
 import torch
 
-from warmprior import Prior, WarmPriorActor
-from warmprior.diagnostics import (
-    SharedObservations,
+from warmprior import WarmPriorActor
+from warmprior.diagnostics import SharedObservations, flow_paths
+from warmprior.experiments import (
+    PRESETS,
+    Comparison,
+    HeldOutOptions,
+    MeasuredRecipe,
+    PolicyOptions,
+    Results,
     curvature_table,
-    flow_paths,
-    plot_flow_paths,
+    finished_policies,
+    observe,
+    parse,
     prior_label,
+    record,
+    run_script,
+    started,
     straightness,
-    write_results,
+    write_report,
 )
-from warmprior.io.files import check_writable, write_atomic
+from warmprior.experiments.navigation_figures import plot_flow_paths
+from warmprior.experiments.recipe import Flat, refuse_ignored
+from warmprior.experiments.results import facts_of_machine
 
 SHOWN = 40
 
-Measured = tuple[dict[str, Any], dict[str, list[WarmPriorActor]], SharedObservations, str]
-"""Facts, policies by prior, the observations to measure on, and what these are in words."""
+
+@dataclass(frozen=True)
+class CurvatureRecipe(MeasuredRecipe):
+    """What to measure.
+
+    Attributes:
+        policies: of another run, instead of those of the options.
+        coordinate: of the action, in flow_paths.png.
+    """
+
+    policies: Annotated[PolicyOptions, Flat] = field(default_factory=PolicyOptions)
+    coordinate: int = 0
+
+    @property
+    def name(self) -> str:
+        """Of the output folder."""
+        run = self.policies.run
+        return super().name if run is None else run.resolve().name
+
+    def check(self) -> None:
+        """Refuse what cannot work, or has no effect, before any work."""
+        super().check()
+        if self.policies.run is not None:
+            base = PRESETS[self.run.preset]
+            parts = ["data", "network", "training", "evaluation"]
+            # Priors of one's own are not what to compare, but what to import for it.
+            parts += [] if all(":" in name for name in self.sources.prior) else ["sources"]
+            refuse_ignored(self, base, parts, "--run measures policies as they were trained")
+        elif not any(prior.is_flow for prior in self.sources.priors()):
+            raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
 
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = robomimic.make_parser()
-    parser.description = __doc__
-    add = parser.add_argument
-    add(
-        "--run",
-        type=Path,
-        help="folder of a finished run of robomimic.py; only the options below and --out, --device "
-        "go with it, and --prior package.module:Class where it compares priors of your own",
-    )
-    measurement.add_options(parser, observations=2_000)
-    add("--coordinate", type=int, default=0, help="of the action, in flow_paths.png (%(default)s)")
-    return parser
+@dataclass
+class Measured:
+    """What is measured: the facts of the problem, policies, and observations with their name."""
+
+    results: Results
+    facts: dict[str, Any]
+    actors: dict[str, list[WarmPriorActor]]
+    observations: SharedObservations
+    source: str
 
 
-def parse(argv: list[str] | None) -> argparse.Namespace:
-    args = make_parser().parse_args(argv)
-    if args.run is None:
-        return experiment.parse(make_parser, argv, "curvature-")
-    allowed = {"run", "out", "device", "coordinate", "validation", "observations", "steps", "draws"}
-    defaults = vars(make_parser().parse_args([]))
-    if all(":" in name for name in args.prior):  # not what to compare, but what to import for it
-        for place in args.prior:
-            Prior.find(place)
-        allowed.add("prior")
-    ignored = [k for k, v in vars(args).items() if k not in allowed and v != defaults[k]]
-    if ignored:
-        told = ", ".join(f"--{key.replace('_', '-')}" for key in ignored)
-        raise ValueError(f"--run measures policies as they were trained: leave out {told}")
-    run = args.run = args.run.resolve()
-    default = experiment.numbered_folder(run.parent, f"curvature-{run.name}")
-    args.out = experiment.output_folder(args) if args.out is not None else default
-    return args
+def own_run(recipe: CurvatureRecipe) -> Measured:
+    """The policies of these options: those of earlier runs where they exist, or trained now."""
+    comparison = Comparison(recipe, "curvature")
+    # Before the training: what cannot be measured on is better known now.
+    observations, source = comparison.observe(recipe.held_out)
+    check_coordinate(recipe, observations)
+    comparison.train()
+    facts = comparison.results.meta["problems"][0]
+    return Measured(comparison.results, facts, comparison.policies(), observations, source)
 
 
-def flows_of(priors: Sequence[Prior]) -> list[Prior]:
-    """The priors that have a flow to measure; says which have none."""
-    for prior in priors:
-        if not prior.is_flow:
-            print(f"{prior.name} has no flow and is left out.")
-    flows = [prior for prior in priors if prior.is_flow]
-    if not flows:
-        raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
-    return flows
-
-
-def finished_run(args: argparse.Namespace) -> Measured:
+def finished_run(recipe: CurvatureRecipe, run: Path) -> Measured:
     """The last policies of a run of robomimic.py."""
-    meta, actors = experiment.finished_run(args.run, args.device)
-    flows = flows_of([group[0].prior for group in actors.values()])
-    actors = {prior.name: actors[prior.name] for prior in flows}
+    facts, actors = finished_policies(run, recipe.run.device)
     first = next(iter(actors.values()))[0]
-    observations, source = measurement.observe(
-        args,
-        meta,
+    observations, source = observe(
+        recipe.held_out,
+        facts,
         first.normalizer,
         chunk_length=first.prior.chunk_length,
         observation_steps=first.network.observation_steps,
+        device=recipe.run.device,
     )
-    return meta, actors, observations, source
+    check_coordinate(recipe, observations)
+    identity = {"study": "curvature", "recipe": record(recipe)}
+    meta = facts_of_machine() | {"problems": [facts]}
+    results = Results(recipe.run.directory / "results.json", meta, identity)
+    described = {group[0].prior.describe(): group for group in actors.values()}
+    return Measured(results, facts, described, observations, source)
 
 
-def own_run(args: argparse.Namespace) -> Measured:
-    """The policies of these options: those of earlier runs where they exist, or trained now."""
-    preset, priors = experiment.make_preset(args), flows_of(robomimic.make_priors(args))
-    options = experiment.store_options(args)
-    policies = experiment.find_policies(args, preset)
-    meta = policies.facts() | {"options": options}
-    # Before the training: what cannot be measured on is better known now.
-    observations, source = measurement.observe(
-        args,
-        meta,
-        policies.normalizer,
-        chunk_length=args.chunk,
-        observation_steps=preset.observation_steps,
-    )
-    actors = {p.name: [policies.policy(p, seed) for seed in range(preset.seeds)] for p in priors}
-    return meta, actors, observations, source
+def check_coordinate(recipe: CurvatureRecipe, observations: SharedObservations) -> None:
+    width = observations.data["action"].shape[-1]
+    if not 0 <= recipe.coordinate < width:
+        raise ValueError(f"--coordinate must be in [0, {width}), got {recipe.coordinate}")
 
 
-def draw(
-    args: argparse.Namespace,
-    actors: dict[str, list[WarmPriorActor]],
-    observations: SharedObservations,
-    title: str,
-) -> None:
+def draw(recipe: CurvatureRecipe, measured: Measured) -> None:
+    observations, paths = measured.observations, {}
     few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
-    paths = {}
-    for name, (actor, *_) in actors.items():
-        generator = torch.Generator(args.device).manual_seed(0)
-        path = flow_paths(actor, few.windows(actor.prior), args.steps, generator=generator)
-        paths[prior_label(name)] = path[..., 0, args.coordinate].cpu()
-    plot_flow_paths(paths, args.out / "flow_paths.png", title=title)
+    for actor, *_ in measured.actors.values():
+        if actor.prior.is_flow:
+            generator = torch.Generator(recipe.run.device).manual_seed(0)
+            windows = few.windows(actor.prior)
+            path = flow_paths(actor, windows, recipe.held_out.steps, generator=generator)
+            paths[prior_label(actor.prior.name)] = path[..., 0, recipe.coordinate].cpu()
+    title = f"{measured.facts['task']} {measured.facts['style']}: action coordinate {recipe.coordinate} "
+    plot_flow_paths(
+        paths,
+        recipe.run.directory / "flow_paths.png",
+        title=f"{title}along the flow, {measured.source}",
+    )
 
 
-def main(argv: list[str] | None = None) -> int:
-    try:
-        args = parse(argv)
-        experiment.check(args)
-        measurement.check(args)
-        check_writable(args.out)
-        print(f"Output folder: {args.out}", flush=True)
-        meta, actors, observations, source = (
-            own_run(args) if args.run is None else finished_run(args)
-        )
-        width = observations.data["action"].shape[-1]
-        if not 0 <= args.coordinate < width:
-            raise ValueError(f"--coordinate must be in [0, {width}), got {args.coordinate}")
+def run(argv: Sequence[str] | None) -> None:
+    held_out = HeldOutOptions(observations=2_000)
+    presets = {n: CurvatureRecipe.of(p, held_out=held_out) for n, p in PRESETS.items()}
+    recipe = parse(presets, argv, study="curvature", description=__doc__)
+    with started(recipe, "curvature") as out:
+        folder = recipe.policies.run
+        measured = own_run(recipe) if folder is None else finished_run(recipe, folder)
         rows = straightness(
-            actors, observations, n_steps=args.steps, draws=args.draws, description="curvature"
+            measured.actors,
+            measured.observations,
+            n_steps=recipe.held_out.steps,
+            draws=recipe.held_out.draws,
+            description="curvature",
         )
-        task, data = meta["task"], meta["style"]
-        meta["curvature"] = {"observations": source, "steps": args.steps, "draws": args.draws}
-        write_results(args.out / "results.json", meta, rows)
-        table = curvature_table(rows, task=task, data=data, source=source)
-        write_atomic(args.out / "table.md", lambda path: path.write_text(table))
-        title = f"{task} {data}: action coordinate {args.coordinate} along the flow, {source}"
-        draw(args, actors, observations, title)
-    except experiment.ERRORS as error:
-        print(f"curvature.py: error: {error}", file=sys.stderr)
-        return 2
-    print(f"\n{table}\nResults, table and picture: {args.out}")
-    return 0
+        measured.results.meta["observations"] = measured.source
+        measured.results.add(*rows)
+        draw(recipe, measured)
+        task, style = measured.facts["task"], measured.facts["style"]
+        write_report(out, curvature_table(rows, task=task, data=style, source=measured.source))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    return run_script(run, argv, "curvature.py")
 
 
 if __name__ == "__main__":
-    experiment.launch(main)
+    sys.exit(main())

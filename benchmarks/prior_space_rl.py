@@ -10,244 +10,189 @@ A frozen policy per prior and seed comes from --run (a finished run of robomimic
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
-import time
-from collections.abc import Callable
-from dataclasses import asdict
-from functools import partial
-from importlib.metadata import version
+from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-import _experiment as experiment
-import torch
-from _prior_space_budgets import BUDGETS, Budget, algorithms, make_config
-from _prior_space_report import draw, make_table, summarize
-from torchrl.envs import EnvBase, TransformedEnv
-
-from warmprior import Prior, PriorAnchor, WarmPriorActor
-from warmprior.diagnostics import write_results
-from warmprior.envs import GoalNavigationEnv, get_task
+from warmprior import WarmPriorActor
 from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.io.files import check_writable, write_atomic
+from warmprior.experiments import (
+    Comparison,
+    Results,
+    Row,
+    Store,
+    finished_policies,
+    mean_cell,
+    navigation_problem,
+    parse,
+    plot_reinforcement,
+    plot_success,
+    record,
+    run_script,
+    select,
+    started,
+    table,
+    write_report,
+)
+from warmprior.experiments.figures import agent_label
+from warmprior.experiments.prior_space import (
+    PRIOR_SPACE_PRESETS,
+    PriorSpaceRecipe,
+    agent_environment,
+    prior_space_preset,
+)
+from warmprior.experiments.results import facts_of_machine, grouped, played
 from warmprior.rl import PriorSpaceTraining
-from warmprior.training import PRESETS, NavigationStudy, parallel_env
-from warmprior.training.policies import Policies
 from warmprior.training.threads import torch_threads
-from warmprior.transforms import policy_transforms
 
-PER_AGENT = ("algorithm", "backup_entropy", "delta", "seed")
-TASKS = ("navigation", "lift", "can", "square", "transport")
-Task = tuple[WarmPriorActor, Callable[[int], EnvBase]]
+Frozen = dict[str, list[WarmPriorActor]]
+"""Policies by prior name, one per training seed."""
 
 
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    add = parser.add_argument
-    told = "; ".join(f"{name}: {budget.summary}" for name, budget in BUDGETS.items())
-    add("--preset", default="quick", choices=BUDGETS, help=f"{told} (%(default)s)")
-    add("--task", choices=TASKS, help="default: navigation, the toy, in unit; lift otherwise")
-    add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (%(default)s)")
-    add("--dataset", type=Path, help="a robomimic HDF5 file for the frozen policy")
-    add("--download", action="store_true", help="fetch the official file from the hub instead")
-    add(
-        "--run", type=Path, help="take policies, task and data of this finished run of robomimic.py"
-    )
-    add(
-        "--algorithm",
-        nargs="+",
-        choices=("dsrl-na", "dsrl-sac"),
-        help="default: dsrl-na; for transport in paper dsrl-sac too, the official choice",
-    )
-    add("--prior", nargs="+", metavar="NAME", help="as for robomimic.py (default: the preset's)")
-    add("--delta", type=float, help="half the agent's box (default: 0.5 around a mean, 1.5 else)")
-    add("--horizon", type=int, help="time limit in control steps (default: the preset's or task's)")
-    add("--alpha", type=float, help="initial temperature (default: the preset's)")
-    add("--nfe", type=int, help="network evaluations per chunk (default: the preset's)")
-    add(
-        "--chunk", type=int, help="chunk length H of a newly trained policy (default: the preset's)"
-    )
-    add("--steps", type=int, help="control steps, warm-up included (default: the preset's)")
-    add("--warmup", type=int, help="control steps of the warm-up (default: the preset's)")
-    add("--updates", type=int, help="updates per vector step (default: the preset's)")
-    add("--evaluate-every", type=int, help="control steps (default: the preset's)")
-    add("--episodes", type=int, help="per evaluation (default: the preset's)")
-    add(
-        "--iterations", type=int, help="gradient steps of the frozen policy (default: the preset's)"
-    )
-    add("--demonstrations", type=int, help="of the frozen policy (default: the preset's)")
-    add("--seeds", type=int, help="number of seeds (default: the preset's)")
-    add("--envs", type=int, help="parallel environments (default: the preset's)")
-    add("--out", type=Path, help="output folder (default: a numbered one under runs/)")
-    add("--resume", action="store_true", help="continue in --out, or in the latest default folder")
-    add("--device", default="cpu", help="of the networks (%(default)s)")
-    add("--compile", action="store_true", help="torch.compile the network in the first training")
-    add("--logger", default="csv", choices=("csv", "none"), help="of the first training")
-    return parser
-
-
-def default_task(args: argparse.Namespace) -> str:
-    if args.run is not None:
-        return str(experiment.run_facts(args.run)["task"])
-    return "navigation" if args.preset == "unit" else "lift"
-
-
-def toy_task(args: argparse.Namespace, budget: Budget, prior: Prior, seed: int) -> Task:
-    """A policy that knows both routes, and the toy that rewards one."""
-    study = NavigationStudy(budget.pretraining, {prior.name: prior}, args.out / "policies")
-    with torch_threads(budget.threads):
-        actor = study.train(prior.name, seed).to(args.device)
-
-    def make_env(env_seed: int) -> EnvBase:
-        transforms = policy_transforms(actor.prior, observation_steps=1)
-        transforms.append(PriorAnchor(actor.prior, seed=env_seed))
-        return TransformedEnv(GoalNavigationEnv(batch_size=[budget.envs]), transforms)
-
-    return actor, make_env
-
-
-def manipulation_env(make_workers: Callable[[], EnvBase], prior: Prior, env_seed: int) -> EnvBase:
-    # The anchor outside of the workers: one transform draws for all of them.
-    env = TransformedEnv(make_workers(), PriorAnchor(prior, seed=env_seed))
-    env.set_seed(env_seed, static_seed=True)
-    return env
-
-
-def manipulation_tasks(
-    args: argparse.Namespace, budget: Budget
-) -> tuple[Callable[[Prior, int], Task], dict[str, Any]]:
-    """Frozen policies and simulators, by prior and seed; and the facts about them."""
-    stored = None
-    if args.run is None:
-        policies = experiment.find_policies(args, budget.pretraining)
-    else:
-        policies, stored = finished_policies(args)
-        names = [Prior.find(name).name for name in budget.priors]
-        missing = [name for name in names if name not in stored]
+def frozen_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], Frozen]:
+    """The facts of the problem, and the policies: of --run, or trained now where they are not yet."""
+    run, device = recipe.policies.run, recipe.run.device
+    if run is not None:
+        facts, actors = finished_policies(run, device)
+        if recipe.data.task not in ((), (facts["task"],)):
+            raise ValueError(f"--run {run} is of {facts['task']}, not of {recipe.data.task[0]}")
+        missing = [p.name for p in recipe.sources.priors() if p.name not in actors]
         if missing:
             raise ValueError(
-                f"--run {args.run} has policies of {', '.join(stored)}, but none of {', '.join(missing)}"
+                f"--run {run} has policies of {', '.join(actors)}, but none of {', '.join(missing)}"
             )
-
-    def frozen(prior: Prior, seed: int) -> WarmPriorActor:
-        if stored is None:
-            return policies.policy(prior, seed)
-        group = stored[prior.name]
-        if seed >= len(group):
-            print(f"--run has {len(group)} seeds of {prior.name}: agent {seed} shares a policy")
-        return group[seed % len(group)]
-
-    def task(prior: Prior, seed: int) -> Task:
-        # A copy of its own: to continue, an agent must find the very policy it began with, even if
-        # another version would train another by now.
-        kept = args.out / "policies" / f"{prior.name}-seed{seed}"
-        if not (args.resume and (kept / "config.json").exists()):
-            frozen(prior, seed).save_pretrained(kept)
-        actor = WarmPriorActor.from_pretrained(kept, device=args.device)
-        transforms = partial(
-            policy_transforms,
-            actor.prior,
-            normalizer=policies.normalizer,
-            observation_steps=actor.network.observation_steps,
-        )
-        make_worker = partial(policies.make_env, horizon=budget.horizon)
-        workers = partial(parallel_env, make_worker, transforms, budget.envs)
-        return actor, partial(manipulation_env, workers, actor.prior)
-
-    facts = policies.facts()
-    horizon = budget.horizon or get_task(facts["task"]).horizon(facts["style"])
-    return task, facts | {"horizon": horizon}
+        return facts, actors
+    stores = None
+    if recipe.is_toy:
+        policies, logs = out.parent / "policies", out / "logs"
+        stores = [Store(navigation_problem(), recipe.network, policies, logs, recipe.run)]
+    comparison = Comparison(recipe, "frozen policies", stores=stores, directory=out / "frozen")
+    comparison.train()
+    grouped_actors: Frozen = {}
+    for contestant in comparison.contestants:
+        grouped_actors.setdefault(contestant.prior.name, []).append(contestant.policy())
+    return comparison.results.meta["problems"][0], grouped_actors
 
 
-def finished_policies(
-    args: argparse.Namespace,
-) -> tuple[Policies, dict[str, list[WarmPriorActor]]]:
-    """The data of a finished run, from which its simulators and normaliser follow, and its policies."""
-    meta, actors = experiment.finished_run(args.run, args.device)
-    if args.task != meta["task"]:
-        raise ValueError(f"--run {args.run} is of {meta['task']}, not of {args.task}")
-    options = meta["options"]
-    data = {key: options[key] for key in ("data", "dataset", "download", "demonstrations")}
-    data["dataset"] = data["dataset"] and Path(data["dataset"])
-    theirs = argparse.Namespace(**vars(args) | data)
-    policies = experiment.find_policies(theirs, PRESETS[options["preset"]])
-    if policies.demonstrations.sha256 != meta["data"]["sha256"]:
-        raise ValueError(
-            f"{policies.demonstrations.path} is not the file that --run {args.run} was trained on: its "
-            "policies would meet observations normalised in another way. Put the file back, or run "
-            "robomimic.py again"
-        )
-    return policies, actors
+def kept(recipe: PriorSpaceRecipe, out: Path, actor: WarmPriorActor, seed: int) -> WarmPriorActor:
+    """A copy of the frozen policy that belongs to the agent: to continue, it must find the very policy
+    it began with, even if another version would train another by now.
+    """
+    folder = out / "policies" / f"{actor.prior.name}-seed{seed}"
+    if not (recipe.run.resume and (folder / "config.json").exists()):
+        actor.save_pretrained(folder)
+    return WarmPriorActor.from_pretrained(folder, device=recipe.run.device)
 
 
-def main(argv: list[str] | None = None) -> int:
-    try:
-        args = experiment.parse(make_parser, argv, "rl-", default_task, changeable=())
-        budget, config = make_config(args)
-        experiment.check(args)
-        check_writable(args.out)
-        options = experiment.store_options(args)
-        print(f"Output folder: {args.out}", flush=True)
-        if args.preset == "unit":
-            task, facts = partial(toy_task, args, budget), {"task": args.task}
-        else:
-            task, facts = manipulation_tasks(args, budget)
-        packages = ("warmprior", "torch", "torchrl", "tensordict")
-        meta: dict[str, Any] = {
-            "versions": {package: version(package) for package in packages},
-            "hardware": {
-                "cores": os.cpu_count(),
-                "torch_threads": budget.threads or torch.get_num_threads(),
-            },
-            "options": options,
-            "config": {k: v for k, v in asdict(config).items() if k not in PER_AGENT},
-            **facts,
-        }
-        rows: list[dict[str, Any]] = []
-        curve: list[dict[str, Any]] = []
-        diverged: list[str] = []
-        started = time.monotonic()
-        priors = [Prior.make(name, budget.chunk) for name in budget.priors]
-        for seed, algorithm, prior in product(range(budget.seeds), algorithms(args), priors):
-            agent = f"{algorithm} {prior.name}, seed {seed}"
-            mine = budget.agent(config, algorithm, prior, seed)
-            actor, make_env = task(prior, seed)
+def make_table(rows: Sequence[Row]) -> str:
+    """Success before and after, mean and standard deviation over seeds."""
+    percent = mean_cell("success_rate", ".1f", 100)
+
+    def last(kind: str) -> Callable[[list[Row]], str | None]:
+        def cell(rows: list[Row]) -> str | None:
+            ended = grouped(select(rows, evaluation=kind), lambda row: row["seed"])
+            return percent([group[-1] for group in ended.values()])
+
+        return cell
+
+    seeds = {
+        agent: len(grouped(g, lambda r: r["seed"])) for agent, g in grouped(rows, agent_of).items()
+    }
+    return table(
+        rows,
+        lambda row: agent_label(row, seeds[agent_of(row)]),
+        None,
+        {
+            "delta": lambda rows: f"{rows[0]['delta']:g}",
+            "control steps": lambda rows: str(max(row["environment_steps"] for row in rows)),
+            "frozen policy (%)": last("base"),
+            "greedy agent (%)": last("greedy"),
+            "stochastic agent (%)": last("stochastic"),
+        },
+        head="agent",
+    )
+
+
+def agent_of(row: Row) -> tuple[str, str]:
+    return row["algorithm"], row["prior"]
+
+
+def draw(rows: Sequence[Row], out: Path, title: str, warmup: int) -> None:
+    """The curves, and the posteriors of the greedy agents."""
+    plot_reinforcement(rows, out / "curves.png", title=title, warmup_steps=warmup)
+    ends = grouped(select(rows, evaluation="greedy"), lambda row: (*agent_of(row), row["seed"]))
+    plot_success(
+        [group[-1] for group in ends.values()],
+        out / "success.png",
+        title=f"{title}: greedy agents",
+        group=lambda row: row["algorithm"].upper(),
+    )
+
+
+def run(argv: Sequence[str] | None) -> None:
+    recipe = parse(
+        PRIOR_SPACE_PRESETS, argv, study="rl", description=__doc__, preset=prior_space_preset
+    )
+    with started(recipe, "rl") as out:
+        problem, frozen = frozen_policies(recipe, out)
+        meta = facts_of_machine(torch_threads=recipe.agents.threads) | {"problems": [problem]}
+        identity = {"study": "rl", "recipe": record(recipe)}
+        results = Results(out / "results.json", meta, identity, resume=recipe.run.resume)
+        diverged: dict[tuple[str, str, int], str] = {}
+        names = dict.fromkeys(prior.name for prior in recipe.sources.priors())
+        for seed, algorithm, name in product(recipe.seeds, recipe.agents.algorithm, names):
+            agent, i = f"{algorithm} {name}, seed {seed}", seed - recipe.seeds[0]
+            if i >= len(frozen[name]):
+                print(
+                    f"--run has {len(frozen[name])} seeds of {name}: agent {seed} shares a policy"
+                )
+            actor = kept(recipe, out, frozen[name][i % len(frozen[name])], seed)
+            config = recipe.agent(actor.prior, algorithm, seed)
             training = PriorSpaceTraining(
                 actor,
-                make_env,
-                mine,
-                args.out / f"{algorithm}-{prior.name}-seed{seed}",
+                agent_environment(recipe, actor),
+                config,
+                out / f"{algorithm}-{name}-seed{seed}",
                 evaluation_seed=EVALUATION_SEED,
                 description=agent,
             )
             try:
-                with torch_threads(budget.threads):
+                with torch_threads(recipe.agents.threads):
                     training.run()
-                rows.append(summarize(seed, mine, training))
             except FloatingPointError as error:  # no reason to keep the other agents from learning
-                diverged.append(f"{agent}: {error}")
-            key = {"algorithm": algorithm, "prior": prior.name, "seed": seed}
-            curve += [key | row for row in training.curve]
-            meta["wall_time_s"] = time.monotonic() - started
-            write_results(args.out / "results.json", meta, rows, curve=curve)
-        table = make_table(rows)
-        write_atomic(args.out / "table.md", lambda path: path.write_text(table))
-        where = " ".join(facts[key] for key in ("task", "style") if key in facts)
-        if rows:
-            draw(rows, args.out, curve, f"{where}, NFE {config.nfe}", config.warmup_steps)
+                diverged[algorithm, name, seed] = f"{agent}: {error}"
+            facts = {
+                "task": problem["task"],
+                "data": problem["style"],
+                "algorithm": algorithm,
+                "prior": name,
+                "sigma": actor.prior.sigma,
+                "chunk": actor.prior.chunk_length,
+                "nfe": config.nfe,
+                "delta": training.decoder.delta,
+                "seed": seed,
+            }
+            results.add(*(evaluated(facts, point) for point in training.curve))
+        complete = [row for row in results.rows if (*agent_of(row), row["seed"]) not in diverged]
+        if complete:
+            title = f"{problem['task']} {problem['style']}, NFE {recipe.evaluation.nfe[0]}"
+            draw(complete, out, title, recipe.rl.warmup_steps)
+            write_report(out, make_table(complete))
         if diverged:
-            raise FloatingPointError("; ".join(diverged))
-    except experiment.ERRORS as error:
-        print(f"prior_space_rl.py: error: {error}", file=sys.stderr)
-        return 2
-    print(f"\n{table}\nResults, table and pictures: {args.out}")
-    return 0
+            raise FloatingPointError("; ".join(diverged.values()))
+
+
+def evaluated(facts: dict[str, Any], point: dict[str, Any]) -> Row:
+    """The row of one evaluation of an agent."""
+    told = {name: point[name] for name in ("environment_steps", "evaluation")}
+    return played(facts | told, point["successes"], point["episodes"])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    return run_script(run, argv, "prior_space_rl.py")
 
 
 if __name__ == "__main__":
-    experiment.launch(main)
+    sys.exit(main())

@@ -1,117 +1,115 @@
 """The paper's Table 1: Gaussian source, WP-Past and WP-Preview on Robomimic tasks from state.
 
 python benchmarks/robomimic.py                                   # a first table within 15 minutes
-python benchmarks/robomimic.py --task can --data mh --preset cpu
+python benchmarks/robomimic.py --task can stack --data ph mh --preset cpu
 python benchmarks/robomimic.py --download --preset paper --device cuda --out runs/paper
 python benchmarks/robomimic.py --resume --out runs/paper         # after an interruption
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Sequence
 
-import _experiment as experiment
-
-from warmprior import Prior
-from warmprior.diagnostics.plots import plot_filmstrip, plot_learning_curves, plot_success
-from warmprior.diagnostics.results import success_table
 from warmprior.envs import rendering_backend
 from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.io.files import write_atomic
-from warmprior.training.comparison import Comparison
-from warmprior.training.filmstrip import record_filmstrip
+from warmprior.experiments import (
+    PRESETS,
+    Comparison,
+    Row,
+    parse,
+    plot_filmstrip,
+    plot_learning_curves,
+    plot_success,
+    prior_label,
+    run_script,
+    select,
+    started,
+    success_table,
+    write_report,
+)
+from warmprior.experiments.store import Store
+from warmprior.training import record_filmstrip
+
+TRAINED_AFTER = {"preview": 40_000}
+"""Iterations up to which success was measured to rise at the small network and batch (docs/evidence.md)."""
 
 
-def add_options(parser: argparse.ArgumentParser) -> Callable[..., argparse.Action]:
-    """Add the options of a comparison of sources and return ``parser.add_argument``."""
-    add = experiment.add_options(parser)
-    experiment.add_prior(parser, experiment.COMPARED, "what to compare, gains being over the first")
-    add("--sigma", type=float, help="noise of the warm priors (default: past 0.5, preview 1.0)")
-    add("--nfe", nargs="+", type=int, default=[9, 3, 1], help="evaluations per chunk (%(default)s)")
-    add("--chunk", type=int, default=8, help="chunk length H (%(default)s)")
-    return add
-
-
-def make_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def notes(comparison: Comparison) -> list[str]:
+    if comparison.recipe.run.preset == "paper":
+        return []
+    iterations = comparison.recipe.training.iterations
+    names = dict.fromkeys(prior.name for prior in comparison.priors)
+    short = [prior_label(n) for n in names if iterations < TRAINED_AFTER.get(n, 0)]
+    told = (
+        "Success still rises with more iterations than these (docs/evidence.md, 'Training budget')."
     )
-    add_options(parser)
-    return parser
+    lines = [f"- {', '.join(short)}: short of training. {told}"] if short else []
+    return [*lines, "- Network and training budget are smaller than the paper's."]
 
 
-def parse(argv: list[str] | None = None) -> argparse.Namespace:
-    return experiment.parse(make_parser, argv)
-
-
-def make_priors(args: argparse.Namespace) -> list[Prior]:
-    names = list(dict.fromkeys(args.prior))
-    if args.sigma is not None and not any(Prior.find(name).takes("sigma") for name in names):
-        raise ValueError(f"--sigma belongs to warm priors; {', '.join(names)} take none")
-    options = {"sigma": args.sigma, "cold_probability": args.cold_probability}
-    return [Prior.make(name, args.chunk, **options) for name in names]
-
-
-def draw(comparison: Comparison) -> None:
-    results, out, policies = comparison.results, comparison.directory, comparison.policies
-    priors = [prior.name for prior in comparison.priors]
-    first = results.rows[0]
-    title = f"{first.task} {first.data} ({results.meta['data_source']} data), H = {first.chunk}"
-    plot_success(
-        results.rows, out / "success.png", priors=priors, nfes=comparison.nfes, title=title
-    )
-    plot_learning_curves(
-        comparison.losses,
-        results.rows,
-        out / "learning_curves.png",
-        nfe=min(comparison.nfes),
-        title=title,
-    )
+def draw(comparison: Comparison, rows: Sequence[Row]) -> None:
+    """One set of pictures per problem."""
+    out, several = comparison.directory, len(comparison.stores) > 1
+    for store in comparison.stores:
+        problem = store.problem
+        mine = select(rows, task=problem.task, data=problem.style)
+        end = f"_{problem.task}_{problem.style}.png" if several else ".png"
+        last = [row for row in mine if row["checkpoint"] == row["iterations"]]
+        chunks = ", ".join(map(str, sorted({row["chunk"] for row in mine})))
+        title = f"{problem.name}, H = {chunks}"
+        plot_success(last, out / f"success{end}", title=title)
+        curve = select(mine, nfe=min(comparison.nfes))
+        plot_learning_curves(
+            comparison.losses(store), curve, out / f"learning_curves{end}", title=title
+        )
+        if rendering_backend() is not None:
+            film(comparison, store, end)
     if rendering_backend() is None:
         print(
             "No filmstrips: neither EGL nor OSMesa works here. On Debian or Ubuntu: "
             "apt-get install libegl1 libegl-mesa0 (or libosmesa6)."
         )
-        return
-    for prior in comparison.priors:
-        nfe = min(prior.allowed_nfes(comparison.nfes))
-        policy = policies.policy(prior, comparison.seeds[0])
+
+
+def film(comparison: Comparison, store: Store, end: str) -> None:
+    """An episode of every source's first policy."""
+    first = {c.prior.name: c for c in reversed(comparison.contestants) if c.store is store}
+    for name, contestant in first.items():
+        nfe, policy = min(contestant.prior.allowed_nfes(comparison.nfes)), contestant.policy()
         strip = record_filmstrip(
             policy,
-            policies.make_env,
-            policies.transforms(policy.prior),
+            store.problem.make_env,
+            store.transforms(policy.prior),
             seed=EVALUATION_SEED,
             nfe=nfe,
-            policy_seed=comparison.seeds[0],
+            policy_seed=contestant.training.seed,
         )
         outcome = "solved" if strip.success else "not solved"
         plot_filmstrip(
             strip.frames,
             [f"step {step}" for step in strip.steps],
-            out / f"filmstrip_{prior.name}.png",
-            title=f"{prior.label}, NFE {nfe}, episode {EVALUATION_SEED}: {outcome}",
+            comparison.directory / f"filmstrip_{name}{end}",
+            title=f"{prior_label(name)}, NFE {nfe}, episode {EVALUATION_SEED}: {outcome}",
         )
 
 
-def main(argv: list[str] | None = None) -> int:
-    try:
-        args = parse(argv)
-        preset, priors = experiment.make_preset(args), make_priors(args)
-        comparison = experiment.start_comparison(args, preset, priors, args.nfe)
-        results = comparison.run()
+def run(argv: Sequence[str] | None) -> None:
+    recipe = parse(PRESETS, argv, study="robomimic", description=__doc__)
+    with started(recipe, "robomimic") as out:
+        comparison = Comparison(recipe, "robomimic")
+        rows = comparison.run().rows
+        source = comparison.stores[0].problem.facts["source"]
         table = success_table(
-            results, priors=[p.name for p in priors], nfes=comparison.nfes, top_k=preset.top_k
+            rows, top_k=recipe.evaluation.top_k, source=source, notes=notes(comparison)
         )
-        write_atomic(args.out / "table.md", lambda path: path.write_text(table))
-        draw(comparison)
-    except experiment.ERRORS as error:
-        print(f"robomimic.py: error: {error}", file=sys.stderr)
-        return 2
-    print(f"\n{table}\nResults, table and pictures: {args.out}")
-    return 0
+        draw(comparison, rows)
+        write_report(out, table)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    return run_script(run, argv, "robomimic.py")
 
 
 if __name__ == "__main__":
-    experiment.launch(main)
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Saved policies from the command line: ``python -m warmprior evaluate FOLDER --episodes 50 --nfe 1``."""
+"""Policies from the command line: ``python -m warmprior evaluate FOLDER --episodes 50 --nfe 1``."""
 
 from __future__ import annotations
 
@@ -74,6 +74,18 @@ def evaluate(args: argparse.Namespace) -> None:
         print(f"{args.video}: episode {args.first_seed}, {'' if outcome else 'not '}solved")
 
 
+def train(args: argparse.Namespace) -> None:
+    """Train policies, and play nothing: the options of benchmarks/robomimic.py."""
+    from warmprior.experiments import PRESETS, Comparison, parse, started
+
+    recipe = parse(PRESETS, args.options, study="train", description=train.__doc__)
+    with started(recipe, "train"):
+        comparison = Comparison(recipe, "train")
+        comparison.train()
+    for contestant in comparison.contestants:
+        print(f"{contestant.prior.describe()}, seed {contestant.training.seed}: {contestant.path}")
+
+
 def demonstrations(args: argparse.Namespace) -> None:
     """Generate scripted demonstrations."""
     from warmprior.data import generate_demonstrations
@@ -108,6 +120,11 @@ def make_parser() -> argparse.ArgumentParser:
     add("--first-seed", type=int, default=EVALUATION_SEED, help="of the simulator (%(default)s)")
     add("--policy-seed", type=int, default=0, help="of the source samples (%(default)s)")
     add("--video", type=Path, help="MP4 of the first episode; needs EGL or OSMesa, and PyAV")
+
+    # Its options are those of the recipe, --help included.
+    added = commands.add_parser("train", help=train.__doc__, add_help=False, prefix_chars="\0")
+    added.set_defaults(run=train)
+    added.add_argument("options", nargs=argparse.REMAINDER)
 
     add = command(demonstrations)
     add("task", choices=[name for name, task in TASKS.items() if task.scripted])

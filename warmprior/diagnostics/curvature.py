@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -19,13 +18,12 @@ from warmprior.diagnostics.flow import (
     evaluation_mode,
     field_of,
     flat_windows,
-    observed,
 )
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.ode import integrate
 
-__all__ = ["compare_curvature", "curvature"]
+__all__ = ["curvature"]
 
 NO_MOTION = 0.95
 """Share of a zero field's loss from which on a field counts as not having learnt to move."""
@@ -171,53 +169,3 @@ def _flag_no_motion(
             )
             for name in ("kappa", "relative"):
                 out[name + suffix] = torch.full_like(out[name + suffix], math.nan)
-
-
-def compare_curvature(
-    policies: Mapping[str, WarmPriorActor],
-    batches: Mapping[str, TensorDictBase],
-    n_steps: int = 100,
-    **options: Any,
-) -> dict[str, dict[str, float]]:
-    """Mean curvatures of several policies on the same observations (Table 2).
-
-    Args:
-        policies: by name, the baseline first.
-        batches: the observations, with each policy's own mean.
-        n_steps: Euler steps.
-        options: see :func:`curvature`.
-
-    Returns:
-        For each policy the means of :func:`curvature`'s entries over observations, and
-        ``"ratio"``, ``"ratio_executed"`` and ``"ratio_relative"`` (of ``"relative_executed"``) to the
-        baseline.
-
-    Raises:
-        ValueError: if chunk lengths or observations differ between policies.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
-        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), GaussianPrior(8))
-        >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3), "prior": {
-        ...     "loc": torch.zeros(5, 8, 2), "warm": torch.zeros(5, 8, 1, dtype=torch.bool)}}, [5])
-        >>> compare_curvature({"base": actor}, {"base": batch})["base"]["ratio"]
-        1.0
-    """
-    lengths = {name: policy.prior.chunk_length for name, policy in policies.items()}
-    if len(set(lengths.values())) > 1:
-        raise ValueError(f"curvatures compare at one chunk length only, got {lengths}")
-    observations = [observed(policy, batches[name]) for name, policy in policies.items()]
-    if any(not torch.equal(observations[0], other) for other in observations[1:]):
-        raise ValueError("curvatures compare on the same observations only; these batches differ")
-    results: dict[str, dict[str, float]] = {}
-    for name, policy in policies.items():
-        values = curvature(policy, batches[name], n_steps, **options)
-        mean = {key: float(value.mean()) for key, value in values.items()}
-        base = next(iter(results.values()), mean)
-        mean["ratio"] = mean["kappa"] / base["kappa"]
-        mean["ratio_executed"] = mean["kappa_executed"] / base["kappa_executed"]
-        mean["ratio_relative"] = mean["relative_executed"] / base["relative_executed"]
-        results[name] = mean
-    return results

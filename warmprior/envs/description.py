@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from torchrl.envs import TransformedEnv
+from torchrl.envs.transforms import Compose
 
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms.policy import policy_transforms
 
-__all__ = ["environment_description", "environment_name", "environment_of"]
+__all__ = ["environment_description", "environment_name", "environment_of", "environment_parts"]
 
 
 def environment_description(
@@ -30,6 +33,37 @@ def environment_description(
     }
 
 
+def environment_parts(
+    actor: WarmPriorActor,
+) -> tuple[Callable[..., RobosuiteEnv], Callable[[], Compose]]:
+    """What builds the environment that a policy was made for, and the policy's transforms.
+
+    Args:
+        actor: a policy, such as one that was loaded.
+
+    Returns:
+        Two functions, of further options of :class:`RobosuiteEnv` and of nothing.
+
+    Raises:
+        ValueError: if the policy keeps no description of an environment.
+    """
+    description: Any = actor.environment
+    if not _describes_robosuite(description):
+        raise ValueError(
+            f"the policy keeps no description of a robosuite environment, but {description}: build the "
+            "environment yourself, with policy_transforms(actor.prior, normalizer=actor.normalizer)"
+        )
+    normalizer = copy.deepcopy(actor.normalizer)
+    transforms = partial(
+        policy_transforms,
+        actor.prior,
+        # The environments' stays on the CPU, wherever the policy goes.
+        normalizer=None if normalizer is None else normalizer.to("cpu"),
+        observation_steps=description["observation_steps"],
+    )
+    return partial(RobosuiteEnv, **description["robosuite"]), transforms
+
+
 def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
     """The environment that a policy was made for, with the policy's own transforms.
 
@@ -45,18 +79,8 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         >>> environment_of(actor).rollout(10, actor)["next", "success"].any()  # doctest: +SKIP
         tensor(True)
     """
-    description: Any = actor.environment
-    if not _describes_robosuite(description):
-        raise ValueError(
-            f"the policy keeps no description of a robosuite environment, but {description}: build the "
-            "environment yourself, with policy_transforms(actor.prior, normalizer=actor.normalizer)"
-        )
-    transforms = policy_transforms(
-        actor.prior,
-        normalizer=actor.normalizer,
-        observation_steps=description["observation_steps"],
-    )
-    return TransformedEnv(RobosuiteEnv(**description["robosuite"], **options), transforms)
+    make_env, make_transforms = environment_parts(actor)
+    return TransformedEnv(make_env(**options), make_transforms())
 
 
 def environment_name(actor: WarmPriorActor) -> str | None:

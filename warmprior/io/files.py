@@ -22,6 +22,7 @@ __all__ = [
     "as_json",
     "check_regular",
     "check_writable",
+    "digest_of",
     "exclusive",
     "file_digest",
     "load_file",
@@ -89,6 +90,11 @@ def file_digest(path: Path) -> str:
     """SHA-256 of a file's content."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digest_of(*parts: Any) -> str:
+    """SHA-256 of values that JSON can hold: the identity of what they determine."""
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 def as_json(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 __all__ = ["TrainingConfig"]
 
@@ -20,10 +20,10 @@ class TrainingConfig:
         eps: AdamW's epsilon.
         warmup_ratio: share of the iterations over which the learning rate rises.
         ema_rate: decay of the averaged weights that are evaluated.
-        checkpoints: how many policies to keep, evenly spaced, the last at the end.
+        checkpoints: how many policies to keep at most, evenly spaced, the last at the end.
         save_every: iterations between saves of the training state; ``None`` for ten per checkpoint.
         log_every: iterations per logged mean loss.
-        seed: of sampling, source, times and dropout.
+        seed: of initial weights, sampling, source, times and dropout.
     """
 
     iterations: int = 200_000
@@ -43,19 +43,6 @@ class TrainingConfig:
         for name in ("iterations", "batch_size", "checkpoints", "log_every"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.checkpoints > self.iterations:
-            raise ValueError(
-                f"cannot keep {self.checkpoints} checkpoints of {self.iterations} iterations"
-            )
-
-    def with_iterations(self, iterations: int) -> TrainingConfig:
-        """The same recipe with another number of gradient steps, and no more checkpoints than those.
-
-        Raises:
-            ValueError: if ``iterations < 1``.
-        """
-        kept = min(self.checkpoints, iterations)
-        return replace(self, iterations=iterations, checkpoints=kept)
 
     @property
     def checkpoint_iterations(self) -> list[int]:
@@ -65,5 +52,5 @@ class TrainingConfig:
             >>> TrainingConfig(iterations=1000, checkpoints=4).checkpoint_iterations
             [250, 500, 750, 1000]
         """
-        n = self.checkpoints
+        n = min(self.checkpoints, self.iterations)
         return [round(self.iterations * (i + 1) / n) for i in range(n)]

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from warmprior.diagnostics._figure import new_figure
 from warmprior.envs.navigation1d import (
     HALF_HEIGHT,
     HALF_WIDTH,
@@ -17,6 +16,7 @@ from warmprior.envs.navigation1d import (
     navigation_heights,
     navigation_positions,
 )
+from warmprior.experiments.figures import new_figure
 
 __all__ = ["plot_flow_paths", "plot_navigation"]
 

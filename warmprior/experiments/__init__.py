@@ -1,0 +1,110 @@
+"""Experiments: from options to trained policies, rows, tables and figures. Needs ``warmprior[sim]``."""
+
+from warmprior.experiments.cli import parse, run_script, started, write_report
+from warmprior.experiments.figures import (
+    plot_filmstrip,
+    plot_learning_curves,
+    plot_reinforcement,
+    plot_success,
+    plot_success_bars,
+)
+from warmprior.experiments.labels import prior_color, prior_label, source_labels
+from warmprior.experiments.navigation1d import (
+    NAVIGATION_PRESETS,
+    NavigationRecipe,
+    judge_navigation,
+    play_navigation,
+)
+from warmprior.experiments.navigation_figures import plot_flow_paths, plot_navigation
+from warmprior.experiments.paper import paper_success
+from warmprior.experiments.problem import (
+    Problem,
+    find_problems,
+    navigation_problem,
+    observe,
+    robosuite_problem,
+)
+from warmprior.experiments.recipe import (
+    PRESETS,
+    DataOptions,
+    EvaluationOptions,
+    HeldOutOptions,
+    MeasuredRecipe,
+    NetworkOptions,
+    PolicyOptions,
+    Recipe,
+    RunOptions,
+    SourceOptions,
+    record,
+    restore,
+)
+from warmprior.experiments.results import Results, Row, grouped, mean_known, select, success_summary
+from warmprior.experiments.run import Comparison, Contestant
+from warmprior.experiments.store import Store, finished_policies
+from warmprior.experiments.straightness import straightness
+from warmprior.experiments.study_figures import plot_budget, plot_chunk_lengths, plot_sigma
+from warmprior.experiments.tables import (
+    curvature_table,
+    mean_cell,
+    success_cell,
+    success_table,
+    table,
+)
+
+__all__ = [
+    "NAVIGATION_PRESETS",
+    "PRESETS",
+    "Comparison",
+    "Contestant",
+    "DataOptions",
+    "EvaluationOptions",
+    "HeldOutOptions",
+    "MeasuredRecipe",
+    "NavigationRecipe",
+    "NetworkOptions",
+    "PolicyOptions",
+    "Problem",
+    "Recipe",
+    "Results",
+    "Row",
+    "RunOptions",
+    "SourceOptions",
+    "Store",
+    "curvature_table",
+    "find_problems",
+    "finished_policies",
+    "grouped",
+    "judge_navigation",
+    "mean_cell",
+    "mean_known",
+    "navigation_problem",
+    "observe",
+    "paper_success",
+    "parse",
+    "play_navigation",
+    "plot_budget",
+    "plot_chunk_lengths",
+    "plot_filmstrip",
+    "plot_flow_paths",
+    "plot_learning_curves",
+    "plot_navigation",
+    "plot_reinforcement",
+    "plot_sigma",
+    "plot_success",
+    "plot_success_bars",
+    "prior_color",
+    "prior_label",
+    "record",
+    "restore",
+    "robosuite_problem",
+    "run_script",
+    "select",
+    "source_labels",
+    "started",
+    "straightness",
+    "success_cell",
+    "success_summary",
+    "success_table",
+    "table",
+    "write_report",
+]

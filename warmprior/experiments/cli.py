@@ -1,0 +1,196 @@
+"""Experiments from the command line: options, output folders, errors and interruptions."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+
+from warmprior.experiments.recipe import Recipe, differences, record, restore
+from warmprior.experiments.results import write_options
+from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
+from warmprior.training.workers import WorkerError
+
+__all__ = ["numbered_folder", "parse", "run_script", "started", "write_report"]
+
+ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError)
+"""What a user can mend: reported without a traceback."""
+
+
+def parse[R: Recipe](
+    presets: Mapping[str, R],
+    argv: Sequence[str] | None,
+    *,
+    study: str,
+    description: str | None = None,
+    preset: Callable[[R], R] | None = None,
+) -> R:
+    """The recipe that a command line asks for, checked, with its output folder.
+
+    The options start from those of ``--preset``, or with ``--resume`` from the stored ones, which the
+    command line may then only repeat, but for where and with how many workers to compute.
+
+    Args:
+        presets: by name; the first is the default.
+        argv: the command line without the program; that of this process by default.
+
+    Keyword Args:
+        study: name of the experiment; a folder holds one.
+        description: of ``--help``.
+        preset: chooses the preset of what is asked for, where it depends on more than its name.
+
+    Raises:
+        ValueError: naming the option that cannot work, or that a continued run does not have.
+        SystemExit: for options that do not exist, and for ``--help``.
+    """
+    argv = sys.argv[1:] if argv is None else list(map(str, argv))
+
+    def read(default: R) -> R:
+        kind: Any = type(default)
+        return tyro.cli(kind, default=default, args=argv, description=description)
+
+    asked = read(next(iter(presets.values())))
+    if asked.run.preset not in presets:
+        told = ", ".join(presets)
+        raise ValueError(f"--preset must be one of {told}, got {asked.run.preset!r}")
+    base = presets[asked.run.preset] if preset is None else preset(asked)
+    recipe = read(base)
+    out = _output_folder(recipe, study)
+    if recipe.run.resume:
+        base = _stored(type(recipe), out, study)
+        recipe = read(base)
+        changed = sorted(differences(record(recipe), record(base)))
+        if changed:
+            raise ValueError(
+                f"{out} was started with {', '.join(changed)}: leave these out, or choose another --out"
+            )
+    generates = recipe.data.dataset is None and not recipe.data.download
+    if recipe.data.demonstrations != base.data.demonstrations and not generates:
+        raise ValueError("--demonstrations says how many to generate: leave it out with a file")
+    name = recipe.run.logger
+    if name in ("tensorboard", "wandb") and find_spec(name) is None:
+        raise ImportError(f"--logger {name} needs the package {name}: pip install it")
+    recipe.check()
+    return replace(recipe, run=replace(recipe.run, out=out))
+
+
+def _output_folder(recipe: Recipe, study: str) -> Path:
+    """The folder to write to; never one that holds a run, unless it is to be continued."""
+    run = recipe.run
+    out = run.out
+    if out is None:
+        parts = [recipe.name, run.preset]
+        prefix = [] if study == "robomimic" else [study]
+        out = numbered_folder(Path("runs"), "-".join([*prefix, *parts]), latest=run.resume)
+    holds = (out / "options.json").exists() or (out / "results.json").exists()
+    if holds and not run.resume:
+        raise ValueError(f"{out} holds a run: add --resume to continue it, or choose another --out")
+    return out
+
+
+def _stored[R: Recipe](kind: type[R], out: Path, study: str) -> R:
+    """The recipe of the run in a folder."""
+    path = out / "options.json"
+    if not path.is_file():
+        raise ValueError(f"--resume: there is no run in {out}; name its folder with --out")
+    tree = read_json(path)
+    theirs = tree.pop("study", None) if isinstance(tree, dict) else None
+    if theirs != study:
+        raise ValueError(
+            f"{out} holds a run of another study ({theirs}): continue it with that script, or choose "
+            "another --out"
+        )
+    try:
+        return restore(kind, tree)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is not of this version: {error}") from error
+
+
+def numbered_folder(parent: Path, name: str, *, latest: bool = False) -> Path:
+    """The first free one of ``name``, ``name-2``, ``name-3``, ...; or the latest one taken."""
+
+    def number(folder: Path) -> int:
+        return int(folder.name[len(name) + 1 :] or 1)
+
+    taken = [
+        d for d in parent.glob(f"{name}*") if d.name == name or d.name[len(name) + 1 :].isdigit()
+    ]
+    if not taken:
+        return parent / name
+    last = max(taken, key=number)
+    return last if latest else parent / f"{name}-{number(last) + 1}"
+
+
+@contextmanager
+def started(recipe: Recipe, study: str) -> Iterator[Path]:
+    """The output folder, with the options in it, and without another process.
+
+    Raises:
+        OSError: if it cannot be written to, or another process works in it.
+    """
+    out = recipe.run.directory
+    check_writable(out)
+    with exclusive(out):
+        write_options(out / "options.json", study, record(recipe))
+        print(f"Output folder: {out}", flush=True)
+        yield out
+
+
+def write_report(out: Path, table: str) -> None:
+    """Write the table of a run and show it.
+
+    Args:
+        out: its folder.
+        table: in Markdown.
+    """
+    write_atomic(out / "table.md", lambda path: path.write_text(table))
+    print(f"\n{table}\nResults, table and pictures: {out}", flush=True)
+
+
+def run_script(
+    script: Callable[[Sequence[str] | None], object], argv: Sequence[str] | None, name: str
+) -> int:
+    """Run a script; what a user can mend, and Ctrl-C, are told in one line.
+
+    Args:
+        script: takes the command line.
+        argv: see :func:`parse`.
+        name: of the script.
+
+    Returns:
+        The exit code.
+    """
+    # Policies are shared between scripts, so all of them compute alike. Small networks gain nothing from
+    # a second thread, and on a busy machine threads that wait for each other cost much.
+    torch.set_float32_matmul_precision("high")
+    torch.set_num_threads(1)
+    interrupted = False
+
+    def interrupt(number: int, frame: Any) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        script(argv)
+    except BaseException as error:
+        if interrupted:  # whatever the libraries in between have made of it
+            print(f"\n{name}: interrupted; --resume continues", file=sys.stderr)
+            return 130
+        if not isinstance(error, ERRORS):
+            raise
+        told = error.args[0] if isinstance(error, KeyError) and error.args else error
+        print(f"{name}: error: {told}", file=sys.stderr)
+        return 2
+    finally:
+        signal.signal(signal.SIGINT, before)
+    return 0

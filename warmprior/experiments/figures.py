@@ -1,0 +1,276 @@
+"""Figures of comparisons: success posteriors, learning curves, filmstrips, agents."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warmprior.diagnostics.statistics import SeedSummary, success_posterior, summarize_seeds
+from warmprior.experiments.labels import prior_color, prior_label, source_labels
+from warmprior.experiments.results import Row, grouped, select, success_summary
+from warmprior.io.extras import require
+
+__all__ = [
+    "plot_filmstrip",
+    "plot_learning_curves",
+    "plot_reinforcement",
+    "plot_success",
+    "plot_success_bars",
+]
+
+
+def new_figure(
+    width: float, height: float, rows: int = 1, columns: int = 1, *, share: bool = False
+) -> tuple[Any, list[Any]]:
+    """A figure and its axes, row by row.
+
+    Raises:
+        ImportError: if matplotlib is missing.
+    """
+    # The Agg canvas needs no display, and no pyplot state is left behind.
+    require("matplotlib", "sim")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=share, sharey=share)
+    return figure, list(axes.flat)
+
+
+def band(axis: Any, x: Sequence[float], points: Sequence[SeedSummary], **line: Any) -> None:
+    """A line of means, with one standard deviation over seeds shaded."""
+    mean = np.array([point.mean for point in points])
+    spread = np.nan_to_num([point.std for point in points])
+    drawn = axis.plot(x, mean, **{"marker": "o", "ms": 4, "lw": 1.4} | line)[0]
+    axis.fill_between(x, mean - spread, mean + spread, color=drawn.get_color(), alpha=0.2, lw=0)
+
+
+def plot_success(
+    rows: Iterable[Row],
+    path: str | Path,
+    *,
+    title: str,
+    group: Callable[[Row], str] = lambda row: f"NFE {row['nfe']}",
+) -> None:
+    """Beta-posterior violins of the success rate (appendix A).
+
+    The width at height ``p`` is the posterior density Beta(k + 1, n - k + 1) of the episodes of all
+    seeds together; the tick is its mean, and ``k/n`` stands below.
+
+    Args:
+        rows: evaluations; those of one source and group are pooled.
+        path: of the PNG.
+
+    Keyword Args:
+        title: of the figure.
+        group: names what stands side by side.
+    """
+    rows = list(rows)
+    label, groups = source_labels(rows), grouped(rows, group)
+    sources = list(grouped(rows, label))
+    figure, (axis,) = new_figure(2.2 + 0.55 * (len(sources) + 1) * len(groups), 4.2)
+    grid = np.linspace(0.0, 1.0, 801)
+    ticks: list[float] = []
+    shown: set[str] = set()
+    for g, members in enumerate(groups.values()):
+        start = g * (len(sources) + 0.8)
+        for j, source in enumerate(sources):
+            cell = [row for row in members if label(row) == source]
+            if not cell:
+                continue
+            k, n = (sum(row[name] for row in cell) for name in ("successes", "episodes"))
+            posterior = success_posterior(k, n)
+            density = posterior.pdf(grid)
+            x, half = start + j, 0.42 * density / density.max()
+            axis.fill_betweenx(
+                grid,
+                x - half,
+                x + half,
+                color=prior_color(cell[0]["prior"]),
+                alpha=0.75,
+                lw=0,
+                label=None if source in shown else source,
+            )
+            shown.add(source)
+            axis.plot([x - 0.3, x + 0.3], [posterior.mean()] * 2, color="black", lw=1.2)
+            axis.text(x, -0.025, f"{k}/{n}", ha="center", va="top", fontsize=7, color="0.35")
+        ticks.append(start + (len(sources) - 1) / 2)
+    axis.set_xticks(ticks, list(groups))
+    axis.set_ylim(-0.08, 1.0)
+    axis.set_yticks(np.linspace(0, 1, 6))
+    axis.set_ylabel("success rate (posterior density)")
+    axis.set_title(title, fontsize=10)
+    axis.grid(axis="y", alpha=0.25)
+    figure.legend(loc="outside lower center", ncols=min(4, len(sources)), frameon=False, fontsize=9)
+    figure.savefig(path, dpi=150)
+
+
+def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, title: str) -> None:
+    """Success rates as bars, a group per chunk length, with one seed standard deviation (Fig. 6).
+
+    Args:
+        rows: evaluations of one task at one NFE.
+        path: of the PNG.
+
+    Keyword Args:
+        top_k: checkpoints averaged per seed.
+        title: of the figure.
+    """
+    priors, groups = grouped(rows, lambda row: row["prior"]), grouped(rows, lambda r: r["chunk"])
+    figure, (axis,) = new_figure(1.8 + 1.5 * len(groups), 3.6)
+    for g, members in enumerate(groups.values()):
+        for j, prior in enumerate(priors):
+            cell = select(members, prior=prior)
+            if not cell:
+                continue
+            summary = success_summary(cell, top_k)
+            x = g * (len(priors) + 0.8) + j
+            axis.bar(
+                x,
+                summary.mean,
+                0.85,
+                yerr=None if math.isnan(summary.std) else summary.std,
+                capsize=3,
+                color=prior_color(prior),
+                label=prior_label(prior) if g == 0 else None,
+            )
+            axis.text(x, summary.mean + 0.015, f"{100 * summary.mean:.0f}", ha="center", fontsize=8)
+    centre = (len(priors) - 1) / 2
+    at = [g * (len(priors) + 0.8) + centre for g in range(len(groups))]
+    axis.set_xticks(at, [f"H = {chunk}" for chunk in groups])
+    axis.set_ylim(0, 1.08)
+    axis.set_ylabel(f"success rate (NFE {rows[0]['nfe']})")
+    axis.grid(axis="y", alpha=0.25)
+    figure.legend(loc="outside lower center", ncols=len(priors), frameon=False, fontsize=9)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=150)
+
+
+def plot_learning_curves(
+    losses: Mapping[str, Sequence[Sequence[tuple[int, float]]]],
+    rows: Iterable[Row],
+    path: str | Path,
+    *,
+    title: str,
+) -> None:
+    """Training loss and success rate against the iteration.
+
+    Args:
+        losses: per prior, one ``[(iteration, loss), ...]`` per seed.
+        rows: evaluations of one problem at one NFE.
+        path: of the PNG.
+
+    Keyword Args:
+        title: of the figure.
+    """
+    rows = list(rows)
+    figure, (left, right) = new_figure(9.0, 3.6, columns=2)
+    for prior, seeds in losses.items():
+        for i, curve in enumerate(seeds):
+            label = prior_label(prior) if i == 0 else None
+            left.plot(*zip(*curve, strict=True), color=prior_color(prior), lw=1.0, label=label)
+    left.set_yscale("log")
+    left.set_ylabel("flow-matching loss (own source)")
+    for prior in losses:
+        cells = grouped(select(rows, prior=prior), lambda row: row["checkpoint"])
+        points = [success_summary(cells[checkpoint], 1) for checkpoint in sorted(cells)]
+        right.errorbar(
+            sorted(cells),
+            [point.mean for point in points],
+            yerr=np.nan_to_num([point.std for point in points]),
+            marker="o",
+            ms=4,
+            lw=1.0,
+            capsize=2,
+            color=prior_color(prior),
+        )
+    right.set_xlim(left.get_xlim())
+    right.set_ylim(-0.02, 1.02)
+    right.set_ylabel("success rate" + (f" (NFE {rows[0]['nfe']})" if rows else ""))
+    for axis in (left, right):
+        axis.set_xlabel("iteration")
+        axis.grid(alpha=0.25)
+    left.legend(frameon=False, fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=150)
+
+
+def plot_filmstrip(
+    frames: Sequence[np.ndarray], labels: Sequence[str], path: str | Path, *, title: str
+) -> None:
+    """One episode as a row of pictures.
+
+    Args:
+        frames: uint8 ``[h, w, 3]`` each.
+        labels: text below each frame.
+        path: of the PNG.
+
+    Keyword Args:
+        title: of the figure.
+    """
+    figure, axes = new_figure(1.5 * len(frames), 2.0, columns=len(frames))
+    for axis, frame, label in zip(axes, frames, labels, strict=True):
+        axis.imshow(frame)
+        axis.set_axis_off()
+        axis.text(0.5, -0.04, label, transform=axis.transAxes, ha="center", va="top", fontsize=7)
+    figure.suptitle(title, fontsize=9)
+    figure.savefig(path, dpi=150)
+
+
+def agent_label(row: Row, seeds: int) -> str:
+    """What figures and tables call the agents of one algorithm and prior."""
+    many = "" if seeds == 1 else "s"
+    return f"{row['algorithm'].upper()}, {prior_label(row['prior'])} ({seeds} seed{many})"
+
+
+def plot_reinforcement(
+    rows: Iterable[Row], path: str | Path, *, title: str, warmup_steps: int
+) -> None:
+    """Success rate against control steps, mean and one standard deviation over seeds (Fig. 7).
+
+    A panel for the greedy and one for the stochastic agent. Seeds are averaged evaluation by
+    evaluation: they are due at the same number of control steps, and made at the next decision.
+
+    Args:
+        rows: evaluations with ``algorithm``, ``prior``, ``seed``, ``environment_steps`` and
+            ``evaluation`` (``"base"``, ``"greedy"`` or ``"stochastic"``).
+        path: of the PNG.
+
+    Keyword Args:
+        title: of the figure.
+        warmup_steps: control steps before the first update, shaded.
+    """
+    rows = list(rows)
+    figure, axes = new_figure(10.0, 3.8, 1, 2, share=True)
+    agents = grouped(rows, lambda row: (row["algorithm"], row["prior"]))
+    for axis, kind in zip(axes, ("greedy", "stochastic"), strict=True):
+        for (algorithm, prior), members in agents.items():
+            shown = [row for row in members if row["evaluation"] in ("base", kind)]
+            seeds = list(grouped(shown, lambda row: row["seed"]).values())
+            shared = range(min(map(len, seeds)))
+            band(
+                axis,
+                [
+                    float(np.mean([points[k]["environment_steps"] for points in seeds]))
+                    for k in shared
+                ],
+                [summarize_seeds([points[k]["success_rate"] for points in seeds]) for k in shared],
+                color=prior_color(prior),
+                ls="--" if algorithm == "dsrl-sac" else "-",
+                ms=3,
+                label=agent_label(members[0], len(seeds)),
+            )
+        axis.axvspan(0, warmup_steps, color="0.92", lw=0, zorder=-1)
+        axis.set_title(f"{kind} agent; at 0 the frozen policy", fontsize=9)
+        axis.set_xlabel("control steps (shaded: warm-up)")
+        axis.set_ylim(-0.02, 1.02)
+        axis.grid(alpha=0.25)
+    axes[0].set_ylabel("success rate")
+    axes[0].legend(frameon=False, fontsize=8, loc="lower right")
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=150)

@@ -1,0 +1,290 @@
+"""Reinforcement learning in the source space of frozen policies: recipes, and their environments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, asdict, dataclass, field, fields, make_dataclass, replace
+from functools import partial
+from typing import Annotated, Any, Literal, get_type_hints
+
+import tyro
+from torchrl.envs import EnvBase, TransformedEnv
+
+from warmprior.envs import GoalNavigationEnv
+from warmprior.envs.description import environment_parts
+from warmprior.experiments.navigation1d import NAVIGATION_PRESETS
+from warmprior.experiments.recipe import (
+    PRESETS,
+    DataOptions,
+    EvaluationOptions,
+    Flat,
+    PolicyOptions,
+    Recipe,
+    SourceOptions,
+    check_counts,
+    refuse_ignored,
+)
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.prior import Prior
+from warmprior.rl import PriorAnchor, PriorSpaceConfig
+from warmprior.training.evaluation import parallel_env
+from warmprior.transforms import policy_transforms
+
+__all__ = ["PRIOR_SPACE_PRESETS", "PriorSpaceRecipe", "agent_environment", "prior_space_preset"]
+
+TOY = "navigation"
+
+PER_AGENT = ("algorithm", "seed", "nfe", "evaluation_episodes")
+"""Of the recipe of an agent: told by the options that all experiments share."""
+
+_HINTS = get_type_hints(PriorSpaceConfig)
+AgentOptions: Any = make_dataclass(
+    "AgentOptions",
+    [
+        (f.name, _HINTS[f.name], field(default=f.default))
+        for f in fields(PriorSpaceConfig)
+        if f.name not in PER_AGENT and f.default is not MISSING
+    ],
+    frozen=True,
+    namespace={"__doc__": PriorSpaceConfig.__doc__},
+)
+"""The rest of :class:`~warmprior.rl.PriorSpaceConfig`, the same for all agents of an experiment."""
+
+
+@dataclass(frozen=True)
+class GroupOptions:
+    """The agents to compare.
+
+    Attributes:
+        algorithm: of their learning.
+        horizon: time limit in control steps (default: the task's).
+        base_delta: half the agent's box around zero, where --rl.delta is not given (default: 1.5).
+        num_envs: parallel environments of an agent.
+        threads: of an agent's training; more than one only wait for each other in small networks.
+    """
+
+    algorithm: tuple[Literal["dsrl-na", "dsrl-sac"], ...] = ("dsrl-na",)
+    horizon: int | None = None
+    base_delta: float | None = None
+    num_envs: int = 4
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        check_counts(self, "horizon", "num_envs", "threads")
+
+
+@dataclass(frozen=True)
+class PriorSpaceRecipe(Recipe):
+    """Everything that determines a comparison of agents; the frozen policies are those of a comparison.
+
+    Attributes:
+        policies: of a finished run, instead of those of the options.
+        rl: what all agents share.
+        agents: what is compared.
+    """
+
+    policies: Annotated[PolicyOptions, Flat] = field(default_factory=PolicyOptions)
+    # With their prefix: gradient steps, say, are those of behaviour cloning in all experiments.
+    rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
+    agents: Annotated[GroupOptions, Flat] = field(default_factory=GroupOptions)
+
+    @property
+    def is_toy(self) -> bool:
+        """Whether it is of the navigation toy."""
+        return self.data.task == (TOY,)
+
+    @property
+    def name(self) -> str:
+        """Of the output folder."""
+        return TOY if self.is_toy else super().name
+
+    def check(self) -> None:
+        """Refuse what cannot work, or has no effect, before any work."""
+        if self.is_toy != (self.run.preset == "unit"):
+            raise ValueError(f"--task {TOY} and --preset unit belong together")
+        self.check_single(problem=True, chunk=True, nfe=True)
+        base = prior_space_preset(self)
+        if self.policies.run is not None:
+            told, parts = (
+                "--run brings its policies and their data",
+                ["data", "network", "training"],
+            )
+            refuse_ignored(
+                replace(self, data=replace(self.data, task=base.data.task)), base, parts, told
+            )
+        elif self.is_toy:
+            told = "the toy has demonstrations and a time limit of its own"
+            refuse_ignored(self, base, ["data"], told)
+            if self.agents.horizon is not None:
+                raise ValueError(f"{told}: leave out --horizon")
+        else:
+            self.data.check()
+        for prior in self.sources.priors():
+            if not prior.is_flow:
+                raise ValueError(
+                    f"--prior {prior.name} is no flow: there is no source space to act in"
+                )
+            for algorithm in self.agents.algorithm:
+                self.agent(prior, algorithm, 0)
+        if self.run.preset == "paper" and not self.data.task:
+            raise ValueError("--preset paper has hyper-parameters per task: add the --task")
+
+    def agent(self, prior: Prior, algorithm: str, seed: int) -> PriorSpaceConfig:
+        """The recipe of one agent.
+
+        Args:
+            prior: of its frozen policy.
+            algorithm: of its learning.
+            seed: its seed.
+
+        Raises:
+            ValueError: for a number out of its range, naming it.
+        """
+        shared: Mapping[str, Any] = asdict(self.rl)
+        own: dict[str, Any] = {
+            "algorithm": algorithm,
+            "seed": seed,
+            "nfe": self.evaluation.nfe[0],
+            "evaluation_episodes": self.evaluation.episodes,
+            "backup_entropy": shared["backup_entropy"] or algorithm == "dsrl-sac",
+        }
+        if shared["delta"] is None and not prior.moves_source:
+            own["delta"] = self.agents.base_delta
+        return PriorSpaceConfig(**{**shared, **own})
+
+
+def agent_environment(recipe: PriorSpaceRecipe, actor: WarmPriorActor) -> Callable[[int], EnvBase]:
+    """The environment of agents around a frozen policy, as a function of its seed.
+
+    Args:
+        recipe: how many at once, and the time limit.
+        actor: the frozen policy, which knows its own environment.
+    """
+    if recipe.is_toy:
+        return partial(_toy, actor, recipe.agents.num_envs)
+    make_env, make_transforms = environment_parts(actor)
+    make_env = partial(make_env, horizon=recipe.agents.horizon)
+    return partial(_simulators, actor, make_env, make_transforms, recipe.agents.num_envs)
+
+
+def _toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
+    transforms = policy_transforms(actor.prior, observation_steps=1)
+    transforms.append(PriorAnchor(actor.prior, seed=seed))
+    return TransformedEnv(GoalNavigationEnv(batch_size=[num_envs]), transforms)
+
+
+def _simulators(
+    actor: WarmPriorActor, make_env: Any, make_transforms: Any, num_envs: int, seed: int
+) -> EnvBase:
+    # The anchor outside of the workers: one transform draws for all of them.
+    workers = parallel_env(make_env, make_transforms, num_envs)
+    env = TransformedEnv(workers, PriorAnchor(actor.prior, seed=seed))
+    env.set_seed(seed, static_seed=True)
+    return env
+
+
+def _with(recipe: PriorSpaceRecipe, **parts: Mapping[str, Any]) -> PriorSpaceRecipe:
+    """Replace leaves of a recipe, by part."""
+    made = {part: replace(getattr(recipe, part), **values) for part, values in parts.items()}
+    return replace(recipe, **made)
+
+
+_TOY, _QUICK, _PAPER = NAVIGATION_PRESETS["quick"], PRESETS["quick"], PRESETS["paper"]
+
+PRIOR_SPACE_PRESETS: dict[str, PriorSpaceRecipe] = {
+    # Lift from a weak policy, WP-Past against the base, two seeds: half an hour.
+    "quick": PriorSpaceRecipe(
+        data=DataOptions(task=("lift",)),
+        network=_QUICK.network,
+        training=_QUICK.training,
+        sources=SourceOptions(prior=("gaussian", "past")),
+        evaluation=EvaluationOptions(seeds=2, episodes=40, nfe=(1,)),
+        rl=AgentOptions(
+            environment_steps=24_000,
+            warmup_steps=3_000,
+            updates=4,
+            noise_critic_steps=2,
+            learning_rate=1e-3,
+            gamma=0.97,
+            hidden_dim=128,
+            # At 1, the entropy of 56 coordinates outweighs the 8 control steps of a decision: the agent
+            # would be paid for not solving the task, until the temperature has fallen.
+            alpha_init=0.05,
+            evaluate_every=6_000,
+        ),
+        agents=GroupOptions(threads=1),
+    ),
+    # The navigation toy with a goal, three seeds: under two minutes.
+    "unit": PriorSpaceRecipe(
+        data=DataOptions(task=(TOY,)),
+        network=_TOY.network,
+        training=replace(_TOY.training, iterations=800, save_every=800),
+        sources=SourceOptions(prior=("past",)),
+        evaluation=EvaluationOptions(seeds=3, episodes=128, nfe=(2,)),
+        rl=AgentOptions(
+            environment_steps=12_000,
+            warmup_steps=3_000,
+            updates=12,
+            noise_critic_steps=4,
+            learning_rate=1e-3,
+            tau=0.05,
+            gamma=1.0,
+            hidden_dim=128,
+            num_layers=2,
+            # Failure ends the episode: entropy in the targets would pay for not failing, whatever the reward.
+            backup_entropy=False,
+            alpha_init=0.02,
+            reward_offset=0.0,
+            evaluate_every=6_000,
+        ),
+        agents=GroupOptions(num_envs=32, threads=1),
+    ),
+    # DSRL's hyper-parameters per task, three seeds: needs a GPU.
+    "paper": PriorSpaceRecipe(
+        data=_PAPER.data,
+        network=_PAPER.network,
+        training=_PAPER.training,
+        sources=SourceOptions(chunk=(4,)),
+        evaluation=EvaluationOptions(seeds=3, episodes=200, nfe=(1,)),
+        # Success ends the episode here, unlike in DSRL: entropy in the targets would pay for not solving it.
+        rl=AgentOptions(environment_steps=1_000_000, backup_entropy=False, evaluate_every=50_000),
+    ),
+}
+"""Budgets of comparisons of agents."""
+
+_BY_TASK: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
+    # Weak policies: solved in 0.3 to 0.8 of the episodes.
+    ("quick", "lift"): {
+        "data": {"demonstrations": (5,)},
+        "training": {"iterations": 300},
+        "agents": {"horizon": 90},
+    },
+    ("quick", "can"): {"training": {"iterations": 500}},
+    ("paper", "lift"): {"rl": {"updates": 30}, "agents": {"horizon": 300}},
+    ("paper", "can"): {"agents": {"horizon": 300}},
+    ("paper", "square"): {
+        "rl": {"gamma": 0.999, "warmup_steps": 32_000},
+        "agents": {"horizon": 400},
+    },
+    # DSRL's own choice there is SAC.
+    ("paper", "transport"): {
+        "rl": {"hidden_dim": 128, "warmup_steps": 640_000},
+        "sources": {"chunk": (8,)},
+        "agents": {"horizon": 800, "base_delta": 1.0, "algorithm": ("dsrl-na", "dsrl-sac")},
+    },
+}
+"""What a preset does differently on a task."""
+
+
+def prior_space_preset(asked: PriorSpaceRecipe) -> PriorSpaceRecipe:
+    """The preset that is asked for, with the hyper-parameters of the task.
+
+    Args:
+        asked: names both.
+    """
+    base = PRIOR_SPACE_PRESETS[asked.run.preset]
+    task = next(iter(asked.data.task or base.data.task), "")
+    if asked.run.preset == "unit":
+        task = TOY
+    changed = _with(base, **_BY_TASK.get((asked.run.preset, task), {}))
+    return _with(changed, data={"task": (task,) if task else ()})

@@ -1,0 +1,226 @@
+"""What policies of any source are trained for: demonstrations, their units, and the environment."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from warmprior.data import (
+    RobomimicExperienceReplay,
+    download_robomimic,
+    generate_demonstrations,
+)
+from warmprior.diagnostics.shared_observations import SharedObservations
+from warmprior.envs import RobosuiteEnv
+from warmprior.envs.description import environment_description
+from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
+from warmprior.experiments.recipe import DataOptions, HeldOutOptions
+from warmprior.io.files import file_digest
+from warmprior.modules.normalize import Normalizer
+
+__all__ = [
+    "Problem",
+    "find_problems",
+    "navigation_problem",
+    "observe",
+    "robosuite_problem",
+]
+
+HELD_OUT_SEED = 50
+"""Of the generated files that no training uses; training files have seed 0."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A task as every policy meets it.
+
+    Attributes:
+        task: short name.
+        style: of the demonstrations, such as ``"ph"``.
+        data: contiguous steps in normalised units, see :class:`~warmprior.ActionWindow`.
+        make_env: builds the environment; one that is evaluated by episodes tells ``"success"`` and starts
+            the same episode after every ``set_seed(seed)``.
+        identity: of the data, which is part of the identity of every policy trained on them.
+        facts: what results tell about the data, as JSON.
+        normalizer: between raw and normalised units; ``None`` if they are the same.
+        clip: bound of the normalised actions that are executed; ``None`` for none.
+        environment: what a saved policy keeps of the environment, see
+            :func:`~warmprior.envs.environment_of`.
+    """
+
+    task: str
+    style: str
+    data: TensorDictBase
+    make_env: Callable[..., EnvBase]
+    identity: str
+    facts: dict[str, Any] = field(default_factory=dict)
+    normalizer: Normalizer | None = None
+    clip: float | None = None
+    environment: Mapping[str, Any] | None = None
+
+    @property
+    def name(self) -> str:
+        """Task and style, for titles."""
+        source = self.facts.get("source")
+        return f"{self.task} {self.style}" + (f" ({source} data)" if source else "")
+
+
+def robosuite_problem(
+    path: Path, style: str = "ph", *, source: str = "file", observation_steps: int = 2
+) -> Problem:
+    """The problem of a robomimic HDF5 file, in its own simulator.
+
+    Args:
+        path: of the file.
+        style: ``"ph"`` or ``"mh"``; decides the time limit of tasks of ours.
+
+    Keyword Args:
+        source: where the file comes from: ``"scripted"``, ``"official"`` or ``"file"``.
+        observation_steps: ``To`` of the policies.
+
+    Raises:
+        DatasetError: if the file cannot be read.
+    """
+    dataset = RobomimicExperienceReplay(path)
+    normalizer, digest = Normalizer.fit(dataset.data), file_digest(path)
+    return Problem(
+        task=task_of(dataset),
+        style=style,
+        data=normalizer.normalize(dataset.data.exclude("next")),
+        make_env=partial(RobosuiteEnv, env_args=dataset.env_args, style=style),
+        identity=digest,
+        facts={
+            "source": source,
+            "file": path.name,
+            "sha256": digest,
+            "demonstrations": dataset.num_episodes,
+            "steps": len(dataset.data),
+        },
+        normalizer=normalizer,
+        # The normalised demonstrations span [-1, 1]: what leaves it is executed, and remembered, at the
+        # bound.
+        clip=1.0,
+        environment=environment_description(dataset.env_args, style, observation_steps),
+    )
+
+
+def navigation_problem() -> Problem:
+    """The one-dimensional navigation toy (Fig. 5)."""
+    return Problem(
+        "navigation", "toy", navigation_demonstrations(), NavigationEnv, "navigation1d", {}
+    )
+
+
+def task_of(dataset: RobomimicExperienceReplay) -> str:
+    """Short name of a dataset's task, or the environment's where it is none of ours."""
+    task = dataset.task
+    return str(dataset.env_args["env_name"]).lower() if task is None else task.name
+
+
+def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Problem]:
+    """Read, download or generate the demonstrations of every task and style.
+
+    Args:
+        options: which.
+        observation_steps: ``To`` of the policies.
+
+    Raises:
+        ValueError: if a file is of another task than the one that is named.
+    """
+    options.check()
+    if options.dataset is not None:
+        found = robosuite_problem(
+            options.dataset, options.data[0], observation_steps=observation_steps
+        )
+        if options.task not in ((), (found.task,)):
+            raise ValueError(
+                f"{options.dataset} holds demonstrations of {found.task}, not of {options.task[0]}: leave "
+                "--task out or correct it"
+            )
+        return [found]
+    if not options.download:
+        counts = ", ".join(f"{options.count(style)} {style}" for style in options.data)
+        print(
+            f"Data: {counts} scripted demonstrations per task. They stand in for the official human data "
+            "(--download); success rates on them are not comparable with the paper's.",
+            flush=True,
+        )
+    problems = []
+    for task in options.task or ("square",):
+        for style in options.data:
+            if options.download:
+                path, source = download_robomimic(task, style), "official"
+            else:
+                path = generate_demonstrations(task, style, options.count(style))
+                source = "scripted"
+            problems.append(
+                robosuite_problem(path, style, source=source, observation_steps=observation_steps)
+            )
+    return problems
+
+
+def observe(
+    options: HeldOutOptions,
+    facts: Mapping[str, Any],
+    normalizer: Normalizer,
+    *,
+    chunk_length: int,
+    observation_steps: int,
+    device: str = "cpu",
+) -> tuple[SharedObservations, str]:
+    """Draw observations, normalised as policies were trained, and say what they are.
+
+    Args:
+        options: which.
+        facts: of the problem: ``task``, ``style``, and those of the data.
+        normalizer: of the policies.
+
+    Keyword Args:
+        chunk_length: ``H``.
+        observation_steps: ``To``.
+        device: where to keep them.
+
+    Raises:
+        ValueError: if there are no demonstrations to hold out, or they are of another task.
+    """
+    task, style = facts["task"], facts["style"]
+    if options.validation is not None:
+        path, told = options.validation, options.validation.name
+        if file_digest(path) == facts["sha256"]:
+            told = "the TRAINING demonstrations (not held out)"
+    elif facts["source"] != "scripted":
+        raise ValueError(
+            f"these policies are trained on all demonstrations of {facts['file']}: add --validation FILE "
+            "with others (or with the same file, to measure on the training data)"
+        )
+    else:
+        # As many as the training demonstrations suggest, with room to spare.
+        mean_steps = facts["steps"] / facts["demonstrations"]
+        usable = max(1.0, min(50.0, 0.8 * (mean_steps - chunk_length)))
+        n = max(20, int(-(-options.observations // usable)))
+        path = generate_demonstrations(task, style, n, HELD_OUT_SEED)
+        told = f"{n} newly generated demonstrations"
+    dataset = RobomimicExperienceReplay(path)
+    if task_of(dataset) != task:
+        raise ValueError(
+            f"--validation {path} holds demonstrations of {task_of(dataset)}, but these policies are for "
+            f"{task}"
+        )
+    # A copy: the data are normalised on the CPU, the policy may live elsewhere.
+    normalizer = copy.deepcopy(normalizer).to("cpu")
+    shared = SharedObservations(
+        normalizer.normalize(dataset.data.exclude("next")).to(device),
+        chunk_length,
+        observation_steps=observation_steps,
+        count=options.observations,
+        generator=torch.Generator().manual_seed(0),
+    )
+    return shared, told

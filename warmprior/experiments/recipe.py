@@ -1,0 +1,519 @@
+"""What determines an experiment: one tree of options, from which command line, files and identity come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, get_args, get_type_hints
+
+import torch
+import tyro
+
+from warmprior.envs.tasks import get_task
+from warmprior.modules import ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior.modules.prior import Prior
+from warmprior.training.training_config import TrainingConfig
+
+__all__ = [
+    "PRESETS",
+    "DataOptions",
+    "EvaluationOptions",
+    "HeldOutOptions",
+    "MeasuredRecipe",
+    "NetworkOptions",
+    "PolicyOptions",
+    "Recipe",
+    "RunOptions",
+    "SourceOptions",
+    "record",
+    "restore",
+]
+
+Flat = tyro.conf.OmitArgPrefixes
+"""Marks a part of the tree whose options carry their own names alone on the command line."""
+
+MOST = 1_000_000
+"""No count of seeds, episodes, ... above it is meant."""
+
+
+def check_counts(options: Any, *names: str, least: int = 1) -> None:
+    """Refuse counts that cannot be meant.
+
+    Args:
+        options: the dataclass that holds them.
+        names: of its fields; ``None`` is fine.
+        least: the smallest count.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    for name in names:
+        value = getattr(options, name)
+        for count in value if isinstance(value, tuple) else (value,):
+            if count is not None and not least <= count <= MOST:
+                raise ValueError(
+                    f"--{name.replace('_', '-')} must be between {least} and {MOST:,}, got {count}"
+                )
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """What policies are trained on.
+
+    Attributes:
+        task: manipulation tasks; by default square, or the file's.
+        data: ph (one operator) or mh (six operators).
+        dataset: a robomimic HDF5 file, instead of generated data.
+        download: fetch the official files from the hub instead.
+        demonstrations: scripted demonstrations to generate; two numbers for ph and mh.
+    """
+
+    task: tuple[str, ...] = ()
+    data: tuple[Literal["ph", "mh"], ...] = ("ph",)
+    dataset: Path | None = None
+    download: bool = False
+    demonstrations: tuple[int, ...] = (150,)
+
+    def __post_init__(self) -> None:
+        check_counts(self, "demonstrations")
+        if not 1 <= len(self.demonstrations) <= 2:
+            raise ValueError(
+                f"--demonstrations takes one number, or one for ph and one for mh, got "
+                f"{self.demonstrations}"
+            )
+
+    def check(self) -> None:
+        """Refuse options that cannot work, before anything is generated or downloaded.
+
+        Raises:
+            ValueError: naming the options.
+            FileNotFoundError: if the file does not exist.
+        """
+        for task in self.task:
+            if self.dataset is None and not (get_task(task).scripted or self.download):
+                raise ValueError(
+                    f"there is no scripted expert for {task}: add --download for the official data, or "
+                    "--dataset FILE"
+                )
+        if self.dataset is None:
+            return
+        if self.download:
+            raise ValueError("--dataset reads a file: leave out --download")
+        if len(self.task) > 1 or len(self.data) > 1:
+            raise ValueError(
+                "--dataset is of one task and style: name at most one --task and --data"
+            )
+        if not self.dataset.is_file():
+            raise FileNotFoundError(f"--dataset {self.dataset}: no such file")
+
+    def count(self, style: str) -> int:
+        """Scripted demonstrations of a style."""
+        return self.demonstrations[-1 if style == "mh" else 0]
+
+
+_NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
+    "mlp": (VelocityMLP, "hidden_dim"),
+    "chi_transformer": (ChiTransformer, "embedding_dim"),
+}
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """The velocity network.
+
+    Attributes:
+        network: its kind.
+        hidden_dim: its width; the class's own by default.
+        precondition: by the second moments of source and data, see PreconditionedNetwork.
+        observation_steps: To, observations per decision.
+    """
+
+    network: Literal["mlp", "chi_transformer"] = "mlp"
+    hidden_dim: int | None = None
+    precondition: bool = True
+    observation_steps: int = 2
+
+    def __post_init__(self) -> None:
+        check_counts(self, "hidden_dim", "observation_steps")
+
+    def make(
+        self, action_dim: int, observation_dim: int, prediction_length: int
+    ) -> VelocityNetwork:
+        """A network with fresh weights.
+
+        Args:
+            action_dim: ``d_a``.
+            observation_dim: ``d_o``.
+            prediction_length: ``P``.
+        """
+        kind, width = _NETWORKS[self.network]
+        options = {} if self.hidden_dim is None else {width: self.hidden_dim}
+        return kind(
+            action_dim, observation_dim, prediction_length, self.observation_steps, **options
+        )
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """The source distributions to compare.
+
+    Attributes:
+        prior: by name (gaussian, past, preview, history, regression) or, your own, as
+            package.module:Class; gains are over the first.
+        chunk: chunk lengths H.
+        sigma: residual noise of the warm priors, one policy each (default: past 0.5, preview 1.0).
+        cold_probability: share of training samples without a mean; the paper's Algorithm 1 has none.
+    """
+
+    prior: tuple[str, ...] = ("gaussian", "past", "preview")
+    chunk: tuple[int, ...] = (8,)
+    sigma: tuple[float, ...] = ()
+    cold_probability: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("prior", "chunk"):
+            if not getattr(self, name):
+                raise ValueError(f"--{name} needs at least one value")
+
+    def priors(self) -> list[Prior]:
+        """All of them, chunk length by chunk length.
+
+        Raises:
+            ValueError: if there is no such prior, an argument is out of range, or ``sigma`` has no effect.
+
+        Examples:
+            >>> [p.describe() for p in SourceOptions(("gaussian", "past"), sigma=(1.0, 0.5)).priors()]
+            ['gaussian, sigma 1, H 8', 'past, sigma 1, H 8', 'past, sigma 0.5, H 8']
+        """
+        check_counts(self, "chunk")
+        names = dict.fromkeys(self.prior)
+        noisy = {name: Prior.find(name).takes("sigma") for name in names}
+        if self.sigma and not any(noisy.values()):
+            raise ValueError(f"--sigma belongs to warm priors; {', '.join(names)} take none")
+        return [
+            Prior.make(name, chunk, sigma=sigma, cold_probability=self.cold_probability)
+            for chunk in sorted(set(self.chunk))
+            for name in names
+            for sigma in (dict.fromkeys(self.sigma) if noisy[name] and self.sigma else (None,))
+        ]
+
+
+@dataclass(frozen=True)
+class EvaluationOptions:
+    """How policies are evaluated.
+
+    Attributes:
+        seeds: number of training seeds, from --seed on.
+        episodes: evaluation episodes per cell.
+        nfe: network evaluations per chunk.
+        top_k: best checkpoints averaged per seed.
+    """
+
+    seeds: int = 1
+    episodes: int = 25
+    nfe: tuple[int, ...] = (9, 3, 1)
+    top_k: int = 1
+
+    def __post_init__(self) -> None:
+        check_counts(self, "seeds", "episodes", "nfe", "top_k")
+        if not self.nfe:
+            raise ValueError("--nfe needs at least one number of network evaluations")
+
+    @property
+    def nfes(self) -> list[int]:
+        """The numbers of network evaluations, the largest first."""
+        return sorted(set(self.nfe), reverse=True)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Where and how to compute.
+
+    Attributes:
+        preset: the budget that the other options start from.
+        out: output folder (default: a numbered one under runs/).
+        resume: continue in --out, or in the latest default folder, with the options stored there.
+        envs: worker processes that train and play, with the same results (default: one per core).
+        device: of networks and data, such as cuda.
+        compile: torch.compile the network in training.
+        logger: TorchRL logger of the training curves.
+    """
+
+    preset: str = "quick"
+    out: Path | None = None
+    resume: bool = False
+    envs: int | None = None
+    device: str = "cpu"
+    compile: bool = False
+    logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"
+
+    def __post_init__(self) -> None:
+        check_counts(self, "envs")
+        try:
+            # Computed and read: there are devices that can only be named, such as meta.
+            torch.ones(1, device=self.device).add(1).item()
+        except (RuntimeError, AssertionError, NotImplementedError) as error:
+            reason = str(error).splitlines()[0]
+            raise ValueError(f"--device {self.device} does not work here: {reason}") from error
+
+    @property
+    def directory(self) -> Path:
+        """The output folder, once it is chosen."""
+        assert self.out is not None, "the command line chooses one"
+        return self.out
+
+
+@dataclass(frozen=True)
+class HeldOutOptions:
+    """Observations to measure on, which no policy was trained on.
+
+    Attributes:
+        validation: robomimic HDF5 file of held-out demonstrations (default: newly generated ones).
+        observations: how many; the paper's curvature has 2000.
+        steps: Euler steps of a curvature.
+        draws: source samples per observation.
+    """
+
+    validation: Path | None = None
+    observations: int = 500
+    steps: int = 100
+    draws: int = 1
+
+    def __post_init__(self) -> None:
+        check_counts(self, "observations", "draws")
+        check_counts(self, "steps", least=2)
+        if self.validation is not None and not self.validation.is_file():
+            raise FileNotFoundError(f"--validation {self.validation}: no such file")
+
+
+@dataclass(frozen=True)
+class PolicyOptions:
+    """Which policies to take.
+
+    Attributes:
+        run: a finished run of robomimic.py, whose policies to take instead of training them.
+    """
+
+    run: Path | None = None
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """Everything that determines a comparison of sources; its leaves are the options.
+
+    Attributes:
+        data: what policies are trained on.
+        network: the velocity network.
+        training: behaviour cloning.
+        sources: what is compared.
+        evaluation: how.
+        run: where and how to compute, which changes no result.
+    """
+
+    data: Annotated[DataOptions, Flat] = field(default_factory=DataOptions)
+    network: Annotated[NetworkOptions, Flat] = field(default_factory=NetworkOptions)
+    training: Annotated[TrainingConfig, Flat] = field(default_factory=TrainingConfig)
+    sources: Annotated[SourceOptions, Flat] = field(default_factory=SourceOptions)
+    evaluation: Annotated[EvaluationOptions, Flat] = field(default_factory=EvaluationOptions)
+    run: Annotated[RunOptions, Flat] = field(default_factory=RunOptions)
+
+    @property
+    def name(self) -> str:
+        """Of the problems, in names of folders."""
+        file = self.data.dataset
+        tasks = self.data.task or ("square" if file is None else file.stem,)
+        return "-".join([*tasks, *self.data.data])
+
+    @property
+    def seeds(self) -> range:
+        """The training seeds."""
+        return range(self.training.seed, self.training.seed + self.evaluation.seeds)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before any work.
+
+        Raises:
+            ValueError: naming the option.
+        """
+        self.data.check()
+        for prior in self.sources.priors():
+            prior.allowed_nfes(self.evaluation.nfes)
+
+    def check_single(
+        self, *, problem: bool = False, chunk: bool = False, nfe: bool = False
+    ) -> None:
+        """Refuse several of what a study has one of.
+
+        Keyword Args:
+            problem: one task and style.
+            chunk: one chunk length.
+            nfe: one number of network evaluations.
+
+        Raises:
+            ValueError: naming the option.
+        """
+        given = {
+            "task": self.data.task if problem else (),
+            "data": self.data.data if problem else (),
+            "chunk": self.sources.chunk if chunk else (),
+            "nfe": self.evaluation.nfe if nfe else (),
+        }
+        for name, values in given.items():
+            if len(values) > 1:
+                raise ValueError(f"this study has one --{name}, got {' '.join(map(str, values))}")
+
+    def trainings(self) -> list[TrainingConfig]:
+        """The recipes of behaviour cloning to compare, one per length, without seeds."""
+        return [self.training]
+
+
+@dataclass(frozen=True)
+class MeasuredRecipe(Recipe):
+    """A comparison with measures on held-out observations of one problem.
+
+    Attributes:
+        held_out: the observations.
+    """
+
+    held_out: Annotated[HeldOutOptions, Flat] = field(default_factory=HeldOutOptions)
+
+    @classmethod
+    def of(cls, preset: Recipe, **parts: Any) -> Self:
+        """A preset with further parts.
+
+        Args:
+            preset: of a plain comparison.
+            parts: by name.
+        """
+        return cls(**{f.name: getattr(preset, f.name) for f in fields(preset)}, **parts)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before any work."""
+        super().check()
+        self.check_single(problem=True, chunk=True)
+
+
+CHANGEABLE = ("out", "resume", "envs")
+"""Run options that a continued run may change: they change no result."""
+
+
+def record(recipe: Any) -> dict[str, Any]:
+    """A recipe as JSON holds it, without what may change when it is continued.
+
+    Args:
+        recipe: a dataclass, such as :class:`Recipe`.
+
+    Examples:
+        >>> record(EvaluationOptions())["nfe"]
+        [9, 3, 1]
+    """
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(v) for key, v in value.items()}
+        if isinstance(value, (tuple, list)):
+            return [plain(v) for v in value]
+        # The same file from another working directory.
+        return str(value.resolve()) if isinstance(value, Path) else value
+
+    tree = plain(asdict(recipe))
+    for name in CHANGEABLE:
+        tree.get("run", {}).pop(name, None)
+    return tree
+
+
+def restore[T](kind: type[T], tree: dict[str, Any]) -> T:
+    """The inverse of :func:`record`.
+
+    Args:
+        kind: of the dataclass.
+        tree: what :func:`record` gave.
+
+    Raises:
+        ValueError: if it is of another version of this library, naming the option.
+
+    Examples:
+        >>> restore(EvaluationOptions, record(EvaluationOptions(episodes=3))).episodes
+        3
+    """
+    hints, values = get_type_hints(kind), {}
+    unknown = tree.keys() - {f.name for f in fields(kind)}  # type: ignore[arg-type]
+    if unknown:
+        raise ValueError(f"there is no option {min(unknown)}")
+    for name, value in tree.items():
+        if is_dataclass(hints[name]):
+            value = restore(hints[name], value)  # type: ignore[arg-type]
+        elif isinstance(value, list):
+            value = tuple(value)
+        elif isinstance(value, str) and Path in get_args(hints[name]):
+            value = Path(value)
+        values[name] = value
+    return kind(**values)
+
+
+def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> Iterable[str]:
+    """The options in which two records differ, as the second has them on the command line."""
+    for name in mine.keys() | theirs.keys():
+        value, other = mine.get(name), theirs.get(name)
+        if value == other:
+            continue
+        if isinstance(value, dict) and isinstance(other, dict):
+            yield from differences(value, other)
+            continue
+        option = "--" + name.replace("_", "-")
+        if other is None or other is False:
+            yield f"no {option}"
+        elif other is True:
+            yield option
+        else:
+            yield f"{option} {' '.join(map(str, other)) if isinstance(other, list) else other}"
+
+
+def refuse_ignored(recipe: Recipe, base: Recipe, parts: Iterable[str], told: str) -> None:
+    """Refuse options that were given and would have no effect.
+
+    Args:
+        recipe: what is asked for.
+        base: what it started from.
+        parts: of the tree, that have no effect.
+        told: why.
+
+    Raises:
+        ValueError: naming the options.
+    """
+    given = {
+        name
+        for part in parts
+        for name, value in record(getattr(recipe, part)).items()
+        if value != record(getattr(base, part))[name]
+    }
+    if given:
+        options = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(given))
+        raise ValueError(f"{told}: leave out {options}")
+
+
+# Chosen from success against iterations on square (docs/evidence.md, "Training budget"). Half the batch at
+# twice the iterations is as good.
+_SMALL = TrainingConfig(
+    iterations=10_000, batch_size=128, learning_rate=1e-3, warmup_ratio=0.1, checkpoints=1
+)
+
+PRESETS: dict[str, Recipe] = {
+    # One seed, small network: a first table within 15 minutes on two cores.
+    "quick": Recipe(network=NetworkOptions(hidden_dim=384), training=_SMALL),
+    # Three seeds, twice the iterations: a table with seeds within two hours on two cores.
+    "cpu": Recipe(
+        data=DataOptions(demonstrations=(150, 300)),
+        network=NetworkOptions(hidden_dim=384),
+        training=replace(_SMALL, iterations=20_000),
+        evaluation=EvaluationOptions(seeds=3, episodes=50),
+    ),
+    # The paper's (Table 4): 20M parameters, 200k iterations.
+    "paper": Recipe(
+        data=DataOptions(demonstrations=(200, 300)),
+        network=NetworkOptions(network="chi_transformer", precondition=False),
+        evaluation=EvaluationOptions(seeds=3, episodes=200, top_k=3),
+    ),
+}
+"""Budgets of comparisons of sources."""

@@ -1,0 +1,271 @@
+"""What was measured: rows on disk, and their averages over checkpoints and seeds."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from warmprior.diagnostics.statistics import SeedSummary, summarize_seeds, top_k_mean
+from warmprior.io.files import as_json, read_json, write_atomic
+from warmprior.training.checkpoint import check_identity
+
+__all__ = [
+    "Results",
+    "Row",
+    "facts_of_machine",
+    "grouped",
+    "mean_known",
+    "played",
+    "select",
+    "success_summary",
+]
+
+Fact = str | int | float | bool | None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement.
+
+    Attributes:
+        facts: what was measured: task, prior, seed, ...
+        measures: what came out; ``None`` where it is not known, as JSON has no NaN.
+
+    Examples:
+        >>> row = Row({"prior": "past"}, {"success_rate": 0.5, "kappa": float("nan")})
+        >>> row["prior"], row["success_rate"], row["kappa"]
+        ('past', 0.5, None)
+    """
+
+    facts: Mapping[str, Fact]
+    measures: Mapping[str, float | None]
+
+    def __post_init__(self) -> None:
+        known = {
+            name: None if isinstance(value, float) and not math.isfinite(value) else value
+            for name, value in self.measures.items()
+        }
+        object.__setattr__(self, "measures", known)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.facts[name] if name in self.facts else self.measures[name]
+
+    def get(self, name: str) -> Any:
+        """A fact or measure; ``None`` if the row has none of this name."""
+        return self.facts.get(name, self.measures.get(name))
+
+
+def played(facts: Mapping[str, Fact], successes: int, episodes: int, **measures: Any) -> Row:
+    """The row of an evaluation by episodes.
+
+    Args:
+        facts: of the row.
+        successes: how many episodes succeeded.
+        episodes: how many were played.
+        measures: further ones.
+    """
+    counts = {"episodes": episodes, "successes": successes, "success_rate": successes / episodes}
+    return Row(facts, counts | measures)
+
+
+def select(rows: Iterable[Row], measure: str | None = None, **facts: Fact) -> list[Row]:
+    """The rows that have a measure (known or not) and some facts.
+
+    Args:
+        rows: of any kind.
+        measure: its name; any by default.
+        facts: by name.
+    """
+    return [
+        row
+        for row in rows
+        if (measure is None or measure in row.measures)
+        and all(name in row.facts and row.facts[name] == value for name, value in facts.items())
+    ]
+
+
+def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row]]:
+    """Rows by what a function makes of them, in the order of their first."""
+    groups: dict[Any, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups
+
+
+def mean_known(rows: Iterable[Row], measure: str) -> float | None:
+    """Mean of a measure over the rows that know it; ``None`` if none does."""
+    values = [value for row in rows if (value := row.get(measure)) is not None]
+    return math.fsum(values) / len(values) if values else None
+
+
+def success_summary(rows: Iterable[Row], top_k: int) -> SeedSummary:
+    """Average the best ``top_k`` checkpoints per seed, then summarise over seeds.
+
+    Args:
+        rows: of one cell: they differ in seed and checkpoint alone.
+        top_k: how many checkpoints to average.
+
+    Raises:
+        ValueError: if there is no row.
+    """
+    by_seed: dict[int, list[float]] = {}
+    for row in rows:
+        by_seed.setdefault(row["seed"], []).append(row["success_rate"])
+    return summarize_seeds([top_k_mean(rates, top_k) for rates in by_seed.values()])
+
+
+def facts_of_machine(**more: Any) -> dict[str, Any]:
+    """Versions and hardware, as every results file tells them.
+
+    Args:
+        more: about the hardware.
+    """
+    versions = {"python": platform.python_version()}
+    for package in ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "numpy"):
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            continue  # an extra that this run does without
+    hardware = {"machine": platform.machine(), "cores": os.cpu_count(), **more}
+    if torch.cuda.is_available():
+        hardware["gpu"] = torch.cuda.get_device_name()
+    return {"versions": versions, "hardware": hardware}
+
+
+class Results:
+    """``results.json``: facts about the run and its rows, saved after every row.
+
+    Args:
+        path: the file.
+        meta: facts about the run.
+        identity: what must be equal in a file that is continued.
+        resume: keep the rows that the file has.
+
+    Raises:
+        ValueError: if the file to resume is damaged or belongs to a run with another identity.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        meta: Mapping[str, Any],
+        identity: Mapping[str, Any],
+        *,
+        resume: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        self.meta: dict[str, Any] = {**meta, "identity": identity, "wall_time_s": 0.0}
+        self.rows: list[Row] = []
+        self._started = time.monotonic()
+        if resume and self.path.exists():
+            stored = read_json(self.path)
+            try:
+                earlier = float(stored["meta"]["wall_time_s"])
+                theirs, self.rows = stored["meta"]["identity"], _read_rows(stored["rows"])
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                reason = str(error) if type(error) is ValueError else repr(error)
+                raise ValueError(
+                    f"{self.path} is not a results file of this version: {reason}"
+                ) from error
+            check_identity(self.path, theirs, identity)
+            self._started -= earlier
+
+    def find(self, facts: Mapping[str, Fact]) -> Row | None:
+        """The row with exactly these facts, if there is one."""
+        return next((row for row in self.rows if row.facts == facts), None)
+
+    def add(self, *rows: Row, order: Callable[[Row], Any] | None = None) -> None:
+        """Add rows, in place of those with the same facts, and save.
+
+        Args:
+            rows: new ones.
+            order: sorts all rows; by default the new ones come last.
+        """
+        for row in rows:
+            self.rows = [old for old in self.rows if old.facts != row.facts]
+            self.rows.append(row)
+        if order is not None:
+            self.rows.sort(key=order)
+        self.save()
+
+    def save(self) -> None:
+        """Write the file atomically."""
+        self.meta["wall_time_s"] = time.monotonic() - self._started
+        rows = [{"facts": dict(row.facts), "measures": dict(row.measures)} for row in self.rows]
+        text = json.dumps({"meta": self.meta, "rows": rows}, indent=1, allow_nan=False) + "\n"
+        write_atomic(self.path, lambda temporary: temporary.write_text(text))
+
+
+def _read_rows(records: Sequence[Any]) -> list[Row]:
+    """Rows as they are stored, after checking that they can have been measured.
+
+    Raises:
+        ValueError: naming the row and the entry, from 0 on.
+    """
+    rows: list[Row] = []
+    for i, stored in enumerate(records):
+        try:
+            if set(stored) != {"facts", "measures"}:
+                raise ValueError(f"it has {sorted(stored)} instead of facts and measures")
+            row = Row(**stored)
+            _check(row)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise ValueError(f"row {i}: {error}") from error
+        same = next((j for j, other in enumerate(rows) if other.facts == row.facts), None)
+        if same is not None and row != rows[same]:
+            raise ValueError(f"row {i} contradicts row {same}; remove the wrong one")
+        if same is None:
+            rows.append(row)
+    return rows
+
+
+_COUNTS = ("chunk", "nfe", "seed", "checkpoint", "iterations", "episodes", "successes")
+_RATES = ("success_rate", "mean_steps", "boundary_jump", "inner_jump", "source_leak")
+
+
+def _check(row: Row) -> None:
+    """Refuse what cannot have been measured."""
+    for name, value in row.facts.items():
+        if not (value is None or isinstance(value, str | int | float)):
+            raise ValueError(f"{name} cannot be {value!r}")
+    for name, value in row.measures.items():
+        if not (value is None or (isinstance(value, int | float) and not isinstance(value, bool))):
+            raise ValueError(f"{name} cannot be {value!r}")
+    for name in _COUNTS:
+        value = row.get(name)
+        if value is not None and (type(value) is not int or value < 0):
+            raise ValueError(f"{name} cannot be {value!r}")
+    for name in _RATES:
+        value = row.get(name)
+        if value is not None and value < 0:
+            raise ValueError(f"{name} cannot be {value!r}")
+    if "success_rate" in row.measures:
+        successes, episodes, rate = (
+            row.get(name) for name in ("successes", "episodes", "success_rate")
+        )
+        if None in (successes, episodes, rate) or not 0 <= successes <= episodes or not episodes:
+            raise ValueError(f"{successes} successes in {episodes} episodes")
+        if not math.isclose(rate, successes / episodes):
+            raise ValueError(f"its success_rate is {rate!r}, not {successes / episodes}")
+
+
+def write_options(path: Path, study: str, tree: Mapping[str, Any]) -> None:
+    """Write the options of a run atomically.
+
+    Args:
+        path: of the file.
+        study: which experiment they belong to.
+        tree: of the options.
+    """
+    text = json.dumps({"study": study, **as_json(tree)}, indent=1) + "\n"
+    write_atomic(path, lambda temporary: temporary.write_text(text))

@@ -1,0 +1,245 @@
+"""Trained policies on disk, found again by everything that determines them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from contextlib import closing, nullcontext
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import nn
+from torchrl.record.loggers import get_logger
+
+from warmprior.experiments.problem import Problem
+from warmprior.experiments.recipe import NetworkOptions, RunOptions
+from warmprior.io.files import check_writable, digest_of, read_json
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.prior import Prior
+from warmprior.training.behaviour_cloning import (
+    STATE_FORMAT,
+    BehaviourCloning,
+    policy_path,
+    precondition,
+)
+from warmprior.training.threads import torch_threads
+from warmprior.training.training_config import TrainingConfig
+from warmprior.transforms import MeanObservation, policy_transforms
+
+__all__ = ["Store", "finished_policies"]
+
+Losses = list[tuple[int, float]]
+
+
+@dataclass
+class Store:
+    """Policies that differ in their source and recipe alone, trained on one problem.
+
+    Each lies in a folder named by a digest of everything that determines it (data, recipe, prior,
+    network): whoever asks for the same shares it, and an interrupted training continues from its last
+    state.
+
+    Attributes:
+        problem: data and environment.
+        network: what is trained.
+        directory: where the policies lie.
+        logs: folder of the training logs.
+        run: device, compilation and logger.
+
+    Raises:
+        OSError: if ``directory`` cannot be written to.
+    """
+
+    problem: Problem
+    network: NetworkOptions
+    directory: Path
+    logs: Path
+    run: RunOptions = field(default_factory=RunOptions)
+    _losses: dict[Path, Losses] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        check_writable(self.directory)
+
+    def new_actor(self, prior: Prior, seed: int) -> WarmPriorActor:
+        """An untrained policy; its initial weights depend on the seed alone."""
+        torch.manual_seed(seed)
+        if isinstance(prior, nn.Module):  # it learns: every policy has its own
+            prior = Prior.from_config(prior.config())
+        problem = self.problem
+        action_dim = problem.data["action"].shape[-1]
+        width = problem.data["observation"].shape[-1] + MeanObservation.width(prior, action_dim)
+        network = self.network.make(action_dim, width, prior.prediction_length)
+        if self.network.precondition:
+            steps = self.network.observation_steps
+            network = precondition(network, problem.data, prior, observation_steps=steps)
+        actor = WarmPriorActor(
+            network,
+            prior,
+            # A copy: the policy moves to the device, the environments' normaliser stays on the CPU.
+            normalizer=copy.deepcopy(problem.normalizer),
+            clip=problem.clip,
+            environment=problem.environment,
+        )
+        return actor.to(self.run.device)
+
+    def folder(self, prior: Prior, training: TrainingConfig) -> Path:
+        """Where a policy lies, or will lie.
+
+        Args:
+            prior: its source distribution.
+            training: its recipe, with its seed.
+        """
+        digest = digest_of(
+            self.problem.identity,
+            asdict(training),
+            prior.config(),
+            asdict(self.network),
+            self.run.device,
+            self.run.compile,
+            version("torch"),
+            version("warmprior"),
+            STATE_FORMAT,
+        )
+        task, style = self.problem.task, self.problem.style
+        return self.directory / f"{task}-{style}-{prior.name}-seed{training.seed}-{digest[:10]}"
+
+    def train(
+        self,
+        prior: Prior,
+        training: TrainingConfig,
+        progress: Callable[[int], object] | None = None,
+    ) -> Losses:
+        """Train a policy; continue or reuse the stored one of the same options.
+
+        On a CPU it is trained by one thread, wherever: another number would give other weights.
+
+        Args:
+            prior: its source distribution.
+            training: its recipe, with its seed.
+            progress: called with the number of iterations after each; a bar if ``None``.
+
+        Returns:
+            The training curve, ``[(iteration, loss), ...]``.
+
+        Raises:
+            FloatingPointError: if the loss becomes NaN or infinite.
+        """
+        folder = self.folder(prior, training)
+        if folder not in self._losses:
+            logger = self._logger(folder.name)
+            on_cpu = torch.device(self.run.device).type == "cpu"
+            with (
+                torch_threads(1 if on_cpu else None),
+                # A worker process ends without the exit handlers that some loggers write in.
+                nullcontext() if logger is None else closing(logger),
+            ):
+                cloning = BehaviourCloning(
+                    self.new_actor(prior, training.seed),
+                    self.problem.data.to(self.run.device),
+                    training,
+                    folder,
+                    observation_steps=self.network.observation_steps,
+                    logger=logger,
+                    compile=self.run.compile,
+                )
+                told = f"train {prior.describe()}, seed {training.seed}"
+                cloning.run(told if progress is None else None, progress)
+            self.note_trained(prior, training, cloning.losses)
+        return self._losses[folder]
+
+    def note_trained(self, prior: Prior, training: TrainingConfig, losses: Losses) -> None:
+        """Take note of a policy that another process trained.
+
+        Args:
+            prior: its source distribution.
+            training: its recipe.
+            losses: what :meth:`train` returned there.
+        """
+        self._losses[self.folder(prior, training)] = losses
+
+    def policy(self, prior: Prior, training: TrainingConfig) -> WarmPriorActor:
+        """The last policy of averaged weights, trained if it is not yet, on the run's device.
+
+        Args:
+            prior: its source distribution.
+            training: its recipe.
+        """
+        self.train(prior, training)
+        return self.load(prior, training).to(self.run.device)
+
+    def load(
+        self, prior: Prior, training: TrainingConfig, checkpoint: int | None = None
+    ) -> WarmPriorActor:
+        """A trained policy of averaged weights, from disk, on the CPU.
+
+        Args:
+            prior: its source distribution.
+            training: its recipe.
+            checkpoint: iteration; the last by default.
+
+        Raises:
+            FileNotFoundError: if it is not trained that far.
+        """
+        path = policy_path(self.folder(prior, training), checkpoint or training.iterations)
+        return WarmPriorActor.from_pretrained(path, prior=prior)
+
+    def transforms(self, prior: Prior) -> partial[Any]:
+        """Builder of the environment transforms that these policies need."""
+        return partial(
+            policy_transforms,
+            prior,
+            normalizer=self.problem.normalizer,
+            observation_steps=self.network.observation_steps,
+        )
+
+    def _logger(self, name: str) -> Any:
+        if self.run.logger == "none":
+            return None
+        return get_logger(self.run.logger, logger_name=str(self.logs), experiment_name=name)
+
+
+def finished_policies(
+    run: Path, device: str = "cpu"
+) -> tuple[dict[str, Any], dict[str, list[WarmPriorActor]]]:
+    """The last policies of a finished comparison of sources, one per prior and training seed.
+
+    Args:
+        run: its folder.
+        device: where to put them.
+
+    Returns:
+        Facts of the problem (``task``, ``style`` and those of the data), and by prior the policies.
+
+    Raises:
+        FileNotFoundError: if there are no results, or a policy is missing.
+        ValueError: if the results are of something else, or of several problems or recipes.
+    """
+    path = run / "results.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"--run {run}: it has no results.json; name a run of robomimic.py")
+    meta = read_json(path)["meta"]
+    if not {"policies", "problems"} <= meta.keys():
+        raise ValueError(f"{path} does not say where its policies lie: run robomimic.py again")
+    entries = [(Prior.from_config(entry["prior"]), entry) for entry in meta["policies"]]
+    told = {(prior.describe(), entry["iterations"]): prior.name for prior, entry in entries}
+    if len(set(told.values())) < len(told) or len(meta["problems"]) > 1:
+        raise ValueError(
+            f"--run {run} compares {'; '.join(name for name, _ in told)} on {len(meta['problems'])} "
+            "problem(s): name a run of one task and style, with one sigma and one chunk length"
+        )
+    actors: dict[str, list[WarmPriorActor]] = {}
+    for prior, entry in entries:
+        folder = policy_path(
+            run.resolve().parent / "policies" / entry["folder"], entry["iterations"]
+        )
+        if not folder.is_dir():
+            raise FileNotFoundError(
+                f"{folder} is missing: finish the run with --resume --out {run}"
+            )
+        actor = WarmPriorActor.from_pretrained(folder, prior=prior, device=device)
+        actors.setdefault(prior.name, []).append(actor)
+    return meta["problems"][0], actors

@@ -1,0 +1,183 @@
+"""Figures of the studies of sigma, of the chunk length and of the training budget."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from warmprior.diagnostics.statistics import summarize_seeds
+from warmprior.experiments.figures import band, new_figure
+from warmprior.experiments.labels import prior_color, prior_label
+from warmprior.experiments.paper import PAPER_SIGMA
+from warmprior.experiments.results import Row, grouped, mean_known, select, success_summary
+from warmprior.experiments.straightness import pooled
+from warmprior.modules.prior import Prior
+
+__all__ = ["plot_budget", "plot_chunk_lengths", "plot_sigma"]
+
+
+def plot_sigma(
+    rows: Sequence[Row], path: str | Path, *, top_k: int, title: str, paper: bool = False
+) -> None:
+    """Success against sigma, with the curvature and the branching bound on the same axis (appendix).
+
+    A panel per warm prior; shaded is one seed standard deviation. Curvature (executed positions, mean
+    of the training) and bound are those of the prior over those of the baseline.
+
+    Args:
+        rows: evaluations at one NFE, the baseline's first, and those of
+            :func:`~warmprior.experiments.straightness` for the same policies.
+        path: of the PNG.
+
+    Keyword Args:
+        top_k: checkpoints averaged per seed.
+        title: of the figure.
+        paper: add the success rates that the paper reports.
+    """
+    played = select(rows, "success_rate")
+    measured = pooled(select(rows, "ratio_executed", mean="training"))
+    by_prior = grouped(played, lambda row: row["prior"])
+    warm = [name for name in by_prior if Prior.find(name).takes("sigma")]
+    base = next((name for name in by_prior if name not in warm), None)
+    base_bound = mean_known(select(measured, prior=base), "bound_executed")
+    figure, axes = new_figure(5.2 * len(warm), 4.2, 1, len(warm))
+    for axis, prior in zip(axes, warm, strict=True):
+        cells = grouped(by_prior[prior], lambda row: row["sigma"])
+        sigmas = sorted(cells, reverse=True)
+        points = [success_summary(cells[sigma], top_k) for sigma in sigmas]
+        band(axis, range(len(sigmas)), points, color=prior_color(prior), label="success rate")
+        if base is not None:
+            level = success_summary(by_prior[base], top_k).mean
+            label = f"{prior_label(base)}"
+            axis.axhline(level, color=prior_color(base), ls="--", lw=1.2, label=label)
+        if paper:
+            told = PAPER_SIGMA.get(prior, {})
+            x = [i for i, s in enumerate(sigmas) if s in told]
+            axis.plot(x, [told[sigmas[i]] for i in x], "*", color="black", ms=10, label="paper")
+        right = axis.twinx()
+        for measure, scale, marker, label in (
+            ("ratio_executed", 1.0, "s", "curvature (executed H)"),
+            ("bound_executed", base_bound, "^", "branching bound"),
+        ):
+            found = {s: mean_known(select(measured, prior=prior, sigma=s), measure) for s in sigmas}
+            known = {s: value for s, value in found.items() if value is not None and scale}
+            right.plot(
+                [sigmas.index(s) for s in known],
+                [value / scale for value in known.values()],  # type: ignore[operator]
+                color="0.3",
+                ls=":",
+                marker=marker,
+                ms=4,
+                lw=1.0,
+                label=label,
+            )
+        right.set_ylim(bottom=0)
+        right.set_ylabel("relative to the baseline")
+        axis.set_xticks(range(len(sigmas)), [f"{s:g}" for s in sigmas])
+        axis.set_xlabel(r"$\sigma$")
+        axis.set_ylim(-0.02, 1.02)
+        axis.set_ylabel("success rate")
+        axis.set_title(prior_label(prior), fontsize=10)
+        axis.grid(axis="y", alpha=0.25)
+        handles, labels = (
+            [part for a in (axis, right) for part in a.get_legend_handles_labels()[i]]
+            for i in (0, 1)
+        )
+        axis.legend(handles, labels, fontsize=7, frameon=False, loc="upper right")
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=150)
+
+
+def plot_chunk_lengths(rows: Sequence[Row], path: str | Path, *, top_k: int, title: str) -> None:
+    """Success, and jumps at chunk boundaries, against the chunk length.
+
+    Above a panel per NFE with the success rate; below the mean distance between the last action of a
+    chunk and the first of the next, in normalised action units, and dotted that between consecutive
+    actions inside chunks, of the last checkpoints.
+
+    Args:
+        rows: evaluations of one task.
+        path: of the PNG.
+
+    Keyword Args:
+        top_k: checkpoints averaged per seed.
+        title: of the figure.
+    """
+    by_nfe = grouped(rows, lambda row: row["nfe"])
+    chunks = sorted({row["chunk"] for row in rows})
+    figure, axes = new_figure(3.4 * len(by_nfe), 6.0, 2, len(by_nfe))
+    for column, (nfe, members) in enumerate(by_nfe.items()):
+        above, below = axes[column], axes[len(by_nfe) + column]
+        for prior, cells in grouped(members, lambda row: row["prior"]).items():
+            found = grouped(cells, lambda row: row["chunk"])
+            known = sorted(found)
+            at = [chunks.index(chunk) for chunk in known]
+            points = [success_summary(found[chunk], top_k) for chunk in known]
+            band(above, at, points, color=prior_color(prior), label=prior_label(prior))
+            for measure, style in (("boundary_jump", "-"), ("inner_jump", ":")):
+                jumps = {
+                    chunks.index(chunk): mean_known(
+                        [r for r in found[chunk] if r["checkpoint"] == r["iterations"]], measure
+                    )
+                    for chunk in known
+                }
+                shown = {x: jump for x, jump in jumps.items() if jump is not None}
+                line = {"color": prior_color(prior), "ls": style, "marker": "o", "ms": 3, "lw": 1.2}
+                below.plot(list(shown), list(shown.values()), **line)
+        above.set_title(f"NFE {nfe}", fontsize=10)
+        above.set_ylim(-0.02, 1.02)
+        below.set_ylim(bottom=0)
+        below.set_xlabel("chunk length H")
+        for axis in (above, below):
+            axis.set_xticks(range(len(chunks)), [str(c) for c in chunks])
+            axis.grid(alpha=0.25)
+    axes[0].set_ylabel("success rate")
+    axes[len(by_nfe)].set_ylabel("jump at boundaries (dotted: inside)")
+    axes[0].legend(frameon=False, fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=150)
+
+
+def plot_budget(rows: Sequence[Row], path: str | Path, *, top_k: int, title: str) -> None:
+    """Success, and error on held-out demonstrations, against the iterations of the training.
+
+    A column per NFE; shaded is one seed standard deviation.
+
+    Args:
+        rows: evaluations of trainings of several lengths, and their ``action_error``, see
+            :func:`~warmprior.diagnostics.action_error`.
+        path: of the PNG.
+
+    Keyword Args:
+        top_k: checkpoints averaged per seed.
+        title: of the figure.
+    """
+    by_nfe = grouped(sorted(rows, key=lambda row: row["nfe"]), lambda row: row["nfe"])
+    budgets = sorted({row["iterations"] for row in rows})
+    figure, axes = new_figure(3.6 * len(by_nfe), 6.0, 2, len(by_nfe))
+    for column, (nfe, members) in enumerate(by_nfe.items()):
+        above, below = axes[column], axes[len(by_nfe) + column]
+        for prior, cells in grouped(members, lambda row: row["prior"]).items():
+            found = grouped(cells, lambda row: row["iterations"])
+            known = sorted(found)
+            success = [success_summary(select(found[n], "success_rate"), top_k) for n in known]
+            errors = [
+                summarize_seeds([row["action_error"] for row in select(found[n], "action_error")])
+                for n in known
+            ]
+            band(above, known, success, color=prior_color(prior), label=prior_label(prior))
+            band(below, known, errors, color=prior_color(prior))
+        above.set_title(f"NFE {nfe}", fontsize=10)
+        above.set_ylim(-0.02, 1.02)
+        below.set_ylim(bottom=0)
+        below.set_xlabel("iterations")
+        for axis in (above, below):
+            axis.set_xscale("log")
+            axis.set_xticks(budgets, [f"{n:,}" for n in budgets], fontsize=8)
+            axis.minorticks_off()
+            axis.grid(alpha=0.25)
+    axes[0].set_ylabel("success rate")
+    axes[len(by_nfe)].set_ylabel("squared error of executed actions, held out", fontsize=9)
+    axes[0].legend(frameon=False, fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=150)

@@ -1,0 +1,297 @@
+"""Tables in Markdown, made from rows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+from warmprior.diagnostics.source_leak import INNER_STEP_BOUND, LEAK_BOUND
+from warmprior.diagnostics.statistics import exceeds_one_sigma, summarize_seeds
+from warmprior.experiments.labels import source_labels
+from warmprior.experiments.paper import PAPER_CURVATURE, paper_success
+from warmprior.experiments.results import Row, grouped, mean_known, select, success_summary
+from warmprior.experiments.straightness import RATIOS, pooled
+
+__all__ = ["curvature_table", "mean_cell", "success_cell", "success_table", "table"]
+
+Cell = Callable[[list[Row]], str | None]
+"""Makes a cell of the rows that belong to it; ``None`` where there is nothing to tell."""
+
+
+def table(
+    rows: Iterable[Row],
+    index: Callable[[Row], str],
+    columns: Callable[[Row], str] | None,
+    cells: Mapping[str, Cell],
+    *,
+    head: str = "",
+    notes: Iterable[str] = (),
+) -> str:
+    r"""A table, and what there is to say about it.
+
+    With ``columns`` there is a line per value of the index and kind of cell, without them a line per value
+    of the index and a column per kind of cell. Values have the order of their first rows; lines without
+    any cell are left out.
+
+    Args:
+        rows: what to show.
+        index: names the line of a row.
+        columns: names its column.
+        cells: the kinds of cells, by name.
+
+    Keyword Args:
+        head: of the first column.
+        notes: lines below the table.
+
+    Examples:
+        >>> rows = [Row({"H": h, "prior": p}, {"rate": r})
+        ...         for h, p, r in [(1, "past", 0.5), (8, "past", 0.25), (8, "preview", 1.0)]]
+        >>> print(table(rows, lambda r: f"H = {r['H']}", lambda r: r["prior"],
+        ...             {"": mean_cell("rate", ".2f")}, notes=["Shares."]))
+        |  | past | preview |
+        |---|---|---|
+        | H = 1 | 0.50 | - |
+        | H = 8 | 0.25 | 1.00 |
+        <BLANKLINE>
+        Shares.
+        <BLANKLINE>
+    """
+    rows = list(rows)
+    groups, lines = grouped(rows, index), []
+    if columns is None:
+        names = list(cells)
+        for name, group in groups.items():
+            lines.append([name, *(cell(group) for cell in cells.values())])
+    else:
+        names = list(dict.fromkeys(map(columns, rows)))
+        for name, group in groups.items():
+            for kind, cell in cells.items():
+                parts = {c: [row for row in group if columns(row) == c] for c in names}
+                line = [cell(part) if part else None for part in parts.values()]
+                if any(line):
+                    lines.append([", ".join(filter(None, (name, kind))), *line])
+    text = [[head, *names], ["---"] * (len(names) + 1), *lines]
+    shown = [f"| {' | '.join('-' if c is None else c for c in line)} |" for line in text]
+    shown[1] = "|" + "---|" * (len(names) + 1)
+    notes = list(notes)
+    return "\n".join([*shown, "", *notes] if notes else shown) + "\n"
+
+
+def mean_cell(measure: str, form: str, scale: float = 1.0) -> Cell:
+    """Mean and, over several rows, standard deviation of a measure; the rows are those of seeds.
+
+    Args:
+        measure: its name.
+        form: format of the numbers.
+        scale: what to multiply them with.
+    """
+
+    def cell(rows: list[Row]) -> str | None:
+        found = [row.get(measure) for row in rows if measure in row.measures]
+        known = [scale * value for value in found if value is not None]
+        if not known:
+            return None
+        summary, lost = summarize_seeds(known), len(found) - len(known)
+        spread = "" if summary.seeds == 1 else f" ± {summary.std:{form}}"
+        return f"{summary.mean:{form}}{spread}" + (f" ({lost} not finite)" if lost else "")
+
+    return cell
+
+
+def success_cell(top_k: int) -> Cell:
+    """Success rate in percent, with one standard deviation over several seeds.
+
+    Args:
+        top_k: checkpoints averaged per seed.
+    """
+
+    def cell(rows: list[Row]) -> str:
+        summary = success_summary(rows, top_k)
+        spread = f" ± {100 * summary.std:.1f}" if summary.seeds > 1 else ""
+        return f"{100 * summary.mean:.1f}{spread}"
+
+    return cell
+
+
+def last_checkpoints(rows: Sequence[Row]) -> list[Row]:
+    """The rows of the last checkpoint of every training."""
+    return [row for row in rows if row["checkpoint"] == row["iterations"]]
+
+
+def source_at_nfe(rows: Sequence[Row]) -> Callable[[Row], str]:
+    """Names the column of a row in tables that compare sources at several NFEs."""
+    label = source_labels(rows)
+    return lambda row: f"NFE {row['nfe']}: {label(row)}"
+
+
+def success_table(
+    rows: Sequence[Row], *, top_k: int, source: str | None, notes: Iterable[str] = ()
+) -> str:
+    """The layout of the paper's Table 1, with the paper's own numbers in lines of their own.
+
+    Args:
+        rows: evaluations with one sigma and chunk length per prior; the baseline's first.
+
+    Keyword Args:
+        top_k: checkpoints averaged per seed.
+        source: of the demonstrations: ``"official"`` stands beside the paper's as an equal.
+        notes: further ones.
+    """
+    rows = select(rows, "success_rate")
+    # In the order of the groups: all sources at one NFE side by side.
+    rows = sorted(rows, key=lambda row: -row["nfe"])
+    label = source_labels(rows)
+    base = label(rows[0])
+
+    def measured(cell: list[Row]) -> str:
+        same = {name: cell[0][name] for name in ("task", "data", "nfe")}
+        sources = grouped(select(rows, **same), label)
+        summaries = {name: success_summary(group, top_k) for name, group in sources.items()}
+        mine, baseline = summaries[label(cell[0])], summaries.get(base)
+        text = f"{100 * mine.mean:.1f}"
+        if mine.mean == max(summary.mean for summary in summaries.values()):
+            text = f"**{text}**"
+        if baseline is None or mine is baseline:
+            return text
+        mark = "*" if exceeds_one_sigma(mine, baseline) else ""
+        gain = round(100 * (mine.mean - baseline.mean), 1) + 0.0  # no minus before a zero
+        return f"{text} ({gain:+.1f}{mark})"
+
+    def paper(cell: list[Row]) -> str | None:
+        row = cell[0]
+        place = row["task"], row["data"]
+        value, baseline = (
+            paper_success(*place, p, row["nfe"], row["chunk"]) for p in (row["prior"], "gaussian")
+        )
+        if value is None or baseline is None:
+            return None
+        gain = "" if row["prior"] == "gaussian" else f" ({value - baseline:+.1f})"
+        return f"{value:.1f}{gain}"
+
+    return table(
+        rows,
+        lambda row: f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}",
+        source_at_nfe(rows),
+        {
+            f"measured ({source} data)": measured,
+            "paper (official data)": paper,
+            f"spread over draws of the source / data's (bound {LEAK_BOUND:g})": _bounded(
+                "source_leak", LEAK_BOUND
+            ),
+            f"step inside chunks / data's (bound {INNER_STEP_BOUND:g})": _bounded(
+                "inner_step_ratio", INNER_STEP_BOUND
+            ),
+        },
+        head="Success rate (%)",
+        notes=[*_success_notes(rows, top_k, source), *notes],
+    )
+
+
+def _bounded(measure: str, bound: float) -> Cell:
+    """Mean of a measure over the seeds' last checkpoints, marked where it exceeds its bound."""
+
+    def cell(rows: list[Row]) -> str | None:
+        mean = mean_known(last_checkpoints(rows), measure)
+        if mean is None:
+            return None
+        return f"{mean:.2f} (!)" if mean > bound else f"{mean:.2f}"
+
+    return cell
+
+
+def _success_notes(rows: Sequence[Row], top_k: int, source: str | None) -> list[str]:
+    seeds = len({row["seed"] for row in rows})
+    checkpoints = len({row["checkpoint"] for row in rows})
+    chosen = (
+        f"the best {min(top_k, checkpoints)} of {checkpoints} checkpoints"
+        if checkpoints > 1
+        else "the last checkpoint"
+    )
+    chunks = ", ".join(str(chunk) for chunk in dict.fromkeys(row["chunk"] for row in rows))
+    notes = [
+        f"- H = {chunks}; {seeds} seed(s); {max(row['episodes'] for row in rows)} episodes per cell; "
+        f"{chosen} per seed. In parentheses the gain over the first column of each group, in bold the best.",
+        "- `*` marks gains above the sum of both seed standard deviations (one-sigma rule)."
+        if seeds > 1
+        else "- One seed has no spread: no gain is marked. success.png shows the episodes' posterior.",
+    ]
+    if any(row.get("source_leak") is not None for row in rows):
+        notes.append(
+            "- Spread and steps tell how much of the source's noise reaches the actions (last checkpoints, "
+            "training data): at or below the bound, none is seen. What exceeds it says more about the "
+            "network's training than about the source."
+        )
+    if source != "official":
+        notes.append(
+            "- The measured rows are from other demonstrations than the paper's, which are the official "
+            "human ones: compare gains within a row, not numbers across rows."
+        )
+    return notes
+
+
+def curvature_table(rows: Sequence[Row], *, task: str, data: str, source: str) -> str:
+    """The layout of the paper's Table 2, with the paper's own numbers in a line of their own.
+
+    The paper's are for ``H = 8`` and relative to the Gaussian source; otherwise they are left out.
+
+    Args:
+        rows: of :func:`straightness`.
+
+    Keyword Args:
+        task: short task name.
+        data: ``"ph"`` or ``"mh"``.
+        source: what the observations are, in words.
+    """
+    chosen = pooled(rows)
+    first = chosen[0]
+    title = f"{task.replace('_', '-').title()}-{data.upper()}"
+
+    def ratio(name: str, mean: str) -> Cell:
+        def cell(rows: list[Row]) -> str | None:
+            if not select(chosen, mean=mean):
+                return None
+            # A policy without a mean is the same at both.
+            row = next(iter(select(rows, mean=mean)), rows[0])
+            value, low, high = (row[name + end] for end in ("", "_low", "_high"))
+            if value is None:
+                return "no motion"
+            interval = (
+                "" if row["policy"] == first["policy"] or low is None else _interval(low, high)
+            )
+            return f"{value:.3f}{interval}"
+
+        return cell
+
+    def paper(rows: list[Row]) -> str | None:
+        told = PAPER_CURVATURE.get((task, data))
+        if told is None or first["prior"] != "gaussian" or first["chunk"] != 8:
+            return None
+        value = {"gaussian": 1.0, **told}.get(rows[0]["prior"])
+        return None if value is None else f"{value:.3f}"
+
+    several = len({row["seed"] for row in rows} - {None})
+    averaged = f", averaged over {several} training seeds" if several > 1 else ", one seed"
+    return table(
+        chosen,
+        lambda row: title,
+        source_labels(chosen),
+        {
+            f"{what}, {mean} mean": ratio(name, mean)
+            for name, (_, what) in RATIOS.items()
+            for mean in ("training", "deployed")
+        }
+        | {"paper (official data)": paper},
+        head="curvature relative to the first column",
+        notes=[
+            f"- {first['observations']} observations of {source}{averaged}; in brackets 95% bootstrap "
+            "intervals over episodes.",
+            "- Deployed mean: made from the policy's own prediction one decision earlier. The paper does "
+            "not say which mean it uses, nor whether it counts a prediction of 2H whole.",
+            "- Curvature shrinks with the length of the transport; divided by the squared mean velocity "
+            "it does not.",
+        ],
+    )
+
+
+def _interval(low: float, high: float) -> str:
+    return "" if math.isnan(low) else f" [{low:.3f}, {high:.3f}]"
