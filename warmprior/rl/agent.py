@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from itertools import chain
 from typing import Any
 
 import torch
@@ -17,10 +16,10 @@ from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.box_normal import BoxTanhNormal
+from warmprior.rl.checks import check_finite
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.decoder import PriorDecoder
 from warmprior.rl.dsrl import DSRLNALoss
-from warmprior.rl.loss import check_finite
 from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
 from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
@@ -142,7 +141,7 @@ class PriorSpaceAgent:
         for compute in self._schedule():
             result = compute(buffer.sample())
             losses = {k: v for k, v in result.items() if k.startswith("loss_")}
-            check_finite(losses)
+            check_finite(losses)  # TorchRL's SAC does not look by itself
             self.optimizer.zero_grad()
             torch.stack(list(losses.values())).sum().backward()
             self.optimizer.step()
@@ -152,9 +151,11 @@ class PriorSpaceAgent:
         return {"q": float(values["loss_qvalue"]), "alpha": float(values["alpha"])}
 
     def _parameters(self) -> dict[str, Tensor]:
-        # Of the buffers those of the target critics: the others are constants, some of them made late.
-        targets = (item for item in self.loss.named_buffers() if "_params." in item[0])
-        return dict(chain(self.loss.named_parameters(), targets))
+        # Of the buffers those of the target critics: the others are the frozen policy and constants, some of
+        # these made late.
+        buffers = self.loss.named_buffers()
+        targets = {k: v for k, v in buffers if k.split(".")[0].endswith("_params")}
+        return dict(self.loss.named_parameters()) | targets
 
     def state(self) -> dict[str, Tensor]:
         """All that learning has changed, by name.
@@ -167,12 +168,7 @@ class PriorSpaceAgent:
             **named("loss", self._parameters()),
             **named("optimizer", snapshot_optimizer(self.optimizer)),
         }
-        wrong = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
-        if wrong:
-            raise FloatingPointError(
-                f"{wrong[0]} and {len(wrong) - 1} more tensors of the agent are NaN or infinite: the "
-                "training has diverged; lower the learning rate or check the rewards"
-            )
+        check_finite(tensors)
         return tensors
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,14 +16,9 @@ from torchrl.envs import EnvBase, TransformedEnv
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
+from warmprior.rl.checks import check_positive
 
-__all__ = ["PriorDecoder", "check_delta", "visible_priors"]
-
-
-def check_delta(delta: float) -> None:
-    """Raise ValueError if there is no such box."""
-    if not (delta > 0 and math.isfinite(delta)):
-        raise ValueError(f"delta must be a finite number > 0, got {delta}")
+__all__ = ["PriorDecoder", "visible_priors"]
 
 
 class PriorDecoder(TensorDictModuleBase):
@@ -87,7 +81,7 @@ class PriorDecoder(TensorDictModuleBase):
         noise_key: NestedKey = keys.NOISE,
     ) -> None:
         super().__init__()
-        check_delta(delta)
+        check_positive(delta=delta)
         if not actor.prior.is_flow:
             raise ValueError(
                 f"{actor.prior} starts at a single point and its field means nothing elsewhere: there is "
