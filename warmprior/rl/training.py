@@ -174,7 +174,7 @@ class PriorSpaceTraining:
         warming = self.steps < self.config.warmup_steps
         policy = self.agent.warmup if warming else self.agent.policy
         with set_exploration_type(ExplorationType.RANDOM):
-            data = policy(data.to(self.device)).to("cpu")
+            data = policy(data.to(self.device)).to(env.device or torch.device("cpu"))
         # Before a simulator sees them.
         self._check_finite(data.select(keys.DELTA, keys.CHUNK))
         data, following = env.step_and_maybe_reset(data)
