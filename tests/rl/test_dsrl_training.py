@@ -46,6 +46,7 @@ def test_target_updates_and_saved_state():
     state = {k: v.clone() for k, v in loss.state_dict().items()}
     decoder = {f"decoder.{name}": value for name, value in loss.decoder.state_dict().items()}
     assert all(torch.equal(state[name], value) for name, value in decoder.items())
+    assert not decoder.keys() & {name for name, _ in loss.named_parameters()}
     other = build()
     other.load_state_dict(state)
     torch.manual_seed(1)

@@ -10,8 +10,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.data import ReplayBuffer
-from torchrl.modules import TanhNormal
-from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
@@ -56,7 +56,7 @@ class PriorSpaceAgent:
     """
 
     def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
-        self.config, self._prior, self._network = config, actor.prior, actor.network
+        self.config = config
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
         # By default what is drawn around a mean stays in the box, but not what is drawn around zero.
@@ -65,42 +65,38 @@ class PriorSpaceAgent:
             ResidualSampler(self.decoder, distribution=drawn), self.decoder
         )
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
-        network = self._make(
-            make_prior_space_actor,
+        frozen: Any = actor.network
+        sizes = {
+            "action_dim": frozen.action_dim,
+            "observation_dim": frozen.observation_dim,
+            "prediction_length": actor.prior.prediction_length,
+            "observation_steps": frozen.observation_steps,
+            "hidden_dim": config.hidden_dim,
+            "num_layers": config.num_layers,
+        }
+        network = make_prior_space_actor(
+            **sizes,
             delta=self.decoder.delta,
             in_keys=self.state_keys,
             # DSRL-NA changes units by itself, TorchRL's SAC does not.
             distribution_class=BoxTanhNormal if config.algorithm == "dsrl-sac" else TanhNormal,
         ).to(self.device)
         self.policy = TensorDictSequential(network, self.decoder)
-        self.loss = self._make_loss(network).to(self.device)
+        self.loss = self._make_loss(network, sizes).to(self.device)
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
         self._updater = SoftUpdate(self.loss, tau=config.tau)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.learning_rate)
 
-    def _make(self, make: Callable[..., Any], **options: Any) -> Any:
-        network: Any = self._network
-        return make(
-            network.action_dim,
-            network.observation_dim,
-            self._prior.prediction_length,
-            network.observation_steps,
-            hidden_dim=self.config.hidden_dim,
-            num_layers=self.config.num_layers,
-            **options,
-        )
-
-    def _make_loss(self, network: Any) -> Any:
-        config, delta = self.config, self.decoder.delta
-        noise_critic = self._make(
-            make_prior_space_critic, delta=delta, in_keys=(*self.state_keys, keys.DELTA)
+    def _make_loss(self, network: ProbabilisticActor, sizes: dict[str, int]) -> LossModule:
+        config = self.config
+        noise_critic = make_prior_space_critic(
+            **sizes, delta=self.decoder.delta, in_keys=(*self.state_keys, keys.DELTA)
         )
         if config.algorithm == "dsrl-na":
+            chunk_keys = (self.decoder.observation_key, keys.CHUNK)
             return DSRLNALoss(
                 network,
-                self._make(
-                    make_prior_space_critic, in_keys=(self.decoder.observation_key, keys.CHUNK)
-                ),
+                make_prior_space_critic(**sizes, in_keys=chunk_keys),
                 noise_critic,
                 self.decoder,
                 backup=config.backup,
