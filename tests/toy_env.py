@@ -14,8 +14,8 @@ ACTION_DIM = 2
 class CountingEnv(EnvBase):
     """Observation ``[step, episode, *last action]``; reward ``step`` at each step; ends after ``length``."""
 
-    def __init__(self, length: int = 7, truncate: bool = False) -> None:
-        super().__init__(device="cpu", batch_size=[])
+    def __init__(self, length: int = 7, truncate: bool = False, device: str | None = "cpu") -> None:
+        super().__init__(device=device, batch_size=[])
         self.length, self.truncate = length, truncate
         self.observation_spec = Composite(observation=Unbounded((2 + ACTION_DIM,)))
         self.action_spec = Bounded(-1, 1, (ACTION_DIM,))

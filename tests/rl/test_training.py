@@ -10,6 +10,8 @@ from tests.rl.training_parts import (
     LENGTHS,
     H,
     make_actor,
+    make_config,
+    make_env,
     make_training,
 )
 from warmprior import (
@@ -234,6 +236,35 @@ def test_the_targets_of_sac_by_hand(tmp_path, delta):
     expected = (errors + variance).mean().item()
     found = sum(loss(data.clone())["loss_qvalue"].item() for _ in range(300)) / 300
     assert found == pytest.approx(2 * expected, rel=0.02)  # summed over two critics
+
+
+def test_the_environment_may_live_anywhere(tmp_path):
+    """PyTorch takes ``cpu:0`` for another device than ``cpu``."""
+    runs = []
+    for device in (None, "cpu", "cpu:0"):
+        seen = set()
+
+        def spied(seed, device=device, seen=seen):
+            env = make_env(seed, device=device)
+            step = env.step_and_maybe_reset
+
+            def spy(data):
+                seen.add(str(data.device))
+                return step(data)
+
+            env.step_and_maybe_reset = spy
+            return env
+
+        training = PriorSpaceTraining(
+            make_actor(), spied, make_config(), tmp_path / str(device), evaluation_seed=100
+        )
+        curve = training.run()
+        assert seen == {device or "cpu"}
+        again = make_training(tmp_path / str(device))
+        runs.append((curve, training.buffer[:]))
+        assert (again.buffer[:] == training.buffer[:]).all()
+    (curve, data), *others = runs
+    assert all(curve == other and (data == stored).all() for other, stored in others)
 
 
 def test_a_prior_without_noise_warms_up_in_its_box(tmp_path):

@@ -30,9 +30,10 @@ class SolvableEnv(CountingEnv):
 
     before_step = None
 
-    def __init__(self, length, truncate=False):
-        super().__init__(length, truncate)
-        self.observation_spec["success"] = Categorical(2, dtype=torch.bool, shape=(1,))
+    def __init__(self, length, truncate=False, device="cpu"):
+        super().__init__(length, truncate, device)
+        success = Categorical(2, dtype=torch.bool, shape=(1,), device=device)
+        self.observation_spec["success"] = success
 
     def _reset(self, tensordict=None, **kwargs):
         return super()._reset(tensordict).set("success", torch.zeros(1, dtype=torch.bool))
@@ -51,10 +52,10 @@ def make_actor(prior=None, seed=0, action_dim=ACTION_DIM):
     return WarmPriorActor(network, prior, nfe=2, clip=1.0)
 
 
-def make_env(seed, prior=None, truncate=True, hook=None, **chunking):
+def make_env(seed, prior=None, truncate=True, hook=None, device="cpu", **chunking):
     """Two environments; the hook gets what those of the training (and not of evaluations) return."""
     prior = PastPrior(H) if prior is None else prior
-    bases = [SolvableEnv(length, truncate) for length in LENGTHS]
+    bases = [SolvableEnv(length, truncate, device) for length in LENGTHS]
     for base in bases:
         base.before_step = None if seed == 0 else hook
     transforms = policy_transforms(prior, observation_steps=1, **chunking)

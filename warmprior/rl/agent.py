@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from itertools import chain
 from typing import Any
 
 import torch
@@ -11,16 +10,16 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictSequential
 from torch import Tensor
 from torchrl.data import ReplayBuffer
-from torchrl.modules import TanhNormal
-from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
+from torchrl.modules import ProbabilisticActor, TanhNormal
+from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.box_normal import BoxTanhNormal
+from warmprior.rl.checks import check_finite
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.decoder import PriorDecoder
 from warmprior.rl.dsrl import DSRLNALoss
-from warmprior.rl.loss import check_finite
 from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
 from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
@@ -57,7 +56,7 @@ class PriorSpaceAgent:
     """
 
     def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
-        self.config, self._prior, self._network = config, actor.prior, actor.network
+        self.config = config
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
         # By default what is drawn around a mean stays in the box, but not what is drawn around zero.
@@ -66,42 +65,38 @@ class PriorSpaceAgent:
             ResidualSampler(self.decoder, distribution=drawn), self.decoder
         )
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
-        network = self._make(
-            make_prior_space_actor,
+        frozen: Any = actor.network
+        sizes = {
+            "action_dim": frozen.action_dim,
+            "observation_dim": frozen.observation_dim,
+            "prediction_length": actor.prior.prediction_length,
+            "observation_steps": frozen.observation_steps,
+            "hidden_dim": config.hidden_dim,
+            "num_layers": config.num_layers,
+        }
+        network = make_prior_space_actor(
+            **sizes,
             delta=self.decoder.delta,
             in_keys=self.state_keys,
             # DSRL-NA changes units by itself, TorchRL's SAC does not.
             distribution_class=BoxTanhNormal if config.algorithm == "dsrl-sac" else TanhNormal,
         ).to(self.device)
         self.policy = TensorDictSequential(network, self.decoder)
-        self.loss = self._make_loss(network).to(self.device)
+        self.loss = self._make_loss(network, sizes).to(self.device)
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=config.gamma)
         self._updater = SoftUpdate(self.loss, tau=config.tau)
         self.optimizer = torch.optim.Adam(self.loss.parameters(), lr=config.learning_rate)
 
-    def _make(self, make: Callable[..., Any], **options: Any) -> Any:
-        network: Any = self._network
-        return make(
-            network.action_dim,
-            network.observation_dim,
-            self._prior.prediction_length,
-            network.observation_steps,
-            hidden_dim=self.config.hidden_dim,
-            num_layers=self.config.num_layers,
-            **options,
-        )
-
-    def _make_loss(self, network: Any) -> Any:
-        config, delta = self.config, self.decoder.delta
-        noise_critic = self._make(
-            make_prior_space_critic, delta=delta, in_keys=(*self.state_keys, keys.DELTA)
+    def _make_loss(self, network: ProbabilisticActor, sizes: dict[str, int]) -> LossModule:
+        config = self.config
+        noise_critic = make_prior_space_critic(
+            **sizes, delta=self.decoder.delta, in_keys=(*self.state_keys, keys.DELTA)
         )
         if config.algorithm == "dsrl-na":
+            chunk_keys = (self.decoder.observation_key, keys.CHUNK)
             return DSRLNALoss(
                 network,
-                self._make(
-                    make_prior_space_critic, in_keys=(self.decoder.observation_key, keys.CHUNK)
-                ),
+                make_prior_space_critic(**sizes, in_keys=chunk_keys),
                 noise_critic,
                 self.decoder,
                 backup=config.backup,
@@ -142,7 +137,7 @@ class PriorSpaceAgent:
         for compute in self._schedule():
             result = compute(buffer.sample())
             losses = {k: v for k, v in result.items() if k.startswith("loss_")}
-            check_finite(losses)
+            check_finite(losses)  # TorchRL's SAC does not look by itself
             self.optimizer.zero_grad()
             torch.stack(list(losses.values())).sum().backward()
             self.optimizer.step()
@@ -152,9 +147,11 @@ class PriorSpaceAgent:
         return {"q": float(values["loss_qvalue"]), "alpha": float(values["alpha"])}
 
     def _parameters(self) -> dict[str, Tensor]:
-        # Of the buffers those of the target critics: the others are constants, some of them made late.
-        targets = (item for item in self.loss.named_buffers() if "_params." in item[0])
-        return dict(chain(self.loss.named_parameters(), targets))
+        # Of the buffers those of the target critics: the others are the frozen policy and constants, some of
+        # these made late.
+        buffers = self.loss.named_buffers()
+        targets = {k: v for k, v in buffers if k.split(".")[0].endswith("_params")}
+        return dict(self.loss.named_parameters()) | targets
 
     def state(self) -> dict[str, Tensor]:
         """All that learning has changed, by name.
@@ -167,12 +164,7 @@ class PriorSpaceAgent:
             **named("loss", self._parameters()),
             **named("optimizer", snapshot_optimizer(self.optimizer)),
         }
-        wrong = [name for name, value in tensors.items() if not torch.isfinite(value).all()]
-        if wrong:
-            raise FloatingPointError(
-                f"{wrong[0]} and {len(wrong) - 1} more tensors of the agent are NaN or infinite: the "
-                "training has diverged; lower the learning rate or check the rewards"
-            )
+        check_finite(tensors)
         return tensors
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import multiprocessing
 import random
-import weakref
 from typing import Any, Literal, Self
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import TensorSpec
-from torchrl.envs import EnvBase
-from torchrl.envs.transforms import Compose, Transform
+from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.modules.prior import Prior
@@ -94,8 +92,7 @@ class PriorAnchor(Transform):
         self.seed_offset = seed_offset
         self.loc_key, self.warm_key = unravel_key(loc_key), unravel_key(warm_key)
         self.anchor_key = unravel_key(anchor_key)
-        self.generator = torch.Generator()
-        self._seeded = seed is not None
+        self.generator: torch.Generator | None = None
         if seed is not None:
             self.set_seed(seed)
 
@@ -105,24 +102,45 @@ class PriorAnchor(Transform):
         Args:
             seed: anything that has one text; mixed with ``seed_offset``.
         """
-        self._seeded = True
-        self.generator.manual_seed(random.Random(f"{seed}/{self.seed_offset}").getrandbits(62))
+        state = random.Random(f"{seed}/{self.seed_offset}").getrandbits(62)
+        self.generator = torch.Generator().manual_seed(state)
 
     def clone(self) -> Self:
         """A copy without environment, whose noise continues by itself."""
         twin = super().clone()
-        twin.generator = self.generator.clone_state()
+        if self.generator is not None:
+            twin.generator = self.generator.clone_state()
         return twin
+
+    def _environment(self) -> Any:
+        try:
+            return self.container
+        except ValueError:  # of a chain that has none yet
+            return None
 
     def set_container(self, container: Any) -> None:
         """Attach the transform, and have it told the seeds that its environment is given."""
         super().set_container(container)
-        while isinstance(container, Compose):
-            reference = container.__dict__.get("_container")
-            container = None if reference is None else reference()
-        if isinstance(container, EnvBase):
-            # TorchRL hands seeds to the base environment alone.
-            container.__dict__["set_seed"] = _SetSeed(container)
+        env = self._environment()
+        if env is not None:
+            # TorchRL hands seeds to the base environment alone. A method is copied with its object, so that
+            # copies of the environment seed themselves.
+            env.__dict__["set_seed"] = self._set_env_seed
+
+    def reset_parent(self) -> None:
+        """Detach the transform, whose environment gets its own ``set_seed`` back."""
+        env = self._environment()
+        if env is not None:
+            env.__dict__.pop("set_seed", None)
+        super().reset_parent()
+
+    def _set_env_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
+        env = self._environment()
+        if seed is not None:
+            for transform in env.transform.modules():
+                if isinstance(transform, PriorAnchor):
+                    transform.set_seed(seed)
+        return type(env).set_seed(env, seed, static_seed=static_seed)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         loc = next_tensordict.get(self.loc_key, None)
@@ -137,7 +155,7 @@ class PriorAnchor(Transform):
                 f"{self.prior.prediction_length} actions: ActionHistory must carry the same prior"
             )
         if self.cold == "noise":
-            if not self._seeded:
+            if self.generator is None:
                 drawn = int(torch.randint(2**62, ()))
                 self.set_seed(f"{drawn}/{multiprocessing.current_process().name}")
             # Drawn on the CPU: one seed gives one noise on every device.
@@ -171,25 +189,3 @@ class PriorAnchor(Transform):
                 )
         observation_spec[self.anchor_key] = observation_spec[self.loc_key].clone()
         return observation_spec
-
-
-class _SetSeed:
-    """Stands for ``env.set_seed``: also seeds the anchors among the environment's transforms."""
-
-    def __init__(self, env: EnvBase) -> None:
-        self._env = weakref.ref(env)
-
-    def __call__(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        env: Any = self._env()
-        following = type(env).set_seed(env, seed, static_seed=static_seed)
-        for transform in env.transform.modules():
-            if isinstance(transform, PriorAnchor) and seed is not None:
-                transform.set_seed(seed)
-        return following
-
-    def __getstate__(self) -> EnvBase | None:
-        # Copies of the environment must seed themselves, and not the original.
-        return self._env()
-
-    def __setstate__(self, env: EnvBase) -> None:
-        self._env = weakref.ref(env)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.rl.checks import check_counts, check_positive
 
 __all__ = ["PriorSpaceConfig"]
 
@@ -80,18 +81,16 @@ class PriorSpaceConfig:
         for name in ("target_entropy", "reward_offset"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be a finite number, got {getattr(self, name)}")
-        for name in ("delta", "learning_rate", "alpha_init"):
-            value = getattr(self, name)
-            if value is not None and not (value > 0 and math.isfinite(value)):
-                raise ValueError(f"{name} must be a finite number > 0, got {value}")
+        check_positive(learning_rate=self.learning_rate, alpha_init=self.alpha_init)
+        if self.delta is not None:
+            check_positive(delta=self.delta)
         for name in ("gamma", "tau"):
             if not 0 < getattr(self, name) <= 1:
                 raise ValueError(f"{name} must lie in (0, 1], got {getattr(self, name)}")
         counts = ("environment_steps", "warmup_steps", "nfe", "updates", "batch_size")
         sizes = ("noise_critic_steps", "hidden_dim", "num_layers")
-        for name in (*counts, *sizes, "evaluate_every", "evaluation_episodes"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        names = (*counts, *sizes, "evaluate_every", "evaluation_episodes")
+        check_counts(**{name: getattr(self, name) for name in names})
         if self.warmup_steps > self.environment_steps:
             raise ValueError(
                 f"warmup_steps ({self.warmup_steps}) exceed environment_steps "

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterator
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -17,14 +15,9 @@ from torchrl.envs import EnvBase, TransformedEnv
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
+from warmprior.rl.checks import check_positive
 
-__all__ = ["PriorDecoder", "check_delta", "visible_priors"]
-
-
-def check_delta(delta: float) -> None:
-    """Raise ValueError if there is no such box."""
-    if not (delta > 0 and math.isfinite(delta)):
-        raise ValueError(f"delta must be a finite number > 0, got {delta}")
+__all__ = ["PriorDecoder", "visible_priors"]
 
 
 class PriorDecoder(TensorDictModuleBase):
@@ -87,7 +80,7 @@ class PriorDecoder(TensorDictModuleBase):
         noise_key: NestedKey = keys.NOISE,
     ) -> None:
         super().__init__()
-        check_delta(delta)
+        check_positive(delta=delta)
         if not actor.prior.is_flow:
             raise ValueError(
                 f"{actor.prior} starts at a single point and its field means nothing elsewhere: there is "
@@ -128,7 +121,12 @@ class PriorDecoder(TensorDictModuleBase):
                 "anchor in an environment and the agent the residual"
             )
         anchor, delta = tensordict.get(self.anchor_key), tensordict.get(self.delta_key)
-        self._check_shape(anchor, self.anchor_key)
+        expected = (self.prediction_length, self.action_dim or anchor.shape[-1])
+        if tuple(anchor.shape[-2:]) != expected:
+            raise ValueError(
+                f"{self.anchor_key} has shape {tuple(anchor.shape)}, but the policy predicts chunks "
+                f"[*B, P, d_a] with (P, d_a) = {expected}"
+            )
         if delta.shape != anchor.shape:
             raise ValueError(
                 f"{self.delta_key} has shape {tuple(delta.shape)}, but {self.anchor_key} has "
@@ -140,14 +138,6 @@ class PriorDecoder(TensorDictModuleBase):
             chunk = self.ode(inputs, nfe=self.nfe).get(self.chunk_key)
         tensordict.set(self.noise_key, noise)
         return tensordict.set(self.chunk_key, chunk)
-
-    def _check_shape(self, anchor: Tensor, name: Any) -> None:
-        action_dim = self.action_dim or anchor.shape[-1]
-        if tuple(anchor.shape[-2:]) != (self.prediction_length, action_dim):
-            raise ValueError(
-                f"{name} has shape {tuple(anchor.shape)}, but the policy predicts chunks "
-                f"[*B, P, d_a] with (P, d_a) = {(self.prediction_length, action_dim)}"
-            )
 
     def check_env(self, env: EnvBase) -> None:
         """Compare the policy with an environment: chunk length, action width and prior.

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModule,
+    TensorDictModuleBase,
+)
 from tensordict.utils import NestedKey, unravel_key
-from torch import Tensor
-from torchrl.objectives.utils import _vmap_func
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.objectives import ValueEstimators
+from torchrl.objectives.common import LossModule
+from torchrl.objectives.sac import compute_rsample_log_prob
+from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from warmprior import keys
+from warmprior.rl.box_normal import BoxTanhNormal
+from warmprior.rl.checks import check_counts, check_finite, check_positive
 from warmprior.rl.decoder import PriorDecoder
-from warmprior.rl.loss import PriorSpaceLoss, check_counts, check_networks
 from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 
 __all__ = ["DSRLNALoss"]
@@ -23,7 +33,7 @@ __all__ = ["DSRLNALoss"]
 type Critics = TensorDictModule | list[TensorDictModule]
 
 
-class DSRLNALoss(PriorSpaceLoss):
+class DSRLNALoss(LossModule):
     r"""Noise-aliased DSRL (`Wagenmaker et al. 2025 <https://arxiv.org/abs/2506.15799>`_), around any anchor.
 
     Many sources decode to the same chunk, so what a transition teaches is learned about the *chunk*: an
@@ -66,8 +76,8 @@ class DSRLNALoss(PriorSpaceLoss):
             :func:`~warmprior.make_prior_space_critic`); one module, initialised ``num_qvalue_nets`` times
             anew, or a list.
         noise_qvalue_network: :math:`Q^W`, which reads ``decoder.delta_key``; the same.
-        decoder: the frozen policy. It is not among the loss's submodules: ``parameters()``,
-            ``state_dict()`` and target updates never see it; ``loss.to(device)`` moves it along.
+        decoder: the frozen policy. Its buffers are in the loss's ``state_dict()`` and move with
+            ``loss.to(device)``; ``parameters()`` and target updates never see it.
 
     Keyword Args:
         num_qvalue_nets: critics of each kind.
@@ -94,7 +104,8 @@ class DSRLNALoss(PriorSpaceLoss):
         ``reward``, ``done``, ``terminated`` and ``executed``; ``priority``, where the TD error of each
         row is written; ``priority_weight``; ``state_action_value``, the critics' output. Beyond them the
         networks' and the decoder's ``in_keys``, at the root and under ``"next"``. The residual that led to
-        the chunk is not needed.
+        the chunk is not needed. ``loss.in_keys`` holds all that is read:
+        ``buffer.extend(data.reshape(-1).select(*loss.in_keys))``.
 
     Raises:
         TypeError: if the actor gives no distribution.
@@ -132,8 +143,14 @@ class DSRLNALoss(PriorSpaceLoss):
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
-    _results = ("loss_actor", "loss_alpha", "loss_qvalue", "loss_qvalue_noise")
-    _diagnostics = ("alpha", "entropy", "td_error")
+    default_value_estimator = ValueEstimators.TD0
+    decoder: PriorDecoder
+    log_alpha: Tensor
+    target_entropy: Tensor
+    # TorchRL warns of parameters that are not annotated.
+    actor_network: ProbabilisticTensorDictSequential
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
     qvalue_network: TensorDictModule
     qvalue_network_params: TensorDictParams
     target_qvalue_network_params: TensorDictParams
@@ -162,14 +179,24 @@ class DSRLNALoss(PriorSpaceLoss):
         deactivate_vmap: bool = False,
         generator: torch.Generator | None = None,
     ) -> None:
-        super().__init__(
-            decoder, backup=backup, bootstrap_timeouts=bootstrap_timeouts, discount=discount
-        )
+        if backup not in ("min", "mean"):
+            raise ValueError(f"backup must be 'min' or 'mean', got {backup!r}")
+        if discount not in ("step", "decision"):
+            raise ValueError(f"discount must be 'step' or 'decision', got {discount!r}")
         check_counts(num_qvalue_nets=num_qvalue_nets, noise_critic_steps=noise_critic_steps)
-        check_networks(actor_network, qvalue_network, noise_qvalue_network, decoder)
+        check_positive(alpha_init=alpha_init)
+        if not math.isfinite(target_entropy):
+            raise ValueError(f"target_entropy must be a finite number, got {target_entropy}")
+        _check_networks(actor_network, qvalue_network, noise_qvalue_network, decoder)
+        super().__init__()
+        self.decoder = decoder
+        self.backup = backup
         self.backup_entropy = backup_entropy
+        self.bootstrap_timeouts = bootstrap_timeouts
+        self.discount = discount
         self.noise_critic_steps = noise_critic_steps
         self.deactivate_vmap = deactivate_vmap
+        self.reduction = "mean"
         self.distillation = ResidualSampler(
             decoder, distribution=distillation, sigma=distillation_sigma, generator=generator
         )
@@ -178,8 +205,16 @@ class DSRLNALoss(PriorSpaceLoss):
             qvalue_network, "qvalue_network", num_qvalue_nets, create_target_params=True
         )
         self.convert_to_functional(noise_qvalue_network, "noise_qvalue_network", num_qvalue_nets)
-        self._register_temperature(alpha_init, fixed_alpha, target_entropy)
+        log_alpha = torch.tensor(math.log(alpha_init), device=self._default_device)
+        if fixed_alpha:
+            self.register_buffer("log_alpha", log_alpha)
+        else:
+            self.log_alpha = nn.Parameter(log_alpha)
+        self.register_buffer("target_entropy", torch.full_like(log_alpha, target_entropy))
         self._make_vmap()
+        self._set_in_keys()
+        self.out_keys = ["loss_actor", "loss_alpha", "loss_qvalue", "loss_qvalue_noise"]
+        self.out_keys += ["alpha", "entropy", "td_error"]
 
     def _make_vmap(self) -> None:
         options = {"randomness": self.vmap_randomness, "pseudo_vmap": self.deactivate_vmap}
@@ -196,8 +231,44 @@ class DSRLNALoss(PriorSpaceLoss):
     def _distillation_keys(self) -> list[NestedKey]:
         return self._states(self.decoder, self.qvalue_network, self.noise_qvalue_network)
 
-    def _needed_keys(self) -> list[NestedKey]:
-        return [*self._reinforcement_keys(), *self._distillation_keys()]
+    def _set_in_keys(self) -> None:
+        """TorchRL calls it from :meth:`set_keys`."""
+        needed = [*self._reinforcement_keys(), *self._distillation_keys()]
+        self.in_keys = list(dict.fromkeys(unravel_key(key) for key in needed))
+
+    def _states(self, *modules: TensorDictModuleBase) -> list[NestedKey]:
+        """What the modules read, actions apart."""
+        actions = {self.decoder.delta_key, self.decoder.chunk_key}
+        needed = dict.fromkeys(unravel_key(key) for module in modules for key in module.in_keys)
+        return [key for key in needed if key not in actions]
+
+    def _check_keys(self, tensordict: TensorDictBase, needed: list[NestedKey]) -> None:
+        missing = [key for key in needed if tensordict.get(key, None) is None]
+        if missing:
+            raise KeyError(
+                f"{type(self).__name__} needs the keys {needed}; missing: {missing}. Data from an "
+                'environment with PriorSpace hold the chunk under ("next", "decoded", "chunk"): '
+                "set_keys(chunk=...)"
+            )
+
+    def make_value_estimator(
+        self, value_type: ValueEstimators | None = None, **hyperparams: Any
+    ) -> None:
+        """Choose the discount: ``make_value_estimator(ValueEstimators.TD0, gamma=0.99)``.
+
+        Args:
+            value_type: ``TD0``, the only one that fits, or an estimator of the user's.
+            hyperparams: ``gamma``, see the option ``discount``.
+        """
+        value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
+        if value_type is not None:
+            dispatch_value_estimator(
+                self,
+                value_type,
+                supported=(ValueEstimators.TD0,),
+                value_network=None,
+                **hyperparams,
+            )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """All four losses on one batch.
@@ -287,3 +358,98 @@ class DSRLNALoss(PriorSpaceLoss):
         value = self._values(self._vmap_noise_qvalue(state, self.noise_qvalue_network_params))
         loss = 0.5 * (value - target).square().sum(0)
         return self._finish({"loss_qvalue_noise": loss}, tensordict, weights)
+
+    def _td_target(self, after: TensorDictBase, value: Tensor) -> Tensor:
+        k = self.tensor_keys
+        estimator = self.value_estimator
+        e = estimator.tensor_keys
+        reward = after.get(k.reward)
+        ended = after.get(k.terminated if self.bootstrap_timeouts else k.done)
+        data = TensorDict({}, batch_size=after.batch_size)
+        data.set(("next", e.reward), reward)
+        data.set(("next", e.done), after.get(k.done))
+        data.set(("next", e.terminated), ended)
+        if self.discount == "step":
+            data.set(e.steps_to_next_obs, after.get(k.executed))
+        return estimator.value_estimate(data, next_value=value.view_as(reward)).squeeze(-1)
+
+    def _act(self, state: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """A residual and its log-probability in units of the box."""
+        with (
+            set_exploration_type(ExplorationType.RANDOM),
+            self.actor_network_params.to_module(self.actor_network, preserve_module_state=False),
+        ):
+            distribution = self.actor_network.get_dist(state)
+            delta, log_prob = compute_rsample_log_prob(distribution)
+        if log_prob.shape != state.shape:
+            raise ValueError(
+                f"the actor gives log-probabilities {tuple(log_prob.shape)} for {tuple(state.shape)} "
+                "states: its distribution needs event_dims=2"
+            )
+        if not isinstance(distribution, BoxTanhNormal):
+            log_prob = log_prob + delta.shape[-2:].numel() * math.log(self.decoder.delta)
+        return delta, log_prob
+
+    def _values(self, data: TensorDictBase) -> Tensor:
+        key = self.tensor_keys.state_action_value
+        values = data.get(key, None)
+        if values is None or values.shape[-1:] != (1,):
+            found = "none" if values is None else f"the shape {tuple(values.shape)}"
+            raise ValueError(f"every critic must give one value [*B, 1] at {key!r}, found {found}")
+        return values.squeeze(-1)
+
+    def _combine(self, data: TensorDictBase) -> Tensor:
+        values = self._values(data)
+        return values.amin(0) if self.backup == "min" else values.mean(0)
+
+    def _finish(
+        self, losses: dict[str, Tensor], tensordict: TensorDictBase, weights: Tensor | None
+    ) -> TensorDict:
+        reduced = {
+            name: self._reduce_loss(loss, tensordict=tensordict, weights=weights)
+            for name, loss in losses.items()
+        }
+        check_finite(reduced)
+        return TensorDict(reduced, batch_size=[])
+
+
+def _check_networks(
+    actor: ProbabilisticTensorDictSequential,
+    chunk_critic: Any,
+    noise_critic: Any,
+    decoder: PriorDecoder,
+) -> None:
+    """Whether the networks read and write what the decoder does.
+
+    Raises:
+        TypeError: if the actor gives no distribution.
+        ValueError: naming the network and the key or size.
+    """
+    if not isinstance(actor, ProbabilisticTensorDictSequential):
+        raise TypeError(
+            f"the actor must be the ProbabilisticActor alone, without a decoder behind it, got "
+            f"{type(actor).__name__}"
+        )
+    written = [unravel_key(key) for key in actor.dist_sample_keys]
+    if written != [decoder.delta_key]:
+        raise ValueError(f"the actor writes {written}, but the decoder reads {decoder.delta_key}")
+    spec = getattr(actor, "spec", None)
+    box = (
+        None
+        if spec is None or decoder.delta_key not in spec.keys(True, True)
+        else spec[decoder.delta_key]
+    )
+    high = getattr(box, "high", None)
+    if high is not None and not torch.allclose(high, torch.full_like(high, decoder.delta)):
+        raise ValueError(
+            f"the actor's residuals lie in a box of half side {float(high.max())}, the decoder's in one of "
+            f"{decoder.delta}: build the actor with delta=decoder.delta"
+        )
+    for name, critic, key in (
+        ("qvalue_network", chunk_critic, decoder.chunk_key),
+        ("noise_qvalue_network", noise_critic, decoder.delta_key),
+    ):
+        critics = critic if isinstance(critic, list) else [critic]
+        for module in critics:
+            if key not in [unravel_key(k) for k in module.in_keys]:
+                raise ValueError(f"{name} must read {key}, it reads {module.in_keys}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
-from warmprior.rl.decoder import check_delta
+from warmprior.rl.checks import check_counts, check_positive
 
 __all__ = ["make_prior_space_actor", "make_prior_space_critic"]
 
@@ -21,39 +21,49 @@ LOG_STD_RANGE = (-20.0, 2.0)
 
 
 class _Trunk(nn.Module):
-    """Linear, LayerNorm and Tanh ``num_layers`` times, then linear; on flattened, concatenated inputs."""
+    """Linear, LayerNorm and Tanh ``num_layers`` times, then linear; on flattened, concatenated inputs.
+
+    The first input is an observation ``[*B, To, d_o]``, the others are ``[*B, P, d_a]``.
+    """
 
     def __init__(
         self,
-        event_dims: Sequence[int],
-        scales: Sequence[float],
-        in_features: int,
+        in_keys: Sequence[NestedKey],
+        chunk: tuple[int, int],
+        observation: tuple[int, int],
         out_features: int,
         hidden_dim: int,
         num_layers: int,
+        scales: Mapping[NestedKey, float],
     ) -> None:
         super().__init__()
-        self.event_dims = tuple(event_dims)
-        self.scales = tuple(scales)
-        self.in_features = in_features
+        check_counts(
+            prediction_length=chunk[0],
+            action_dim=chunk[1],
+            observation_steps=observation[0],
+            observation_dim=observation[1],
+            hidden_dim=hidden_dim,
+            num_layers=num_layers,
+            out_features=out_features,
+        )
+        if not in_keys:
+            raise ValueError("in_keys is empty: the first is the observation")
+        self.scales = [scales.get(unravel_key(key), 1.0) for key in in_keys]
+        self.in_features = math.prod(observation) + (len(in_keys) - 1) * math.prod(chunk)
         layers: list[nn.Module] = []
-        for i in range(num_layers):
-            width = in_features if i == 0 else hidden_dim
+        width = self.in_features
+        for _ in range(num_layers):
             layers += [nn.Linear(width, hidden_dim), nn.LayerNorm(hidden_dim), nn.Tanh()]
+            width = hidden_dim
         self.net = nn.Sequential(*layers, nn.Linear(hidden_dim, out_features))
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        x = torch.cat(
-            [
-                x.flatten(-n) * scale
-                for x, n, scale in zip(inputs, self.event_dims, self.scales, strict=True)
-            ],
-            dim=-1,
-        )
+        scaled = zip(inputs, self.scales, strict=True)
+        x = torch.cat([value.flatten(-2) * scale for value, scale in scaled], dim=-1)
         if x.shape[-1] != self.in_features:
             raise ValueError(
                 f"the network was built for {self.in_features} inputs, got the shapes "
-                f"{[tuple(x.shape) for x in inputs]}"
+                f"{[tuple(value.shape) for value in inputs]}"
             )
         return self.net(x)
 
@@ -70,40 +80,6 @@ class _ActorHead(nn.Module):
         loc, log_std = self.trunk(*inputs).chunk(2, dim=-1)
         scale = log_std.clamp(*LOG_STD_RANGE).exp()
         return loc.unflatten(-1, self.shape), scale.unflatten(-1, self.shape)
-
-
-def _make_trunk(
-    in_keys: Sequence[NestedKey],
-    chunk: tuple[int, int],
-    observation: tuple[int, int],
-    out_features: int,
-    hidden_dim: int,
-    num_layers: int,
-    scales: dict[NestedKey, float],
-) -> _Trunk:
-    sizes = {
-        "prediction_length": chunk[0],
-        "action_dim": chunk[1],
-        "observation_steps": observation[0],
-        "observation_dim": observation[1],
-        "hidden_dim": hidden_dim,
-        "num_layers": num_layers,
-        "out_features": out_features,
-    }
-    for name, size in sizes.items():
-        if size < 1:
-            raise ValueError(f"{name} must be at least 1, got {size}")
-    if not in_keys:
-        raise ValueError("in_keys is empty: the first is the observation")
-    width = math.prod(observation) + (len(in_keys) - 1) * math.prod(chunk)
-    return _Trunk(
-        [2] * len(in_keys),
-        [scales.get(unravel_key(key), 1.0) for key in in_keys],
-        width,
-        out_features,
-        hidden_dim,
-        num_layers,
-    )
 
 
 def make_prior_space_actor(
@@ -154,9 +130,9 @@ def make_prior_space_actor(
         >>> data["prior", "delta"].shape, data["prior", "delta_log_prob"].shape
         (torch.Size([5, 4, 2]), torch.Size([5]))
     """
-    check_delta(delta)
+    check_positive(delta=delta)
     chunk = (prediction_length, action_dim)
-    trunk = _make_trunk(
+    trunk = _Trunk(
         in_keys,
         chunk,
         (observation_steps, observation_dim),
@@ -224,8 +200,8 @@ def make_prior_space_critic(
         ...     "vla_action": {"chunk": torch.zeros(5, 4, 2)}}, [5]))["state_action_value"].shape
         torch.Size([5, 1])
     """
-    check_delta(delta)
-    trunk = _make_trunk(
+    check_positive(delta=delta)
+    trunk = _Trunk(
         in_keys,
         (prediction_length, action_dim),
         (observation_steps, observation_dim),

@@ -46,7 +46,7 @@ class ReplaySegments:
 
     def append(self, transitions: TensorDictBase) -> None:
         """Remember transitions ``[n]`` for the next :meth:`write`."""
-        self._pending.append(transitions)
+        self._pending.append(transitions.cpu())
 
     def write(self) -> None:
         """Write what was appended as one new segment, if anything was."""
@@ -54,7 +54,7 @@ class ReplaySegments:
             return
         data: Any = torch.cat(self._pending)  # type: ignore[arg-type]
         tensors = {
-            json.dumps(key): value.cpu().contiguous()  # names may hold any separator
+            json.dumps(key): value.contiguous()  # names may hold any separator
             for key, value in data.items(True, True)
         }
         write_atomic(self._path(self.committed), lambda path: save_file(tensors, path))

@@ -21,6 +21,7 @@ from tqdm import tqdm
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent
+from warmprior.rl.checks import check_finite
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.replay_segments import ReplaySegments
 from warmprior.training.checkpoint import check_identity, load_state, save_state
@@ -173,17 +174,21 @@ class PriorSpaceTraining:
         warming = self.steps < self.config.warmup_steps
         policy = self.agent.warmup if warming else self.agent.policy
         with set_exploration_type(ExplorationType.RANDOM):
-            data = policy(data.to(self.device)).to("cpu")
+            data = policy(data.to(self.device)).to(env.device or torch.device("cpu"))
         # Before a simulator sees them.
-        _check_finite(data.select(keys.DELTA, keys.CHUNK))
+        self._check_finite(data.select(keys.DELTA, keys.CHUNK))
         data, following = env.step_and_maybe_reset(data)
         transitions = self._transitions(data)
         # Before they are saved: they would end every later training on them.
-        _check_finite(transitions)
+        self._check_finite(transitions)
         self._check_executed(transitions["next"])
         self.buffer.extend(transitions)
         self.segments.append(transitions)
         return following, int(data["next", keys.EXECUTED].sum())
+
+    def _check_finite(self, data: TensorDictBase) -> None:
+        cause = "the policy or the training has diverged, or the environment is at fault"
+        check_finite(dict(data.items(True, True)), cause)
 
     def _check_executed(self, after: TensorDictBase) -> None:
         """Partial execution would put actions into the next mean that the critics do not see."""
@@ -283,19 +288,6 @@ class PriorSpaceTraining:
                     f"{key} is {tuple(shape)}, this policy predicts chunks of (P, d_a) = "
                     f"{(length, self.decoder.action_dim)}. Choose another output folder."
                 )
-
-
-def _check_finite(data: TensorDictBase) -> None:
-    wrong = [
-        key
-        for key, value in data.items(True, True)
-        if value.is_floating_point() and not torch.isfinite(value).all()
-    ]
-    if wrong:
-        raise FloatingPointError(
-            f"a transition holds NaN or infinity at {wrong}: the policy or the training has diverged, or "
-            "the environment is at fault"
-        )
 
 
 def _digest(actor: WarmPriorActor) -> str:
