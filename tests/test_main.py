@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 
 import pytest
 
@@ -13,9 +12,9 @@ from warmprior.__main__ import main
 
 pytest.importorskip("robosuite")
 from warmprior.envs import RobosuiteEnv, rendering_backend
-from warmprior.training import PRESETS, TrainingConfig, play_episode
-from warmprior.training.demonstrations import Demonstrations
-from warmprior.training.policies import Policies
+from warmprior.experiments import NetworkOptions, RunOptions, Store, robosuite_problem
+from warmprior.training import TrainingConfig, play_episode
+from warmprior.training.behaviour_cloning import policy_path
 
 
 @pytest.fixture(scope="module")
@@ -24,23 +23,19 @@ def saved(tmp_path_factory):
     folder = tmp_path_factory.mktemp("saved")
     path = folder / "lift.hdf5"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
-    preset = replace(
-        PRESETS["quick"],
-        training=TrainingConfig(iterations=3, batch_size=8, checkpoints=1),
-        network_options={"hidden_dim": 16},
-    )
-    demonstrations = Demonstrations(path, "file", "ph")
-    policies = Policies(demonstrations, preset, folder / "policies", folder / "logs", logger="none")
+    training = TrainingConfig(iterations=3, batch_size=8, checkpoints=1)
+    problem, network = robosuite_problem(path), NetworkOptions(hidden_dim=16)
+    run = RunOptions(logger="none")
+    store = Store(problem, network, folder / "policies", folder / "logs", run)
     prior = PastPrior(8)
-    actor = policies.policy(prior, 0)
-    env = policies.make_env()
-    env = env.append_transform(policies.transforms(prior)())
+    actor = store.policy(prior, training)
+    env = problem.make_env().append_transform(store.transforms(prior)())
     episode = play_episode(actor, env, 10_000_000, nfe=1)
     env.close()
     kept = folder / "kept"
-    shutil.copytree(policies.path(prior, 0), kept)
+    shutil.copytree(policy_path(store.folder(prior, training), 3), kept)
     path.unlink()
-    shutil.rmtree(policies.directory)
+    shutil.rmtree(store.directory)
     return kept, episode
 
 
@@ -89,6 +84,18 @@ def test_what_a_user_can_mend_is_told_in_one_line(saved, tmp_path, capsys):
         assert main(argv) == 2
         told = capsys.readouterr().err
         assert message in told and told.startswith("warmprior: error: ") and told.count("\n") == 1
+
+
+def test_train(tmp_path, capsys):
+    path, out = tmp_path / "lift.hdf5", tmp_path / "out"
+    write_robomimic_file(path, lengths=(30, 40), task="lift")
+    small = ["--iterations", "2", "--hidden-dim", "8", "--prior", "past", "--logger", "none"]
+    assert main(["train", "--dataset", str(path), "--out", str(out), *small]) == 0
+    folder = capsys.readouterr().out.splitlines()[-1].split(": ")[-1]
+    assert main(["info", folder]) == 0
+    assert "PastPrior(chunk_length=8" in capsys.readouterr().out
+    assert main(["train", "--dataset", str(path), "--out", str(out)]) == 2
+    assert "add --resume" in capsys.readouterr().err
 
 
 def test_demonstrations(tmp_path, capsys):

@@ -47,7 +47,7 @@ def evaluate(args: argparse.Namespace) -> None:
     actor.ode.check_nfe(nfe)
     if args.video is not None:  # known now rather than after the episodes
         check_video(args.video)
-    env = environment_of(actor)
+    env = environment_of(actor, terminate_on_success=not args.play_on)
     try:
         episodes = play(
             actor,
@@ -119,6 +119,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--nfe", type=int, help="network evaluations per chunk (default: the policy's)")
     add("--first-seed", type=int, default=EVALUATION_SEED, help="of the simulator (%(default)s)")
     add("--policy-seed", type=int, default=0, help="of the source samples (%(default)s)")
+    add("--play-on", action="store_true", help="up to the time limit, also after success")
     add("--video", type=Path, help="MP4 of the first episode; needs EGL or OSMesa, and PyAV")
 
     # Its options are those of the recipe, --help included.

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import importlib
-import json
 
 import pytest
 
-from tests.benchmarks.conftest import options
-from tests.data.synthetic import write_robomimic_file
+from tests.benchmarks.script_parts import is_png, options, refused, stored, written
 from warmprior import WarmPriorActor
-from warmprior.diagnostics import action_error
-from warmprior.training.policies import Policies
+from warmprior.data import RobomimicExperienceReplay
+from warmprior.diagnostics import SharedObservations, action_error
 
 pytest.importorskip("robosuite")
+pytest.importorskip("tyro")
+
+from warmprior.experiments import Store
 
 
 @pytest.fixture(scope="module")
@@ -21,75 +22,81 @@ def budget():
     return importlib.import_module("budget")
 
 
-@pytest.fixture(scope="module")
-def validation(tmp_path_factory):
-    path = tmp_path_factory.mktemp("held-out") / "val.hdf5"
-    write_robomimic_file(path, lengths=(25, 30), task="lift", seed=1)
-    return path
-
-
 def arguments(dataset, out, held_out, **extra):
     extra = {"validation": held_out, "observations": 20, "prior": "past"} | extra
     return options(dataset, out, **{"iterations": None, "budgets": [4, 2]} | extra)
+
+
+def held_out_windows(actor, validation):
+    """All of them: any draw of 20 is close."""
+    data = actor.normalizer.normalize(RobomimicExperienceReplay(validation).data.exclude("next"))
+    return SharedObservations(data, 8, observation_steps=2).windows(actor.prior)
 
 
 def test_every_budget_is_a_training_of_its_own(budget, dataset, validation, tmp_path, capsys):
     out = tmp_path / "runs" / "budget"
     argv = arguments(dataset, out, validation)
     assert budget.main(argv) == 0
-    stored = json.loads((out / "results.json").read_text())
-    assert [row["checkpoint"] for row in stored["rows"]] == [2, 4]
-    assert all("success_rate" in row for row in stored["rows"])
-    assert [b["iterations"] for b in stored["meta"]["budgets"]] == [2, 4]
-    assert all((out / b["folder"] / "results.json").exists() for b in stored["meta"]["budgets"])
+    result = stored(out)
+    places = [(row["iterations"], row["checkpoint"]) for row in result["rows"]]
+    assert places == [(2, 2), (4, 4)]
+    assert all("success_rate" in row for row in result["rows"])
+    assert [policy["iterations"] for policy in result["meta"]["policies"]] == [2, 4]
+    assert "val.hdf5" in result["meta"]["observations"]
     table = (out / "table.md").read_text()
     assert table in capsys.readouterr().out and "| 2 |" in table and "| 4 |" in table
-    assert (out / "budget.png").read_bytes().startswith(b"\x89PNG")
+    assert is_png(out / "budget.png")
 
     # The errors are those of the policies on disk, each trained for its own number of iterations.
-    folders = sorted((out.parent / "policies").iterdir())
-    names = sorted(path.name for folder in folders for path in folder.glob("policy_*"))
+    folders = {p["iterations"]: p["folder"] for p in result["meta"]["policies"]}
+    policies = out.parent / "policies"
+    assert {folder.name for folder in policies.iterdir()} == set(folders.values())
+    names = sorted(path.name for path in policies.glob("*/policy_*"))
     assert names == ["policy_000002", "policy_000004"]
-    held_out = {row["iterations"]: row["action_error"] for row in stored["held_out"]}
-    paths = {int(p.name[-6:]): p for folder in folders for p in folder.glob("policy_*")}
-    for iterations, path in paths.items():
-        actor = WarmPriorActor.from_pretrained(path)
-        # Of all held-out steps, as many as there are: any draw of 20 is close.
+    for row in result["rows"]:
+        n = row["iterations"]
+        actor = WarmPriorActor.from_pretrained(policies / folders[n] / f"policy_{n:06d}")
         error = action_error(actor, held_out_windows(actor, validation), nfes=(1,))[1]
-        assert held_out[iterations] == pytest.approx(error, rel=0.3)
+        assert row["action_error"] == pytest.approx(error, rel=0.3)
+        assert f"({row['action_error']:.4f})" in table
 
     # What is finished is not trained again.
-    before = {path: path.stat().st_mtime_ns for path in out.parent.rglob("*.safetensors")}
+    before = written(out.parent)
     assert budget.main([*argv, "--resume"]) == 0
-    assert all(path.stat().st_mtime_ns == time for path, time in before.items())
-    assert json.loads((out / "results.json").read_text())["rows"] == stored["rows"]
+    assert written(out.parent) == before
+    assert stored(out)["rows"] == result["rows"]
 
 
-def held_out_windows(actor, validation):
-    from warmprior.data import RobomimicExperienceReplay
-    from warmprior.diagnostics import SharedObservations
-
-    data = actor.normalizer.normalize(RobomimicExperienceReplay(validation).data.exclude("next"))
-    return SharedObservations(data, 8, observation_steps=2).windows(actor.prior)
+def test_several_seeds_and_nfes(budget, dataset, validation, tmp_path):
+    """The error of every cell is that of its own policy, at its own number of evaluations."""
+    out = tmp_path / "runs" / "budget"
+    assert budget.main(arguments(dataset, out, validation, seeds=2, nfe=[1, 3])) == 0
+    rows = stored(out)["rows"]
+    cells = {(row["iterations"], row["seed"], row["nfe"]): row["action_error"] for row in rows}
+    assert len(cells) == len(rows) == len(set(cells.values())) == 2 * 2 * 2
+    table = (out / "table.md").read_text()
+    mean = (cells[2, 0, 3] + cells[2, 1, 3]) / 2
+    (line,) = (line for line in table.splitlines() if line.startswith("| 2 |"))
+    assert f"({mean:.4f})" in line.split("|")[2]  # the larger NFE stands first
 
 
 def test_bad_options_stop_before_any_work(
     budget, dataset, validation, tmp_path, capsys, monkeypatch
 ):
-    def never(self, *args):
+    def never(*args, **options):
         raise AssertionError("training started")
 
-    monkeypatch.setattr(Policies, "train", never)
+    monkeypatch.setattr(Store, "train", never)
     for i, (extra, message) in enumerate(
         (
-            ({"iterations": 3}, "name it with --budgets"),
-            ({"budgets": [0]}, "--budgets must be at least 1, got 0"),
-            ({"nfe": 0}, "--nfe must be at least 1"),
+            ({"iterations": 3}, "--budgets"),
+            ({"budgets": [0]}, "--budgets must be between 1 and 1,000,000, got 0"),
+            ({"nfe": 0}, "--nfe must be between 1 and"),
             ({"validation": None}, "add --validation"),
             ({"observations": 1_000}, "1000 observations are asked for"),
-            ({"observations": 0}, "--observations must be at least 1"),
+            ({"observations": 0}, "--observations must be between 1 and"),
             ({"validation": tmp_path / "none.hdf5"}, "none.hdf5"),
         )
     ):
-        assert budget.main(arguments(dataset, tmp_path / str(i), validation, **extra)) == 2
-        assert message in capsys.readouterr().err
+        argv = arguments(dataset, tmp_path / str(i), validation, **extra)
+        assert message in refused(budget.main, argv, capsys)

@@ -2,90 +2,124 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
+import importlib
 import math
-from pathlib import Path
 
 import pytest
 
-pytest.importorskip("matplotlib")
-pytest.importorskip("tqdm")
+from tests.benchmarks.script_parts import command_line, having, is_png, refused, stored, written
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "navigation1d.py"
+pytest.importorskip("matplotlib")
+pytest.importorskip("tyro")
+
+from warmprior.experiments import Row
 
 
 @pytest.fixture(scope="module")
 def benchmark():
-    spec = importlib.util.spec_from_file_location("benchmark_navigation1d", SCRIPT)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module("navigation1d")
 
 
 @pytest.mark.filterwarnings("ignore:.*curvature is NaN")
 def test_run_writes_results_table_and_pictures(benchmark, tmp_path, capsys):
-    out = tmp_path / "out"
-    argv = ["--iterations", "5", "--rollouts", "4", "--chunk", "32", "--out", str(out)]
+    out = tmp_path / "runs" / "out"
+    argv = command_line(iterations=5, episodes=4, chunk=32, envs=1, logger="none", out=out)
     assert benchmark.main(argv) == 0
-    stored = json.loads((out / "results.json").read_text())
-    assert len(stored["rows"]) == 7
-    fields = "policy prior sigma seed switch_rate collision_rate route_entropy kappa"
-    for row in stored["rows"]:
-        assert set(fields.split()) <= set(row) and row["chunk"] == 32
-    assert [row["kappa"] for row in stored["rows"] if row["prior"] == "regression"] == [None]
-    assert {"versions", "hardware", "training", "priors", "wall_time_s"} <= set(stored["meta"])
+    result = stored(out)
+    played, curved = having(result["rows"], "collision_rate"), having(result["rows"], "kappa")
+    assert len(played) + len(curved) == len(result["rows"])
+    policies = {(row["prior"], row["sigma"]) for row in played}
+    warm = {(name, sigma) for name in ("past", "preview") for sigma in (0.1, 0.5)}
+    assert len(policies) == 7 and warm < policies
+    # All but the regression at 9 and at 1 network evaluation.
+    assert len(played) == 7 * 2 - 1
+    fields = (
+        "task prior sigma chunk seed nfe switch_rate collision_rate route_entropy distance jerk"
+    )
+    for row in played:
+        assert set(fields.split()) <= set(row)
+        assert (row["task"], row["chunk"], row["iterations"]) == ("navigation", 32, 5)
+    assert {row["seed"] for row in curved} == {0}
+    assert {(row["prior"], row["sigma"]) for row in curved} == policies - {("regression", 0.0)}
+    assert {row["prior"] for row in curved if row["mean"] == "deployed"} == {"past", "preview"}
+    assert {"versions", "hardware", "identity", "policies", "wall_time_s"} <= set(result["meta"])
     table = (out / "table.md").read_text()
     assert table in capsys.readouterr().out
-    assert table.count("\n") == 2 + 7
+    assert table.count("\n") == 2 + 7 * 2 - 1
     for picture in ("navigation1d.png", "flow_paths.png"):
-        assert (out / picture).read_bytes().startswith(b"\x89PNG")
+        assert is_png(out / picture)
 
     # A folder with results is left alone, unless its policies are to be reused.
-    assert benchmark.main(argv) == 2
-    assert "--resume" in capsys.readouterr().err
+    assert "--resume" in refused(benchmark.main, argv, capsys)
+    before = written(out.parent)
+    assert before
     assert benchmark.main([*argv, "--resume"]) == 0
-    assert json.loads((out / "results.json").read_text())["rows"] == stored["rows"]
+    assert stored(out)["rows"] == result["rows"] and written(out.parent) == before
     # Another recipe does not fit these policies.
-    assert benchmark.main([*argv, "--resume", "--cold-probability", "0.5"]) == 2
-    assert "another prior" in capsys.readouterr().err
+    told = refused(benchmark.main, [*argv, "--resume", "--cold-probability", "0.5"], capsys)
+    assert "was started with --cold-probability 0.1" in told
 
 
 @pytest.mark.parametrize(
-    ("option", "value"),
+    ("option", "value", "message"),
     [
-        ("seeds", "0"),
-        ("nfe", "0"),
-        ("rollouts", "0"),
-        ("chunk", "0"),
-        ("chunk", "64"),
-        ("iterations", "0"),
-        ("cold-probability", "2"),
+        ("seeds", 0, "--seeds must be"),
+        ("nfe", 0, "--nfe must be"),
+        ("episodes", 0, "--episodes must be"),
+        ("chunk", 0, "--chunk must be"),
+        ("chunk", 64, "--chunk must be between 1 and 32, got 64"),
+        ("chunk", [4, 8], "this study has one --chunk"),
+        ("iterations", 0, "iterations must be at least 1"),
+        ("cold_probability", 2, "cold_probability"),
+        ("task", "lift", "the toy has demonstrations of its own: leave out --task"),
     ],
 )
-def test_bad_options_stop_before_any_work(benchmark, tmp_path, capsys, option, value):
-    out = tmp_path / "out"
-    assert benchmark.main([f"--{option}", value, "--out", str(out)]) == 2
-    assert "error" in capsys.readouterr().err and not (out / "results.json").exists()
+def test_bad_options_stop_before_any_work(benchmark, tmp_path, capsys, option, value, message):
+    out = tmp_path / "runs" / "out"
+    told = refused(benchmark.main, command_line(**{option: value}, out=out), capsys)
+    assert message in told
+    assert not out.exists() and not (tmp_path / "runs" / "policies").exists()
 
 
-def test_a_training_that_diverges_ends_without_a_traceback(
-    benchmark, tmp_path, capsys, monkeypatch
-):
-    def diverge(study, seed):
-        raise FloatingPointError("the loss became nan")
-
-    monkeypatch.setattr(benchmark, "run_seed", diverge)
-    assert benchmark.main(["--out", str(tmp_path / "out")]) == 2
-    assert "error: the loss became nan" in capsys.readouterr().err
+def test_a_training_that_diverges_ends_without_a_traceback(benchmark, tmp_path, capsys):
+    out = tmp_path / "runs" / "out"
+    argv = command_line(learning_rate=1e30, iterations=40, save_every=10, prior="gaussian", out=out)
+    told = refused(benchmark.main, argv, capsys)
+    assert told.startswith("navigation1d.py: error: ") and "nan" in told.lower()
+    assert stored(out)["rows"] == [] and not (out / "table.md").exists()
 
 
 def test_table_tells_what_is_missing(benchmark):
-    rows = [
-        {"policy": "a", "switch_rate": 0.25, "kappa_executed": math.nan},
-        {"policy": "a", "switch_rate": 0.75, "kappa_executed": 1.0},
-        {"policy": "b", "switch_rate": math.nan},
-    ]
-    lines = benchmark.table(rows, ["a", "b"]).splitlines()
-    assert "0.500 ± 0.354" in lines[2] and "1.000 (1 not finite)" in lines[2]
-    assert set(lines[3].replace("| b |", "").split()) <= {"-", "|"}
+    def rows(prior, seed, nfe=1, **measures):
+        facts = {"prior": prior, "sigma": 1.0, "chunk": 4, "seed": seed}
+        yield Row(facts | {"nfe": nfe}, {"collision_rate": 0.0} | measures)
+
+    def curvature(prior, seed, mean, kappa):
+        facts = {"prior": prior, "sigma": 1.0, "chunk": 4, "seed": seed, "mean": mean}
+        yield Row(facts, {"kappa_executed": kappa})
+
+    lines = benchmark.make_table(
+        [
+            *rows("past", 0, switch_rate=0.25),
+            *rows("past", 1, switch_rate=0.75),
+            *rows("gaussian", 0, switch_rate=math.nan),
+            *curvature("past", 0, "training", math.nan),
+            *curvature("past", 1, "training", 1.0),
+            *curvature("past", 1, "deployed", 7.0),  # not this mean's
+        ]
+    ).splitlines()
+    assert lines[2].startswith("| WP-Past, NFE 1 | 0.500 ± 0.354 |")
+    assert "| 1.000 (1 not finite) |" in lines[2] and "7.0" not in lines[2]
+    cells = [cell.strip() for cell in lines[3].strip("|").split("|")]
+    collisions = 1 + list(benchmark.COLUMNS).index("collisions")
+    assert cells.pop(collisions) == "0.000"
+    assert cells.pop(0) == "Base, NFE 1" and set(cells) == {"-"}
+
+
+def test_curvature_stands_beside_the_largest_number_of_evaluations(benchmark):
+    facts = {"prior": "past", "sigma": 0.5, "chunk": 4, "seed": 0}
+    rows = [Row(facts | {"nfe": nfe}, {"collision_rate": nfe / 10}) for nfe in (9, 1)]
+    curved = Row(facts | {"mean": "training"}, {"kappa_executed": 2.5})
+    first, second = benchmark.make_table([*rows, curved]).splitlines()[2:]
+    assert first.startswith("| WP-Past, NFE 9 |") and "0.900" in first and "2.500" in first
+    assert second.startswith("| WP-Past, NFE 1 |") and "0.100" in second and "2.500" not in second

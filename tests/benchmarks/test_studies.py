@@ -7,13 +7,22 @@ import json
 
 import pytest
 
-from tests.benchmarks.conftest import options
+from tests.benchmarks.script_parts import (
+    command_line,
+    having,
+    is_png,
+    options,
+    refused,
+    stored,
+    written,
+)
 from tests.data.synthetic import write_robomimic_file
 from warmprior import PastPrior
-from warmprior.diagnostics import Row
-from warmprior.training.policies import Policies
 
 pytest.importorskip("robosuite")
+pytest.importorskip("tyro")
+
+from warmprior.experiments import PRESETS, Row, Store, parse, started
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 
@@ -22,13 +31,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*d
 def scripts():
     names = ("robomimic", "curvature", "sigma", "chunking")
     return {name: importlib.import_module(name) for name in names}
-
-
-@pytest.fixture(scope="module")
-def validation(tmp_path_factory):
-    path = tmp_path_factory.mktemp("held-out") / "val.hdf5"
-    write_robomimic_file(path, lengths=(25, 30), task="lift", seed=1)
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -42,51 +44,45 @@ def finished(scripts, dataset, tmp_path_factory):
     return out
 
 
-def written(folder):
-    return {path: path.stat().st_mtime_ns for path in folder.rglob("*.safetensors")}
-
-
-def stored(out):
-    return json.loads((out / "results.json").read_text())
-
-
-def is_png(path):
-    return path.read_bytes().startswith(b"\x89PNG")
-
-
 def measured(out, validation):
     return {"out": out, "validation": validation, "observations": 20, "steps": 8}
 
 
 def test_curvature_of_a_finished_run_trains_nothing(scripts, finished, validation, capsys):
     before = written(finished.parent)
-    argv = ["--run", finished, "--validation", validation, "--observations", 20, "--steps", 8]
-    assert scripts["curvature"].main([str(word) for word in argv]) == 0
+    out = finished.parent / "of-main"
+    told = {"run": finished, **measured(out, validation)}
+    assert scripts["curvature"].main(command_line(**told)) == 0
     assert written(finished.parent) == before
-    out = finished.parent / "curvature-main"
     rows = stored(out)["rows"]
     assert len(rows) == (1 + 2 + 2) * 3  # training and deployed means; two seeds and their average
     assert {row["observations"] for row in rows} == {20}
     base = [row for row in rows if row["prior"] == "gaussian"]
-    assert all(row["ratio"] in (1.0, None) for row in base)
-    assert (out / "table.md").read_text() in capsys.readouterr().out
+    assert len(base) == 3 and all(row["ratio"] in (1.0, None) for row in base)
+    printed = capsys.readouterr().out
+    table = (out / "table.md").read_text()
+    assert table in printed and "20 observations of val.hdf5" in table
+    assert "averaged over 2 training seeds" in table and "not held out" not in table
     assert is_png(out / "flow_paths.png")
     # The training data are allowed, but called what they are.
-    training = stored(finished)["meta"]["options"]["dataset"]
+    training = stored(finished)["meta"]["identity"]["recipe"]["data"]["dataset"]
     again = finished.parent / "curvature-training"
-    argv = [*argv[:3], training, *argv[4:], "--out", again]
-    assert scripts["curvature"].main([str(word) for word in argv]) == 0
+    told |= {"validation": training, "out": again}
+    assert scripts["curvature"].main(command_line(**told)) == 0
     assert "not held out" in (again / "table.md").read_text()
 
 
 def test_curvature_finds_the_policies_of_the_same_options(scripts, finished, dataset, validation):
     before = written(finished.parent)
-    out = finished.parent / "own"
-    argv = options(dataset, seeds=2, iterations=60, **measured(out, validation))
+    own, of_run = (finished.parent / name for name in ("own", "of-run"))
+    argv = options(dataset, seeds=2, iterations=60, **measured(own, validation))
     assert scripts["curvature"].main(argv) == 0
+    assert (
+        scripts["curvature"].main(command_line(run=finished, **measured(of_run, validation))) == 0
+    )
     assert written(finished.parent) == before
-    assert stored(out)["rows"] == stored(finished.parent / "curvature-main")["rows"]
-    assert all(row["speed"] > 0 for row in stored(out)["rows"])
+    assert stored(own)["rows"] == stored(of_run)["rows"]
+    assert all(row["speed"] > 0 for row in stored(own)["rows"])
 
 
 def test_sigma_study(scripts, finished, dataset, validation):
@@ -96,8 +92,8 @@ def test_sigma_study(scripts, finished, dataset, validation):
         dataset,
         seeds=2,
         iterations=60,
-        prior="past",
-        sigmas=[0.5, 1.0, 0.0],
+        prior=["gaussian", "past"],
+        sigma=[0.5, 1.0, 0.0],
         **measured(out, validation),
     )
     assert scripts["sigma"].main(argv) == 0
@@ -106,35 +102,48 @@ def test_sigma_study(scripts, finished, dataset, validation):
     # Of 2 x (1 + 3) policies the Gaussian ones and those with sigma 0.5 existed: 4 are new.
     new = {path.parents[1].name for path in after.keys() - before.keys() if "policy_" in str(path)}
     assert len(new) == 4
-    result = stored(out)
-    cells = {(row["prior"], row["sigma"], row["seed"]) for row in result["rows"]}
-    assert len(cells) == len(result["rows"]) == 8
-    curvatures = {(r["policy"], r["seed"], r["mean"]) for r in result["curvature"]}
-    assert len(curvatures) == (1 + 3 * 2) * 3
-    bounds = {r["sigma"]: r["bound"] for r in result["curvature"] if r["prior"] == "past"}
+    rows = stored(out)["rows"]
+    played, curved = having(rows, "success_rate"), having(rows, "ratio")
+    cells = {(row["prior"], row["sigma"], row["seed"]) for row in played}
+    assert len(cells) == len(played) == 8 and len(played) + len(curved) == len(rows)
+    curvatures = {(r["policy"], r["seed"], r["mean"]) for r in curved}
+    assert len(curvatures) == len(curved) == (1 + 3 * 2) * 3
+    bounds = {r["sigma"]: r["bound"] for r in curved if r["prior"] == "past"}
     assert bounds[0.0] < bounds[0.5] < bounds[1.0]  # the bound grows with sigma^2
     assert is_png(out / "sigma.png")
-    assert (out / "table.md").read_text().count("| WP-Past |") == 3
+    table = (out / "table.md").read_text()
+    assert table.count("| WP-Past, sigma ") == 3 and table.count("| Base, sigma 1 |") == 1
+    # Continuing measures the same again, once.
+    assert scripts["sigma"].main([*argv, "--resume"]) == 0
+    assert written(finished.parent) == after
+    assert stored(out)["rows"] == rows and (out / "table.md").read_text() == table
 
 
-def test_studies_cover_the_papers_grid_by_default(scripts):
-    sigma, chunking = scripts["sigma"], scripts["chunking"]
-    priors = sigma.make_priors(sigma.make_parser().parse_args([]))
-    grid = {(prior.name, prior.sigma) for prior in priors}
+def test_studies_cover_the_papers_grid_by_default(scripts, monkeypatch):
+    made = {}
+
+    def keep(recipe, study):
+        made[study] = recipe
+        raise ValueError("enough")
+
+    for name in ("sigma", "chunking"):
+        monkeypatch.setattr(scripts[name], "started", keep)
+        assert scripts[name].main([]) == 2
+    grid = {(prior.name, prior.sigma) for prior in made["sigma"].sources.priors()}
     sigmas = {1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0}
     assert grid == {("gaussian", 1.0)} | {(n, s) for n in ("past", "preview") for s in sigmas}
-    args = chunking.make_parser().parse_args([])
-    lengths = {(prior.name, prior.chunk_length) for prior in chunking.make_priors(args)}
+    assert made["sigma"].evaluation.nfes == [1]
+    lengths = {(prior.name, prior.chunk_length) for prior in made["chunking"].sources.priors()}
     names = ("gaussian", "past", "preview")
     assert lengths == {(n, h) for n in names for h in (1, 2, 4, 8, 16)}
-    assert sorted(args.nfe) == [1, 3, 9]
+    assert made["chunking"].evaluation.nfes == [9, 3, 1]
 
 
 def test_chunk_length_study(scripts, dataset, tmp_path):
     out = tmp_path / "chunks"
-    assert scripts["chunking"].main(options(dataset, out, chunks=[1, 8])) == 0
+    assert scripts["chunking"].main(options(dataset, out, chunk=[1, 8])) == 0
     rows = stored(out)["rows"]
-    assert len(rows) == 2 * 3
+    assert len(rows) == 2 * 3 and {row["chunk"] for row in rows} == {1, 8}
     for row in rows:
         assert row["boundary_jump"] > 0
         assert (row["inner_jump"] is None) == (row["chunk"] == 1)
@@ -142,27 +151,30 @@ def test_chunk_length_study(scripts, dataset, tmp_path):
         assert is_png(out / picture)
     assert (out / "table.md").read_text().count("| H = ") == 4
     # Continuing plays nothing again.
-    assert scripts["chunking"].main([*options(dataset, out, chunks=[1, 8]), "--resume"]) == 0
-    assert stored(out)["rows"] == rows
+    before = written(out.parent)
+    assert scripts["chunking"].main([*options(dataset, out, chunk=[1, 8]), "--resume"]) == 0
+    assert stored(out)["rows"] == rows and written(out.parent) == before
 
 
 @pytest.mark.parametrize(
     ("script", "extra", "message"),
     [
-        ("sigma", {"sigmas": [-1.0]}, "sigma"),
+        ("sigma", {"sigma": [-1.0]}, "sigma"),
         ("sigma", {"nfe": 0}, "--nfe"),
-        ("chunking", {"chunks": [0]}, "chunk_length"),
+        ("sigma", {"nfe": [1, 3]}, "this study has one --nfe, got 1 3"),
+        ("sigma", {"chunk": [4, 8]}, "this study has one --chunk, got 4 8"),
+        ("chunking", {"chunk": [0]}, "--chunk"),
+        ("chunking", {"dataset": None, "task": ["lift", "can"]}, "this study has one --task"),
         ("curvature", {"coordinate": 9}, "--coordinate must be in [0, 7)"),
     ],
 )
 def test_bad_options_are_named(
-    scripts, finished, dataset, validation, tmp_path, capsys, script, extra, message
+    scripts, finished, dataset, validation, capsys, no_training, script, extra, message
 ):
     out = finished.parent / f"bad-{script}-{next(iter(extra))}"
-    values = measured(out, validation) if script == "curvature" else {"out": out}
+    values = {"out": out} if script == "chunking" else measured(out, validation)
     argv = options(dataset, **{"seeds": 2, "iterations": 60} | values | extra)
-    assert scripts[script].main(argv) == 2
-    assert message in capsys.readouterr().err
+    assert message in refused(scripts[script].main, argv, capsys)
 
 
 @pytest.mark.parametrize("content", [None, '{"meta": {}, "rows": []}'])
@@ -171,8 +183,8 @@ def test_a_folder_that_is_no_finished_run_is_named(scripts, tmp_path, capsys, co
     run.mkdir()
     if content is not None:
         (run / "results.json").write_text(content)
-    assert scripts["curvature"].main(["--run", str(run)]) == 2
-    assert "robomimic.py" in capsys.readouterr().err
+    argv = command_line(run=run, out=tmp_path / "out")
+    assert "robomimic.py" in refused(scripts["curvature"].main, argv, capsys)
 
 
 @pytest.fixture
@@ -180,7 +192,7 @@ def no_training(monkeypatch):
     def train(*args, **options):
         pytest.fail("something was trained")
 
-    monkeypatch.setattr(Policies, "train", train)
+    monkeypatch.setattr(Store, "train", train)
 
 
 @pytest.mark.parametrize("script", ["sigma", "curvature"])
@@ -191,8 +203,8 @@ def no_training(monkeypatch):
         ({"validation": "missing.hdf5"}, "missing.hdf5"),
         ({"validation": "square"}, "holds demonstrations of square"),
         ({"observations": 5_000}, "5000 observations are asked for"),
-        ({"steps": 1}, "--steps must be at least 2"),
-        ({"draws": 0}, "--draws must be at least 1"),
+        ({"steps": 1}, "--steps must be between 2 and"),
+        ({"draws": 0}, "--draws must be between 1 and"),
     ],
 )
 def test_what_cannot_be_measured_is_named_before_any_training(
@@ -203,24 +215,26 @@ def test_what_cannot_be_measured_is_named_before_any_training(
         write_robomimic_file(path, lengths=(25, 30), task="square", seed=1)
         extra = {"validation": path}
     argv = options(dataset, **measured(tmp_path / "out", validation) | extra)
-    assert scripts[script].main(argv) == 2
-    assert message in capsys.readouterr().err
+    assert message in refused(scripts[script].main, argv, capsys)
 
 
 def test_policies_without_a_flow_have_no_curvature(
     scripts, dataset, validation, tmp_path, capsys, no_training
 ):
     argv = options(dataset, prior="regression", **measured(tmp_path / "out", validation))
-    assert scripts["curvature"].main(argv) == 2
-    assert "none of these policies has a flow" in capsys.readouterr().err
+    told = refused(scripts["curvature"].main, argv, capsys)
+    assert "none of these policies has a flow" in told
 
 
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
         (["--seeds", "3"], "leave out --seeds"),
+        (["--chunk", "4", "--iterations", "3"], "leave out --chunk, --iterations"),
+        (["--prior", "past"], "leave out --prior"),
         (["--out", "{run}"], "holds a run"),
-        (["--resume"], "leave out --resume"),
+        (["--resume", "--out", "{run}"], "another study (None)"),
+        (["--resume", "--out", "{run}-other"], "--resume: there is no run"),
     ],
 )
 def test_a_measured_run_is_neither_overwritten_nor_given_other_options(
@@ -228,19 +242,23 @@ def test_a_measured_run_is_neither_overwritten_nor_given_other_options(
 ):
     run = tmp_path / "run"
     run.mkdir()
-    (run / "results.json").write_text('{"meta": {}, "rows": []}')
-    argv = ["--run", str(run), *(word.format(run=run) for word in extra)]
-    assert scripts["curvature"].main(argv) == 2
-    assert message in capsys.readouterr().err
-    assert stored(run) == {"meta": {}, "rows": []}
+    for name in ("results", "options"):
+        (run / f"{name}.json").write_text('{"meta": {}, "rows": []}')
+    argv = ["--run", run, *([] if "--out" in extra else ["--out", tmp_path / "out"])]
+    argv += [word.format(run=run) for word in extra]
+    assert message in refused(scripts["curvature"].main, argv, capsys)
+    for name in ("results", "options"):
+        assert json.loads((run / f"{name}.json").read_text()) == {"meta": {}, "rows": []}
 
 
-def test_measuring_a_run_twice_keeps_both_results(scripts, tmp_path):
-    parse = scripts["curvature"].parse
-    argv = ["--run", str(tmp_path / "main")]
-    assert parse(argv).out == tmp_path / "curvature-main"
-    (tmp_path / "curvature-main").mkdir()
-    assert parse(argv).out == tmp_path / "curvature-main-2"
+def test_measuring_a_run_twice_keeps_both_results(
+    scripts, finished, validation, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    for name in ("curvature-main-quick", "curvature-main-quick-2"):
+        argv = command_line(run=finished, **measured(None, validation))
+        assert scripts["curvature"].main(argv) == 0
+        assert len(stored(tmp_path / "runs" / name)["rows"]) == 15
 
 
 def test_only_the_same_study_continues_a_folder(scripts, dataset, tmp_path, capsys):
@@ -248,40 +266,65 @@ def test_only_the_same_study_continues_a_folder(scripts, dataset, tmp_path, caps
     out.mkdir()
     told = json.dumps({"study": "sigma", "nfe": 1})
     (out / "options.json").write_text(told)
-    assert scripts["robomimic"].main(["--resume", "--out", str(out)]) == 2
-    assert "another study (sigma)" in capsys.readouterr().err
+    message = refused(scripts["robomimic"].main, ["--resume", "--out", out], capsys)
+    assert "another study (sigma)" in message
     assert (out / "options.json").read_text() == told
 
 
 def test_a_relative_path_continues_the_run_of_the_same_file(
     scripts, dataset, tmp_path, monkeypatch
 ):
-    experiment = importlib.import_module("_experiment")
+    presets = {name: scripts["sigma"].study(preset) for name, preset in PRESETS.items()}
     monkeypatch.chdir(dataset.parent)
-    argv = ["--dataset", dataset.name, "--out", str(tmp_path)]
-    make_parser = scripts["sigma"].make_parser
-    experiment.store_options(experiment.parse(make_parser, argv, "sigma-"))
-    again = experiment.parse(make_parser, [*argv, "--resume"], "sigma-")
-    assert again.dataset.resolve() == dataset
+    argv = ["--dataset", dataset.name, "--out", str(tmp_path / "out")]
+    with started(parse(presets, argv, study="sigma"), "sigma"):
+        pass
+    assert parse(presets, [*argv, "--resume"], study="sigma").data.dataset.resolve() == dataset
+    monkeypatch.chdir(tmp_path)
+    again = parse(presets, ["--out", "out", "--resume"], study="sigma")
+    assert again.data.dataset == dataset
+    with pytest.raises(ValueError, match="started with --dataset"):
+        parse(presets, ["--out", "out", "--resume", "--dataset", "another.hdf5"], study="sigma")
 
 
-def test_a_run_of_several_sigmas_is_not_taken_for_seeds(scripts, tmp_path, capsys):
+@pytest.mark.parametrize("changes", [{"sigma": 1.0}, {"chunk_length": 4}, {"iterations": 2}])
+def test_a_run_of_several_policies_of_a_prior_is_not_taken_for_seeds(
+    scripts, tmp_path, capsys, changes
+):
     run = tmp_path / "sigma"
     run.mkdir()
-    policies = [
-        {"prior": PastPrior(8, sigma=sigma).config(), "seed": 0, "folder": f"past-{sigma}"}
-        for sigma in (0.5, 1.0)
-    ]
-    meta = {"policies": policies, "task": "lift", "training": {"iterations": 1}}
+    policies = []
+    for change in ({}, changes):
+        values = {"chunk_length": 8, "sigma": 0.5, "iterations": 1} | change
+        iterations = values.pop("iterations")
+        entry = {"prior": PastPrior(**values).config(), "iterations": iterations, "seed": 0}
+        policies.append(entry | {"folder": "past"})
+    meta = {"policies": policies, "problems": [{"task": "lift"}]}
     (run / "results.json").write_text(json.dumps({"meta": meta, "rows": []}))
-    assert scripts["curvature"].main(["--run", str(run)]) == 2
-    assert "one sigma and one chunk length" in capsys.readouterr().err
+    argv = command_line(run=run, out=tmp_path / "out")
+    told = refused(scripts["curvature"].main, argv, capsys)
+    assert "one sigma and one chunk length" in told
+
+
+def test_a_missing_policy_of_a_run_is_named(scripts, tmp_path, capsys):
+    run = tmp_path / "main"
+    run.mkdir()
+    entry = {"prior": PastPrior(8).config(), "iterations": 1, "seed": 0, "folder": "past"}
+    meta = {"policies": [entry], "problems": [{"task": "lift"}]}
+    (run / "results.json").write_text(json.dumps({"meta": meta, "rows": []}))
+    argv = command_line(run=run, out=tmp_path / "out")
+    told = refused(scripts["curvature"].main, argv, capsys)
+    assert "policy_000001 is missing: finish the run with --resume" in told
 
 
 def test_jumps_are_those_of_the_last_checkpoint_as_in_the_figure(scripts):
     def row(prior, checkpoint, jump):
-        return Row("lift", "ph", prior, 1.0, 1, 1, 0, checkpoint, 10, 5, 9.0, jump)
+        facts = {"task": "lift", "data": "ph", "prior": prior, "sigma": 1.0, "chunk": 1, "nfe": 1}
+        facts |= {"seed": 0, "iterations": 10, "checkpoint": checkpoint}
+        counts = {"episodes": 10, "successes": 5, "success_rate": 0.5}
+        return Row(facts, counts | {"boundary_jump": jump})
 
     rows = [row(p, *at) for p in ("gaussian", "past", "preview") for at in ((5, 9.0), (10, 0.25))]
-    table = scripts["chunking"].make_table(rows, [1], [1], 2)
-    assert table.splitlines()[6] == "| H = 1 | 0.250 | 0.250 | 0.250 |"
+    table = scripts["chunking"].make_table(rows, 2)
+    assert "| H = 1, success (%) | 50.0 | 50.0 | 50.0 |" in table
+    assert "| H = 1, jump at boundaries | 0.250 | 0.250 | 0.250 |" in table

@@ -8,9 +8,9 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -128,7 +128,7 @@ def test_cached_file_is_returned_at_once(lift_file, monkeypatch):
     def fail(*_):
         raise AssertionError("generated again")
 
-    monkeypatch.setattr(generate_module, "_players", fail)
+    monkeypatch.setattr(generate_module, "WorkerPool", fail)
     folder = lift_file.parent.parent
     assert generate_demonstrations("lift", n=3, cache_dir=folder) == lift_file
     monkeypatch.setenv("WARMPRIOR_CACHE", str(folder))
@@ -179,30 +179,41 @@ def fake_episode(seed, style="mh", success=True):
     )
 
 
-@pytest.mark.parametrize("ahead", [1, 2, 7])
-def test_operators_contribute_equally(ahead):
-    def play(seed):
-        future = Future()
-        # The last operator succeeds every fourth time only.
-        future.set_result(fake_episode(seed, success=seed % 6 != 5 or seed % 24 == 5))
-        return future
+def generated(monkeypatch, path, run_episode, **options):
+    """The demonstrations that would be written, of episodes that are made up."""
+    kept = []
 
-    kept = list(generate_module._successes(play, "mh", 14, 0, ahead, lambda _: None))
-    assert [kept.count(e) for e in kept] == [1] * 14
+    def write(path, episodes, **facts):
+        kept.extend(episodes)
+
+    monkeypatch.setattr(generate_module, "expert_loop", MagicMock())
+    monkeypatch.setattr(generate_module, "run_episode", run_episode)
+    monkeypatch.setattr(generate_module, "write_robomimic", write)
+    generate_demonstrations("lift", path=path, progress=False, **options)
+    return kept
+
+
+@pytest.mark.parametrize("workers", [1, 2, 7])
+def test_operators_contribute_equally(workers, tmp_path, monkeypatch):
+    def run_episode(loop, task, style, seed, image_size):
+        time.sleep(0.01 * (seed % 3))  # they end in another order than they began
+        # The last operator succeeds every fourth time only.
+        return fake_episode(seed, success=seed % 6 != 5 or seed % 24 == 5)
+
+    path = tmp_path / "out.hdf5"
+    kept = generated(monkeypatch, path, run_episode, style="mh", n=14, workers=workers)
     assert [sum(e.operator == i for e in kept) for i in range(6)] == [3, 3, 2, 2, 2, 2]
     seeds = [episode.seed for episode in kept]
-    assert seeds == sorted(seeds)
+    assert seeds == sorted(set(seeds)) and len(seeds) == 14
     assert max(seeds) == 29
 
 
-def test_gives_up_when_the_expert_never_succeeds():
-    def play(seed):
-        future = Future()
-        future.set_result(fake_episode(seed, "ph", success=False))
-        return future
+def test_gives_up_when_the_expert_never_succeeds(tmp_path, monkeypatch):
+    def run_episode(loop, task, style, seed, image_size):
+        return fake_episode(seed, "ph", success=False)
 
     with pytest.raises(RuntimeError, match="only 0 of 2 demonstrations succeeded in 140"):
-        list(generate_module._successes(play, "ph", 2, 0, 1, lambda _: None))
+        generated(monkeypatch, tmp_path / "out.hdf5", run_episode, n=2, workers=1)
 
 
 def test_filter_keys_of_several_operators(tmp_path):
@@ -275,25 +286,24 @@ def test_success_rate(task, style, count, least):
 
 
 GENERATING = """
-import sys, multiprocessing
+import multiprocessing, sys, threading, time
+from unittest.mock import MagicMock
 from warmprior.data.scripted import generate
-generate.expert_loop = lambda task: None
-def hang(*args):
-    import time
-    time.sleep(300)
-generate.run_episode = hang
-with generate._players("lift", "ph", 0, 2) as play:
-    for seed in range(4):
-        play(seed)
+generate.expert_loop = MagicMock()
+generate.run_episode = lambda *args: time.sleep(300)
+def tell():
+    while len(multiprocessing.active_children()) < 2:
+        time.sleep(0.05)
     print(*(process.pid for process in multiprocessing.active_children()), flush=True)
-    play(4).result()
+threading.Thread(target=tell, daemon=True).start()
+generate.generate_demonstrations("lift", n=4, path=sys.argv[1], workers=2, progress=False)
 """
 
 
 @pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_workers_end_with_whoever_generates(sent):
+def test_workers_end_with_whoever_generates(sent, tmp_path):
     process = subprocess.Popen(
-        [sys.executable, "-c", GENERATING],
+        [sys.executable, "-c", GENERATING, str(tmp_path / "out.hdf5")],
         cwd=Path(__file__).parents[2],
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

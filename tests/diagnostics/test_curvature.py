@@ -16,7 +16,7 @@ from warmprior import (
     RegressionPrior,
     VelocityMLP,
 )
-from warmprior.diagnostics import compare_curvature, curvature
+from warmprior.diagnostics import curvature
 from warmprior.modules import WarmPriorActor
 
 
@@ -146,28 +146,6 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
         assert torch.isfinite(
             curvature(policy(lazy, prior), data.exclude("vla_action"))["kappa"]
         ).all()
-
-
-def test_comparison_is_relative_to_the_first():
-    fields = {"a": policy(lambda t, a, o: -a), "b": policy(lambda t, a, o: -2 * a)}
-    data = batch(2000)
-    out = compare_curvature(fields, {"a": data, "b": data})
-    steps = torch.arange(100, dtype=torch.float64)
-    kappas = [(rate * (1 - rate / 100) ** steps).var(correction=0) for rate in (1.0, 2.0)]
-    assert out["a"]["ratio"] == 1.0
-    assert out["b"]["ratio"] == pytest.approx(float(kappas[1] / kappas[0]), rel=0.1)
-
-
-def test_comparison_refuses_other_chunks_and_other_observations():
-    data = batch()
-    fields = {"a": policy(lambda t, a, o: -a), "b": policy(lambda t, a, o: -a, PastPrior(H + 1))}
-    with pytest.raises(ValueError, match="one chunk length"):
-        compare_curvature(fields, {"a": data, "b": batch(length=H + 1)})
-    fields["b"] = fields["a"]
-    other = data.clone()
-    other["observation"] += 1
-    with pytest.raises(ValueError, match="same observations"):
-        compare_curvature(fields, {"a": data, "b": other})
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from warmprior import (
     WarmPriorActor,
     window_replay_buffer,
 )
-from warmprior.diagnostics import prior_color, prior_label
+from warmprior.experiments import prior_color, prior_label
 from warmprior.training import BehaviourCloning, TrainingConfig
 
 D_A, D_O, H, TO = 2, 3, 4, 2

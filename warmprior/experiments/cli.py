@@ -17,7 +17,7 @@ import tyro
 from warmprior.experiments.recipe import Recipe, differences, record, restore
 from warmprior.experiments.results import write_options
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
-from warmprior.training.workers import WorkerError
+from warmprior.io.workers import WorkerError
 
 __all__ = ["numbered_folder", "parse", "run_script", "started", "write_report"]
 

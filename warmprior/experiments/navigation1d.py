@@ -44,7 +44,10 @@ class NavigationRecipe(Recipe):
         """Refuse what cannot work, or has no effect, before any work."""
         super().check()
         self.check_single(chunk=True)
-        refuse_ignored(self, NavigationRecipe(), ["data"], "the toy has demonstrations of its own")
+        told = "the toy has demonstrations and an end of its own"
+        refuse_ignored(self, NavigationRecipe(), ["data"], told)
+        if self.evaluation.play_on:
+            raise ValueError(f"{told}: leave out --play-on")
         steps = len(navigation_positions()) // 2
         if not 1 <= self.sources.chunk[0] <= steps:
             raise ValueError(f"--chunk must be between 1 and {steps}, got {self.sources.chunk[0]}")

@@ -115,8 +115,12 @@ class PriorSpaceRecipe(Recipe):
         elif self.is_toy:
             told = "the toy has demonstrations and a time limit of its own"
             refuse_ignored(self, base, ["data"], told)
-            if self.agents.horizon is not None:
-                raise ValueError(f"{told}: leave out --horizon")
+            for name, given in (
+                ("horizon", self.agents.horizon is not None),
+                ("play-on", self.evaluation.play_on),
+            ):
+                if given:
+                    raise ValueError(f"{told}: leave out --{name}")
         else:
             self.data.check()
         for prior in self.sources.priors():
@@ -163,7 +167,7 @@ def agent_environment(recipe: PriorSpaceRecipe, actor: WarmPriorActor) -> Callab
     if recipe.is_toy:
         return partial(_toy, actor, recipe.agents.num_envs)
     make_env, make_transforms = environment_parts(actor)
-    make_env = partial(make_env, horizon=recipe.agents.horizon)
+    make_env = partial(make_env, horizon=recipe.agents.horizon, **recipe.evaluation.environment)
     return partial(_simulators, actor, make_env, make_transforms, recipe.agents.num_envs)
 
 

@@ -157,7 +157,8 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
     for task in options.task or ("square",):
         for style in options.data:
             if options.download:
-                path, source = download_robomimic(task, style), "official"
+                path = download_robomimic(task, style, force=options.force_download)
+                source = "official"
             else:
                 path = generate_demonstrations(task, style, options.count(style))
                 source = "scripted"

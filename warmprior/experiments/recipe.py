@@ -33,17 +33,15 @@ __all__ = [
 Flat = tyro.conf.OmitArgPrefixes
 """Marks a part of the tree whose options carry their own names alone on the command line."""
 
-MOST = 1_000_000
-"""No count of seeds, episodes, ... above it is meant."""
 
-
-def check_counts(options: Any, *names: str, least: int = 1) -> None:
+def check_counts(options: Any, *names: str, least: int = 1, most: int = 1_000_000) -> None:
     """Refuse counts that cannot be meant.
 
     Args:
         options: the dataclass that holds them.
         names: of its fields; ``None`` is fine.
         least: the smallest count.
+        most: the largest.
 
     Raises:
         ValueError: naming the option.
@@ -51,9 +49,9 @@ def check_counts(options: Any, *names: str, least: int = 1) -> None:
     for name in names:
         value = getattr(options, name)
         for count in value if isinstance(value, tuple) else (value,):
-            if count is not None and not least <= count <= MOST:
+            if count is not None and not least <= count <= most:
                 raise ValueError(
-                    f"--{name.replace('_', '-')} must be between {least} and {MOST:,}, got {count}"
+                    f"--{name.replace('_', '-')} must be between {least} and {most:,}, got {count}"
                 )
 
 
@@ -66,6 +64,7 @@ class DataOptions:
         data: ph (one operator) or mh (six operators).
         dataset: a robomimic HDF5 file, instead of generated data.
         download: fetch the official files from the hub instead.
+        force_download: fetch them again, in place of a broken local copy.
         demonstrations: scripted demonstrations to generate; two numbers for ph and mh.
     """
 
@@ -73,6 +72,7 @@ class DataOptions:
     data: tuple[Literal["ph", "mh"], ...] = ("ph",)
     dataset: Path | None = None
     download: bool = False
+    force_download: bool = False
     demonstrations: tuple[int, ...] = (150,)
 
     def __post_init__(self) -> None:
@@ -90,6 +90,8 @@ class DataOptions:
             ValueError: naming the options.
             FileNotFoundError: if the file does not exist.
         """
+        if self.force_download and not self.download:
+            raise ValueError("--force-download belongs to --download")
         for task in self.task:
             if self.dataset is None and not (get_task(task).scripted or self.download):
                 raise ValueError(
@@ -208,17 +210,25 @@ class EvaluationOptions:
         episodes: evaluation episodes per cell.
         nfe: network evaluations per chunk.
         top_k: best checkpoints averaged per seed.
+        play_on: go on after success, up to the time limit; solved is solved at any step.
     """
 
     seeds: int = 1
     episodes: int = 25
     nfe: tuple[int, ...] = (9, 3, 1)
     top_k: int = 1
+    play_on: bool = False
 
     def __post_init__(self) -> None:
-        check_counts(self, "seeds", "episodes", "nfe", "top_k")
+        check_counts(self, "seeds", most=1_000)
+        check_counts(self, "episodes", "nfe", "top_k")
         if not self.nfe:
             raise ValueError("--nfe needs at least one number of network evaluations")
+
+    @property
+    def environment(self) -> dict[str, Any]:
+        """Options of the environment."""
+        return {"terminate_on_success": False} if self.play_on else {}
 
     @property
     def nfes(self) -> list[int]:

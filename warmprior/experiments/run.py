@@ -18,16 +18,16 @@ from warmprior.diagnostics.source_leak import SourceLeak, source_leak
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.experiments.problem import find_problems, observe
 from warmprior.experiments.progress import ComparisonProgress
-from warmprior.experiments.recipe import HeldOutOptions, Recipe, record
+from warmprior.experiments.recipe import EvaluationOptions, HeldOutOptions, Recipe, record
 from warmprior.experiments.results import Results, Row, facts_of_machine, played
 from warmprior.experiments.store import Losses, Store
 from warmprior.io.files import check_writable
+from warmprior.io.workers import WorkerPool, available_cores
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.training.behaviour_cloning import policy_path
 from warmprior.training.evaluation import Episode, play_episode
 from warmprior.training.training_config import TrainingConfig
-from warmprior.training.workers import WorkerPool, available_cores
 
 __all__ = ["Comparison", "Contestant"]
 
@@ -110,8 +110,8 @@ class _Worker:
     needs no preparation.
     """
 
-    def __init__(self, contestants: Sequence[Contestant], nfes: Sequence[int]) -> None:
-        self.contestants, self.nfes = contestants, nfes
+    def __init__(self, contestants: Sequence[Contestant], options: EvaluationOptions) -> None:
+        self.contestants, self.options = contestants, options
         # Iterations of each training, for the process that shows them. Without a lock, which a killed
         # worker might hold for ever: each entry has a single writer.
         self.iterations = multiprocessing.RawArray("q", len(contestants))
@@ -150,13 +150,14 @@ class _Worker:
             return {}  # no two episodes with steps to compare
         policy = chosen.store.load(chosen.prior, chosen.training)
         windows = shared.windows(chosen.prior)
-        return source_leak(policy, windows, nfes=self.nfes, episodes=shared.episodes)
+        return source_leak(policy, windows, nfes=self.options.nfes, episodes=shared.episodes)
 
     def _prepare(self, chosen: Contestant, checkpoint: int) -> tuple[WarmPriorActor, EnvBase]:
         if self._store is not chosen.store:
             if self._store is not None:
                 self._simulator.close(raise_if_closed=False)
-            self._simulator, self._store = chosen.store.problem.make_env(), chosen.store
+            self._simulator = chosen.store.problem.make_env(**self.options.environment)
+            self._store = chosen.store
         policy = chosen.store.load(chosen.prior, chosen.training, checkpoint)
         # The policy's own prior, which may have learnt.
         transforms = chosen.store.transforms(policy.prior)()
@@ -254,6 +255,11 @@ class Comparison:
         return self.recipe.run.envs or available_cores()
 
     @property
+    def trainings_at_once(self) -> int | None:
+        """How many trainings may share the device; no limit on a CPU, where each has a thread."""
+        return None if torch.device(self.recipe.run.device).type == "cpu" else 1
+
+    @property
     def title(self) -> str:
         """What is compared, for figures."""
         return ", ".join(store.problem.name for store in self.stores)
@@ -342,10 +348,9 @@ class Comparison:
     def _compute(self, following: Mapping[int, Sequence[_Leak | _Play]]) -> None:
         """Longest jobs first: trainings, then measures and episodes of what is trained."""
         self.results.save()
-        cuda = torch.device(self.recipe.run.device).type == "cuda"
-        at_once = 1 if cuda else len(following)
+        at_once = self.trainings_at_once or len(following)
         to_train, ready = deque(_Train(n) for n in following), deque[_Leak | _Play]()
-        worker = _Worker(self.contestants, self.nfes)
+        worker = _Worker(self.contestants, self.recipe.evaluation)
         outcomes: dict[_Play, Episode] = {}
         leaks: dict[int, dict[int, SourceLeak]] = {}
         episodes = sum(isinstance(job, _Play) for jobs in following.values() for job in jobs)

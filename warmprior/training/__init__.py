@@ -1,12 +1,12 @@
 """Behaviour cloning, evaluation and worker processes."""
 
+from warmprior.io.workers import WorkerError
 from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
 from warmprior.training.evaluation import Episode, evaluate, parallel_env, play_episode
 from warmprior.training.filmstrip import Filmstrip, record_filmstrip
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.training_config import TrainingConfig
 from warmprior.training.video import record_video
-from warmprior.training.workers import WorkerError
 
 __all__ = [
     "BehaviourCloning",

@@ -20,9 +20,9 @@ from torchrl.envs.transforms import Compose
 from tqdm import tqdm
 
 from warmprior import keys
+from warmprior.io.workers import end_with_parent, start_method, worker_died
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.threads import torch_threads
-from warmprior.training.workers import end_with_parent, start_method, worker_died
 
 __all__ = ["Episode", "evaluate", "parallel_env", "play_episode"]
 

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import multiprocessing
 import os
-import signal
-import sys
-import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +25,7 @@ from warmprior.envs.control_loop import ControlLoop
 from warmprior.envs.simulator import import_robosuite, task_env_args
 from warmprior.envs.tasks import EVALUATION_SEED, get_task
 from warmprior.io.extras import require
-from warmprior.io.processes import end_with_parent
+from warmprior.io.workers import WorkerPool, available_cores
 
 __all__ = ["GENERATOR_VERSION", "SEEDS_PER_FILE", "generate_demonstrations"]
 
@@ -108,18 +104,18 @@ def generate_demonstrations(
     for module in ("h5py", "tqdm"):
         require(module, "sim")
     import_robosuite()
-    workers = min(n, workers or _available_cores())
-    with contextlib.ExitStack() as stack:
-        play = stack.enter_context(_players(task, style, image_size, workers))
-        bar = stack.enter_context(
-            require("tqdm", "sim").tqdm(
-                total=n, desc=f"{task}/{style}", unit="demo", disable=not progress
-            )
-        )
-        model_file = play(None).result()
+    workers = min(n, workers or available_cores())
+    with (
+        WorkerPool(workers, _Player(task, style, image_size)) as pool,
+        require("tqdm", "sim").tqdm(
+            total=n, desc=f"{task}/{style}", unit="demo", disable=not progress
+        ) as bar,
+    ):
+        pool.submit(_Player.model)
+        ((_, model_file),) = pool.wait()
         write_robomimic(
             path,
-            _successes(play, style, n, seed * SEEDS_PER_FILE, 2 * workers, bar.update),
+            _successes(pool, style, n, seed * SEEDS_PER_FILE, bar.update),
             env_args=task_env_args(task, image_size),
             model_file=model_file,
             seed=seed,
@@ -128,108 +124,63 @@ def generate_demonstrations(
     return path
 
 
-_LINUX = sys.platform.startswith("linux")
-_Play = Callable[[int | None], "Future[Any]"]
-
-
-def _available_cores() -> int:
-    return len(os.sched_getaffinity(0)) if _LINUX else os.cpu_count() or 1
-
-
 def _cache_folder(cache_dir: str | Path | None) -> Path:
     folder = cache_dir or os.environ.get("WARMPRIOR_CACHE") or Path.home() / ".cache" / "warmprior"
     return Path(folder).expanduser()
 
 
 def _successes(
-    play: _Play, style: str, n: int, first: int, ahead: int, report: Callable[[int], Any]
+    pool: WorkerPool[_Player], style: str, n: int, first: int, report: Callable[[int], Any]
 ) -> Iterator[Episode]:
     """Yield the first ``n`` successes in seed order, the same number from each operator."""
     operators = len(OPERATORS) if style == "mh" else 1
     wanted = [n // operators + (i < n % operators) for i in range(operators)]
     limit = min(SEEDS_PER_FILE, 20 * n + 100 * operators)
     upcoming = iter(range(first, first + limit))
-    running: deque[Future[Episode]] = deque()
+    running: deque[_Play] = deque()
+    ended: dict[_Play, Episode] = {}
     played = 0
     while any(wanted):
-        while len(running) < ahead:
+        while len(running) < 2 * pool.num_workers:
             # Whoever has contributed enough is skipped, which never changes what is kept.
             following = next((s for s in upcoming if wanted[operator_of(style, s)]), None)
             if following is None:
                 break
-            running.append(play(following))
+            running.append(_Play(following))
+            pool.submit(running[-1])
         if not running:
             raise RuntimeError(
                 f"only {n - sum(wanted)} of {n} demonstrations succeeded in {played} episodes"
             )
-        episode = running.popleft().result()
+        while running[0] not in ended:
+            ended |= pool.wait()
+        episode = ended.pop(running.popleft())
         played += 1
         if episode.success and wanted[episode.operator]:
             wanted[episode.operator] -= 1
             report(1)
             yield episode
-    for future in running:
-        future.cancel()
     logger.info(f"{n} demonstrations from {played} scripted episodes")
 
 
-@contextlib.contextmanager
-def _players(task: str, style: str, image_size: int, workers: int) -> Iterator[_Play]:
-    """Give a function that starts an episode by seed, or reads the model's XML for ``None``."""
-    if workers == 1:
-        player = _Player(task, style, image_size)
-
-        def play_here(seed: int | None) -> Future[Any]:
-            future: Future[Any] = Future()
-            future.set_result(player(seed))
-            return future
-
-        yield play_here
-        return
-    # Forking needs neither another import of torch nor a __main__ guard in the caller's script,
-    # and the children use nothing that has threads.
-    context = multiprocessing.get_context("fork" if _LINUX else "spawn")
-    pool = ProcessPoolExecutor(workers, context, _start_worker, (task, style, image_size))
-
-    def play_there(seed: int | None) -> Future[Any]:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", ".*fork.*", DeprecationWarning)
-            return pool.submit(_work, seed)
-
-    try:
-        yield play_there
-    except BaseException:  # Ctrl-C included: nobody waits for episodes that are under way
-        for process in list((pool._processes or {}).values()):
-            process.kill()
-        raise
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
 class _Player:
-    """One simulation and the episodes played in it."""
+    """One simulation and the episodes played in it; it is made in the worker that plays."""
 
     def __init__(self, task: str, style: str, image_size: int) -> None:
         self.task, self.style, self.image_size = task, style, image_size
-        self.loop: ControlLoop = expert_loop(task)
 
-    def __call__(self, seed: int | None) -> Any:
-        if seed is None:
-            return self.loop.env.sim.model.get_xml()
-        return run_episode(self.loop, self.task, self.style, seed, self.image_size)
+    @cached_property
+    def loop(self) -> ControlLoop:
+        return expert_loop(self.task)
 
-
-_player: _Player | None = None
-
-
-def _start_worker(task: str, style: str, image_size: int) -> None:
-    global _player
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the parent ends its workers
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    end_with_parent()
-    _player = _Player(task, style, image_size)
+    def model(self) -> str:
+        """The simulator's model as XML."""
+        return str(self.loop.env.sim.model.get_xml())
 
 
-def _work(seed: int | None) -> Any:
-    assert _player is not None
-    return _player(seed)
+@dataclass(frozen=True)
+class _Play:
+    seed: int
+
+    def __call__(self, player: _Player) -> Episode:
+        return run_episode(player.loop, player.task, player.style, self.seed, player.image_size)

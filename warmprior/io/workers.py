@@ -7,6 +7,7 @@ import os
 import pickle
 import signal
 import threading
+import time
 import warnings
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -16,8 +17,6 @@ from typing import Any, Self
 
 import torch
 from tqdm import tqdm
-
-from warmprior.io.processes import end_with_parent
 
 __all__ = ["WorkerError", "WorkerPool", "available_cores", "end_with_parent", "start_method"]
 
@@ -29,7 +28,7 @@ class WorkerError(RuntimeError):
 def worker_died(worker: str, advice: str) -> WorkerError:
     """The error that tells which worker died, the likely reason, and what to do."""
     return WorkerError(
-        f"{worker} died. It may have been killed for lack of memory; use fewer --envs, or {advice}."
+        f"{worker} died. It may have been killed for lack of memory; use fewer workers (--envs), or {advice}."
     )
 
 
@@ -47,6 +46,24 @@ def available_cores() -> int:
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
+
+
+def end_with_parent() -> None:
+    """Let this process end when the one that started it dies, however abruptly.
+
+    A killed process cannot tell its workers to stop, and they would wait for hours: its ends of their
+    pipes stay open in whatever else it forked later. The main process is left alone.
+    """
+    if multiprocessing.parent_process() is None:
+        return
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)  # nobody is left to be told, and the environment may be in the middle of a step
+
+    threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 
 
 class WorkerPool[State]:

@@ -1,4 +1,4 @@
-"""Curvature tables, on fields whose ratios are known."""
+"""Straightness of flows and its table, on fields whose ratios are known."""
 
 from __future__ import annotations
 
@@ -9,9 +9,13 @@ import pytest
 import torch
 
 from tests.diagnostics.fields import policy
-from tests.diagnostics.test_held_out import H, steps
+from tests.diagnostics.test_shared_observations import H, steps
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, RegressionPrior
-from warmprior.diagnostics import SharedObservations, curvature_table, straightness
+from warmprior.diagnostics import SharedObservations
+
+pytest.importorskip("tyro")
+
+from warmprior.experiments import Row, curvature_table, straightness
 
 
 def turning(speed):
@@ -28,7 +32,10 @@ def shared(count=20):
 @pytest.mark.filterwarnings("ignore:.*has not learnt to move")
 def test_a_field_worse_than_none_is_flagged():
     rows = straightness({"gaussian": [policy(turning(9.0))]}, shared(), n_steps=10)
-    assert math.isnan(rows[0]["ratio"])
+    assert rows[0].measures["ratio"] is None
+    text = curvature_table(rows, task="lift", data="ph", source="a test")
+    assert "| Lift-PH, whole prediction, training mean | no motion |" in text
+    assert "20 observations of a test, one seed" in text
 
 
 def small_loss(monkeypatch):
@@ -66,7 +73,7 @@ def test_ratios_follow_from_the_fields(monkeypatch):
     # The paper's numbers are for H = 8 and relative to the Gaussian source.
     own = curvature_table(list(rows.values()), task="square", data="mh", source="a test")
     assert "paper (official data)" not in own
-    eight = [row | {"chunk": 8} for row in rows.values()]
+    eight = [Row({**row.facts, "chunk": 8}, row.measures) for row in rows.values()]
     warm = [row for row in eight if row["prior"] != "gaussian"]
     assert "paper (official" not in curvature_table(warm, task="square", data="mh", source="")
     text = curvature_table(eight, task="square", data="mh", source="a test")
@@ -89,11 +96,11 @@ def test_an_average_over_seeds_leaves_none_out(monkeypatch):
     for seed in (0, None):
         row = rows["past", seed, "training"]
         # Nor is an exact Euler step from nowhere to nowhere a merit.
-        assert math.isnan(row["ratio_executed"]) and math.isnan(row["ratio_one_step"])
+        assert row.measures["ratio_executed"] is None and row.measures["ratio_one_step"] is None
     with pytest.warns(UserWarning, match="do not move"):  # the baseline, now
         rows = straightness(dict(reversed(policies.items())), shared())
     base = [row for row in rows if (row["policy"], row["seed"]) == ("gaussian", 0)]
-    assert len(base) == 1 and math.isnan(base[0]["ratio_one_step"])
+    assert len(base) == 1 and base[0].measures["ratio_one_step"] is None
 
 
 def test_the_noise_of_the_earlier_prediction_is_not_that_of_the_path(monkeypatch):
@@ -147,5 +154,31 @@ def test_bad_input_is_named():
         straightness({"a": [base], "b": [base, base]}, shared())
     with pytest.raises(ValueError, match="one chunk length only"):
         straightness({"a": [policy(turning(1.0), PastPrior(H + 1))]}, shared())
-    with pytest.raises(ValueError, match="no path"):
+    with pytest.raises(ValueError, match="none of these policies has a flow"):
         straightness({"a": [policy(turning(1.0), RegressionPrior(H))]}, shared())
+
+
+def test_policies_without_a_flow_are_left_out(monkeypatch):
+    small_loss(monkeypatch)
+    policies = {
+        "regression": [policy(turning(5.0), RegressionPrior(H))],
+        "gaussian": [policy(turning(2.0))],
+        "past": [policy(turning(1.0), PastPrior(H))],
+    }
+    rows = straightness(policies, shared())
+    # The baseline is the first of those with a flow.
+    found = {(row["policy"], row["mean"]): row["ratio"] for row in rows}
+    assert found["gaussian", "training"] == 1.0
+    assert found["past", "training"] == pytest.approx(1 / 4, rel=1e-4)
+    assert {name for name, _ in found} == {"gaussian", "past"}
+
+
+def test_the_ratio_of_linear_fields_has_the_closed_form(monkeypatch):
+    """v = -rate * a: v_k = -rate * (1 - rate/N)^k a0 at step k, from the same sources a0."""
+    small_loss(monkeypatch)
+    fields = {"a": [policy(lambda t, a, o: -a)], "b": [policy(lambda t, a, o: -2 * a)]}
+    rows = {row["policy"]: row for row in straightness(fields, shared(), draws=2)}
+    steps = torch.arange(100, dtype=torch.float64)
+    kappas = [(rate * (1 - rate / 100) ** steps).var(correction=0) for rate in (1.0, 2.0)]
+    assert rows["a"]["ratio"] == 1.0
+    assert rows["b"]["ratio"] == pytest.approx(float(kappas[1] / kappas[0]), rel=1e-3)

@@ -16,8 +16,8 @@ import pytest
 import torch
 
 from tests.training.test_evaluation import ended
-from warmprior.training import workers
-from warmprior.training.workers import WorkerError, WorkerPool
+from warmprior.io import workers
+from warmprior.io.workers import WorkerError, WorkerPool
 
 
 def gather(pool, jobs):
@@ -106,7 +106,7 @@ def test_an_error_of_a_job_arrives_as_itself_and_ends_the_others():
         WorkerPool(2, None) as pool,
     ):
         pool.submit(partial(sleep_and_tell, 300))
-        processes = list(pool._executor._processes)
+        processes = [process.pid for process in multiprocessing.active_children()]
         gather(pool, [nan])
     assert len(processes) == 2 and all(ended(pid) for pid in processes)
     assert time.monotonic() - started < 60
@@ -118,7 +118,7 @@ def test_an_error_does_not_lose_what_others_have_finished():
         pool.submit(partial(sleep_and_tell, 0.0))
         time.sleep(2.0)  # both have ended when the parent looks
         ((_, pid),) = pool.wait(60)
-        assert pid in pool._executor._processes
+        assert pid in [process.pid for process in multiprocessing.active_children()]
         pool.wait(60)
 
 
@@ -127,7 +127,7 @@ def test_an_error_of_the_parent_ends_its_workers():
     with pytest.raises(KeyboardInterrupt), WorkerPool(2, None) as pool:
         for _ in range(2):
             pool.submit(partial(sleep_and_tell, 300))
-        processes = list(pool._executor._processes)
+        processes = [p.pid for p in multiprocessing.active_children()]
         assert pool.wait(0.2) == []
         raise KeyboardInterrupt
     assert all(ended(pid) for pid in processes)
@@ -140,7 +140,7 @@ def test_a_killed_worker_is_an_error_and_not_a_hang(job):
     told = r"of 2 \(exit code -9\) died.*memory.*--envs"
     with pytest.raises(WorkerError, match=told) as raised, WorkerPool(2, None) as pool:
         pool.submit(job)
-        processes = list(pool._executor._processes)
+        processes = [p.pid for p in multiprocessing.active_children()]
         if job is not kill_oneself:
             time.sleep(0.5)
             os.kill(processes[1], signal.SIGKILL)  # busy or idle
@@ -155,7 +155,7 @@ def test_a_killed_worker_is_an_error_and_not_a_hang(job):
 def hold_workers(pipe):
     with WorkerPool(2, None) as pool:
         pool.submit(partial(sleep_and_tell, 300))
-        pipe.send(list(pool._executor._processes))
+        pipe.send([p.pid for p in multiprocessing.active_children()])
         pool.wait()
 
 
@@ -180,13 +180,14 @@ def test_workers_end_with_a_killed_parent():
 
 
 INTERRUPTED = """
+import multiprocessing
 from functools import partial
-from tests.training.test_workers import sleep_and_tell
-from warmprior.training.workers import WorkerPool
+from tests.io.test_workers import sleep_and_tell
+from warmprior.io.workers import WorkerPool
 with WorkerPool(2, None) as pool:
     for _ in range(2):
         pool.submit(partial(sleep_and_tell, 300))
-    print(*pool._executor._processes, flush=True)
+    print(*(process.pid for process in multiprocessing.active_children()), flush=True)
     pool.wait()
 """
 

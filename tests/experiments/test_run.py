@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import signal
 import threading
 import time
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -16,19 +18,26 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from tests.data.synthetic import write_robomimic_file
 from tests.training.cloning_parts import same
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations, source_leak
 from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io import workers
 from warmprior.io.files import load_file
-from warmprior.training import PRESETS, TrainingConfig, WorkerError, workers
-from warmprior.training.comparison import Comparison
-from warmprior.training.demonstrations import Demonstrations
-from warmprior.training.policies import Policies
-from warmprior.training.schedule import PlayJob, Schedule, TrainJob
+from warmprior.modules import Normalizer
+from warmprior.training import TrainingConfig, WorkerError
 
-pytest.importorskip("h5py")
+pytest.importorskip("tyro")
+
+from warmprior.experiments import (
+    Comparison,
+    EvaluationOptions,
+    NetworkOptions,
+    Problem,
+    Recipe,
+    RunOptions,
+    Store,
+)
 
 H = 4
 PRIORS = (GaussianPrior(H), PastPrior(H), PreviewPrior(H))
@@ -90,50 +99,64 @@ class DriftEnv(EnvBase):
         )
 
 
-@pytest.fixture(scope="module")
-def demonstrations(tmp_path_factory):
-    path = tmp_path_factory.mktemp("data") / "lift.hdf5"
-    write_robomimic_file(path, lengths=(30, 5, 40), task="lift")
-    return Demonstrations(path, "file", "ph")
-
-
-class ToyPolicies(Policies):
-    """Of the demonstrations of lift, in an environment of the same widths."""
-
-    env: DriftEnv | None = None
-
-    def make_env(self):
-        return DriftEnv() if self.env is None else self.env
+def drift_problem(env=None):
+    """A user's own: demonstrations made here, in units of their own, and an environment of ours."""
+    generator = torch.Generator().manual_seed(0)
+    episodes = [
+        TensorDict(
+            {
+                "observation": torch.randn(n, OBSERVATION_DIM, generator=generator).cumsum(0),
+                "action": torch.randn(n, ACTION_DIM, generator=generator).tanh(),
+                "episode": torch.full((n,), i),
+            },
+            [n],
+        )
+        for i, n in enumerate((30, 5, 40))
+    ]
+    data = torch.cat(episodes)
+    normalizer = Normalizer.fit(data)
+    make_env = DriftEnv if env is None else partial(lambda env: env, env)
+    return Problem(
+        "drift", "own", normalizer.normalize(data), make_env, "1", normalizer=normalizer, clip=1.0
+    )
 
 
 def comparison(
-    demonstrations,
     folder,
     envs,
     *,
     priors=PRIORS,
-    kind=ToyPolicies,
+    kind=Store,
     training=TRAINING,
     resume=False,
     episodes=5,
-    seeds=(0, 1),
-    env=None,
+    seeds=2,
+    problem=None,
     logger="none",
+    precondition=True,
 ):
-    network = {"network": "mlp", "network_options": {"hidden_dim": 16}}
-    preset = dataclasses.replace(
-        PRESETS["quick"], training=training, envs=envs, episodes=episodes, **network
+    recipe = Recipe(
+        network=NetworkOptions(hidden_dim=16, precondition=precondition),
+        training=training,
+        evaluation=EvaluationOptions(seeds=seeds, episodes=episodes, nfe=(3, 1)),
+        run=RunOptions(out=folder / "out", resume=resume, envs=envs, logger=logger),
     )
-    policies = kind(
-        demonstrations, preset, folder / "policies", folder / "out" / "logs", logger=logger
+    store = kind(
+        problem or drift_problem(),
+        recipe.network,
+        folder / "policies",
+        folder / "out" / "logs",
+        recipe.run,
     )
-    del policies.make_env  # the data's
-    policies.env = env
-    return Comparison(policies, priors, [3, 1], folder / "out", seeds, resume=resume)
+    return Comparison(recipe, stores=[store], priors=priors)
 
 
 def stored(folder):
     return json.loads((folder / "out" / "results.json").read_text())
+
+
+def rows_of(folder):
+    return [{**row["facts"], **row["measures"]} for row in stored(folder)["rows"]]
 
 
 def weights(folder):
@@ -145,66 +168,64 @@ def weights(folder):
 
 
 @pytest.fixture(scope="module")
-def undisturbed(demonstrations, tmp_path_factory):
+def undisturbed(tmp_path_factory):
     """By one worker."""
     folder = tmp_path_factory.mktemp("undisturbed")
-    comparison(demonstrations, folder, 1).run()
+    comparison(folder, 1).run()
     return folder
 
 
 @pytest.mark.parametrize("envs", [2, 3])
-def test_rows_and_weights_do_not_depend_on_the_number_of_workers(
-    demonstrations, undisturbed, tmp_path, envs
-):
+def test_rows_and_weights_do_not_depend_on_the_number_of_workers(undisturbed, tmp_path, envs):
     threads = torch.get_num_threads()
     torch.set_num_threads(2)  # the parent's number is none of their business either
     try:
-        comparison(demonstrations, tmp_path, envs).run()
+        comparison(tmp_path, envs).run()
     finally:
         torch.set_num_threads(threads)
     assert same(weights(tmp_path), weights(undisturbed))
-    assert stored(tmp_path)["rows"] == stored(undisturbed)["rows"]
-    rows = stored(undisturbed)["rows"]
+    assert rows_of(tmp_path) == rows_of(undisturbed)
+    rows = rows_of(undisturbed)
     assert all(row["boundary_jump"] > 0 and row["inner_jump"] > 0 for row in rows)
     # The comparison above says something: the policies and their noise decide.
     assert len({row["boundary_jump"] for row in rows}) == len(rows)
     assert 0 < sum(row["successes"] for row in rows) < sum(row["episodes"] for row in rows)
 
 
-def test_spawned_workers_give_the_same_rows(demonstrations, undisturbed, tmp_path, monkeypatch):
+def test_spawned_workers_give_the_same_rows(undisturbed, tmp_path, monkeypatch):
     """As beside CUDA: everything that a worker needs is handed over instead of inherited."""
     monkeypatch.setattr(workers, "start_method", lambda: "spawn")
-    comparison(demonstrations, tmp_path, 2, priors=PRIORS[1:2], seeds=[0]).run()
-    expected = [r for r in stored(undisturbed)["rows"] if (r["prior"], r["seed"]) == ("past", 0)]
-    assert stored(tmp_path)["rows"] == expected
+    comparison(tmp_path, 2, priors=PRIORS[1:2], seeds=1).run()
+    expected = [r for r in rows_of(undisturbed) if (r["prior"], r["seed"]) == ("past", 0)]
+    assert rows_of(tmp_path) == expected
 
 
-class LastIsFirst(ToyPolicies):
+class LastIsFirst(Store):
     """The trainings end in the opposite order, some of them later than others."""
 
-    def train(self, prior, seed, progress=None):
-        losses = super().train(prior, seed, progress)
-        time.sleep(1.5 - 0.5 * [p.name for p in PRIORS].index(prior.name) - 0.2 * seed)
+    def train(self, prior, training, progress=None):
+        losses = super().train(prior, training, progress)
+        time.sleep(1.5 - 0.5 * [p.name for p in PRIORS].index(prior.name) - 0.2 * training.seed)
         return losses
 
 
-def test_rows_have_their_order_whatever_ends_first(demonstrations, undisturbed, tmp_path, capsys):
-    comparison(demonstrations, tmp_path, 6, kind=LastIsFirst).run()
-    rows = stored(tmp_path)["rows"]
+def test_rows_have_their_order_whatever_ends_first(undisturbed, tmp_path, capsys):
+    comparison(tmp_path, 6, kind=LastIsFirst).run()
+    rows = rows_of(tmp_path)
     cells = [(row["prior"], row["seed"], row["checkpoint"], row["nfe"]) for row in rows]
     names = ("gaussian", "past", "preview")
     assert cells == [(p, s, c, n) for p in names for s in (0, 1) for c in (10, 20) for n in (3, 1)]
-    assert rows == stored(undisturbed)["rows"]
+    assert rows == rows_of(undisturbed)
     told = capsys.readouterr().out
     assert told.count("trained ") == 6 and told.count("played ") == 24
-    assert told.index("trained preview") < told.index("trained gaussian")
+    assert told.index("trained drift, preview") < told.index("trained drift, gaussian")
 
 
-def test_every_worker_plays_each_seed_once_per_cell(demonstrations, tmp_path):
+def test_every_worker_plays_each_seed_once_per_cell(tmp_path):
     log = tmp_path / "log"
     log.mkdir()
     env = DriftEnv(log, sleep=0.01)
-    comparison(demonstrations, tmp_path, 2, env=env, priors=PRIORS[:2]).run()
+    comparison(tmp_path, 2, problem=drift_problem(env), priors=PRIORS[:2]).run()
     names = [path.name.split("-") for path in log.iterdir()]
     seeds = [int(seed) for seed, _, _ in names]
     cells = 2 * 2 * 2 * 2
@@ -213,98 +234,97 @@ def test_every_worker_plays_each_seed_once_per_cell(demonstrations, tmp_path):
     assert len(processes) == 2 and str(os.getpid()) not in processes
 
 
-class WaitsForAnEpisode(ToyPolicies):
+class WaitsForAnEpisode(Store):
     """The last training does not end before an episode was played."""
 
-    def train(self, prior, seed, progress=None):
+    def train(self, prior, training, progress=None):
         deadline = time.monotonic() + 30
-        while prior.name == "preview" and not any(self.env.log.iterdir()):
+        while prior.name == "preview" and not any(self.problem.make_env().log.iterdir()):
             assert time.monotonic() < deadline, "nothing was played while this training ran"
             time.sleep(0.05)
-        return super().train(prior, seed, progress)
+        return super().train(prior, training, progress)
 
 
-def test_a_policy_is_played_before_the_last_training_ended(demonstrations, tmp_path):
+def test_a_policy_is_played_before_the_last_training_ended(tmp_path):
     log = tmp_path / "log"
     log.mkdir()
     comparison(
-        demonstrations, tmp_path, 2, kind=WaitsForAnEpisode, env=DriftEnv(log), seeds=[0]
+        tmp_path, 2, kind=WaitsForAnEpisode, problem=drift_problem(DriftEnv(log)), seeds=1
     ).run()
 
 
 def test_losses_are_those_of_the_workers_and_nothing_is_trained_again(
-    demonstrations, undisturbed, tmp_path, monkeypatch
+    undisturbed, tmp_path, monkeypatch
 ):
-    finished = comparison(demonstrations, tmp_path, 2, logger="csv")
+    finished = comparison(tmp_path, 2, logger="csv")
     finished.run()
     iterations = [5, 10, 15, 20]
-    monkeypatch.setattr(Policies, "new_actor", lambda *args: pytest.fail("something was trained"))
-    losses = finished.losses
+    monkeypatch.setattr(Store, "new_actor", lambda *args: pytest.fail("something was trained"))
+    losses = finished.losses(finished.stores[0])
     assert {name: len(curves) for name, curves in losses.items()} == {p.name: 2 for p in PRIORS}
     assert all([i for i, _ in curve] == iterations for c in losses.values() for curve in c)
     monkeypatch.undo()
-    assert comparison(demonstrations, undisturbed, 1, resume=True).losses == losses
+    again = comparison(undisturbed, 1, resume=True)
+    assert again.losses(again.stores[0]) == losses
     logs = tmp_path / "out" / "logs"
     logged = {path.relative_to(logs).parts[0] for path in logs.rglob("*loss*.csv")}
     assert logged == {path.name for path in (tmp_path / "policies").iterdir()}
 
 
-def test_meta_tells_what_computed(demonstrations, undisturbed):
+def test_meta_tells_what_computed(undisturbed):
     meta = stored(undisturbed)["meta"]
     assert meta["hardware"]["torch_threads"] == 1 and meta["hardware"]["workers"] == 1
-    assert "envs" not in meta["evaluation"] and meta["wall_time_s"] > 0
+    assert "envs" not in meta["identity"]["recipe"]["run"] and meta["wall_time_s"] > 0
+    assert [p["seed"] for p in meta["policies"]] == [0, 1] * 3
 
 
-def test_another_number_of_workers_continues(demonstrations, undisturbed, tmp_path):
+def test_another_number_of_workers_continues(undisturbed, tmp_path):
     """Stored rows are kept, missing ones played."""
     whole = stored(undisturbed)["rows"]
-    comparison(demonstrations, tmp_path, 1).run()
+    comparison(tmp_path, 1).run()
     path = tmp_path / "out" / "results.json"
     results = json.loads(path.read_text())
-    results["rows"] = [row | {"mean_steps": 12_345.0} for row in whole[3:9]]
+    results["rows"] = [
+        row | {"measures": row["measures"] | {"mean_steps": 12_345.0}} for row in whole[3:9]
+    ]
     path.write_text(json.dumps(results))
-    comparison(demonstrations, tmp_path, 2, resume=True).run()
+    comparison(tmp_path, 2, resume=True).run()
     assert stored(tmp_path)["rows"] == whole[:3] + results["rows"] + whole[9:]
 
 
-def test_rows_tell_what_the_source_leaks(demonstrations, undisturbed):
+def test_rows_tell_what_the_source_leaks(undisturbed):
     """The same as measured here, on the policy that the row is about, if it is a last checkpoint."""
-    policies = comparison(demonstrations, undisturbed, 1, resume=True).policies
-    for row in stored(undisturbed)["rows"]:
+    (store,) = comparison(undisturbed, 1, resume=True).stores
+    for row in rows_of(undisturbed):
         if row["checkpoint"] != TRAINING.iterations:
             assert row["source_leak"] is None
             continue
         prior = next(prior for prior in PRIORS if prior.name == row["prior"])
-        shared = SharedObservations(policies.data, prior.chunk_length, observation_steps=2)
+        shared = SharedObservations(store.problem.data, prior.chunk_length, observation_steps=2)
         order = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
         windows = shared.subset(order.sort()[0]).windows(prior)
-        policy = policies.load(prior, row["seed"], row["checkpoint"])
+        policy = store.load(prior, replace(TRAINING, seed=row["seed"]), row["checkpoint"])
         leak = source_leak(policy, windows, nfes=(1, 3), episodes=shared.episodes)[row["nfe"]]
         assert row["source_leak"] == pytest.approx(leak.leak)
         assert row["inner_step_ratio"] == pytest.approx(leak.inner_step_ratio)
 
 
-class Diverging(ToyPolicies):
-    def __post_init__(self):
-        super().__post_init__()
-        # Moments would refuse such actions before any training.
-        self.preset = dataclasses.replace(self.preset, precondition=False)
-
-    def train(self, prior, seed, progress=None):
+class Diverging(Store):
+    def train(self, prior, training, progress=None):
         if prior.name == "past":
-            self.data["action"].fill_(1e30)
+            self.problem.data["action"].fill_(1e30)
         elif prior.name == "preview":
             time.sleep(300)
-        return super().train(prior, seed, progress)
+        return super().train(prior, training, progress)
 
 
-def test_a_training_that_diverges_names_its_file_and_stops_the_others(demonstrations, tmp_path):
+def test_a_training_that_diverges_names_its_file_and_stops_the_others(tmp_path):
     started = time.monotonic()
-    compared = comparison(demonstrations, tmp_path, 3, kind=Diverging, seeds=[0])
+    # Moments would refuse such actions before any training.
+    compared = comparison(tmp_path, 3, kind=Diverging, seeds=1, precondition=False)
     with pytest.raises(FloatingPointError) as raised:
         compared.run()
-    state = compared.policies.folder(PRIORS[1], 0) / "state.safetensors"
-    assert str(state) in str(raised.value)
+    assert str(compared.contestants[1].folder / "state.safetensors") in str(raised.value)
     assert time.monotonic() - started < 60
 
 
@@ -315,12 +335,12 @@ class Mortal(DriftEnv):
         return super()._step(tensordict)
 
 
-def test_a_killed_worker_ends_the_run_which_continues(demonstrations, undisturbed, tmp_path):
+def test_a_killed_worker_ends_the_run_which_continues(undisturbed, tmp_path):
     result = []
 
     def run():
         try:
-            comparison(demonstrations, tmp_path, 2, env=Mortal()).run()
+            comparison(tmp_path, 2, problem=drift_problem(Mortal())).run()
         except BaseException as error:
             result.append(error)
 
@@ -329,46 +349,51 @@ def test_a_killed_worker_ends_the_run_which_continues(demonstrations, undisturbe
     thread.join(60)
     assert not thread.is_alive(), "the comparison hangs after its worker was killed"
     assert isinstance(result[0], WorkerError) and "--envs" in str(result[0])
-    comparison(demonstrations, tmp_path, 3, resume=True).run()
-    assert stored(tmp_path)["rows"] == stored(undisturbed)["rows"]
+    comparison(tmp_path, 3, resume=True).run()
+    assert rows_of(tmp_path) == rows_of(undisturbed)
 
 
-def test_the_same_policy_is_trained_once(demonstrations, tmp_path, capsys):
+def test_the_same_policy_is_trained_once(tmp_path, capsys):
     twice = [PastPrior(H), PastPrior(H)]
-    compared = comparison(demonstrations, tmp_path, 2, priors=twice, seeds=[0])
+    compared = comparison(tmp_path, 2, priors=twice, seeds=1)
     assert len(compared.run().rows) == 4  # two checkpoints, two NFEs
     assert capsys.readouterr().out.count("trained ") == 1
 
 
-def train_job(number):
-    return TrainJob(PRIORS[0], 0, number)
+class Timed(Store):
+    """Notes when its trainings ran."""
+
+    def train(self, prior, training, progress=None):
+        started = time.monotonic()
+        losses = super().train(prior, training, progress)
+        time.sleep(0.2)
+        note = {"from": started, "to": time.monotonic()}
+        (self.directory / f"{prior.name}-{training.seed}.json").write_text(json.dumps(note))
+        return losses
 
 
-def play_job(episode):
-    return PlayJob(PRIORS[0], None, episode)
+@pytest.mark.parametrize("at_once", [None, 1])
+def test_trainings_share_a_device_only_where_they_may(tmp_path, monkeypatch, at_once):
+    """One at a time, as beside CUDA, and the others' episodes meanwhile."""
+    monkeypatch.setattr(Comparison, "trainings_at_once", at_once)
+    comparison(tmp_path, 3, kind=Timed).run()
+    notes = [json.loads(path.read_text()) for path in (tmp_path / "policies").glob("*.json")]
+    notes.sort(key=lambda note: note["from"])
+    apart = [a["to"] <= b["from"] for a, b in pairwise(notes)]
+    assert len(notes) == 6 and (all(apart) if at_once else not all(apart))
 
 
-def test_schedule_gives_trainings_first_and_then_what_can_be_played():
-    first, second = train_job(0), train_job(1)
-    episodes = {first: [play_job(0), play_job(1)], second: [play_job(2)]}
-    schedule = Schedule(episodes)
-    assert [schedule.next() for _ in range(3)] == [first, second, None]
-    schedule.trained(second)
-    assert schedule.next() is episodes[second][0] and schedule.next() is None
-    schedule.trained(first)
-    assert [schedule.next() for _ in range(3)] == [*episodes[first], None]
+def test_a_chunk_longer_than_every_demonstration_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="longest demonstration of drift own has, 40"):
+        comparison(tmp_path, 1, priors=[PastPrior(41)])
 
 
-def test_schedule_of_one_training_at_a_time_plays_beside_it():
-    first, second = train_job(0), train_job(1)
-    episodes = {first: [play_job(0), play_job(1)], second: []}
-    schedule = Schedule(episodes, trainings_at_once=1)
-    assert schedule.next() is first and schedule.next() is None
-    schedule.trained(first)
-    assert [schedule.next() for _ in range(4)] == [second, *episodes[first], None]
+def test_results_of_another_recipe_are_not_continued(undisturbed):
+    with pytest.raises(ValueError, match=r"results\.json belongs to another"):
+        comparison(undisturbed, 1, resume=True, episodes=6)
 
 
-def test_what_rows_could_not_tell_is_refused(demonstrations, tmp_path):
+def test_what_rows_could_not_tell_is_refused(tmp_path):
     twins = [PastPrior(3), PastPrior(3, cold_probability=0.5)]
-    with pytest.raises(ValueError, match="rows tell priors apart by name, sigma and chunk length"):
-        comparison(demonstrations, tmp_path, 1, priors=twins)
+    with pytest.raises(ValueError, match="rows tell policies apart by their task"):
+        comparison(tmp_path, 1, priors=twins)

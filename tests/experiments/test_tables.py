@@ -1,0 +1,108 @@
+"""Tables in Markdown: which numbers end up in which cell."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("tyro")
+
+from tests.experiments.row_parts import compared, row
+from warmprior.experiments import Row, mean_cell, paper_success, success_cell, success_table, table
+
+
+def lines(text, start="| Square-PH"):
+    return [line for line in text.splitlines() if line.startswith(start)]
+
+
+def test_table_shows_gains_marks_and_the_papers_row():
+    text = success_table(compared(), top_k=1, source="scripted", notes=["- A note."])
+    measured, paper = lines(text)
+    assert measured == (
+        "| Square-PH, measured (scripted data) | 50.0 | **80.0** (+30.0*) | 50.0 (+0.0) |"
+    )
+    assert paper == "| Square-PH, paper (official data) | 83.6 | 86.6 (+3.0) | 87.3 (+3.7) |"
+    head = "| Success rate (%) | NFE 1: Base | NFE 1: WP-Past | NFE 1: WP-Preview |"
+    assert text.startswith(head)
+    assert "H = 8; 3 seed(s); 10 episodes per cell; the best 1 of 2 checkpoints per seed" in text
+    assert "compare gains within a row" in text and text.endswith("- A note.\n")
+    assert "bound" not in text
+    assert "compare gains within a row" not in success_table(compared(), top_k=1, source="official")
+
+
+def test_gains_are_over_the_baseline_of_the_same_nfe():
+    rows = [
+        row(k, prior=prior, nfe=nfe)
+        for prior, wins in (("gaussian", (2, 5)), ("past", (4, 5)))
+        for nfe, k in zip((1, 9), wins, strict=True)
+    ]
+    text = success_table(rows, top_k=1, source="scripted")
+    assert "| NFE 9: Base | NFE 9: WP-Past | NFE 1: Base | NFE 1: WP-Past |" in text
+    # One seed has no spread: no gain is marked.
+    assert lines(text)[0].endswith("| **50.0** | **50.0** (+0.0) | 20.0 | **40.0** (+20.0) |")
+    assert "One seed has no spread: no gain is marked" in text
+
+
+def test_a_gain_within_the_spread_of_the_seeds_is_not_marked():
+    rows = [
+        row(k, prior=prior, seed=seed)
+        for prior, wins in (("gaussian", (2, 4)), ("past", (3, 5)))
+        for seed, k in enumerate(wins)
+    ]
+    assert "**40.0** (+10.0) |" in lines(success_table(rows, top_k=1, source="file"))[0]
+
+
+def test_a_gain_that_rounds_to_zero_has_no_minus():
+    rows = [
+        row(k, 50, prior=prior, seed=seed)
+        for prior, wins in (("gaussian", (46, 46)), ("past", (45, 47)))  # equal but for rounding
+        for seed, k in enumerate(wins)
+    ]
+    text = success_table(rows, top_k=1, source="scripted")
+    assert "(+0.0)" in text and "-0.0" not in text
+
+
+def test_table_shows_what_the_source_leaks():
+    """Means over seeds of the last checkpoints, with a mark above the bound."""
+
+    def leaking(old):
+        leak = 9.0 if old["checkpoint"] == 50 else None
+        told = {"source_leak": leak, "inner_step_ratio": None}
+        if (old["prior"], old["checkpoint"]) == ("past", 100):
+            told = {"source_leak": 0.2 + old["seed"] / 10, "inner_step_ratio": 1.5}
+        return Row(old.facts, {**old.measures, **told})
+
+    text = success_table([leaking(old) for old in compared()], top_k=1, source="scripted")
+    assert "spread over draws of the source / data's (bound 1) | - | 0.30 | - |" in text
+    assert "step inside chunks / data's (bound 1.3) | - | 1.50 (!) | - |" in text
+
+
+def test_policies_of_several_sigmas_have_columns_of_their_own():
+    rows = [row(5), *(row(k, prior="past", sigma=s) for k, s in ((6, 0.5), (7, 1.0)))]
+    text = success_table(rows, top_k=1, source="scripted")
+    assert "| NFE 1: Base | NFE 1: WP-Past, sigma 0.5 | NFE 1: WP-Past, sigma 1 |" in text
+    assert "| 50.0 | 60.0 (+10.0) | **70.0** (+20.0) |" in lines(text)[0]
+
+
+def test_a_cell_tells_mean_spread_and_what_is_missing():
+    rows = [Row({"seed": i}, {"kappa": k}) for i, k in enumerate((0.25, 0.75, None))]
+    cell = mean_cell("kappa", ".3f")
+    assert cell(rows[:2]) == "0.500 ± 0.354"
+    assert cell(rows[1:]) == "0.750 (1 not finite)"
+    assert cell(rows[2:]) is None and mean_cell("speed", ".3f")(rows) is None
+    assert mean_cell("kappa", ".1f", 100)(rows[:1]) == "25.0"
+    seeds = [row(4, seed=0), row(6, seed=1)]
+    assert success_cell(1)(seeds) == "50.0 ± 14.1" and success_cell(1)(seeds[:1]) == "40.0"
+
+
+def test_lines_without_any_cell_are_left_out():
+    rows = [Row({"a": i, "b": i}, {"kappa": i or None}) for i in range(2)]
+    index, columns = (lambda row: f"a {row['a']}"), (lambda row: f"b {row['b']}")
+    text = table(rows, index, columns, {"": mean_cell("kappa", ".1f")}, head="h")
+    assert text == "| h | b 0 | b 1 |\n|---|---|---|\n| a 1 | - | 1.0 |\n"
+
+
+def test_paper_numbers_cover_table_1():
+    assert paper_success("transport", "mh", "preview", 3) == 30.4
+    assert paper_success("lift", "ph", "past", 1) is None
+    assert paper_success("square", "ph", "regression", 1) is None
+    assert paper_success("square", "ph", "past", 1, chunk=4) is None
