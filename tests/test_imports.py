@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
+from pathlib import Path
 
-OPTIONAL = ("robosuite", "lerobot", "h5py", "matplotlib", "scipy", "numba", "gymnasium", "mujoco")
+import warmprior
+
+OPTIONAL = (
+    "robosuite",
+    "lerobot",
+    "h5py",
+    "matplotlib",
+    "scipy",
+    "numba",
+    "gymnasium",
+    "mujoco",
+    "tyro",
+)
 
 BLOCK = """
 import sys
@@ -58,3 +72,44 @@ print(actor(batch)["vla_action", "chunk"].shape)
     done = python(BLOCK.format(names=OPTIONAL) + code)
     assert done.returncode == 0, done.stderr
     assert "torch.Size([8, 4, 2])" in done.stdout
+
+
+ROOMS = (
+    "io",
+    "modules",
+    "transforms",
+    "objectives",
+    "envs",
+    "data",
+    "training",
+    "rl",
+    "diagnostics",
+    "experiments",
+)
+"""Each may import those before it alone."""
+
+
+def imported(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module, [alias.name for alias in node.names]
+        elif isinstance(node, ast.Import):
+            yield from ((alias.name, []) for alias in node.names)
+
+
+def test_imports_point_one_way_and_name_nothing_private():
+    package = Path(warmprior.__file__).parent
+    root = package.parent
+    assert {path.parent.name for path in package.glob("*/__init__.py")} == set(ROOMS)
+    scripts = [*root.glob("benchmarks/*.py"), *root.glob("tests/**/*.py")]
+    for path in [*package.glob("*/**/*.py"), *scripts]:
+        room = path.relative_to(package).parts[0] if package in path.parents else None
+        for module, names in imported(path):
+            place = module.split(".")
+            if place[0] != "warmprior" or len(place) == 1:
+                continue
+            if room is not None and place[1] in ROOMS:
+                assert ROOMS.index(place[1]) <= ROOMS.index(room), f"{path} imports {module}"
+            if place[1:2] != [room]:
+                private = [n for n in (*place, *names) if n.startswith("_") and n != "__main__"]
+                assert not private, f"{path} imports {private}"

@@ -134,11 +134,12 @@ def comparison(
     problem=None,
     logger="none",
     precondition=True,
+    play_on=False,
 ):
     recipe = Recipe(
         network=NetworkOptions(hidden_dim=16, precondition=precondition),
         training=training,
-        evaluation=EvaluationOptions(seeds=seeds, episodes=episodes, nfe=(3, 1)),
+        evaluation=EvaluationOptions(seeds=seeds, episodes=episodes, nfe=(3, 1), play_on=play_on),
         run=RunOptions(out=folder / "out", resume=resume, envs=envs, logger=logger),
     )
     store = kind(
@@ -397,3 +398,38 @@ def test_what_rows_could_not_tell_is_refused(tmp_path):
     twins = [PastPrior(3), PastPrior(3, cold_probability=0.5)]
     with pytest.raises(ValueError, match="rows tell policies apart by their task"):
         comparison(tmp_path, 1, priors=twins)
+
+
+class SolvedEarly(DriftEnv):
+    """Solved at its third step, and at no other."""
+
+    def __init__(self, terminate_on_success=True):
+        super().__init__()
+        self.ends = terminate_on_success
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.steps = 0
+        return super()._reset(tensordict, **kwargs)
+
+    def _step(self, tensordict):
+        out = super()._step(tensordict)
+        self.steps += 1
+        solved = torch.tensor([self.steps == 3])
+        out["success"] = solved
+        out["done"] = out["terminated"] = out["done"] | (solved & self.ends)
+        return out
+
+
+def test_play_on_goes_to_the_end_and_remembers_success(tmp_path):
+    found = {}
+    for play_on in (False, True):
+        folder = tmp_path / str(play_on)
+        problem = replace(drift_problem(), make_env=SolvedEarly)
+        compared = comparison(
+            folder, 1, priors=PRIORS[:1], seeds=1, problem=problem, play_on=play_on
+        )
+        (found[play_on], *_) = compared.run().rows
+    assert [row["success_rate"] for row in found.values()] == [1.0, 1.0]
+    lengths = [9 + (EVALUATION_SEED + i) % 7 for i in range(5)]
+    assert found[False]["mean_steps"] == 3
+    assert found[True]["mean_steps"] == sum(lengths) / 5
