@@ -20,7 +20,6 @@ import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +44,7 @@ from warmprior.data.scripted.episode import Episode
 from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.simulator import task_env_args
+from warmprior.experiments.results import facts_of_machine
 from warmprior.training import BehaviourCloning, TrainingConfig, precondition
 
 D_O, D_A, H, TO, BATCH = 23, 7, 8, 2, 256
@@ -334,14 +334,11 @@ def main(argv: list[str] | None = None) -> None:
             results[name] = value = measure(Clock(options.repeats, bar))
             shown = f"{value:.4g}" if isinstance(value, float) else json.dumps(value)
             tqdm.write(f"{name:32} {shown} {f'(target {target})' if target else ''}")
-    packages = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "lerobot")
-    results["meta"] = {
-        "versions": {name: version(name) for name in packages if importlib.util.find_spec(name)},
-        "python": platform.python_version(),
-        "cpu": platform.processor() or platform.machine(),
-        "threads": torch.get_num_threads(),
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-    }
+    results["meta"] = facts_of_machine(
+        cpu=platform.processor() or platform.machine(),
+        torch_threads=torch.get_num_threads(),
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
     path.write_text(json.dumps(results, indent=2) + "\n")
     print(f"written to {path}")
 

@@ -47,7 +47,7 @@ def mutate(folder: Path, rng: np.random.Generator) -> tuple[str, Callable[[], Ou
         cloning = training(case, CONFIG)
         stored, facts = load_state(path if signed else whole)
         mine = {
-            **named("network", module_tensors(cloning.actor.network)),
+            **named("trained", module_tensors(cloning.trained)),
             **named("ema", module_tensors(cloning.ema)),
             **named("optimizer", snapshot_optimizer(cloning.optimizer)),
         }

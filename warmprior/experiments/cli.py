@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -55,7 +56,17 @@ def parse[R: Recipe](
 
     def read(default: R) -> R:
         kind: Any = type(default)
-        return tyro.cli(kind, default=default, args=argv, description=description)
+        told = io.StringIO()
+        try:
+            with redirect_stderr(told):
+                return tyro.cli(kind, default=default, args=argv, description=description)
+        except SystemExit as stop:
+            # What a dataclass refuses is told as all that we refuse; what no option is, by tyro.
+            refused: Any = stop.__context__
+            if isinstance(getattr(refused, "arg", None), str):
+                raise ValueError(str(refused.message)) from None
+            sys.stderr.write(told.getvalue())
+            raise
 
     asked = read(next(iter(presets.values())))
     if asked.run.preset not in presets:

@@ -131,7 +131,17 @@ def facts_of_machine(**more: Any) -> dict[str, Any]:
         more: about the hardware.
     """
     versions = {"python": platform.python_version()}
-    for package in ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "numpy"):
+    packages = (
+        "warmprior",
+        "torch",
+        "torchrl",
+        "tensordict",
+        "robosuite",
+        "mujoco",
+        "numpy",
+        "lerobot",
+    )
+    for package in packages:
         try:
             versions[package] = version(package)
         except PackageNotFoundError:
