@@ -106,6 +106,7 @@ EVERY_STEP = {
         [ObservationStack(2)],
     ),
     "reward": (CountingEnv, [norm("reward")]),
+    "state": (CountingEnv, [norm(in_keys_inv=["gain"])]),
 }
 
 
@@ -113,6 +114,24 @@ EVERY_STEP = {
 def test_others_run_at_every_step(case):
     make_base, before = EVERY_STEP[case]
     env = TransformedEnv(make_base(), Compose(*before, ChunkStep(H)), auto_unwrap=False)
+    assert late_of(env) is None
+
+
+def test_a_nested_action():
+    class NestedEnv(CountingEnv):
+        def __init__(self):
+            super().__init__(9)
+            self.action_spec = Composite(robot=Composite(action=Bounded(-1, 1, (ACTION_DIM,))))
+
+        def _step(self, tensordict):
+            return super()._step(tensordict["robot"])
+
+    chunk = ChunkStep(H, action_key=("robot", "action"))
+    env = TransformedEnv(NestedEnv(), Compose(ObservationStack(2), chunk))
+    found = env.rollout(2)
+    seen, planned = found["next", "observation"][..., 2:], found["vla_action", "chunk"]
+    assert torch.equal(seen[0], planned[0, H - 2 :])
+    assert torch.equal(seen[1], planned[1, 2:4])
     assert late_of(env) is None
 
 

@@ -83,8 +83,9 @@ class InnerStep:
             tensordict: the step's input, ``[*B]``, as the environment takes it.
         """
         result = self.base._step(tensordict)
+        found = dict(result.items())  # several times faster to ask
         for key, shape in self._done_shapes:
-            done = result.get(key, None)
+            done = found.get(key) if isinstance(key, str) else result.get(key, None)
             if done is None or done.shape != shape:
                 # Only then: most environments give all flags, and completing them is slow.
                 self.base._complete_done(self._done_spec, result)

@@ -33,15 +33,14 @@ class LateTransforms:
 
     Args:
         step: the step of the environment, through its transforms.
-        action_key: the environment's action.
+        action_key: the environment's action, at the root.
     """
 
-    def __init__(self, step: InnerStep, action_key: NestedKey) -> None:
+    def __init__(self, step: InnerStep, action_key: str) -> None:
         self._step = step
         self._transforms = step.transforms
         self._action_key = action_key
         self._reach = 1 + sum(_REACH[type(t)](t) - 1 for t in self._transforms)
-        self._branches = _roots(key for t in self._transforms for key in t.out_keys)
 
     @classmethod
     def of(
@@ -55,7 +54,10 @@ class LateTransforms:
             read: keys of a step's result that are needed before the end.
         """
         transforms, base = step.transforms, step.base
-        # A transformed base environment has transforms of its own, which may read what these write.
+        if not isinstance(action_key, str):
+            return None
+        # An environment reads its action and states alone: other observations may reach it untransformed.
+        # A transformed one has transforms of its own, which may read what these write.
         if isinstance(base, TransformedEnv) or any(type(t) not in _REACH for t in transforms):
             return None
         written = _roots(key for t in transforms for key in t.out_keys)
@@ -79,15 +81,14 @@ class LateTransforms:
         """
         results = [first]
         batch, device = first.batch_size, first.device
-        stale: Iterable[str] = ()
         for action in self._inverse(actions):
-            if results[-1].get("done").any():
+            advance(current, results[-1], reward_key)
+            if current["done"].any():
                 break
-            advance(current, results[-1], reward_key, stale)
             # Without the constructor's checks: the entries come out of tensordicts of this batch size.
-            inputs = TensorDict._new_unsafe(dict(current), batch_size=batch, device=device)
-            results.append(self._step.bare(inputs.set(self._action_key, action)))
-            stale = self._branches  # from now on these come as the environment gives them
+            entries = current | {self._action_key: action}
+            inputs = TensorDict._new_unsafe(entries, batch_size=batch, device=device)
+            results.append(self._step.bare(inputs))
         if len(results) > 1:
             results[-1] = self._transformed(first, results[1:])
         return results
@@ -110,10 +111,7 @@ class LateTransforms:
 
 
 def advance(
-    current: dict[str, Any],
-    next_tensordict: TensorDictBase,
-    reward_key: NestedKey,
-    without: Iterable[str] = (),
+    current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey
 ) -> None:
     """As ``step_mdp``, in place and without its generality: it runs at every control step.
 
@@ -121,15 +119,13 @@ def advance(
         current: entries of a step's input, ``[*B]``, replaced by what the step led to.
         next_tensordict: that, ``[*B]``.
         reward_key: left out.
-        without: names at the root that stay as they are.
     """
     for key, value in next_tensordict.items():
-        if key == reward_key or key in without:
-            continue
         # The type first: nearly all are plain tensors, and the instance check is slow.
         if type(value) is not Tensor and isinstance(value, TensorDictBase) and key in current:
             value = current[key].copy().update(value)
-        current[key] = value
+        if key != reward_key:
+            current[key] = value
 
 
 def _roots(keys: Iterable[NestedKey]) -> set[str]:
