@@ -62,8 +62,12 @@ class LateTransforms:
             return None
         written = _roots(key for t in transforms for key in t.out_keys)
         needed = _roots([action_key, *read, *base.state_spec.keys(True, True)])
-        inverse = {key for t in transforms for key in (*t.in_keys_inv, *t.out_keys_inv)}
-        return None if written & needed or inverse - {action_key} else cls(step, action_key)
+        inverse = [(list(t.in_keys_inv), list(t.out_keys_inv)) for t in transforms]
+        if written & needed or any(
+            keys not in ([], [action_key]) for pair in inverse for keys in pair
+        ):
+            return None
+        return cls(step, action_key)
 
     def __call__(
         self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
@@ -94,12 +98,12 @@ class LateTransforms:
         return results
 
     def _inverse(self, actions: Tensor) -> tuple[Tensor, ...]:
-        # Elementwise: all of them at once, time first, so that a row's statistics broadcast.
+        # Elementwise: all of them at once, time first, so that what a transform has per row broadcasts.
         actions = actions.movedim(-2, 0)
-        data = TensorDict({self._action_key: actions}, batch_size=actions.shape[:-1])
         for transform in reversed(self._transforms):
-            data = transform._inv_call(data)
-        return data.get(self._action_key).unbind(0)
+            if transform.in_keys_inv:
+                actions = transform._inv_apply_transform(actions)
+        return actions.unbind(0)
 
     def _transformed(self, before: TensorDictBase, results: list[TensorDictBase]) -> TensorDictBase:
         # What lies further back than they reach has no influence, so that `before` may be older.
