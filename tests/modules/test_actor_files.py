@@ -80,6 +80,61 @@ def test_weights_of_another_type_are_not_cast(tmp_path, dtype):
         WarmPriorActor.from_pretrained(tmp_path)
 
 
+@pytest.mark.parametrize("parts", ["all", "network", "normalizer"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16])
+def test_weights_of_any_precision_come_back_bit_by_bit(tmp_path, dtype, parts):
+    actor = saved(tmp_path).eval()
+    (actor if parts == "all" else getattr(actor, parts)).to(dtype)
+    with torch.no_grad():  # what no other precision than float64 holds, and bfloat16 rounds
+        actor.network.head[1].weight.add_(1 / 3)
+    actor.save_pretrained(tmp_path)
+    again = WarmPriorActor.from_pretrained(tmp_path)
+    mine, theirs = actor.state_dict(), again.state_dict()
+    assert {value.dtype for value in mine.values()} == {dtype} | (
+        set() if parts == "all" else {torch.float32}
+    )
+    assert all(theirs[name].dtype == value.dtype for name, value in mine.items())
+    assert all(torch.equal(theirs[name], value) for name, value in mine.items())
+    data = TensorDict(
+        {
+            "observation": torch.randn(4, 2, 5),
+            "prior": {"loc": torch.randn(4, 3, 2), "warm": torch.rand(4, 3, 1) < 0.5},
+        },
+        [4],
+    )
+    chunks = [
+        a(data.clone(), generator=torch.Generator().manual_seed(1))["vla_action", "chunk"]
+        for a in (actor, again)
+    ]
+    assert torch.equal(*chunks)
+
+
+@pytest.mark.parametrize(
+    "precision",
+    [{"network": "bfloat16"}, {"network": "int8"}, {"head": "float64"}, "float64", {"network": []}],
+    ids=str,
+)
+def test_a_precision_that_the_weights_do_not_have(tmp_path, precision):
+    saved(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps(config | {"precision": precision}))
+    resign(tmp_path)
+    with pytest.raises(
+        ValueError, match=r"config\.json is damaged|safetensors.*torch\.float32, not"
+    ):
+        WarmPriorActor.from_pretrained(tmp_path)
+
+
+def test_a_policy_saved_before_its_precision_was_told_loads(tmp_path):
+    actor = saved(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    del config["precision"]
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    resign(tmp_path)
+    again = WarmPriorActor.from_pretrained(tmp_path).state_dict()
+    assert all(torch.equal(again[name], value) for name, value in actor.state_dict().items())
+
+
 @pytest.mark.parametrize(
     ("name", "value"),
     [

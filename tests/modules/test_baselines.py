@@ -5,13 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.envs import GymEnv, TransformedEnv
+from torchrl.envs import Compose, GymEnv, TransformedEnv
 
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
     HistoryPrior,
     MeanObservation,
+    ObservationStack,
     PastPrior,
     PolynomialInterpolant,
     PreviewPrior,
@@ -134,6 +135,12 @@ def test_a_mean_observation_names_the_keys_it_lacks():
         actor_for(HistoryPrior(H))(windows(PastPrior(H)))
 
 
+def test_a_mean_observation_without_a_mean_in_an_environment():
+    env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ObservationStack(2), MeanObservation()))
+    with pytest.raises(KeyError, match=r"missing: .*'loc'.*append it after ActionHistory"):
+        _ = env.observation_spec
+
+
 def test_a_half_warm_mean_counts_as_history():
     class Conditioned(PreviewPrior):
         conditions_network = True
@@ -153,6 +160,20 @@ def test_other_priors_leave_the_observation_alone(prior_class):
     assert MeanObservation.width(prior, D_A) == 0
     assert keys.CONDITIONED not in windows(prior).keys(True)
     assert actor_for(prior).in_keys[0] == "observation"
+
+
+@pytest.mark.parametrize("new", [RegressionPrior(H), HistoryPrior(H), PastPrior(H)])
+@pytest.mark.parametrize("old", [RegressionPrior(H), HistoryPrior(H), PastPrior(H)])
+def test_another_prior_brings_its_own_defaults(old, new):
+    network = actor_for(new).network
+    found = WarmPriorActor(network, old).replace(prior=new)
+    expected = WarmPriorActor(network, new)
+    assert (found.in_keys, found.ode.nfe) == (expected.in_keys, expected.ode.nfe)
+    # What was chosen stays.
+    found = WarmPriorActor(network, PastPrior(H), nfe=4, observation_key="state").replace(
+        prior=HistoryPrior(H)
+    )
+    assert (found.in_keys[0], found.ode.nfe) == ("state", 4)
 
 
 @pytest.mark.parametrize("prior_class", [RegressionPrior, HistoryPrior])

@@ -19,10 +19,13 @@ from tests.training.cloning_parts import (
     weights,
 )
 from warmprior import (
+    HistoryPrior,
+    MeanObservation,
     PastPrior,
     PreconditionedNetwork,
     PreviewPrior,
     SourceMoments,
+    VelocityMLP,
     WarmPriorActor,
 )
 from warmprior.training import TrainingConfig
@@ -158,3 +161,13 @@ def test_infinite_weights_are_not_saved(tmp_path):
 def test_bad_config(options, message):
     with pytest.raises(ValueError, match=message):
         TrainingConfig(**options)
+
+
+def test_a_conditioned_network_that_reads_another_key(tmp_path):
+    prior = HistoryPrior(4)
+    network = VelocityMLP(2, 3 + MeanObservation.width(prior, 2), 4, hidden_dim=8)
+    actor = WarmPriorActor(network, prior, observation_key="state")
+    with pytest.raises(ValueError, match=r"\('prior', 'observation'\).*this policy reads 'state'"):
+        training(tmp_path, actor=actor)
+    assert not list(tmp_path.iterdir())
+    training(tmp_path, actor=actor.replace(observation_key=None)).step()

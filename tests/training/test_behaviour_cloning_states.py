@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import nn
 
-from tests.training.cloning_parts import CONFIG, actor_for, same, training, weights
+from tests.training.cloning_parts import CONFIG, actor_for, mlp, same, training, weights
 from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.training.checkpoint import load_state, save_state
 
@@ -262,6 +262,12 @@ class Incomplete(VelocityMLP):
         super().__init__(*args, hidden_dim=needed, **kwargs)
 
 
+def _half_double():
+    network = VelocityMLP(2, 3, 4, hidden_dim=8)
+    network.head.double()
+    return network
+
+
 def _actor(network):
     return actor_for(PastPrior(4), network)
 
@@ -272,7 +278,7 @@ def _actor(network):
         (Plain, TypeError, "cannot save Plain: only VelocityNetwork"),
         (lambda: Forgetful(2, 3, 4, width=16), ValueError, "Forgetful could not be loaded again"),
         (lambda: Incomplete(2, 3, 4, needed=8), ValueError, "Incomplete could not .*needed"),
-        (lambda: VelocityMLP(2, 3, 4, hidden_dim=8).double(), ValueError, "torch.float64"),
+        (_half_double, ValueError, "head.*has type torch.float64, not torch.float32"),
     ],
 )
 def test_what_cannot_be_saved_is_refused_before_training(tmp_path, network, error, said):
@@ -331,3 +337,29 @@ def test_users_networks_are_saved_resumed_and_loaded(tmp_path, network):
     expected = [value for value in whole.ema.module.state_dict().values()]
     for one, two in zip(policy.network.state_dict().values(), expected, strict=True):
         assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_other_precisions_are_saved_resumed_and_loaded(tmp_path, dtype):
+    def cloning(folder):
+        return training(folder, actor=actor_for(PastPrior(4), mlp()).to(dtype))
+
+    whole = cloning(tmp_path / "whole")
+    whole.run(None)
+    half = cloning(tmp_path / "half")
+
+    def interrupt(iteration):
+        if iteration == 25:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        half.run(None, interrupt)
+    resumed = cloning(tmp_path / "half")
+    assert resumed.iteration == 21
+    resumed.run(None)
+    assert same(weights(whole), weights(resumed))
+    assert all(p.dtype == dtype for p in whole.trained.parameters())
+    loaded = WarmPriorActor.from_pretrained(whole.policy_path(40)).network.state_dict()
+    averaged = whole.ema.module["network"].state_dict()
+    assert all(torch.equal(loaded[name], value) for name, value in averaged.items())
+    assert all(value.dtype == dtype for value in loaded.values())

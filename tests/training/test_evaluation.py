@@ -496,3 +496,20 @@ def test_a_success_counts_at_any_step(place):
     inside = place == "inside"
     env = single(LateFailure) if place == "single" else batched(SerialEnv, LateFailure, 2, inside)
     assert evaluate(actor_for(), env, episodes=6, first_seed=0) == expected(0, 6)
+
+
+@pytest.mark.parametrize("wrapped", [False, True])
+@pytest.mark.parametrize("place", ["single", "outside"])
+def test_a_chunk_of_another_name(place, wrapped):
+    """The same decisions, under the standard key, as of a policy that never renamed it."""
+    found = []
+    for key in (("vla_action", "chunk"), "plan"):
+        actor = WarmPriorActor(Recorder(), PastPrior(H), nfe=2, chunk_key=key)
+        base = SeededEnv() if place == "single" else SerialEnv(2, SeededEnv)
+        env = TransformedEnv(base, policy_transforms(PastPrior(H), chunk_key=key))
+        policy = TensorDictSequential(actor) if wrapped else actor
+        found.append(evaluate(policy, env, episodes=3, first_seed=5))
+    assert found[0] == found[1] == expected(5, 3)
+    for one, two in zip(*found, strict=True):
+        assert (one.decisions == two.decisions).all()
+        assert one.decisions["vla_action", "chunk"].any()

@@ -9,6 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
+from torch import nn
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -142,6 +143,37 @@ def test_renamed_keys():
     assert torch.equal(rollout["mean"][1:], rollout["plan"][:-1])
     assert rollout["age"].flatten().tolist() == [0, 2, 4]
     assert rollout["is", "warm"].all(1).flatten().tolist() == [False, True, True]
+
+
+class Shifted(PastPrior, nn.Module):
+    """A prior that learns something that its means depend on."""
+
+    name = "shifted-of-the-tests"
+
+    def __init__(self, chunk_length):
+        nn.Module.__init__(self)
+        super().__init__(chunk_length)
+        self.shift = nn.Parameter(torch.full((ACTION_DIM,), 0.25))
+
+    def next_mean(self, loc, chunk, executed_steps, elapsed_steps):
+        loc, warm = super().next_mean(loc, chunk, executed_steps, elapsed_steps)
+        return loc + self.shift, warm
+
+
+@pytest.mark.parametrize("to", [torch.float64, torch.device("meta")])
+def test_moving_a_learned_prior_or_its_environment_leaves_the_other(to):
+    """ "meta" stands for a GPU: nothing on it can meet the environment's tensors."""
+    prior = Shifted(2)
+    env = TransformedEnv(CountingEnv(9), Compose(ChunkStep(2), ActionHistory(prior)))
+    prior.to(to)
+    rollout = env.rollout(3)
+    expected = rollout["vla_action", "chunk"][:-1] + 0.25
+    assert torch.equal(rollout["prior", "loc"][1:], expected)
+    assert not list(p for p in env.parameters() if p.requires_grad)
+    prior = Shifted(2)
+    ActionHistory(prior).to(to)
+    assert (prior.shift.dtype, prior.shift.device.type) == (torch.float32, "cpu")
+    assert prior.shift.requires_grad
 
 
 def test_outside_environments_nothing_happens():

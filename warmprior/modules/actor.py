@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Mapping
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from warmprior.modules.blueprint import BlueprintError, blueprint
 from warmprior.modules.compiled import uncompiled, without_compilation
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.ode import ODEActor, Solver
+from warmprior.modules.ode import DEFAULT_NFE, ODEActor, Solver
 from warmprior.modules.prior import Prior
 from warmprior.modules.sampler import PriorSampler
 
@@ -38,6 +39,8 @@ __all__ = ["WarmPriorActor"]
 
 FORMAT = 3
 """Version of the layout that :meth:`WarmPriorActor.save_pretrained` writes."""
+
+_PRECISIONS = {name: getattr(torch, name) for name in ("float16", "bfloat16", "float32", "float64")}
 
 _SAVED_KEYS = ("observation_key", "loc_key", "warm_key", "chunk_key")
 
@@ -109,7 +112,7 @@ class WarmPriorActor(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if observation_key is None:
-            observation_key = keys.CONDITIONED if prior.conditions_network else keys.OBSERVATION
+            observation_key = _following(prior)["observation_key"]
         built_for = getattr(network, "prediction_length", prior.prediction_length)
         if built_for != prior.prediction_length:
             raise ValueError(
@@ -161,7 +164,8 @@ class WarmPriorActor(TensorDictModuleBase):
 
         Args:
             changes: constructor arguments, such as ``nfe`` and ``generator`` where a policy is handed to
-                what calls it, or another ``network``.
+                what calls it, or another ``network``. With another ``prior``, an ``nfe`` and
+                ``observation_key`` that are the defaults for this one become those for the other.
 
         Examples:
             >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -182,6 +186,8 @@ class WarmPriorActor(TensorDictModuleBase):
             **self._keys(),
             "path_key": self.ode.path_key,
         }
+        if "prior" in changes:
+            mine = {k: v for k, v in mine.items() if v != _following(self.prior).get(k, ...)}
         return type(self)(**(mine | changes))
 
     def _keys(self) -> dict[str, NestedKey]:
@@ -214,6 +220,7 @@ class WarmPriorActor(TensorDictModuleBase):
             },
             "normalizer": None if self.normalizer is None else self.normalizer.config(),
             "environment": self.environment,
+            "precision": self._precision(),
         }
         try:
             return as_json(config)
@@ -222,6 +229,16 @@ class WarmPriorActor(TensorDictModuleBase):
                 f"cannot save {self.prior}, {type(network).__name__} and the normaliser: {error}. Use plain "
                 "numbers and text for options, and plain names for the normaliser's keys."
             ) from error
+
+    def _parts(self) -> dict[str, nn.Module]:
+        """What has weights, under the names of the configuration."""
+        parts = {"network": self.network, "prior": self.prior, "normalizer": self.normalizer}
+        return {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
+
+    def _precision(self) -> dict[str, str]:
+        """Names of the parts' precisions. Each its own: half precision is too coarse for statistics."""
+        found = {name: _dtype(part) for name, part in self._parts().items()}
+        return {name: str(dtype).removeprefix("torch.") for name, dtype in found.items() if dtype}
 
     def check_saveable(self) -> None:
         """Whether :meth:`from_pretrained` could load what :meth:`save_pretrained` would write.
@@ -257,7 +274,9 @@ class WarmPriorActor(TensorDictModuleBase):
     def save_pretrained(self, directory: str | Path) -> None:
         """Write ``config.json`` and ``model.safetensors``.
 
-        The configuration holds a digest of both, by which :meth:`from_pretrained` notices any change.
+        Network, prior and normaliser each keep their precision (``torch.float16``, ``bfloat16``,
+        ``float32`` or ``float64``). The configuration holds a digest of both files, by which
+        :meth:`from_pretrained` notices any change.
 
         Args:
             directory: created if needed.
@@ -346,13 +365,21 @@ class WarmPriorActor(TensorDictModuleBase):
             if isinstance(options.get(name), list):  # JSON's form of a nested key
                 options[name] = tuple(options[name])
         normalizer = config["normalizer"]
-        return cls(
+        actor = cls(
             VelocityNetwork.from_config(config["network"]),
             Prior.from_config(config["prior"]),
             normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
             environment=config.get("environment"),
             **options,
         )
+        # Policies saved before it was told are of the default precision.
+        parts = actor._parts()
+        for name, precision in config.get("precision", {}).items():
+            dtype = _PRECISIONS[precision]
+            # Only then: a part may hold other types beside that of its weights.
+            if _dtype(parts[name]) != dtype:
+                parts[name].to(dtype)
+        return actor
 
     @classmethod
     def _blueprint(
@@ -365,6 +392,20 @@ class WarmPriorActor(TensorDictModuleBase):
             raise
         except Exception:  # a wrong option, or a network that needs values to be built
             return None
+
+
+def _following(prior: Prior) -> dict[str, Any]:
+    """The constructor's defaults that follow from the prior."""
+    return {
+        "nfe": DEFAULT_NFE if prior.is_flow else 1,
+        "observation_key": keys.CONDITIONED if prior.conditions_network else keys.OBSERVATION,
+    }
+
+
+def _dtype(part: nn.Module) -> torch.dtype | None:
+    """The precision of a part's weights; ``None`` if it has none."""
+    tensors = chain(part.parameters(), part.buffers())
+    return next((value.dtype for value in tensors if value.is_floating_point()), None)
 
 
 def _difference(built: Mapping[str, Tensor], given: Mapping[str, Any]) -> str | None:

@@ -17,7 +17,7 @@ from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
 from warmprior.io.files import exclusive
-from warmprior.keys import ACTION, EPISODE, OBSERVATION
+from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled
 from warmprior.modules.interpolant import Interpolant
@@ -101,7 +101,9 @@ class BehaviourCloning:
 
     Raises:
         ValueError: if the folder's state is damaged or belongs to another recipe, prior, network or
-            dataset, or the policy could not be loaded again (:meth:`WarmPriorActor.check_saveable`).
+            dataset, the policy could not be loaded again (:meth:`WarmPriorActor.check_saveable`), or its
+            prior conditions the network and it reads another key than :class:`~warmprior.MeanObservation`
+            writes.
         TypeError: if the policy cannot be saved.
     """
 
@@ -127,6 +129,11 @@ class BehaviourCloning:
         observation_key, loc_key, warm_key = actor.in_keys
         renamed = {"loc_key": loc_key, "warm_key": warm_key, "chunk_key": actor.chunk_key}
         if actor.prior.conditions_network:  # what it reads is made of the data's observation
+            if observation_key != CONDITIONED:
+                raise ValueError(
+                    f"with {actor.prior} the network reads what MeanObservation writes, {CONDITIONED!r}, but "
+                    f"this policy reads {observation_key!r}: build it without an observation_key"
+                )
             observation_key = OBSERVATION
         renamed["observation_key"] = observation_key
         self.replay_buffer = window_replay_buffer(

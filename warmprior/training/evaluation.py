@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
@@ -38,9 +39,9 @@ class Episode:
         seed: simulator seed of the reset.
         success: whether the task was solved at any step.
         steps: control steps executed.
-        decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, and under ``"next"``
-            ``"executed_steps"`` and ``"done"``. Episodes concatenated along ``D`` are a rollout for
-            :func:`~warmprior.diagnostics.smoothness`.
+        decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, whatever the policy's own
+            key for it, and under ``"next"`` ``"executed_steps"`` and ``"done"``. Episodes concatenated along
+            ``D`` are a rollout for :func:`~warmprior.diagnostics.smoothness`.
     """
 
     seed: int
@@ -223,6 +224,7 @@ def play_episode(
     policy.eval()
     device = _device(policy)
     home = env.device or torch.device("cpu")
+    chunk_key = _chunk_key(policy, env)
     chunks: list[Tensor] = []
     executed: list[Tensor] = []
     success = False
@@ -231,7 +233,7 @@ def play_episode(
         data = env.reset()
         while True:
             data = env.step(act(data.to(device)).to(home))
-            chunks.append(data[keys.CHUNK].cpu())
+            chunks.append(data[chunk_key].cpu())
             executed.append(data["next", keys.EXECUTED].cpu())
             success |= bool(data["next", keys.SUCCESS])
             if data["next", "done"].all():
@@ -319,6 +321,7 @@ def _play_batched(
     policy.eval()
     device = _device(policy)
     home = env.device or torch.device("cpu")
+    chunk_key = _chunk_key(policy, env)
     played = [0] * num_envs
     success = [False] * num_envs
     chunks: list[list[Tensor]] = [[] for _ in played]
@@ -338,7 +341,7 @@ def _play_batched(
             data = env.step(act(data.to(device)).to(home))
             told = data["next"].select("done", keys.SUCCESS, keys.EXECUTED, keys.ELAPSED).cpu()
             done = told["done"].flatten() & active
-            chunk = data[keys.CHUNK].cpu()
+            chunk = data[chunk_key].cpu()
             for i in active.nonzero().flatten().tolist():
                 chunks[i].append(chunk[i])
                 executed[i].append(told[keys.EXECUTED][i])
@@ -397,6 +400,11 @@ def _check_keys(env: EnvBase) -> None:
             f"the environment lacks {keys.EXECUTED!r} or {keys.ELAPSED!r}: give it the policy's transforms, "
             "see warmprior.policy_transforms"
         )
+
+
+def _chunk_key(policy: TensorDictModuleBase, env: EnvBase) -> NestedKey:
+    """Where the policy writes its chunks; what the environment takes, if the policy does not tell."""
+    return policy.chunk_key if isinstance(policy, WarmPriorActor) else env.action_key
 
 
 def _device(policy: TensorDictModuleBase) -> torch.device:

@@ -14,6 +14,7 @@ from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.transforms.inner_step import InnerStep, rows_where, set_aside
+from warmprior.transforms.late import LateTransforms, advance
 
 __all__ = ["ChunkStep"]
 
@@ -30,8 +31,10 @@ class ChunkStep(Transform):
     inside a chunk and has fixed shapes, so that it works inside and outside batched environments.
 
     Per-step transforms (``StepCounter``, ``RewardSum``, ``ActionScaling``, ``CatFrames``,
-    ``VideoRecorder``) go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after. All of
-    them run themselves at every control step. In a partial step, rows that rest keep all observations.
+    ``VideoRecorder``) go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after. The
+    former run themselves at every control step; where all of them are of those that remember nothing
+    (``ObservationNorm``, ``ActionScaling``, :class:`ObservationStack`), only at those that a chunk's last
+    observation depends on. In a partial step, rows that rest keep all observations.
 
     .. note::
         TorchRL's transforms with memory, such as ``CatFrames`` or ``VecNormV2``, update it in all rows of a
@@ -101,7 +104,7 @@ class ChunkStep(Transform):
         self.executed_key = unravel_key(executed_key)
         self.event_keys = [unravel_key(key) for key in event_keys]
         self._input: TensorDictBase | None = None
-        self._inner: tuple[Any, InnerStep, NestedKey] | None = None
+        self._inner: tuple[Any, InnerStep, LateTransforms | None, NestedKey] | None = None
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         # The wrapped environment's own step executes the first action; _step runs the others.
@@ -118,8 +121,8 @@ class ChunkStep(Transform):
             set_aside(tensordict, self._inner_step()[0].observed)
         return tensordict.set(self.action_key, chunk[..., 0, :])
 
-    def _inner_step(self) -> tuple[InnerStep, NestedKey]:
-        """How to step what this transform wraps, and the key of its reward."""
+    def _inner_step(self) -> tuple[InnerStep, LateTransforms | None, NestedKey]:
+        """How to step what this transform wraps, also with late transforms, and the key of its reward."""
         parent = self.parent
         if self._inner is None or self._inner[0] is not parent:
             # TorchRL builds another parent whenever the transforms change.
@@ -130,16 +133,18 @@ class ChunkStep(Transform):
                     "ChunkStep needs one reward and a root 'done', the environment has "
                     f"rewards {rewards} and done keys {dones}"
                 )
-            self._inner = (parent, inner, rewards[0])
+            read = (*dones, rewards[0], *self.event_keys)
+            late = LateTransforms.of(inner, self.action_key, read)
+            self._inner = (parent, inner, late, rewards[0])
         return self._inner[1:]
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        step, reward_key = self._inner_step()
+        step, late, reward_key = self._inner_step()
         batch = next_tensordict.batch_size
         before, self._input = self._input, None
         if before is None:
             raise RuntimeError("ChunkStep._step was called without ChunkStep.inv: use env.step")
-        chunk = before.get(self.chunk_key)
+        chunk = before.get(self.chunk_key)[..., : self.execute, :]
         # A plain dictionary: a tensordict's checks would be made at every control step.
         current = dict(before.items())
         preset = current.pop("next", None)
@@ -149,41 +154,51 @@ class ChunkStep(Transform):
         if alive is not None:
             alive = alive.view(batch)
             next_tensordict = rows_where(alive, next_tensordict, before)
-        reward: Tensor = next_tensordict.get(reward_key)
-        if not reward.is_floating_point():
-            reward = reward.to(torch.get_default_dtype())
-        steps = torch.ones(batch, dtype=torch.int64, device=chunk.device)
+        results = [next_tensordict]
+        if alive is None and late is not None:
+            results = late(current, next_tensordict, chunk[..., 1:, :], reward_key)
+            next_tensordict = results[-1]
+        earned = [result.get(reward_key) for result in results]
+        steps = torch.full(batch, len(results), dtype=torch.int64, device=chunk.device)
         steps = steps if alive is None else alive.long()
-        events = {key: next_tensordict.get(key, None) for key in self.event_keys}
-        events = {key: value for key, value in events.items() if value is not None}
-        for i in range(1, self.execute):
+        for i in range(len(results), self.execute):
             done = next_tensordict.get("done")
             if done.any():
                 running = ~done.view(batch)
                 alive = running if alive is None else alive & running
             if alive is not None and not alive.any():
                 break
-            _advance(current, next_tensordict, reward_key)
+            advance(current, next_tensordict, reward_key)
             inputs = TensorDict(current, batch_size=batch, device=next_tensordict.device)
             result = step(inputs.set(self.action_key, chunk[..., i, :]), alive)
-            earned = result.get(reward_key)
+            reward = result.get(reward_key)
             if alive is None:
                 next_tensordict = result
                 steps += 1
             else:
-                earned = torch.where(expand_as_right(alive, earned), earned, 0)
+                reward = torch.where(expand_as_right(alive, reward), reward, 0)
                 next_tensordict = rows_where(alive, result, next_tensordict)
                 steps += alive
-            for key in events:
-                events[key] = events[key] | next_tensordict.get(key)
-            reward = torch.add(reward, earned, alpha=self.gamma**i)
+            earned.append(reward)
+            results.append(next_tensordict)
         if preset is not None:
             # A policy may preset other keys under "next", which the inner steps do not return.
             next_tensordict.update(preset.exclude(*next_tensordict.keys(True, True)))
-        next_tensordict.set(reward_key, reward)
-        for key, value in events.items():
-            next_tensordict.set(key, value)
+        for key in self.event_keys:
+            if next_tensordict.get(key, None) is not None:
+                flags = torch.stack([result.get(key) for result in results])
+                next_tensordict.set(key, flags.any(0))
+        next_tensordict.set(reward_key, self._return(earned))
         return next_tensordict.set(self.executed_key, steps.unsqueeze(-1))
+
+    def _return(self, rewards: list[Tensor]) -> Tensor:
+        """The discounted sum, accumulated in floating point."""
+        total = rewards[0]
+        if not total.is_floating_point():
+            total = total.to(torch.get_default_dtype())
+        for i, reward in enumerate(rewards[1:], 1):
+            total = torch.add(total, reward, alpha=self.gamma**i)
+        return total
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -245,14 +260,3 @@ class ChunkStep(Transform):
             (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device
         )
         return observation_spec
-
-
-def _advance(
-    current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey
-) -> None:
-    """As ``step_mdp``, in place and without its generality: it runs at every control step."""
-    for key, value in next_tensordict.items():
-        if isinstance(value, TensorDictBase) and key in current:
-            value = current[key].copy().update(value)
-        if key != reward_key:
-            current[key] = value

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
+from torch import nn
 from torchrl.data import Categorical, TensorSpec, Unbounded
 from torchrl.envs.transforms import Transform
 
@@ -32,7 +35,8 @@ class ActionHistory(Transform):
     =========================  ===========================  ====================================
 
     Args:
-        prior: the source distribution of the policy that will act.
+        prior: the source distribution of the policy that will act. One that learns is copied, as it is now:
+            the copy goes where the environment goes, and the policy's own where the policy goes.
 
     Keyword Args:
         chunk_key: the predicted chunk, ``[*B, P, d_a]``.
@@ -68,6 +72,9 @@ class ActionHistory(Transform):
         elapsed_key: NestedKey = keys.ELAPSED,
     ) -> None:
         super().__init__(in_keys=[chunk_key], out_keys=[loc_key, warm_key, elapsed_key])
+        if isinstance(prior, nn.Module):
+            # It becomes a part of this one: whoever moved or cast the policy would do so to the environment.
+            prior = copy.deepcopy(prior).cpu().requires_grad_(False)
         self.prior = prior
         self.chunk_key = unravel_key(chunk_key)
         self.executed_key = unravel_key(executed_key)

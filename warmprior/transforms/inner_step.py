@@ -71,15 +71,25 @@ class InnerStep:
             set_aside(tensordict, self.observed)
         for transform in reversed(self.transforms):
             tensordict = transform._inv_call(tensordict)
+        result = self.bare(tensordict)
+        for transform in self.transforms:
+            result = transform._step(tensordict, result)
+        return result
+
+    def bare(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """What a step of the environment itself leads to, with all its flags.
+
+        Args:
+            tensordict: the step's input, ``[*B]``, as the environment takes it.
+        """
         result = self.base._step(tensordict)
+        found = dict(result.items())  # several times faster to ask
         for key, shape in self._done_shapes:
-            done = result.get(key, None)
+            done = found.get(key) if isinstance(key, str) else result.get(key, None)
             if done is None or done.shape != shape:
                 # Only then: most environments give all flags, and completing them is slow.
                 self.base._complete_done(self._done_spec, result)
                 break
-        for transform in self.transforms:
-            result = transform._step(tensordict, result)
         return result
 
 

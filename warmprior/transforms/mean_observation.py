@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
@@ -69,15 +71,21 @@ class MeanObservation(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the extended observation."""
-        found = [tensordict.get(key, None) for key in self.in_keys]
-        missing = [key for key, value in zip(self.in_keys, found, strict=True) if value is None]
+        found = self._read(tensordict)
+        return tensordict.set(self.out_keys[0], _extended(*found))
+
+    def _read(self, place: TensorDictBase | Composite) -> list[Any]:
+        """What lies under the input keys, values or their specs."""
+        known = place.keys(True)
+        missing = [key for key in self.in_keys if key not in known]
         if missing:
             raise KeyError(
                 f"MeanObservation needs the keys {self.in_keys}; missing: {missing}. In an environment "
                 "append it after ActionHistory"
             )
+        found = [place[key] for key in self.in_keys]
         self._check_vector(found[0])
-        return tensordict.set(self.out_keys[0], _extended(*found))
+        return found
 
     def _check_vector(self, observation: object) -> None:
         if isinstance(observation, (TensorDictBase, Composite)):
@@ -97,8 +105,7 @@ class MeanObservation(Transform):
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the extended observation."""
-        observation, loc, _ = (observation_spec[key] for key in self.in_keys)
-        self._check_vector(observation)
+        observation, loc, _ = self._read(observation_spec)
         shape = (*observation.shape[:-1], observation.shape[-1] + loc.shape[-2:].numel() + 1)
         observation_spec[self.out_keys[0]] = Unbounded(
             shape, dtype=observation.dtype, device=observation.device

@@ -1,0 +1,136 @@
+"""Transforms that can wait to the end of a chunk, because only its last control steps decide."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform, TransformedEnv
+
+from warmprior.transforms.inner_step import InnerStep
+from warmprior.transforms.stack import ObservationStack
+
+__all__ = ["LateTransforms", "advance"]
+
+_REACH: dict[type[Transform], Callable[[Any], int]] = {
+    ActionScaling: lambda transform: 1,
+    ObservationNorm: lambda transform: 1,
+    ObservationStack: lambda transform: transform.steps,
+}
+"""Transforms without memory, by type: on how many of the last observations what they give depends."""
+
+
+class LateTransforms:
+    """Runs control steps first, and their transforms afterwards, for the steps that count.
+
+    A decision of ``k`` control steps is read once, at its end. What transforms such as
+    :class:`ObservationStack` make of all but its last few observations is thrown away, and beside a
+    fast simulator that takes longer than anything else here. The result is that of transforming every
+    step, bit by bit.
+
+    Args:
+        step: the step of the environment, through its transforms.
+        action_key: the environment's action, at the root.
+    """
+
+    def __init__(self, step: InnerStep, action_key: str) -> None:
+        self._step = step
+        self._transforms = step.transforms
+        self._action_key = action_key
+        self._reach = 1 + sum(_REACH[type(t)](t) - 1 for t in self._transforms)
+
+    @classmethod
+    def of(
+        cls, step: InnerStep, action_key: NestedKey, read: Iterable[NestedKey]
+    ) -> LateTransforms | None:
+        """Such steps, or ``None`` where every transform has to run at every step.
+
+        Args:
+            step: the step of the environment, through its transforms.
+            action_key: the environment's action.
+            read: keys of a step's result that are needed before the end.
+        """
+        transforms, base = step.transforms, step.base
+        if not isinstance(action_key, str):
+            return None
+        # An environment reads its action and states alone: other observations may reach it untransformed.
+        # A transformed one has transforms of its own, which may read what these write.
+        if isinstance(base, TransformedEnv) or any(type(t) not in _REACH for t in transforms):
+            return None
+        written = _roots(key for t in transforms for key in t.out_keys)
+        needed = _roots([action_key, *read, *base.state_spec.keys(True, True)])
+        inverse = [(list(t.in_keys_inv), list(t.out_keys_inv)) for t in transforms]
+        if written & needed or any(
+            keys not in ([], [action_key]) for pair in inverse for keys in pair
+        ):
+            return None
+        return cls(step, action_key)
+
+    def __call__(
+        self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
+    ) -> list[TensorDictBase]:
+        """Take steps until an environment is done.
+
+        Args:
+            current: the entries of the first step's input, of which the following are made in place.
+            first: what that step led to, transformed, ``[*B]``.
+            actions: of the following steps, ``[*B, n, d_a]``.
+            reward_key: the environment's reward.
+
+        Returns:
+            What all of them led to, ``first`` included; only the last one is transformed.
+        """
+        results = [first]
+        batch, device = first.batch_size, first.device
+        for action in self._inverse(actions):
+            advance(current, results[-1], reward_key)
+            if current["done"].any():
+                break
+            # Without the constructor's checks: the entries come out of tensordicts of this batch size.
+            entries = current | {self._action_key: action}
+            inputs = TensorDict._new_unsafe(entries, batch_size=batch, device=device)
+            results.append(self._step.bare(inputs))
+        if len(results) > 1:
+            results[-1] = self._transformed(first, results[1:])
+        return results
+
+    def _inverse(self, actions: Tensor) -> tuple[Tensor, ...]:
+        # Elementwise: all of them at once, time first, so that what a transform has per row broadcasts.
+        actions = actions.movedim(-2, 0)
+        for transform in reversed(self._transforms):
+            if transform.in_keys_inv:
+                actions = transform._inv_apply_transform(actions)
+        return actions.unbind(0)
+
+    def _transformed(self, before: TensorDictBase, results: list[TensorDictBase]) -> TensorDictBase:
+        # What lies further back than they reach has no influence, so that `before` may be older.
+        for result in results[-self._reach :]:
+            for transform in self._transforms:
+                result = transform._step(before, result)
+            before = result
+        return before
+
+
+def advance(
+    current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey
+) -> None:
+    """As ``step_mdp``, in place and without its generality: it runs at every control step.
+
+    Args:
+        current: entries of a step's input, ``[*B]``, replaced by what the step led to.
+        next_tensordict: that, ``[*B]``.
+        reward_key: left out.
+    """
+    for key, value in next_tensordict.items():
+        # The type first: nearly all are plain tensors, and the instance check is slow.
+        if type(value) is not Tensor and isinstance(value, TensorDictBase) and key in current:
+            value = current[key].copy().update(value)
+        if key != reward_key:
+            current[key] = value
+
+
+def _roots(keys: Iterable[NestedKey]) -> set[str]:
+    return {key if isinstance(key, str) else key[0] for key in keys}
