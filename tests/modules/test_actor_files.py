@@ -271,3 +271,11 @@ def test_a_configuration_that_is_no_text(tmp_path, content):
     (tmp_path / "config.json").write_bytes(content)
     with pytest.raises(ValueError, match=r"config\.json is not valid JSON"):
         WarmPriorActor.from_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("key", [3, [1e308, "warm"], ["warm"], ["prior", {}], [], "", None])
+def test_a_key_that_is_none(tmp_path, key):
+    saved(tmp_path)
+    change_config(tmp_path, "actor", warm_key=key)
+    with pytest.raises(ValueError, match=r"config\.json .*warm_key must be a key"):
+        WarmPriorActor.from_pretrained(tmp_path)

@@ -362,8 +362,8 @@ class WarmPriorActor(TensorDictModuleBase):
         """An actor with fresh weights."""
         options: dict[str, Any] = dict(config["actor"])
         for name in _SAVED_KEYS:
-            if isinstance(options.get(name), list):  # JSON's form of a nested key
-                options[name] = tuple(options[name])
+            if name in options:
+                options[name] = _key_from_json(name, options[name])
         normalizer = config["normalizer"]
         actor = cls(
             VelocityNetwork.from_config(config["network"]),
@@ -392,6 +392,14 @@ class WarmPriorActor(TensorDictModuleBase):
             raise
         except Exception:  # a wrong option, or a network that needs values to be built
             return None
+
+
+def _key_from_json(name: str, value: Any) -> NestedKey:
+    """A key as JSON holds it: text, or a list of texts for a nested one."""
+    parts = value if isinstance(value, list) and len(value) > 1 else [value]
+    if not all(isinstance(part, str) and part for part in parts):
+        raise ValueError(f"{name} must be a key, got {value!r}")
+    return tuple(parts) if isinstance(value, list) else value
 
 
 def _following(prior: Prior) -> dict[str, Any]:
