@@ -76,14 +76,13 @@ def film(comparison: Comparison, store: Store, end: str) -> None:
     """An episode of every source's first policy."""
     first = {c.prior.name: c for c in reversed(comparison.contestants) if c.store is store}
     for name, contestant in first.items():
-        nfe, policy = min(contestant.prior.allowed_nfes(comparison.nfes)), contestant.policy()
+        nfe = min(contestant.prior.allowed_nfes(comparison.nfes))
         strip = record_filmstrip(
-            policy,
-            store.problem.make_env,
-            store.transforms(policy.prior),
+            contestant.policy(),
             seed=EVALUATION_SEED,
             nfe=nfe,
             policy_seed=contestant.training.seed,
+            **comparison.recipe.evaluation.environment,
         )
         outcome = "solved" if strip.success else "not solved"
         plot_filmstrip(

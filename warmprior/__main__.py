@@ -40,14 +40,15 @@ def evaluate(args: argparse.Namespace) -> None:
     from warmprior.diagnostics.statistics import success_posterior
     from warmprior.envs.description import environment_of
     from warmprior.training.evaluation import evaluate as play
-    from warmprior.training.video import check_video, record_video
+    from warmprior.training.film import check_video, record_video
 
     actor = _policy(args)
     nfe = actor.ode.nfe if args.nfe is None else args.nfe
     actor.ode.check_nfe(nfe)
     if args.video is not None:  # known now rather than after the episodes
         check_video(args.video)
-    env = environment_of(actor, terminate_on_success=not args.play_on)
+    options = {"terminate_on_success": not args.play_on}
+    env = environment_of(actor, **options)
     try:
         episodes = play(
             actor,
@@ -69,7 +70,12 @@ def evaluate(args: argparse.Namespace) -> None:
     )
     if args.video is not None:
         outcome = record_video(
-            actor, args.video, seed=args.first_seed, nfe=nfe, policy_seed=args.policy_seed
+            actor,
+            args.video,
+            seed=args.first_seed,
+            nfe=nfe,
+            policy_seed=args.policy_seed,
+            **options,
         )
         print(f"{args.video}: episode {args.first_seed}, {'' if outcome else 'not '}solved")
 

@@ -3,10 +3,9 @@
 from warmprior.io.workers import WorkerError
 from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
 from warmprior.training.evaluation import Episode, evaluate, parallel_env, play_episode
-from warmprior.training.filmstrip import Filmstrip, record_filmstrip
+from warmprior.training.film import Filmstrip, record_filmstrip, record_video
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.training_config import TrainingConfig
-from warmprior.training.video import record_video
 
 __all__ = [
     "BehaviourCloning",

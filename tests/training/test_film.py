@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 import torch
-from torchrl.envs import TransformedEnv
 
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+from warmprior import PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.training import play_episode, record_filmstrip
 
 pytest.importorskip("robosuite")
 
 from warmprior.envs import RobosuiteEnv
+from warmprior.envs.description import environment_description, environment_of
+from warmprior.envs.simulator import task_env_args
+from warmprior.training import film
 
 
 def test_frames_are_of_the_evaluated_episode(monkeypatch):
-    prior = PastPrior(4)
-    make_env = partial(RobosuiteEnv, "lift", horizon=20)
-    make_transforms = partial(policy_transforms, prior)
     torch.manual_seed(0)
-    width = make_env().observation_spec["observation"].shape[-1]
-    actor = WarmPriorActor(VelocityMLP(7, width, 4, hidden_dim=16), prior, clip=1.0)
+    environment = environment_description(task_env_args("lift"), "ph", 2)
+    network = VelocityMLP(7, 19, 4, hidden_dim=16)
+    actor = WarmPriorActor(network, PastPrior(4), clip=1.0, environment=environment)
     states = []
 
     def render(self, size):
@@ -31,14 +29,15 @@ def test_frames_are_of_the_evaluated_episode(monkeypatch):
         return np.zeros((size, size, 3), dtype=np.uint8)
 
     monkeypatch.setattr(RobosuiteEnv, "render_frame", render)
+    monkeypatch.setattr(film, "require_rendering", lambda: None)
     strips = {
         (seed, policy_seed): record_filmstrip(
-            actor, make_env, make_transforms, seed=seed, nfe=2, policy_seed=policy_seed, frames=3
+            actor, seed=seed, nfe=2, policy_seed=policy_seed, frames=3, horizon=20
         )
         for seed, policy_seed in ((5, 0), (5, 1))
     }
-    assert [strip.steps for strip in strips.values()] == [[0, 8, 20]] * 2
-    env = TransformedEnv(make_env(), make_transforms())
+    assert [strip.steps for strip in strips.values()] == [[0, 10, 20]] * 2
+    env = environment_of(actor, horizon=20)
     for (seed, policy_seed), strip in strips.items():
         episode = play_episode(actor, env, seed, nfe=2, policy_seed=policy_seed)
         assert (strip.success, strip.steps[-1]) == (episode.success, episode.steps)

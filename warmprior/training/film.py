@@ -1,0 +1,186 @@
+"""One episode in pictures: a film, or a strip of a few of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tensordict import TensorDictBase
+from torchrl.envs.transforms import Transform
+
+from warmprior.envs.description import environment_of
+from warmprior.envs.rendering import require_rendering
+from warmprior.envs.robosuite import RobosuiteEnv
+from warmprior.io.extras import require
+from warmprior.io.files import check_writable, write_atomic
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.training.evaluation import play_episode
+
+__all__ = ["Filmstrip", "check_video", "record_filmstrip", "record_video"]
+
+
+class _Recorder(Transform):
+    """Keeps the simulator's state after the reset and after every control step."""
+
+    def __init__(self, env: RobosuiteEnv) -> None:
+        super().__init__()
+        self.__dict__["env"] = env  # no submodule: the environment contains this
+        self.states: list[Any] = []
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.states.append(self.env.loop.state())
+        return next_tensordict
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+
+@dataclass(frozen=True)
+class _Played:
+    """An episode that :func:`play_episode` played, and the simulator to show it in."""
+
+    env: RobosuiteEnv
+    states: Sequence[Any]
+    success: bool
+
+    def frame(self, step: int, size: int) -> np.ndarray:
+        """The picture after a control step, uint8 ``[h, w, 3]``."""
+        self.env.loop.set_state(self.states[step])
+        return self.env.render_frame(size=size)
+
+
+@contextmanager
+def _played(
+    actor: WarmPriorActor, seed: int, nfe: int | None, policy_seed: int, options: dict[str, Any]
+) -> Iterator[_Played]:
+    require_rendering()
+    env = environment_of(actor, **options)
+    recorder = _Recorder(env.base_env)
+    # First, and so one of the transforms that run at every control step inside of a chunk.
+    env.transform.insert(0, recorder)
+    try:
+        outcome = play_episode(actor, env, seed, nfe=nfe, policy_seed=policy_seed)
+        yield _Played(env.base_env, recorder.states, outcome.success)
+    finally:
+        env.close()
+
+
+@dataclass(frozen=True)
+class Filmstrip:
+    """Evenly spaced frames of one episode.
+
+    Attributes:
+        frames: uint8 ``[h, w, 3]`` each; the first before the first action, the last at the end.
+        steps: control steps executed before each frame.
+        success: whether the task was solved.
+    """
+
+    frames: list[np.ndarray]
+    steps: list[int]
+    success: bool
+
+
+def record_filmstrip(
+    actor: WarmPriorActor,
+    *,
+    seed: int,
+    nfe: int | None = None,
+    policy_seed: int = 0,
+    frames: int = 9,
+    size: int = 160,
+    **options: Any,
+) -> Filmstrip:
+    """Play the episode of one seed and render it at evenly spaced control steps.
+
+    It is the very episode that :func:`play_episode` plays.
+
+    Args:
+        actor: a policy that keeps its environment's description.
+
+    Keyword Args:
+        seed: simulator seed of the episode.
+        nfe: network evaluations per chunk; the policy's own by default.
+        policy_seed: of the source samples.
+        frames: how many pictures.
+        size: side of a picture in pixels.
+        options: further ones of :class:`~warmprior.envs.RobosuiteEnv`.
+
+    Raises:
+        RuntimeError: if nothing on this machine can render; the message names the packages to install.
+        ValueError: if the policy keeps no description of its environment.
+    """
+    with _played(actor, seed, nfe, policy_seed, options) as played:
+        steps = np.unique(np.linspace(0, len(played.states) - 1, frames).round().astype(int))
+        pictures = [played.frame(step, size) for step in steps]
+    return Filmstrip(pictures, steps.tolist(), played.success)
+
+
+def check_video(path: Path) -> None:
+    """Refuse what :func:`record_video` could not write, before anything is played.
+
+    Raises:
+        ImportError: if PyAV is missing.
+        RuntimeError: if nothing on this machine can render.
+        OSError: if the folder cannot be written to.
+    """
+    require("av", "lerobot")
+    require_rendering()
+    check_writable(path.parent)
+
+
+def record_video(
+    actor: WarmPriorActor,
+    path: Path,
+    *,
+    seed: int,
+    nfe: int | None = None,
+    policy_seed: int = 0,
+    size: int = 256,
+    **options: Any,
+) -> bool:
+    """Play the episode of one seed and write it as an MP4, a frame per control step.
+
+    It is the very episode that :func:`play_episode` plays.
+
+    Args:
+        actor: a policy that keeps its environment's description.
+        path: of the MP4.
+
+    Keyword Args:
+        seed: simulator seed of the episode.
+        nfe: network evaluations per chunk; the policy's own by default.
+        policy_seed: of the source samples.
+        size: side of the picture in pixels, even.
+        options: further ones of :class:`~warmprior.envs.RobosuiteEnv`.
+
+    Returns:
+        Whether the task was solved.
+
+    Raises:
+        ImportError: if PyAV is missing.
+        RuntimeError: if nothing on this machine can render; the message names the packages to install.
+        ValueError: if the policy keeps no description of its environment.
+    """
+    av = require("av", "lerobot")
+    with _played(actor, seed, nfe, policy_seed, options) as played:
+        environment: Any = actor.environment
+        kwargs = environment["robosuite"]["env_args"]["env_kwargs"]
+
+        def write(temporary: Path) -> None:
+            with av.open(str(temporary), "w", format="mp4") as container:
+                stream = container.add_stream("h264", rate=round(kwargs.get("control_freq", 20)))
+                stream.width = stream.height = size
+                stream.pix_fmt = "yuv420p"
+                for step in range(len(played.states)):
+                    picture = av.VideoFrame.from_ndarray(played.frame(step, size), format="rgb24")
+                    container.mux(stream.encode(picture))
+                container.mux(stream.encode())
+
+        write_atomic(path, write)
+    return played.success
