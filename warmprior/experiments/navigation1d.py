@@ -135,7 +135,7 @@ def judge_navigation(
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP
-        >>> actor = WarmPriorActor(VelocityMLP(1, 1, 16, 1, hidden_dim=8), PastPrior(16))
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 16, 1, hidden_dim=8), PastPrior(16))
         >>> 0.0 <= judge_navigation(actor, 0, nfe=1, rollouts=8)["collision_rate"] <= 1.0
         True
     """

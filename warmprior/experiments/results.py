@@ -239,31 +239,37 @@ def _read_rows(records: Sequence[Any]) -> list[Row]:
     return rows
 
 
-_COUNTS = ("chunk", "nfe", "seed", "checkpoint", "iterations", "episodes", "successes")
-_RATES = ("success_rate", "mean_steps", "boundary_jump", "inner_jump", "source_leak")
+_TEXTS = ("task", "data", "prior")
+_COUNTS = {"chunk": 1, "nfe": 1, "seed": 0, "iterations": 1, "checkpoint": 0, "episodes": 1}
+_COUNTS |= {"successes": 0}
+_NOT_NEGATIVE = ("sigma", "mean_steps", "boundary_jump", "inner_jump", "source_leak")
 
 
 def _check(row: Row) -> None:
     """Refuse what cannot have been measured."""
-    for name, value in row.facts.items():
-        if not (value is None or isinstance(value, str | int | float)):
-            raise ValueError(f"{name} cannot be {value!r}")
-    for name, value in row.measures.items():
-        if not (value is None or (isinstance(value, int | float) and not isinstance(value, bool))):
-            raise ValueError(f"{name} cannot be {value!r}")
-    for name in _COUNTS:
-        value = row.get(name)
-        if value is not None and (type(value) is not int or value < 0):
-            raise ValueError(f"{name} cannot be {value!r}")
-    for name in _RATES:
-        value = row.get(name)
-        if value is not None and value < 0:
+
+    def number(value: Any) -> bool:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+
+    entries: dict[str, Any] = {**row.facts, **row.measures}
+    for name, value in entries.items():
+        fact = name in row.facts
+        if name in _TEXTS:
+            fine = isinstance(value, str)
+        elif name in _COUNTS:
+            pooled = name == "seed" and value is None
+            fine = pooled or (type(value) is int and value >= _COUNTS[name])
+        elif name in _NOT_NEGATIVE:
+            fine = (value is None and not fact) or (number(value) and value >= 0)
+        else:
+            fine = value is None or number(value) or (fact and isinstance(value, str | bool))
+        if not fine:
             raise ValueError(f"{name} cannot be {value!r}")
     if "success_rate" in row.measures:
         successes, episodes, rate = (
             row.get(name) for name in ("successes", "episodes", "success_rate")
         )
-        if None in (successes, episodes, rate) or not 0 <= successes <= episodes or not episodes:
+        if None in (successes, episodes, rate) or successes > episodes:
             raise ValueError(f"{successes} successes in {episodes} episodes")
         if not math.isclose(rate, successes / episodes):
             raise ValueError(f"its success_rate is {rate!r}, not {successes / episodes}")
