@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from warmprior.diagnostics import probability_better
+
 pytest.importorskip("tyro")
 
 from tests.experiments.row_parts import compared, row
@@ -16,10 +18,13 @@ def lines(text, start="| Square-PH"):
 
 def test_table_shows_gains_marks_and_the_papers_row():
     text = success_table(compared(), top_k=1, source="scripted", notes=["- A note."])
-    measured, paper = lines(text)
+    measured, better, paper = lines(text)
     assert measured == (
         "| Square-PH, measured (scripted data) | 50.0 | **80.0** (+30.0*) | 50.0 (+0.0) |"
     )
+    # Of all seeds' last checkpoints: 15, 24 and 15 of 30.
+    chance = f"{probability_better(24, 30, 15, 30):.2f}"
+    assert better == f"| Square-PH, probability of being better than Base | - | {chance} | 0.50 |"
     assert paper == "| Square-PH, paper (official data) | 83.6 | 86.6 (+3.0) | 87.3 (+3.7) |"
     head = "| Success rate (%) | NFE 1: Base | NFE 1: WP-Past | NFE 1: WP-Preview |"
     assert text.startswith(head)

@@ -6,7 +6,11 @@ import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from warmprior.diagnostics.source_leak import INNER_STEP_BOUND, LEAK_BOUND
-from warmprior.diagnostics.statistics import exceeds_one_sigma, summarize_seeds
+from warmprior.diagnostics.statistics import (
+    exceeds_one_sigma,
+    probability_better,
+    summarize_seeds,
+)
 from warmprior.experiments.labels import source_labels
 from warmprior.experiments.paper import PAPER_CURVATURE, paper_success
 from warmprior.experiments.results import Row, grouped, mean_known, select, success_summary
@@ -157,6 +161,18 @@ def success_table(
         gain = round(100 * (mine.mean - baseline.mean), 1) + 0.0  # no minus before a zero
         return f"{text} ({gain:+.1f}{mark})"
 
+    def better(cell: list[Row]) -> str | None:
+        same = {name: cell[0][name] for name in ("task", "data", "nfe")}
+        sources = grouped(last_checkpoints(select(rows, **same)), label)
+        if label(cell[0]) == base or base not in sources:
+            return None
+        counts = (
+            sum(row[name] for row in sources[source])
+            for source in (label(cell[0]), base)
+            for name in ("successes", "episodes")
+        )
+        return f"{probability_better(*counts):.2f}"
+
     def paper(cell: list[Row]) -> str | None:
         row = cell[0]
         place = row["task"], row["data"]
@@ -174,6 +190,7 @@ def success_table(
         source_at_nfe(rows),
         {
             f"measured ({source} data)": measured,
+            f"probability of being better than {base}": better,
             "paper (official data)": paper,
             f"spread over draws of the source / data's (bound {LEAK_BOUND:g})": _bounded(
                 "source_leak", LEAK_BOUND
@@ -220,6 +237,11 @@ def _success_notes(rows: Sequence[Row], top_k: int, source: str | None) -> list[
             "- Spread and steps tell how much of the source's noise reaches the actions (last checkpoints, "
             "training data): at or below the bound, none is seen. What exceeds it says more about the "
             "network's training than about the source."
+        )
+    if len({row["prior"] for row in rows}) > 1:
+        notes.append(
+            "- Probability: of a higher success rate than the first column's, given the episodes of all "
+            "seeds' last checkpoints (Beta posteriors, uniform prior, episodes taken as independent)."
         )
     if source != "official":
         notes.append(
