@@ -25,13 +25,14 @@ from warmprior.experiments import (
     parse,
     plot_budget,
     prior_label,
+    record,
     run_script,
     started,
     success_cell,
     table,
     write_report,
 )
-from warmprior.experiments.recipe import check_counts
+from warmprior.experiments.recipe import check_counts, refuse_ignored
 from warmprior.training import TrainingConfig
 
 
@@ -48,6 +49,11 @@ class BudgetRecipe(MeasuredRecipe):
     def check(self) -> None:
         """Refuse what cannot work, before any work."""
         super().check()
+        told = "every budget is a number of iterations with one policy, named by --budgets"
+        ignored = [
+            name for name in record(self.training) if name not in ("iterations", "checkpoints")
+        ]
+        refuse_ignored(self, PRESETS[self.run.preset], ["training"], told, but=ignored)
         check_counts(self, "budgets")
         if not self.budgets:
             raise ValueError("--budgets needs at least one number of iterations")

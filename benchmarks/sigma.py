@@ -49,6 +49,7 @@ def run(argv: Sequence[str] | None) -> None:
     presets = {name: study(preset) for name, preset in PRESETS.items()}
     recipe = parse(presets, argv, study="sigma", description=__doc__)
     recipe.check_single(nfe=True)
+    recipe.sources.check_sigma()
     with started(recipe, "sigma") as out:
         comparison = Comparison(recipe, "sigma")
         # Before the hours of training: what cannot be measured on is better known now.

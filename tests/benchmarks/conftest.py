@@ -19,3 +19,17 @@ def validation(tmp_path_factory):
     path = tmp_path_factory.mktemp("held-out") / "val.hdf5"
     write_robomimic_file(path, lengths=(25, 30), task="lift", seed=1)
     return path
+
+
+@pytest.fixture
+def no_work(monkeypatch):
+    """Nothing is generated, downloaded or trained."""
+    pytest.importorskip("tyro")
+    from warmprior.experiments import Store, problem
+
+    def never(*args, **options):
+        raise AssertionError("work was begun")
+
+    monkeypatch.setattr(Store, "train", never)
+    for name in ("generate_demonstrations", "download_robomimic"):
+        monkeypatch.setattr(problem, name, never)

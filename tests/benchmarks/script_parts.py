@@ -32,15 +32,13 @@ def options(path, out, **extra):
 
 
 def refused(main, argv, capsys):
-    """What a script, or the parser of its command line, tells when it refuses one: words in a line."""
-    try:
-        code = main([str(word) for word in argv])
-    except SystemExit as stop:
-        code = stop.code
-    told = capsys.readouterr()
-    assert code == 2, told
-    assert "Traceback" not in told.err
-    return " ".join(re.sub("[─-╿]", " ", told.err).split())  # without frames
+    """The line in which a script refuses a command line."""
+    code = main([str(word) for word in argv])
+    told = capsys.readouterr().err
+    assert code == 2 and "Traceback" not in told, told
+    line = told.splitlines()[-1]  # below the bars of what was begun
+    assert re.match(r"\w+\.py: error: ", line), told
+    return line
 
 
 def stored(out):

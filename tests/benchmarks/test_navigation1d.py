@@ -41,7 +41,8 @@ def test_run_writes_results_table_and_pictures(benchmark, tmp_path, capsys):
         assert (row["task"], row["chunk"], row["iterations"]) == ("navigation", 32, 5)
     assert {row["seed"] for row in curved} == {0}
     assert {(row["prior"], row["sigma"]) for row in curved} == policies - {("regression", 0.0)}
-    assert {row["prior"] for row in curved if row["mean"] == "deployed"} == {"past", "preview"}
+    deployed = {row["prior"] for row in curved if row["mean"] == "deployed"}
+    assert deployed == {"history", "past", "preview"}
     assert {"versions", "hardware", "identity", "policies", "wall_time_s"} <= set(result["meta"])
     table = (out / "table.md").read_text()
     assert table in capsys.readouterr().out
@@ -61,29 +62,30 @@ def test_run_writes_results_table_and_pictures(benchmark, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    ("option", "value", "message"),
+    ("words", "message"),
     [
-        ("seeds", 0, "--seeds must be"),
-        ("nfe", 0, "--nfe must be"),
-        ("episodes", 0, "--episodes must be"),
-        ("chunk", 0, "--chunk must be"),
-        ("chunk", 64, "--chunk must be between 1 and 32, got 64"),
-        ("chunk", [4, 8], "this study has one --chunk"),
-        ("iterations", 0, "iterations must be at least 1"),
-        ("cold_probability", 2, "cold_probability"),
-        ("task", "lift", "the toy has demonstrations of its own: leave out --task"),
+        ("--seeds 0", "--seeds must be"),
+        ("--nfe 0", "--nfe must be"),
+        ("--episodes 0", "--episodes must be"),
+        ("--chunk 0", "--chunk must be"),
+        ("--chunk 64", "--chunk must be between 1 and 32, got 64"),
+        ("--chunk 4 8", "this study has one --chunk"),
+        ("--iterations 0", "iterations must be at least 1"),
+        ("--cold-probability 2", "cold_probability"),
+        ("--task lift --data mh", "demonstrations and an end of its own: leave out --data, --task"),
+        ("--play-on", "leave out --play-on"),
     ],
 )
-def test_bad_options_stop_before_any_work(benchmark, tmp_path, capsys, option, value, message):
+def test_bad_options_stop_before_any_work(benchmark, tmp_path, capsys, no_work, words, message):
     out = tmp_path / "runs" / "out"
-    told = refused(benchmark.main, command_line(**{option: value}, out=out), capsys)
+    told = refused(benchmark.main, [*words.split(), "--out", out], capsys)
     assert message in told
     assert not out.exists() and not (tmp_path / "runs" / "policies").exists()
 
 
 def test_a_training_that_diverges_ends_without_a_traceback(benchmark, tmp_path, capsys):
     out = tmp_path / "runs" / "out"
-    argv = command_line(learning_rate=1e30, iterations=40, save_every=10, prior="gaussian", out=out)
+    argv = command_line(learning_rate=1e30, iterations=40, save_every=10, prior="past", out=out)
     told = refused(benchmark.main, argv, capsys)
     assert told.startswith("navigation1d.py: error: ") and "nan" in told.lower()
     assert stored(out)["rows"] == [] and not (out / "table.md").exists()

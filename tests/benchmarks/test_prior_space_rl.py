@@ -3,33 +3,39 @@
 from __future__ import annotations
 
 import importlib
-import json
 import math
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+from torchrl.envs import UnaryTransform
 
-from tests.benchmarks.conftest import options
-from warmprior import Prior, WarmPriorActor
+from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
+from warmprior import WarmPriorActor
 
 pytest.importorskip("matplotlib")
-pytest.importorskip("tqdm")
+pytest.importorskip("tyro")
+
+from warmprior.experiments import grouped, parse, started
+from warmprior.experiments.prior_space import PRIOR_SPACE_PRESETS, prior_space_preset
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "prior_space_rl.py"
 TINY = {
     "iterations": 20,
-    "steps": 500,
-    "warmup": 200,
-    "updates": 1,
-    "evaluate-every": 300,
+    "rl__environment_steps": 500,
+    "rl__warmup_steps": 200,
+    "rl__updates": 1,
+    "rl__evaluate_every": 300,
     "episodes": 4,
-    "envs": 4,
+    "num_envs": 4,
+    "logger": "none",
+    "envs": 1,
 }
 
 
@@ -39,141 +45,189 @@ def benchmark():
 
 
 def unit(out, **extra):
-    values = {"preset": "unit", "out": out} | TINY | extra
-    words = []
-    for key, value in values.items():
-        words += [f"--{key}", *map(str, value if isinstance(value, list) else [value])]
-    return words
+    return command_line(**{"preset": "unit", "out": out} | TINY | extra)
 
 
-def stored(out):
-    return json.loads((out / "results.json").read_text())
+def read(words):
+    """The recipe of a command line."""
+    return parse(PRIOR_SPACE_PRESETS, words.split(), study="rl", preset=prior_space_preset)
 
 
-def is_png(path):
-    return path.read_bytes().startswith(b"\x89PNG")
+def agents(rows):
+    """The evaluations of every agent, in the order of the agents."""
+    return grouped(rows, lambda row: (row["seed"], row["algorithm"], row["prior"]))
+
+
+def rates(points, kind):
+    return [point["success_rate"] for point in points if point["evaluation"] == kind]
 
 
 def test_the_toy_with_both_algorithms(benchmark, tmp_path, capsys):
-    out = tmp_path / "out"
+    out = tmp_path / "runs" / "out"
     argv = unit(out, seeds=2, algorithm=["dsrl-na", "dsrl-sac"])
     assert benchmark.main(argv) == 0
     result = stored(out)
-    cells = [(row["algorithm"], row["prior"], row["seed"]) for row in result["rows"]]
-    assert cells == [(a, "past", seed) for seed in (0, 1) for a in ("dsrl-na", "dsrl-sac")]
-    for row in result["rows"]:
-        # All control steps, of at most 4 chunks of 8 actions beyond.
-        assert 500 <= row["environment_steps"] < 500 + 4 * 8
-        assert row["delta"] == 0.5 and row["episodes"] == 4 and row["chunk"] == 8
-        points = [
-            point
-            for point in result["curve"]
-            if all(point[key] == row[key] for key in ("algorithm", "prior", "seed"))
-        ]
+    found = agents(result["rows"])
+    algorithms = ("dsrl-na", "dsrl-sac")
+    assert list(found) == [(seed, a, "past") for seed in (0, 1) for a in algorithms]
+    for points in found.values():
         kinds = [point["evaluation"] for point in points]
         assert kinds == ["base", "greedy", "stochastic", "greedy", "stochastic"]
         steps = [point["environment_steps"] for point in points]
-        assert steps[0] == 0 and 300 <= steps[1] < 332 and steps[-1] == row["environment_steps"]
-        rates = [point["success_rate"] for point in points]
-        told = [row[k] for k in ("base_success", "final_success", "final_success_stochastic")]
-        assert told == [rates[0], rates[-2], rates[-1]]
-    assert result["meta"]["options"]["iterations"] == 20
-    assert result["meta"]["config"]["environment_steps"] == 500
-    assert {"versions", "hardware", "task", "wall_time_s"} <= set(result["meta"])
+        assert steps[0] == 0 and 300 <= steps[1] < 332
+        # All control steps, of at most 4 chunks of 8 actions beyond.
+        assert 500 <= steps[-1] < 500 + 4 * 8
+        for point in points:
+            told = {"task": "navigation", "delta": 0.5, "episodes": 4, "chunk": 8, "nfe": 2}
+            assert told.items() <= point.items()
+            assert point["success_rate"] == point["successes"] / 4
+    # Both algorithms start from the same frozen policy.
+    for seed in (0, 1):
+        assert rates(found[seed, "dsrl-na", "past"], "base") == rates(
+            found[seed, "dsrl-sac", "past"], "base"
+        )
+    meta = result["meta"]
+    assert meta["identity"]["recipe"]["training"]["iterations"] == 20
+    assert meta["identity"]["recipe"]["rl"]["environment_steps"] == 500
+    assert {"versions", "hardware", "problems", "wall_time_s"} <= set(meta)
+    assert meta["problems"][0]["task"] == "navigation"
     # The frozen policy of one prior and seed is trained once, as long as it was asked for.
-    policies = sorted(path.name for path in (out / "policies").iterdir())
-    assert policies == ["past-h8-seed0", "past-h8-seed1"]
-    assert (out / "policies" / "past-h8-seed0" / "policy_000020").is_dir()
-    for picture in ("curves", "success_dsrl-na", "success_dsrl-sac"):
+    frozen = sorted((out.parent / "policies").iterdir())
+    assert [path.name[:26] for path in frozen] == [f"navigation-toy-past-seed{i}-" for i in (0, 1)]
+    assert all((path / "policy_000020").is_dir() for path in frozen)
+    for picture in ("curves", "success"):
         assert is_png(out / f"{picture}.png")
     table = (out / "table.md").read_text()
     assert table in capsys.readouterr().out and table.count("\n") == 2 + 2
-    assert "| DSRL-NA, WP-Past (2 seeds) | 0.5 |" in table
+    for algorithm in algorithms:
+        start = f"| {algorithm.upper()}, WP-Past (2 seeds) | 0.5 |"
+        (line,) = (line for line in table.splitlines() if line.startswith(start))
+        means = [float(cell.split("±")[0]) for cell in line.split("|")[4:7]]
+        each = [found[seed, algorithm, "past"] for seed in (0, 1)]
+        for mean, kind in zip(means, ("base", "greedy", "stochastic"), strict=True):
+            last = [rates(points, kind)[-1] for points in each]
+            assert mean == pytest.approx(100 * sum(last) / 2, abs=0.051)
 
     # A folder with results is left alone, unless they are to be continued: here there is nothing to do.
-    assert benchmark.main(argv) == 2
-    assert "--resume" in capsys.readouterr().err
-    before = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
+    assert "--resume" in refused(benchmark.main, argv, capsys)
+    before = written(out.parent)
     assert benchmark.main(["--resume", "--out", str(out)]) == 0
-    assert before == {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
-    again = stored(out)
-    assert (again["rows"], again["curve"]) == (result["rows"], result["curve"])
-    assert benchmark.main(["--resume", "--out", str(out), "--delta", "0.7"]) == 2
-    assert "was started with no --delta" in capsys.readouterr().err
+    assert written(out.parent) == before
+    assert stored(out)["rows"] == result["rows"]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--num-envs 8", "was started with --num-envs 4: leave these out"),
+        ("--seeds 2 --prior gaussian", "was started with --prior past, --seeds 1"),
+        ("--rl.updates 2", "was started with --rl.updates 1"),
+        ("--rl.delta 0.7", "was started with no --rl.delta"),
+    ],
+)
+def test_a_continued_run_has_the_options_it_began_with(tmp_path, words, message):
+    begun = read(" ".join(unit(tmp_path, seeds=1)))
+    with started(begun, "rl"):
+        pass
+    resume = f"--resume --out {tmp_path}"
+    # Those of the folder, whatever the preset that is the default.
+    again = read(resume)
+    assert again == replace(begun, run=replace(begun.run, resume=True, envs=None))
+    with pytest.raises(ValueError, match=message):
+        read(f"{resume} {words}")
 
 
 def test_resume_goes_on_where_it_stopped(benchmark, tmp_path, monkeypatch):
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     assert benchmark.main(unit(whole, seeds=1)) == 0
-    expected = stored(whole)["curve"]
+    expected = stored(whole)["rows"]
+    training = importlib.import_module("warmprior.rl.training")
+    evaluate, calls = training.evaluate, []
 
-    class Interrupted(benchmark.PriorSpaceTraining):
-        def _evaluate(self, env, policies):
-            if self.steps > 350:
-                raise KeyboardInterrupt
-            super()._evaluate(env, policies)
+    def interrupted(*args, **options):
+        calls.append(None)
+        if len(calls) > 3:  # the frozen policy, and both agents after 300 steps
+            raise KeyboardInterrupt
+        return evaluate(*args, **options)
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(benchmark, "PriorSpaceTraining", Interrupted)
+        patch.setattr(training, "evaluate", interrupted)
         benchmark.main(unit(cut, seeds=1))
-    assert not (cut / "results.json").exists()
+    assert len(calls) == 4 and not (cut / "results.json").exists()
     assert benchmark.main(["--resume", "--out", str(cut)]) == 0
-    curve = stored(cut)["curve"]
-    assert len(curve) == len(expected) == 5 and curve[:3] == expected[:3]
-    assert stored(cut)["rows"][0]["environment_steps"] >= 500
+    rows = stored(cut)["rows"]
+    assert len(rows) == len(expected) == 5 and rows[:3] == expected[:3]
+    assert rows[-1]["environment_steps"] >= 500
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--preset unit --delta 0", "delta must be a finite number > 0, got 0.0"),
-        ("--preset unit --delta -1", "delta must be a finite number > 0"),
-        ("--preset unit --warmup 20000", r"warmup_steps (20000) exceed environment_steps"),
-        ("--preset unit --updates 0", "updates must be at least 1"),
-        ("--preset unit --episodes 0", "evaluation_episodes must be at least 1"),
-        ("--preset unit --seeds 0", "--seeds must be at least 1"),
-        ("--preset unit --envs 0", "--envs must be at least 1"),
+        ("--preset unit --rl.delta 0", "delta must be a finite number > 0, got 0.0"),
+        ("--preset unit --rl.delta -1", "delta must be a finite number > 0"),
+        (
+            "--preset unit --rl.warmup-steps 20000",
+            "warmup_steps (20000) exceed environment_steps (12000)",
+        ),
+        ("--preset unit --rl.updates 0", "updates must be"),
+        ("--preset unit --rl.gamma 2", "gamma must lie in (0, 1], got 2.0"),
+        ("--preset unit --episodes 0", "--episodes must be between 1 and"),
+        ("--preset unit --seeds 0", "--seeds must be between 1 and"),
+        ("--preset unit --envs 0", "--envs must be between 1 and"),
+        ("--preset unit --num-envs 0", "--num-envs must be between 1 and"),
+        ("--preset unit --threads 0", "--threads must be between 1 and"),
         ("--preset unit --iterations 0", "iterations"),
+        ("--preset unit --nfe 1 2", "this study has one --nfe, got 1 2"),
+        ("--preset unit --chunk 4 8", "this study has one --chunk, got 4 8"),
         ("--preset unit --device nowhere", "--device nowhere does not work here"),
         ("--preset quick --task navigation", "navigation and --preset unit belong together"),
         ("--preset unit --task can", "navigation and --preset unit belong together"),
         ("--preset unit --horizon 9", "a time limit of its own: leave out --horizon"),
+        ("--preset unit --play-on", "leave out --play-on"),
         ("--preset unit --prior regression", "--prior regression is no flow"),
         ("--preset unit --prior nobodys", "unknown prior 'nobodys'"),
-        ("--horizon 0", "--horizon must be at least 1, got 0"),
+        ("--horizon 0", "--horizon must be between 1 and"),
         (
             "--preset unit --data mh",
             "the toy has demonstrations and a time limit of its own: leave out --data",
         ),
-        ("--preset unit --demonstrations 9 --compile", "leave out --demonstrations, --compile"),
+        ("--preset unit --demonstrations 9", "leave out --demonstrations"),
+        ("--preset unit --download", "leave out --download"),
         ("--preset quick --run {tmp}", "it has no results.json; name a run of robomimic.py"),
         ("--preset quick --dataset {tmp}/none.hdf5", "no such file"),
+        ("--preset quick --task tool_hang", "there is no scripted expert for tool_hang"),
+        ("--preset paper", "has hyper-parameters per task: add the --task"),
+        ("--preset paper --dataset {tmp}/x.hdf5", "add the --task"),
+        ("--preset nobodys", "--preset must be one of quick, unit, paper"),
     ],
 )
-def test_bad_options_stop_before_any_work(benchmark, tmp_path, capsys, words, message):
+def test_bad_options_stop_before_any_work(benchmark, tmp_path, capsys, no_work, words, message):
     out = tmp_path / "out"
-    argv = [*words.format(tmp=tmp_path).split(), "--out", str(out)]
-    assert benchmark.main(argv) == 2
-    told = capsys.readouterr().err
-    assert message in told and told.startswith("prior_space_rl.py: error: ")
-    assert not list(tmp_path.rglob("*.safetensors"))
+    (tmp_path / "x.hdf5").touch()
+    told = refused(benchmark.main, [*words.format(tmp=tmp_path).split(), "--out", out], capsys)
+    assert message in told
+    assert not list(tmp_path.rglob("*.safetensors")) and not (out / "results.json").exists()
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--algorithm dsrl-xy", "invalid choice: 'dsrl-xy'"),
-        ("--task tool_hang", "invalid choice: 'tool_hang'"),
-        ("--detla 0.5", "unrecognized arguments: --detla"),
+        ("--algorithm dsrl-xy", "invalid choice 'dsrl-xy'"),
+        ("--rl.detla 0.5", "--rl.detla"),
+        ("--delta 0.5", "--delta"),  # the agents' own options have their prefix
+        ("--rl.evaluation-episodes 3", "--rl.evaluation-episodes"),  # told by --episodes
+        ("--rl.seed 3", "--rl.seed"),
     ],
 )
-def test_unknown_choices(benchmark, capsys, words, message):
+def test_unknown_choices(benchmark, tmp_path, capsys, words, message):
     with pytest.raises(SystemExit) as stop:
-        benchmark.main(words.split())
-    assert stop.value.code == 2 and message in capsys.readouterr().err
+        benchmark.main([*words.split(), "--out", str(tmp_path / "out")])
+    told = capsys.readouterr()
+    assert stop.value.code == 2 and message in told.err and not told.out
+    assert not (tmp_path / "out").exists()
 
 
-def test_papers_recipes(benchmark):
+def test_papers_recipes():
     """DSRL's table of hyper-parameters; its choice for Transport is SAC."""
     known = {
         "lift": (0.99, 30, 24_000, 2048, 300, 4, 1.5),
@@ -182,37 +236,38 @@ def test_papers_recipes(benchmark):
         "transport": (0.99, 20, 640_000, 128, 800, 8, 1.0),
     }
     for task, values in known.items():
-        args = benchmark.make_parser().parse_args(["--preset", "paper", "--task", task])
-        budget, config = benchmark.make_config(args)
-        priors = {name: Prior.make(name, budget.chunk) for name in budget.priors}
-        agents = {n: budget.agent(config, "dsrl-na", prior, 0) for n, prior in priors.items()}
-        base = agents["gaussian"].delta or 1.5
+        recipe = read(f"--preset paper --task {task} --download")
+        priors = {prior.name: prior for prior in recipe.sources.priors()}
+        assert tuple(priors) == ("gaussian", "past", "preview")
+        chunk = priors["past"].chunk_length
+        made = {name: recipe.agent(prior, "dsrl-na", 0) for name, prior in priors.items()}
+        base, config = made["gaussian"].delta or 1.5, made["past"]
         found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
-        assert (*found, budget.horizon, budget.chunk, base) == values
-        assert agents["past"].delta is None  # the paper's 0.5
-        assert budget.agent(config, "dsrl-sac", priors["past"], 3).seed == 3
+        assert (*found, recipe.agents.horizon, chunk, base) == values
+        assert made["past"].delta is None  # the paper's 0.5
+        other = recipe.agent(priors["past"], "dsrl-sac", 3)
+        assert other.seed == 3 and other.algorithm == "dsrl-sac" and other.backup_entropy
+        assert not config.backup_entropy
         assert (config.alpha_init, config.tau, config.batch_size) == (1.0, 0.005, 256)
-        assert budget.priors == ("gaussian", "past", "preview")
-        expected = ["dsrl-na", "dsrl-sac"] if task == "transport" else ["dsrl-na"]
-        assert benchmark.algorithms(args) == expected
-    args = benchmark.make_parser().parse_args(
-        ["--preset", "paper", "--task", "transport", "--delta", "0.7"]
-    )
-    budget, config = benchmark.make_config(args)
-    for name in ("gaussian", "past"):
-        prior = Prior.make(name, 8)
-        assert budget.agent(config, "dsrl-na", prior, 0).delta == 0.7
-    args = benchmark.make_parser().parse_args(["--preset", "paper", "--dataset", "x.hdf5"])
-    with pytest.raises(ValueError, match=r"add the --task of --dataset x.hdf5"):
-        benchmark.make_config(args)
+        assert (config.nfe, config.evaluation_episodes) == (1, 200)
+        expected = ("dsrl-na", "dsrl-sac") if task == "transport" else ("dsrl-na",)
+        assert recipe.agents.algorithm == expected
+    recipe = read("--preset paper --task transport --download --rl.delta 0.7 --episodes 3 --nfe 9")
+    for prior in recipe.sources.priors():
+        config = recipe.agent(prior, "dsrl-na", 0)
+        assert (config.delta, config.evaluation_episodes, config.nfe) == (0.7, 3, 9)
+    # Options of the command line stand above those of the task.
+    assert read("--preset paper --task square --rl.gamma 0.9").rl.gamma == 0.9
 
 
-def test_quick_pays_for_solving_the_task(benchmark):
+def test_quick_pays_for_solving_the_task():
     """The entropy bonus of a decision must not exceed what its control steps cost."""
-    budget, config = benchmark.make_config(benchmark.make_parser().parse_args(["--task", "lift"]))
-    bonus = config.alpha_init * budget.chunk * 7 * math.log(2)  # uniform in units of the box
-    assert bonus < config.reward_offset * budget.chunk
-    assert (budget.horizon, budget.pretraining.demonstrations["ph"]) == (90, 5)
+    recipe = read("--task lift")
+    chunk = recipe.sources.chunk[0]
+    bonus = recipe.rl.alpha_init * chunk * 7 * math.log(2)  # uniform in units of the box
+    assert bonus < recipe.rl.reward_offset * chunk
+    assert (recipe.agents.horizon, recipe.data.count("ph")) == (90, 5)
+    assert read("") == recipe  # lift is the default
 
 
 def test_a_training_that_diverges_leaves_the_others_alone(benchmark, tmp_path, capsys, monkeypatch):
@@ -224,16 +279,17 @@ def test_a_training_that_diverges_leaves_the_others_alone(benchmark, tmp_path, c
 
     monkeypatch.setattr(benchmark, "PriorSpaceTraining", Diverging)
     out = tmp_path / "out"
-    assert benchmark.main(unit(out, seeds=2, steps=200, warmup=100)) == 2
-    assert "error: dsrl-na past, seed 0: loss_qvalue=nan" in capsys.readouterr().err
-    assert [row["seed"] for row in stored(out)["rows"]] == [1]
-    assert is_png(out / "curves.png") and (out / "table.md").exists()
+    argv = unit(out, seeds=2, rl__environment_steps=200, rl__warmup_steps=100)
+    told = refused(benchmark.main, argv, capsys)
+    assert "error: dsrl-na past, seed 0: loss_qvalue=nan" in told
+    assert {row["seed"] for row in stored(out)["rows"]} == {1}
+    assert is_png(out / "curves.png") and "(1 seed)" in (out / "table.md").read_text()
 
 
 def test_resume_without_a_run(benchmark, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert benchmark.main(["--resume"]) == 2
-    assert "there is no run in runs/rl-lift-ph-quick" in capsys.readouterr().err
+    told = refused(benchmark.main, ["--resume"], capsys)
+    assert "there is no run in runs/rl-lift-ph-quick" in told
     assert not list(tmp_path.iterdir())
 
 
@@ -249,23 +305,52 @@ def finished(dataset, tmp_path_factory):
     return out
 
 
+SHORT = {
+    "rl__environment_steps": 60,
+    "rl__warmup_steps": 30,
+    "rl__evaluate_every": 60,
+    "episodes": 1,
+    "num_envs": 1,
+}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--task can", "is of lift, not of can"),
+        ("--preset unit", "is of lift, not of navigation"),
+        ("--prior preview", "has policies of gaussian, past, but none of preview"),
+        ("--chunk 4", "--run brings its policies and their data: leave out --chunk"),
+        ("--sigma 0.2", "--run brings its policies and their data: leave out --sigma"),
+        ("--data mh", "leave out --data"),
+        ("--iterations 3", "leave out --iterations"),
+        ("--hidden-dim 3", "leave out --hidden-dim"),
+    ],
+)
+def test_what_a_finished_run_does_not_have(
+    benchmark, finished, tmp_path, capsys, no_work, words, message
+):
+    argv = command_line(run=finished, out=tmp_path / "out", **SHORT)
+    assert message in refused(benchmark.main, [*argv, *words.split()], capsys)
+    assert not list(tmp_path.rglob("*.safetensors"))
+
+
 def test_policies_of_a_finished_run(benchmark, finished, tmp_path, capsys):
     """They bring task, data and normaliser; in the simulator, in worker processes."""
-    before = {path: path.stat().st_mtime_ns for path in finished.parent.rglob("*.safetensors")}
+    before = written(finished.parent)
     out = tmp_path / "agents"
-    short = {"steps": 60, "warmup": 30, "evaluate-every": 60, "episodes": 1, "envs": 1}
-    words = [str(word) for key, value in short.items() for word in (f"--{key}", value)]
-    run = ["--run", str(finished), "--out", str(out), "--horizon", "20"]
-    assert benchmark.main([*run, *words, "--seeds", "2", "--prior", "past"]) == 0
+    argv = command_line(run=finished, out=out, horizon=20, seeds=2, prior="past", **SHORT)
+    assert benchmark.main(argv) == 0
     assert "--run has 1 seeds of past: agent 1 shares a policy" in capsys.readouterr().out
     result = stored(out)
-    assert result["meta"]["task"] == "lift" and result["meta"]["horizon"] == 20
-    row, other = result["rows"]
-    assert other["seed"] == 1
+    assert result["meta"]["problems"][0]["task"] == "lift"
+    assert result["meta"]["identity"]["recipe"]["agents"]["horizon"] == 20
+    first, second = agents(result["rows"]).values()
+    assert {row["seed"] for row in second} == {1}
+    row = first[-1]
     assert row["prior"] == "past" and row["chunk"] == 8 and 60 <= row["environment_steps"] < 68
     assert is_png(out / "curves.png")
-    after = {path: path.stat().st_mtime_ns for path in finished.parent.rglob("*.safetensors")}
-    assert after == before  # nothing was trained
+    assert written(finished.parent) == before  # nothing was trained
 
     # An agent goes on with the very policy it began with, whatever has become of the run's.
     for folder in (finished.parent / "policies").glob("*/policy_*"):
@@ -275,58 +360,51 @@ def test_policies_of_a_finished_run(benchmark, finished, tmp_path, capsys):
     assert benchmark.main(["--resume", "--out", str(out)]) == 0
     assert stored(out)["rows"] == result["rows"]
     # Started anew, the folder's agent is not passed off as one of the present policy.
-    (out / "results.json").unlink()
-    assert benchmark.main([*run, *words, "--seeds", "2", "--prior", "past"]) == 2
-    assert "belongs to another policy" in capsys.readouterr().err
-
-    other = ["--run", str(finished), "--out", str(tmp_path / "other")]
-    for extra, message in {
-        ("--task", "can"): "is of lift, not of can",
-        ("--prior", "preview"): "has policies of gaussian, past, but none of preview",
-        ("--chunk", "4"): "--run brings its policies and their data: leave out --chunk",
-        ("--data", "mh"): "leave out --data",
-    }.items():
-        assert benchmark.main([*other, *extra]) == 2
-        assert message in capsys.readouterr().err
+    for name in ("options", "results"):
+        (out / f"{name}.json").unlink()
+    assert "belongs to another policy" in refused(benchmark.main, argv, capsys)
 
 
 @pytest.mark.slow
 def test_the_toy_is_solved_in_the_benchmarks_budget(benchmark, tmp_path):
     out = tmp_path / "out"
     assert benchmark.main(["--preset", "unit", "--out", str(out)]) == 0
-    rows = stored(out)["rows"]
-    assert [row["seed"] for row in rows] == [0, 1, 2]
-    for row in rows:
-        assert row["base_success"] <= 0.6 and row["final_success"] >= 0.9
+    found = agents(stored(out)["rows"])
+    assert [seed for seed, _, _ in found] == [0, 1, 2]
+    for points in found.values():
+        assert rates(points, "base")[0] <= 0.6 and rates(points, "greedy")[-1] >= 0.9
 
 
 @pytest.mark.slow
-def test_the_toy_is_solved_for_its_reward(benchmark, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("factor", "most"), [(-1.0, 0.05), (0.0, 0.6)])
+def test_the_toy_is_solved_for_its_reward(benchmark, tmp_path, monkeypatch, factor, most):
     """With the reward negated the agent keeps away from the goal, and without one it finds no way there."""
-    sign = {"-": -1.0, "0": 0.0}
-    for name, factor in sign.items():
+    make = benchmark.agent_environment
 
-        class Paid(benchmark.PriorSpaceTraining):
-            def _transitions(self, data, factor=factor):
-                transitions = super()._transitions(data)
-                transitions["next", "reward"] *= factor
-                return transitions
+    def paying(recipe, actor):
+        make_env = make(recipe, actor)
 
-        monkeypatch.setattr(benchmark, "PriorSpaceTraining", Paid)
-        out = tmp_path / name
-        assert benchmark.main(["--preset", "unit", "--seeds", "1", "--out", str(out)]) == 0
-        (row,) = stored(out)["rows"]
-        assert row["final_success"] <= (0.05 if factor else 0.6)
+        def make_paying(seed):
+            paid = UnaryTransform(["reward"], ["reward"], fn=lambda reward: factor * reward)
+            return make_env(seed).append_transform(paid)
+
+        return make_paying
+
+    monkeypatch.setattr(benchmark, "agent_environment", paying)
+    out = tmp_path / "out"
+    assert benchmark.main(["--preset", "unit", "--seeds", "1", "--out", str(out)]) == 0
+    (points,) = agents(stored(out)["rows"]).values()
+    assert rates(points, "greedy")[-1] <= most
 
 
 @pytest.mark.slow
 def test_killed_and_resumed(benchmark, tmp_path):
     """SIGKILL in the middle of an agent's training, from a process of its own."""
     whole, cut = tmp_path / "whole", tmp_path / "cut"
-    assert benchmark.main(unit(whole, seeds=1, steps=3_000)) == 0
-    expected = stored(whole)["curve"]
+    assert benchmark.main(unit(whole, seeds=1, rl__environment_steps=3_000)) == 0
+    expected = stored(whole)["rows"]
 
-    argv = [sys.executable, str(SCRIPT), *unit(cut, seeds=1, steps=3_000)]
+    argv = [sys.executable, str(SCRIPT), *unit(cut, seeds=1, rl__environment_steps=3_000)]
     process = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     second = cut / "dsrl-na-past-seed0" / "buffer" / "000001.safetensors"
     deadline = time.monotonic() + 300
@@ -337,9 +415,12 @@ def test_killed_and_resumed(benchmark, tmp_path):
     assert second.exists() and not (cut / "results.json").exists()
 
     assert benchmark.main(["--resume", "--out", str(cut)]) == 0
-    curve = stored(cut)["curve"]
-    kinds = [(row["evaluation"], row["environment_steps"] // 300) for row in curve]
-    assert kinds == [(row["evaluation"], row["environment_steps"] // 300) for row in expected]
+    rows = stored(cut)["rows"]
+
+    def places(rows):
+        return [(row["evaluation"], row["environment_steps"] // 300) for row in rows]
+
+    assert places(rows) == places(expected)
     # What was saved before the kill stands as in the run that was never interrupted.
-    assert curve[:3] == expected[:3]
-    assert 3_000 <= stored(cut)["rows"][0]["environment_steps"] < 3_032
+    assert rows[:3] == expected[:3]
+    assert 3_000 <= rows[-1]["environment_steps"] < 3_032

@@ -22,7 +22,7 @@ from warmprior import PastPrior
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
 
-from warmprior.experiments import PRESETS, Row, Store, parse, started
+from warmprior.experiments import PRESETS, Row, parse, started
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 
@@ -169,7 +169,7 @@ def test_chunk_length_study(scripts, dataset, tmp_path):
     ],
 )
 def test_bad_options_are_named(
-    scripts, finished, dataset, validation, capsys, no_training, script, extra, message
+    scripts, finished, dataset, validation, capsys, no_work, script, extra, message
 ):
     out = finished.parent / f"bad-{script}-{next(iter(extra))}"
     values = {"out": out} if script == "chunking" else measured(out, validation)
@@ -187,14 +187,6 @@ def test_a_folder_that_is_no_finished_run_is_named(scripts, tmp_path, capsys, co
     assert "robomimic.py" in refused(scripts["curvature"].main, argv, capsys)
 
 
-@pytest.fixture
-def no_training(monkeypatch):
-    def train(*args, **options):
-        pytest.fail("something was trained")
-
-    monkeypatch.setattr(Store, "train", train)
-
-
 @pytest.mark.parametrize("script", ["sigma", "curvature"])
 @pytest.mark.parametrize(
     ("extra", "message"),
@@ -208,7 +200,7 @@ def no_training(monkeypatch):
     ],
 )
 def test_what_cannot_be_measured_is_named_before_any_training(
-    scripts, dataset, validation, tmp_path, capsys, no_training, script, extra, message
+    scripts, dataset, validation, tmp_path, capsys, no_work, script, extra, message
 ):
     if extra.get("validation") == "square":
         path = tmp_path / "other.hdf5"
@@ -219,7 +211,7 @@ def test_what_cannot_be_measured_is_named_before_any_training(
 
 
 def test_policies_without_a_flow_have_no_curvature(
-    scripts, dataset, validation, tmp_path, capsys, no_training
+    scripts, dataset, validation, tmp_path, capsys, no_work
 ):
     argv = options(dataset, prior="regression", **measured(tmp_path / "out", validation))
     told = refused(scripts["curvature"].main, argv, capsys)

@@ -47,7 +47,8 @@ def test_writes_every_key(throughput, tmp_path):
     assert results.keys() == KEYS
     assert results["windows_per_second"] > 0
     assert results["env_over_robosuite"] is None
-    assert {"versions", "cpu", "threads", "date"} <= results["meta"].keys()
+    assert {"python", "torch", "warmprior"} <= results["meta"]["versions"].keys()
+    assert {"cpu", "torch_threads", "date"} <= results["meta"]["hardware"].keys()
 
 
 def test_ratio_of_known_times(throughput):

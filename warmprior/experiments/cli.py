@@ -78,7 +78,7 @@ def parse[R: Recipe](
     if recipe.run.resume:
         base = _stored(type(recipe), out, study)
         recipe = read(base)
-        changed = sorted(differences(record(recipe), record(base)))
+        changed = sorted(differences(type(recipe), record(recipe), record(base)))
         if changed:
             raise ValueError(
                 f"{out} was started with {', '.join(changed)}: leave these out, or choose another --out"
@@ -86,6 +86,8 @@ def parse[R: Recipe](
     generates = recipe.data.dataset is None and not recipe.data.download
     if recipe.data.demonstrations != base.data.demonstrations and not generates:
         raise ValueError("--demonstrations says how many to generate: leave it out with a file")
+    if recipe.sources.sigma != base.sources.sigma:
+        recipe.sources.check_sigma()
     name = recipe.run.logger
     if name in ("tensorboard", "wandb") and find_spec(name) is None:
         raise ImportError(f"--logger {name} needs the package {name}: pip install it")

@@ -15,7 +15,6 @@ from warmprior.envs.description import environment_parts
 from warmprior.experiments.navigation1d import NAVIGATION_PRESETS
 from warmprior.experiments.recipe import (
     PRESETS,
-    DataOptions,
     EvaluationOptions,
     Flat,
     PolicyOptions,
@@ -24,6 +23,7 @@ from warmprior.experiments.recipe import (
     check_counts,
     refuse_ignored,
 )
+from warmprior.experiments.store import finished_problem
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.rl import PriorAnchor, PriorSpaceConfig
@@ -105,13 +105,9 @@ class PriorSpaceRecipe(Recipe):
         self.check_single(problem=True, chunk=True, nfe=True)
         base = prior_space_preset(self)
         if self.policies.run is not None:
-            told, parts = (
-                "--run brings its policies and their data",
-                ["data", "network", "training"],
-            )
-            refuse_ignored(
-                replace(self, data=replace(self.data, task=base.data.task)), base, parts, told
-            )
+            told = "--run brings its policies and their data"
+            parts = ["data", "network", "training", "sources"]
+            refuse_ignored(self, base, parts, told, but=["task", "prior"])
         elif self.is_toy:
             told = "the toy has demonstrations and a time limit of its own"
             refuse_ignored(self, base, ["data"], told)
@@ -130,8 +126,6 @@ class PriorSpaceRecipe(Recipe):
                 )
             for algorithm in self.agents.algorithm:
                 self.agent(prior, algorithm, 0)
-        if self.run.preset == "paper" and not self.data.task:
-            raise ValueError("--preset paper has hyper-parameters per task: add the --task")
 
     def agent(self, prior: Prior, algorithm: str, seed: int) -> PriorSpaceConfig:
         """The recipe of one agent.
@@ -198,7 +192,6 @@ _TOY, _QUICK, _PAPER = NAVIGATION_PRESETS["quick"], PRESETS["quick"], PRESETS["p
 PRIOR_SPACE_PRESETS: dict[str, PriorSpaceRecipe] = {
     # Lift from a weak policy, WP-Past against the base, two seeds: half an hour.
     "quick": PriorSpaceRecipe(
-        data=DataOptions(task=("lift",)),
         network=_QUICK.network,
         training=_QUICK.training,
         sources=SourceOptions(prior=("gaussian", "past")),
@@ -220,7 +213,6 @@ PRIOR_SPACE_PRESETS: dict[str, PriorSpaceRecipe] = {
     ),
     # The navigation toy with a goal, three seeds: under two minutes.
     "unit": PriorSpaceRecipe(
-        data=DataOptions(task=(TOY,)),
         network=_TOY.network,
         training=replace(_TOY.training, iterations=800, save_every=800),
         sources=SourceOptions(prior=("past",)),
@@ -256,6 +248,9 @@ PRIOR_SPACE_PRESETS: dict[str, PriorSpaceRecipe] = {
 }
 """Budgets of comparisons of agents."""
 
+_TASKS = {"quick": ("lift",), "unit": (TOY,)}
+"""What a preset is for where no task, file or run is named."""
+
 _BY_TASK: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
     # Weak policies: solved in 0.3 to 0.8 of the episodes.
     ("quick", "lift"): {
@@ -285,10 +280,19 @@ def prior_space_preset(asked: PriorSpaceRecipe) -> PriorSpaceRecipe:
 
     Args:
         asked: names both.
+
+    Raises:
+        ValueError: if the preset needs a task and none is known.
     """
-    base = PRIOR_SPACE_PRESETS[asked.run.preset]
-    task = next(iter(asked.data.task or base.data.task), "")
-    if asked.run.preset == "unit":
-        task = TOY
-    changed = _with(base, **_BY_TASK.get((asked.run.preset, task), {}))
-    return _with(changed, data={"task": (task,) if task else ()})
+    name, given, run = asked.run.preset, asked.data.task, asked.policies.run
+    if name == "unit":
+        given = _TASKS[name]
+    elif run is not None:
+        given = given or (finished_problem(run)["task"],)
+    elif asked.data.dataset is None:
+        given = given or _TASKS.get(name, ())
+    if name == "paper" and not given:
+        raise ValueError("--preset paper has hyper-parameters per task: add the --task")
+    task = next(iter(given), "")
+    changed = _with(PRIOR_SPACE_PRESETS[name], **_BY_TASK.get((name, task), {}))
+    return _with(changed, data={"task": given})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args, get_type_hints
@@ -178,11 +178,20 @@ class SourceOptions:
             if not getattr(self, name):
                 raise ValueError(f"--{name} needs at least one value")
 
+    def check_sigma(self) -> None:
+        """Refuse a ``sigma`` that no prior takes.
+
+        Raises:
+            ValueError: naming them.
+        """
+        if self.sigma and not any(Prior.find(name).takes("sigma") for name in self.prior):
+            raise ValueError(f"--sigma belongs to warm priors; {', '.join(self.prior)} take none")
+
     def priors(self) -> list[Prior]:
         """All of them, chunk length by chunk length.
 
         Raises:
-            ValueError: if there is no such prior, an argument is out of range, or ``sigma`` has no effect.
+            ValueError: if there is no such prior, or an argument is out of range.
 
         Examples:
             >>> [p.describe() for p in SourceOptions(("gaussian", "past"), sigma=(1.0, 0.5)).priors()]
@@ -191,8 +200,6 @@ class SourceOptions:
         check_counts(self, "chunk")
         names = dict.fromkeys(self.prior)
         noisy = {name: Prior.find(name).takes("sigma") for name in names}
-        if self.sigma and not any(noisy.values()):
-            raise ValueError(f"--sigma belongs to warm priors; {', '.join(names)} take none")
         return [
             Prior.make(name, chunk, sigma=sigma, cold_probability=self.cold_probability)
             for chunk in sorted(set(self.chunk))
@@ -462,14 +469,23 @@ def restore[T](kind: type[T], tree: dict[str, Any]) -> T:
     return kind(**values)
 
 
-def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> Iterable[str]:
-    """The options in which two records differ, as the second has them on the command line."""
+def differences(kind: type, mine: dict[str, Any], theirs: dict[str, Any]) -> Iterator[str]:
+    """The options in which two records differ, as the second has them on the command line.
+
+    Args:
+        kind: of the dataclass.
+        mine: what :func:`record` gave.
+        theirs: likewise.
+    """
+    hints, plain = get_type_hints(kind, include_extras=True), get_type_hints(kind)
     for name in mine.keys() | theirs.keys():
         value, other = mine.get(name), theirs.get(name)
         if value == other:
             continue
         if isinstance(value, dict) and isinstance(other, dict):
-            yield from differences(value, other)
+            flat = Flat in getattr(hints[name], "__metadata__", ())
+            for told in differences(plain[name], value, other):
+                yield told if flat else told.replace("--", f"--{name}.", 1)
             continue
         option = "--" + name.replace("_", "-")
         if other is None or other is False:
@@ -480,7 +496,9 @@ def differences(mine: dict[str, Any], theirs: dict[str, Any]) -> Iterable[str]:
             yield f"{option} {' '.join(map(str, other)) if isinstance(other, list) else other}"
 
 
-def refuse_ignored(recipe: Recipe, base: Recipe, parts: Iterable[str], told: str) -> None:
+def refuse_ignored(
+    recipe: Recipe, base: Recipe, parts: Iterable[str], told: str, *, but: Iterable[str] = ()
+) -> None:
     """Refuse options that were given and would have no effect.
 
     Args:
@@ -489,6 +507,9 @@ def refuse_ignored(recipe: Recipe, base: Recipe, parts: Iterable[str], told: str
         parts: of the tree, that have no effect.
         told: why.
 
+    Keyword Args:
+        but: options of theirs that have an effect.
+
     Raises:
         ValueError: naming the options.
     """
@@ -496,7 +517,7 @@ def refuse_ignored(recipe: Recipe, base: Recipe, parts: Iterable[str], told: str
         name
         for part in parts
         for name, value in record(getattr(recipe, part)).items()
-        if value != record(getattr(base, part))[name]
+        if value != record(getattr(base, part))[name] and name not in but
     }
     if given:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(given))

@@ -30,7 +30,7 @@ from warmprior.training.threads import torch_threads
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms import MeanObservation, policy_transforms
 
-__all__ = ["Store", "finished_policies"]
+__all__ = ["Store", "finished_policies", "finished_problem"]
 
 Losses = list[tuple[int, float]]
 
@@ -202,6 +202,31 @@ class Store:
         return get_logger(self.run.logger, logger_name=str(self.logs), experiment_name=name)
 
 
+def _facts_of(run: Path) -> dict[str, Any]:
+    """What the results of a finished comparison tell about it."""
+    path = run / "results.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"--run {run}: it has no results.json; name a run of robomimic.py")
+    stored = read_json(path)
+    meta = stored.get("meta") if isinstance(stored, dict) else None
+    if not (isinstance(meta, dict) and {"policies", "problems"} <= meta.keys()):
+        raise ValueError(f"{path} does not say where its policies lie: run robomimic.py again")
+    return meta
+
+
+def finished_problem(run: Path) -> dict[str, Any]:
+    """Facts of the (first) problem of a finished comparison.
+
+    Args:
+        run: its folder.
+
+    Raises:
+        FileNotFoundError: if there are no results.
+        ValueError: if they are of something else.
+    """
+    return _facts_of(run)["problems"][0]
+
+
 def finished_policies(
     run: Path, device: str = "cpu"
 ) -> tuple[dict[str, Any], dict[str, list[WarmPriorActor]]]:
@@ -218,12 +243,7 @@ def finished_policies(
         FileNotFoundError: if there are no results, or a policy is missing.
         ValueError: if the results are of something else, or of several problems or recipes.
     """
-    path = run / "results.json"
-    if not path.is_file():
-        raise FileNotFoundError(f"--run {run}: it has no results.json; name a run of robomimic.py")
-    meta = read_json(path)["meta"]
-    if not {"policies", "problems"} <= meta.keys():
-        raise ValueError(f"{path} does not say where its policies lie: run robomimic.py again")
+    meta = _facts_of(run)
     entries = [(Prior.from_config(entry["prior"]), entry) for entry in meta["policies"]]
     told = {(prior.describe(), entry["iterations"]): prior.name for prior, entry in entries}
     if len(set(told.values())) < len(told) or len(meta["problems"]) > 1:
