@@ -25,14 +25,13 @@ from warmprior.experiments import (
     parse,
     plot_budget,
     prior_label,
-    record,
-    run_script,
     started,
     success_cell,
     table,
     write_report,
 )
-from warmprior.experiments.recipe import check_counts, refuse_ignored
+from warmprior.experiments.recipe import check_counts
+from warmprior.io.script import run_script
 from warmprior.training import TrainingConfig
 
 
@@ -49,11 +48,7 @@ class BudgetRecipe(MeasuredRecipe):
     def check(self) -> None:
         """Refuse what cannot work, before any work."""
         super().check()
-        told = "every budget is a number of iterations with one policy, named by --budgets"
-        ignored = [
-            name for name in record(self.training) if name not in ("iterations", "checkpoints")
-        ]
-        refuse_ignored(self, PRESETS[self.run.preset], ["training"], told, but=ignored)
+        self.check_single(sigma=True)
         check_counts(self, "budgets")
         if not self.budgets:
             raise ValueError("--budgets needs at least one number of iterations")
@@ -101,7 +96,14 @@ def run(argv: Sequence[str] | None) -> None:
         name: BudgetRecipe.of(preset, held_out=HeldOutOptions(observations=1_000))
         for name, preset in PRESETS.items()
     }
-    recipe = parse(presets, argv, study="budget", description=__doc__)
+    recipe = parse(
+        presets,
+        argv,
+        study="budget",
+        description=__doc__,
+        # Every budget is a number of iterations, with its last policy; no curvature is measured.
+        unused=("iterations", "checkpoints", "steps", "draws"),
+    )
     with started(recipe, "budget") as out:
         comparison = Comparison(recipe, "budget")
         # Before the hours of training: what cannot be measured on is better known now.
@@ -116,7 +118,7 @@ def run(argv: Sequence[str] | None) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    return run_script(run, argv, "budget.py")
+    return run_script(lambda: run(argv), "budget.py")
 
 
 if __name__ == "__main__":

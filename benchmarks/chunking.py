@@ -23,7 +23,6 @@ from warmprior.experiments import (
     plot_success,
     plot_success_bars,
     prior_label,
-    run_script,
     select,
     started,
     success_cell,
@@ -31,6 +30,7 @@ from warmprior.experiments import (
     write_report,
 )
 from warmprior.experiments.tables import last_checkpoints
+from warmprior.io.script import run_script
 
 
 def make_table(rows: Sequence[Row], top_k: int) -> str:
@@ -56,7 +56,7 @@ def run(argv: Sequence[str] | None) -> None:
         for name, preset in PRESETS.items()
     }
     recipe = parse(presets, argv, study="chunking", description=__doc__)
-    recipe.check_single(problem=True)
+    recipe.check_single(problem=True, sigma=True)
     with started(recipe, "chunking") as out:
         comparison = Comparison(recipe, "chunking")
         rows = sorted(comparison.run().rows, key=lambda row: (row["chunk"], -row["nfe"]))
@@ -72,7 +72,7 @@ def run(argv: Sequence[str] | None) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    return run_script(run, argv, "chunking.py")
+    return run_script(lambda: run(argv), "chunking.py")
 
 
 if __name__ == "__main__":

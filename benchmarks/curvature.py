@@ -23,13 +23,14 @@ from warmprior.experiments import (
     MeasuredRecipe,
     PolicyOptions,
     Results,
+    Row,
     curvature_table,
     finished_policies,
+    grouped,
     observe,
     parse,
-    prior_label,
     record,
-    run_script,
+    source_labels,
     started,
     straightness,
     write_report,
@@ -37,6 +38,7 @@ from warmprior.experiments import (
 from warmprior.experiments.navigation_figures import plot_flow_paths
 from warmprior.experiments.recipe import Flat, refuse_ignored
 from warmprior.experiments.results import facts_of_machine
+from warmprior.io.script import run_script
 
 SHOWN = 40
 
@@ -64,10 +66,11 @@ class CurvatureRecipe(MeasuredRecipe):
         super().check()
         if self.policies.run is not None:
             base = PRESETS[self.run.preset]
-            parts = ["data", "network", "training", "evaluation"]
+            parts = ["data", "network", "training", "evaluation", "run"]
             # Priors of one's own are not what to compare, but what to import for it.
             parts += [] if all(":" in name for name in self.sources.prior) else ["sources"]
-            refuse_ignored(self, base, parts, "--run measures policies as they were trained")
+            told = "--run measures policies as they were trained"
+            refuse_ignored(self, base, parts, told, but=["preset", "device"])
         elif not any(prior.is_flow for prior in self.sources.priors()):
             raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
 
@@ -78,7 +81,7 @@ class Measured:
 
     results: Results
     facts: dict[str, Any]
-    actors: dict[str, list[WarmPriorActor]]
+    actors: dict[str, dict[int, WarmPriorActor]]
     observations: SharedObservations
     source: str
 
@@ -97,7 +100,7 @@ def own_run(recipe: CurvatureRecipe) -> Measured:
 def finished_run(recipe: CurvatureRecipe, run: Path) -> Measured:
     """The last policies of a run of robomimic.py."""
     facts, actors = finished_policies(run, recipe.run.device)
-    first = next(iter(actors.values()))[0]
+    first = next(iter(next(iter(actors.values())).values()))
     observations, source = observe(
         recipe.held_out,
         facts,
@@ -110,7 +113,7 @@ def finished_run(recipe: CurvatureRecipe, run: Path) -> Measured:
     identity = {"study": "curvature", "recipe": record(recipe)}
     meta = facts_of_machine() | {"problems": [facts]}
     results = Results(recipe.run.directory / "results.json", meta, identity)
-    described = {group[0].prior.describe(): group for group in actors.values()}
+    described = {next(iter(g.values())).prior.describe(): g for g in actors.values()}
     return Measured(results, facts, described, observations, source)
 
 
@@ -120,27 +123,34 @@ def check_coordinate(recipe: CurvatureRecipe, observations: SharedObservations) 
         raise ValueError(f"--coordinate must be in [0, {width}), got {recipe.coordinate}")
 
 
-def draw(recipe: CurvatureRecipe, measured: Measured) -> None:
+def draw(recipe: CurvatureRecipe, measured: Measured, rows: Sequence[Row]) -> None:
     observations, paths = measured.observations, {}
     few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
-    for actor, *_ in measured.actors.values():
-        if actor.prior.is_flow:
-            generator = torch.Generator(recipe.run.device).manual_seed(0)
-            windows = few.windows(actor.prior)
-            path = flow_paths(actor, windows, recipe.held_out.steps, generator=generator)
-            paths[prior_label(actor.prior.name)] = path[..., 0, recipe.coordinate].cpu()
+    label = source_labels(rows)
+    for policy, group in grouped(rows, lambda row: row["policy"]).items():
+        actor = next(iter(measured.actors[policy].values()))
+        generator = torch.Generator(recipe.run.device).manual_seed(0)
+        windows = few.windows(actor.prior)
+        path = flow_paths(actor, windows, recipe.held_out.steps, generator=generator)
+        paths[label(group[0])] = path[..., 0, recipe.coordinate].cpu()
     title = f"{measured.facts['task']} {measured.facts['style']}: action coordinate {recipe.coordinate} "
     plot_flow_paths(
         paths,
         recipe.run.directory / "flow_paths.png",
-        title=f"{title}along the flow, {measured.source}",
+        title=f"{title}along the flow,\n{measured.source}",
     )
 
 
 def run(argv: Sequence[str] | None) -> None:
     held_out = HeldOutOptions(observations=2_000)
     presets = {n: CurvatureRecipe.of(p, held_out=held_out) for n, p in PRESETS.items()}
-    recipe = parse(presets, argv, study="curvature", description=__doc__)
+    recipe = parse(
+        presets,
+        argv,
+        study="curvature",
+        description=__doc__,
+        unused=("episodes", "nfe", "top_k", "play_on", "checkpoints"),
+    )
     with started(recipe, "curvature") as out:
         folder = recipe.policies.run
         measured = own_run(recipe) if folder is None else finished_run(recipe, folder)
@@ -153,13 +163,13 @@ def run(argv: Sequence[str] | None) -> None:
         )
         measured.results.meta["observations"] = measured.source
         measured.results.add(*rows)
-        draw(recipe, measured)
+        draw(recipe, measured, rows)
         task, style = measured.facts["task"], measured.facts["style"]
         write_report(out, curvature_table(rows, task=task, data=style, source=measured.source))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    return run_script(run, argv, "curvature.py")
+    return run_script(lambda: run(argv), "curvature.py")
 
 
 if __name__ == "__main__":

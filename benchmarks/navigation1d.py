@@ -23,7 +23,6 @@ from warmprior.experiments import (
     parse,
     plot_flow_paths,
     plot_navigation,
-    run_script,
     select,
     source_labels,
     started,
@@ -36,6 +35,7 @@ from warmprior.experiments.navigation1d import (
     judge_navigation,
     play_navigation,
 )
+from warmprior.io.script import run_script
 
 COLUMNS = {
     "switches at boundaries": "switch_rate",
@@ -56,7 +56,7 @@ def judge(comparison: Comparison) -> list[Row]:
     rollouts = comparison.recipe.evaluation.episodes
     rows = []
     for contestant in comparison.contestants:
-        actor, seed = contestant.policy(), contestant.training.seed
+        actor, seed = contestant.policy().to("cpu"), contestant.training.seed
         for nfe in contestant.prior.allowed_nfes(comparison.nfes):
             measures = judge_navigation(actor, seed, nfe=nfe, rollouts=rollouts)
             rows.append(Row(contestant.facts() | {"nfe": nfe}, measures))
@@ -66,10 +66,11 @@ def judge(comparison: Comparison) -> list[Row]:
 def curvatures(comparison: Comparison, observations: SharedObservations) -> list[Row]:
     """Of the flows, seed by seed: the source samples belong to the seed."""
     rows = []
-    for i, seed in enumerate(comparison.recipe.seeds):
-        policies = {name: [group[i]] for name, group in comparison.policies().items()}
-        for row in straightness(policies, observations, draws=4, seed=seed):
-            rows.append(Row({**row.facts, "seed": seed}, row.measures))
+    for seed in comparison.recipe.seeds:
+        policies = {
+            name: {seed: group[seed].to("cpu")} for name, group in comparison.policies().items()
+        }
+        rows += straightness(policies, observations, draws=4, seed=seed)
     return rows
 
 
@@ -100,7 +101,7 @@ def draw(comparison: Comparison, rows: Sequence[Row], observations: SharedObserv
     for contestant in comparison.contestants:
         if contestant.training.seed != seed:
             continue
-        prior, actor = contestant.prior, contestant.policy()
+        prior, actor = contestant.prior, contestant.policy().to("cpu")
         nfe = max(prior.allowed_nfes(comparison.nfes))
         (row,) = select(rows, "collision_rate", **contestant.facts(), nfe=nfe)
         text = [f"collides {row['collision_rate']:.0%}"]
@@ -124,7 +125,13 @@ def draw(comparison: Comparison, rows: Sequence[Row], observations: SharedObserv
 
 
 def run(argv: Sequence[str] | None) -> None:
-    recipe = parse(NAVIGATION_PRESETS, argv, study="navigation1d", description=__doc__)
+    recipe = parse(
+        NAVIGATION_PRESETS,
+        argv,
+        study="navigation1d",
+        description=__doc__,
+        unused=("observation_steps", "top_k", "checkpoints"),
+    )
     with started(recipe, "navigation1d") as out:
         problem = navigation_problem()
         store = Store(problem, recipe.network, out.parent / "policies", out / "logs", recipe.run)
@@ -138,7 +145,7 @@ def run(argv: Sequence[str] | None) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    return run_script(run, argv, "navigation1d.py")
+    return run_script(lambda: run(argv), "navigation1d.py")
 
 
 if __name__ == "__main__":

@@ -10,6 +10,7 @@ A frozen policy per prior and seed comes from --run (a finished run of robomimic
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable, Sequence
 from itertools import product
@@ -30,7 +31,6 @@ from warmprior.experiments import (
     plot_reinforcement,
     plot_success,
     record,
-    run_script,
     select,
     started,
     table,
@@ -44,11 +44,13 @@ from warmprior.experiments.prior_space import (
     prior_space_preset,
 )
 from warmprior.experiments.results import facts_of_machine, grouped, played
+from warmprior.io.files import read_json, write_atomic
+from warmprior.io.script import run_script
 from warmprior.rl import PriorSpaceTraining
 from warmprior.training.threads import torch_threads
 
-Frozen = dict[str, list[WarmPriorActor]]
-"""Policies by prior name, one per training seed."""
+Frozen = dict[str, dict[int, WarmPriorActor]]
+"""Policies by prior name and training seed."""
 
 
 def frozen_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], Frozen]:
@@ -70,20 +72,35 @@ def frozen_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any]
         stores = [Store(navigation_problem(), recipe.network, policies, logs, recipe.run)]
     comparison = Comparison(recipe, "frozen policies", stores=stores, directory=out / "frozen")
     comparison.train()
-    grouped_actors: Frozen = {}
-    for contestant in comparison.contestants:
-        grouped_actors.setdefault(contestant.prior.name, []).append(contestant.policy())
-    return comparison.results.meta["problems"][0], grouped_actors
+    frozen: Frozen = {}
+    for c in comparison.contestants:
+        frozen.setdefault(c.prior.name, {})[c.training.seed] = c.policy()
+    return comparison.results.meta["problems"][0], frozen
 
 
-def kept(recipe: PriorSpaceRecipe, out: Path, actor: WarmPriorActor, seed: int) -> WarmPriorActor:
-    """A copy of the frozen policy that belongs to the agent: to continue, it must find the very policy
-    it began with, even if another version would train another by now.
+def kept_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], Frozen]:
+    """Copies of the frozen policies that belong to the agents.
+
+    To continue, they must find the very policies they began with, whatever has become of those, or would
+    be trained by now.
     """
-    folder = out / "policies" / f"{actor.prior.name}-seed{seed}"
-    if not (recipe.run.resume and (folder / "config.json").exists()):
-        actor.save_pretrained(folder)
-    return WarmPriorActor.from_pretrained(folder, device=recipe.run.device)
+    names = dict.fromkeys(prior.name for prior in recipe.sources.priors())
+    folders = {(n, s): out / "policies" / f"{n}-seed{s}" for n in names for s in recipe.seeds}
+    facts = out / "policies" / "problem.json"
+    if not (recipe.run.resume and facts.exists()):
+        problem, frozen = frozen_policies(recipe, out)
+        for (name, seed), folder in folders.items():
+            group = frozen[name]
+            if seed not in group:
+                print(f"--run has {len(group)} seeds of {name}: agent {seed} shares a policy")
+            of_seeds = list(group.values())
+            group.get(seed, of_seeds[seed % len(of_seeds)]).save_pretrained(folder)
+        text = json.dumps(problem) + "\n"
+        write_atomic(facts, lambda path: path.write_text(text))
+    loaded: Frozen = {name: {} for name in names}
+    for (name, seed), folder in folders.items():
+        loaded[name][seed] = WarmPriorActor.from_pretrained(folder, device=recipe.run.device)
+    return read_json(facts), loaded
 
 
 def make_table(rows: Sequence[Row]) -> str:
@@ -133,22 +150,23 @@ def draw(rows: Sequence[Row], out: Path, title: str, warmup: int) -> None:
 
 def run(argv: Sequence[str] | None) -> None:
     recipe = parse(
-        PRIOR_SPACE_PRESETS, argv, study="rl", description=__doc__, preset=prior_space_preset
+        PRIOR_SPACE_PRESETS,
+        argv,
+        study="rl",
+        description=__doc__,
+        preset=prior_space_preset,
+        unused=("top_k", "checkpoints"),
     )
     with started(recipe, "rl") as out:
-        problem, frozen = frozen_policies(recipe, out)
+        problem, frozen = kept_policies(recipe, out)
         meta = facts_of_machine(torch_threads=recipe.agents.threads) | {"problems": [problem]}
         identity = {"study": "rl", "recipe": record(recipe)}
         results = Results(out / "results.json", meta, identity, resume=recipe.run.resume)
+        results.save()  # from now on there is something to continue
         diverged: dict[tuple[str, str, int], str] = {}
         names = dict.fromkeys(prior.name for prior in recipe.sources.priors())
         for seed, algorithm, name in product(recipe.seeds, recipe.agents.algorithm, names):
-            agent, i = f"{algorithm} {name}, seed {seed}", seed - recipe.seeds[0]
-            if i >= len(frozen[name]):
-                print(
-                    f"--run has {len(frozen[name])} seeds of {name}: agent {seed} shares a policy"
-                )
-            actor = kept(recipe, out, frozen[name][i % len(frozen[name])], seed)
+            agent, actor = f"{algorithm} {name}, seed {seed}", frozen[name][seed]
             config = recipe.agent(actor.prior, algorithm, seed)
             training = PriorSpaceTraining(
                 actor,
@@ -191,7 +209,7 @@ def evaluated(facts: dict[str, Any], point: dict[str, Any]) -> Row:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    return run_script(run, argv, "prior_space_rl.py")
+    return run_script(lambda: run(argv), "prior_space_rl.py")
 
 
 if __name__ == "__main__":

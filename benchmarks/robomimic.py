@@ -8,6 +8,7 @@ python benchmarks/robomimic.py --resume --out runs/paper         # after an inte
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 
@@ -22,13 +23,14 @@ from warmprior.experiments import (
     plot_learning_curves,
     plot_success,
     prior_label,
-    run_script,
     select,
+    source_labels,
     started,
     success_table,
     write_report,
 )
 from warmprior.experiments.store import Store
+from warmprior.io.script import run_script
 from warmprior.training import record_filmstrip
 
 TRAINED_AFTER = {"preview": 40_000}
@@ -36,9 +38,10 @@ TRAINED_AFTER = {"preview": 40_000}
 
 
 def notes(comparison: Comparison) -> list[str]:
-    if comparison.recipe.run.preset == "paper":
+    recipe, paper = comparison.recipe, PRESETS["paper"]
+    iterations = recipe.training.iterations
+    if recipe.network == paper.network and iterations >= paper.training.iterations:
         return []
-    iterations = comparison.recipe.training.iterations
     names = dict.fromkeys(prior.name for prior in comparison.priors)
     short = [prior_label(n) for n in names if iterations < TRAINED_AFTER.get(n, 0)]
     told = (
@@ -74,8 +77,10 @@ def draw(comparison: Comparison, rows: Sequence[Row]) -> None:
 
 def film(comparison: Comparison, store: Store, end: str) -> None:
     """An episode of every source's first policy."""
-    first = {c.prior.name: c for c in reversed(comparison.contestants) if c.store is store}
-    for name, contestant in first.items():
+    mine = [c for c in comparison.contestants if c.store is store]
+    label = source_labels([Row(c.facts(), {}) for c in mine])
+    first = {label(Row(c.facts(), {})): c for c in reversed(mine)}
+    for name, contestant in reversed(first.items()):
         nfe = min(contestant.prior.allowed_nfes(comparison.nfes))
         strip = record_filmstrip(
             contestant.policy(),
@@ -84,12 +89,13 @@ def film(comparison: Comparison, store: Store, end: str) -> None:
             policy_seed=contestant.training.seed,
             **comparison.recipe.evaluation.environment,
         )
+        slug = re.sub(r"[^\w.]+", "-", name if "," in name else contestant.prior.name)
         outcome = "solved" if strip.success else "not solved"
         plot_filmstrip(
             strip.frames,
             [f"step {step}" for step in strip.steps],
-            comparison.directory / f"filmstrip_{name}{end}",
-            title=f"{prior_label(name)}, NFE {nfe}, episode {EVALUATION_SEED}: {outcome}",
+            comparison.directory / f"filmstrip_{slug}{end}",
+            title=f"{name}, NFE {nfe}, episode {EVALUATION_SEED}: {outcome}",
         )
 
 
@@ -107,7 +113,7 @@ def run(argv: Sequence[str] | None) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    return run_script(run, argv, "robomimic.py")
+    return run_script(lambda: run(argv), "robomimic.py")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,6 @@ from warmprior.experiments import (
     parse,
     plot_sigma,
     prior_label,
-    run_script,
     select,
     started,
     straightness,
@@ -32,6 +31,7 @@ from warmprior.experiments import (
 )
 from warmprior.experiments.straightness import pooled
 from warmprior.experiments.tables import Cell
+from warmprior.io.script import run_script
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
 
@@ -106,7 +106,7 @@ def run(argv: Sequence[str] | None) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    return run_script(run, argv, "sigma.py")
+    return run_script(lambda: run(argv), "sigma.py")
 
 
 if __name__ == "__main__":

@@ -8,8 +8,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
+
+UNPLAYED = ("episodes", "nfe", "top_k", "play_on")
+"""Options of what is not played."""
 
 
 def _policy(args: argparse.Namespace) -> WarmPriorActor:
@@ -84,7 +88,7 @@ def train(args: argparse.Namespace) -> None:
     """Train policies, and play nothing: the options of benchmarks/robomimic.py."""
     from warmprior.experiments import PRESETS, Comparison, parse, started
 
-    recipe = parse(PRESETS, args.options, study="train", description=train.__doc__)
+    recipe = parse(PRESETS, args.options, study="train", description=train.__doc__, unused=UNPLAYED)
     with started(recipe, "train"):
         comparison = Comparison(recipe, "train")
         comparison.train()
@@ -151,12 +155,8 @@ def main(argv: list[str] | None = None) -> int:
         The exit code.
     """
     args = make_parser().parse_args(argv)
-    try:
-        args.run(args)
-    except (ValueError, KeyError, OSError, ImportError, FloatingPointError, RuntimeError) as error:
-        print(f"warmprior: error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    # What cannot be rendered, or generated, here is a RuntimeError.
+    return run_script(lambda: args.run(args), "warmprior", errors=(*ERRORS, RuntimeError))
 
 
 if __name__ == "__main__":

@@ -81,7 +81,7 @@ def test_several_seeds_and_nfes(budget, dataset, validation, tmp_path):
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        ({"iterations": 3}, "--budgets"),
+        ({"iterations": 3}, "makes no use of it: leave out --iterations"),
         ({"budgets": [0]}, "--budgets must be between 1 and 1,000,000, got 0"),
         ({"nfe": 0}, "--nfe must be between 1 and"),
         ({"validation": None}, "add --validation"),

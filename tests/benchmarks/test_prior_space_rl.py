@@ -127,12 +127,12 @@ def test_the_toy_with_both_algorithms(benchmark, tmp_path, capsys):
 )
 def test_a_continued_run_has_the_options_it_began_with(tmp_path, words, message):
     begun = read(" ".join(unit(tmp_path, seeds=1)))
-    with started(begun, "rl"):
-        pass
+    with started(begun, "rl") as out:
+        (out / "results.json").write_text("{}")
     resume = f"--resume --out {tmp_path}"
     # Those of the folder, whatever the preset that is the default.
     again = read(resume)
-    assert again == replace(begun, run=replace(begun.run, resume=True, envs=None))
+    assert again == replace(begun, run=replace(begun.run, resume=True))
     with pytest.raises(ValueError, match=message):
         read(f"{resume} {words}")
 
@@ -153,7 +153,7 @@ def test_resume_goes_on_where_it_stopped(benchmark, tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(training, "evaluate", interrupted)
         benchmark.main(unit(cut, seeds=1))
-    assert len(calls) == 4 and not (cut / "results.json").exists()
+    assert len(calls) == 4 and not stored(cut)["rows"]
     assert benchmark.main(["--resume", "--out", str(cut)]) == 0
     rows = stored(cut)["rows"]
     assert len(rows) == len(expected) == 5 and rows[:3] == expected[:3]

@@ -44,8 +44,10 @@ def finished(scripts, dataset, tmp_path_factory):
     return out
 
 
-def measured(out, validation):
-    return {"out": out, "validation": validation, "observations": 20, "steps": 8}
+def measured(out, validation, script="curvature"):
+    held_out = {"out": out, "validation": validation, "observations": 20, "steps": 8}
+    # What is not played has none of these options.
+    return held_out | ({"episodes": None, "nfe": None} if script == "curvature" else {})
 
 
 def test_curvature_of_a_finished_run_trains_nothing(scripts, finished, validation, capsys):
@@ -94,7 +96,7 @@ def test_sigma_study(scripts, finished, dataset, validation):
         iterations=60,
         prior=["gaussian", "past"],
         sigma=[0.5, 1.0, 0.0],
-        **measured(out, validation),
+        **measured(out, validation, "sigma"),
     )
     assert scripts["sigma"].main(argv) == 0
     after = written(finished.parent)
@@ -172,7 +174,7 @@ def test_bad_options_are_named(
     scripts, finished, dataset, validation, capsys, no_work, script, extra, message
 ):
     out = finished.parent / f"bad-{script}-{next(iter(extra))}"
-    values = {"out": out} if script == "chunking" else measured(out, validation)
+    values = {"out": out} if script == "chunking" else measured(out, validation, script)
     argv = options(dataset, **{"seeds": 2, "iterations": 60} | values | extra)
     assert message in refused(scripts[script].main, argv, capsys)
 
@@ -206,7 +208,7 @@ def test_what_cannot_be_measured_is_named_before_any_training(
         path = tmp_path / "other.hdf5"
         write_robomimic_file(path, lengths=(25, 30), task="square", seed=1)
         extra = {"validation": path}
-    argv = options(dataset, **measured(tmp_path / "out", validation) | extra)
+    argv = options(dataset, **measured(tmp_path / "out", validation, script) | extra)
     assert message in refused(scripts[script].main, argv, capsys)
 
 

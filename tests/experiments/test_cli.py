@@ -15,6 +15,7 @@ import pytest
 
 from tests.data.synthetic import write_robomimic_file
 from warmprior.io.files import exclusive
+from warmprior.io.script import run_script
 
 pytest.importorskip("tyro")
 
@@ -27,7 +28,6 @@ from warmprior.experiments import (
     parse,
     record,
     restore,
-    run_script,
     started,
 )
 from warmprior.experiments.prior_space import PRIOR_SPACE_PRESETS
@@ -98,12 +98,18 @@ def test_every_leaf_is_an_option_under_its_own_name(tmp_path):
         ("--download --demonstrations 5", "leave it out with a file"),
         ("--prior gaussian --sigma 0.5", "--sigma belongs to warm priors"),
         ("--iterations 0", "iterations must be at least 1"),
+        ("--seed -1", "seed must be at least 0"),
+        ("--learning-rate nan", "learning_rate must be a finite number > 0"),
+        ("--weight-decay -1", "weight_decay must be a finite number >= 0"),
+        ("--betas 0.9 2", "betas must lie in [0, 1)"),
+        ("--warmup-ratio 3", "warmup_ratio must lie in [0, 1)"),
+        ("--save-every 0", "save_every must be at least 1"),
     ],
 )
 def test_what_cannot_work_is_told_in_one_line_and_leaves_nothing(argv, message, tmp_path, capsys):
     out = tmp_path / "out"
     words = [*argv.split(), "--out", str(out)]
-    code = run_script(lambda argv: parse(PRESETS, argv, study="a-study"), words, "a.py")
+    code = run_script(lambda: parse(PRESETS, words, study="a-study"), "a.py")
     told = capsys.readouterr().err
     assert code == 2 and message in told and not out.exists()
     assert told.startswith("a.py: error: ") and told.count("\n") == 1
@@ -125,17 +131,18 @@ def test_what_is_no_option_is_told_with_the_nearest(argv, words, capsys):
 
 
 def begin(recipe):
-    with started(recipe, "a-study"):
-        pass
+    with started(recipe, "a-study") as out:
+        (out / "results.json").write_text("{}")
 
 
 def test_a_continued_run_has_the_options_it_began_with(tmp_path):
     out = ["--out", str(tmp_path / "out")]
-    first = read("--chunk", "4", "--sigma", "0.3", "--seeds", "2", *out)
+    first = read("--chunk", "4", "--sigma", "0.3", "--logger", "tensorboard", *out)
     begin(first)
     again = read("--resume", *out)
     assert record(again) == record(first)
-    assert read("--resume", "--envs", "3", *out).run.envs == 3
+    changed = read("--resume", "--envs", "3", "--logger", "none", *out).run
+    assert (changed.envs, changed.logger, again.run.logger) == (3, "none", "tensorboard")
     assert record(read("--resume", "--chunk", "4", *out)) == record(first)
     with pytest.raises(ValueError, match=r"was started with --chunk 4: leave these out"):
         read("--resume", "--chunk", "8", *out)
@@ -145,6 +152,28 @@ def test_a_continued_run_has_the_options_it_began_with(tmp_path):
         read(*out)
     with pytest.raises(ValueError, match=r"holds a run of another study \(a-study\)"):
         parse(PRESETS, ["--resume", *out], study="another")
+
+
+def test_what_fails_at_once_is_not_in_the_way_of_its_correction(tmp_path):
+    out = ["--out", str(tmp_path / "out")]
+    with pytest.raises(RuntimeError), started(read("--task", "can", *out), "a-study"):
+        raise RuntimeError("no such data")
+    assert read("--task", "lift", *out).data.task == ("lift",)
+    # What was interrupted later can be continued, and is not overwritten.
+    begin(read(*out))
+    with pytest.raises(RuntimeError), started(read("--resume", *out), "a-study"):
+        raise RuntimeError("killed")
+    assert read("--resume", *out).run.resume
+    with pytest.raises(ValueError, match="add --resume"):
+        read(*out)
+
+
+def test_options_without_effect_are_refused(tmp_path):
+    out = ["--out", str(tmp_path / "out")]
+    for given in ("--episodes 3", "--no-precondition --episodes 3"):
+        with pytest.raises(ValueError, match=r"makes no use of it: leave out --episodes$"):
+            read(*given.split(), *out, unused=("episodes", "top_k"))
+    assert not read("--no-precondition", *out, unused=("episodes",)).network.precondition
 
 
 def test_a_misspelt_folder_starts_no_new_run(tmp_path):
@@ -209,7 +238,7 @@ def test_an_option_that_depends_on_the_task():
 
 
 def test_ctrl_c_is_told_in_one_line_whatever_becomes_of_it(capsys):
-    def script(argv):
+    def script():
         try:
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(1)
@@ -217,17 +246,17 @@ def test_ctrl_c_is_told_in_one_line_whatever_becomes_of_it(capsys):
             raise RuntimeError("in the forward pass") from error
 
     before = signal.getsignal(signal.SIGINT)
-    assert run_script(script, None, "a.py") == 130
+    assert run_script(script, "a.py") == 130
     assert capsys.readouterr().err == "\na.py: interrupted; --resume continues\n"
     assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_errors_of_ours_are_not_hidden():
-    def script(argv):
+    def script():
         raise TypeError("a defect")
 
     with pytest.raises(TypeError, match="a defect"):
-        run_script(script, None, "a.py")
+        run_script(script, "a.py")
 
 
 @pytest.mark.parametrize("group", [True, False])

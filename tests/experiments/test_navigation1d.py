@@ -136,7 +136,7 @@ def test_warm_sources_stop_mode_switching(tmp_path):
     assert of_base["switch_rate"] > 0.4 and of_base["collision_rate"] > 0.8
     assert of_past["switch_rate"] < 0.05 and of_past["collision_rate"] < 0.3
     observations = SharedObservations(store.problem.data, 4)
-    rows = straightness({"base": [base], "past": [past]}, observations, draws=4)
+    rows = straightness({"base": {0: base}, "past": {0: past}}, observations, draws=4)
     assert next(row for row in rows if row["policy"] == "past")["ratio"] < 0.3
     bounds = {row["policy"]: row["bound"] for row in rows}
     assert bounds["past"] < bounds["base"]
@@ -170,7 +170,7 @@ def test_the_figure_at_the_benchmarks_budget(tmp_path, seed):
     assert history["switch_rate"] < 0.03
     assert history["shifted_distance"] > 2 * sharp["shifted_distance"]
     observations = SharedObservations(store.problem.data, 4)
-    policies = {f"{name} {sigma}": [actor] for (name, sigma), actor in chosen.items()}
+    policies = {f"{name} {sigma}": {seed: actor} for (name, sigma), actor in chosen.items()}
     ratios = {
         row["policy"]: row["ratio"]
         for row in straightness(policies, observations, draws=4, seed=seed)

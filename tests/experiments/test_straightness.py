@@ -15,7 +15,13 @@ from warmprior.diagnostics import SharedObservations
 
 pytest.importorskip("tyro")
 
-from warmprior.experiments import Row, curvature_table, straightness
+from warmprior.experiments import Row, curvature_table
+from warmprior.experiments import straightness as by_seed
+
+
+def straightness(policies, *args, **options):
+    """Of the policies of seeds 0, 1, ..."""
+    return by_seed({n: dict(enumerate(group)) for n, group in policies.items()}, *args, **options)
 
 
 def turning(speed):
@@ -150,7 +156,7 @@ def test_one_seed_one_result(monkeypatch):
 
 def test_bad_input_is_named():
     base = policy(turning(1.0))
-    with pytest.raises(ValueError, match="same number of training seeds"):
+    with pytest.raises(ValueError, match="same training seeds"):
         straightness({"a": [base], "b": [base, base]}, shared())
     with pytest.raises(ValueError, match="one chunk length only"):
         straightness({"a": [policy(turning(1.0), PastPrior(H + 1))]}, shared())

@@ -195,6 +195,12 @@ def test_a_learned_prior_trains_saves_resumes_and_freezes(tmp_path):
     assert not torch.equal(decoder.prior.shift, averaged)
 
 
+@pytest.mark.parametrize("name", ["two words", "a/b", ""])
+def test_a_name_that_no_file_can_have_is_refused(name):
+    with pytest.raises(ValueError, match="becomes that of files"):
+        type("Unnamed", (PastPrior,), {"name": name})
+
+
 def test_a_subclass_without_a_name_is_not_taken_for_its_parent(tmp_path):
     class Unnamed(PastPrior):
         pass

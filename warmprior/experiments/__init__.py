@@ -1,6 +1,6 @@
 """Experiments: from options to trained policies, rows, tables and figures. Needs ``warmprior[sim]``."""
 
-from warmprior.experiments.cli import parse, run_script, started, write_report
+from warmprior.experiments.cli import parse, started, write_report
 from warmprior.experiments.figures import (
     plot_filmstrip,
     plot_learning_curves,
@@ -97,7 +97,6 @@ __all__ = [
     "record",
     "restore",
     "robosuite_problem",
-    "run_script",
     "select",
     "source_labels",
     "started",

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import io
-import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import replace
+from glob import escape
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import torch
 import tyro
 
-from warmprior.experiments.recipe import Recipe, differences, record, restore
+from warmprior.experiments.recipe import Recipe, differences, record, refuse_ignored, restore
 from warmprior.experiments.results import write_options
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
-from warmprior.io.workers import WorkerError
 
-__all__ = ["numbered_folder", "parse", "run_script", "started", "write_report"]
-
-ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError)
-"""What a user can mend: reported without a traceback."""
+__all__ = ["numbered_folder", "parse", "started", "write_report"]
 
 
 def parse[R: Recipe](
@@ -33,6 +28,7 @@ def parse[R: Recipe](
     study: str,
     description: str | None = None,
     preset: Callable[[R], R] | None = None,
+    unused: Collection[str] = (),
 ) -> R:
     """The recipe that a command line asks for, checked, with its output folder.
 
@@ -47,6 +43,7 @@ def parse[R: Recipe](
         study: name of the experiment; a folder holds one.
         description: of ``--help``.
         preset: chooses the preset of what is asked for, where it depends on more than its name.
+        unused: options that have no effect in this experiment, and are refused.
 
     Raises:
         ValueError: naming the option that cannot work, or that a continued run does not have.
@@ -86,6 +83,7 @@ def parse[R: Recipe](
     generates = recipe.data.dataset is None and not recipe.data.download
     if recipe.data.demonstrations != base.data.demonstrations and not generates:
         raise ValueError("--demonstrations says how many to generate: leave it out with a file")
+    refuse_ignored(recipe, base, record(recipe), f"{study} makes no use of it", only=unused)
     if recipe.sources.sigma != base.sources.sigma:
         recipe.sources.check_sigma()
     name = recipe.run.logger
@@ -103,8 +101,7 @@ def _output_folder(recipe: Recipe, study: str) -> Path:
         parts = [recipe.name, run.preset]
         prefix = [] if study == "robomimic" else [study]
         out = numbered_folder(Path("runs"), "-".join([*prefix, *parts]), latest=run.resume)
-    holds = (out / "options.json").exists() or (out / "results.json").exists()
-    if holds and not run.resume:
+    if (out / "results.json").exists() and not run.resume:
         raise ValueError(f"{out} holds a run: add --resume to continue it, or choose another --out")
     return out
 
@@ -134,7 +131,9 @@ def numbered_folder(parent: Path, name: str, *, latest: bool = False) -> Path:
         return int(folder.name[len(name) + 1 :] or 1)
 
     taken = [
-        d for d in parent.glob(f"{name}*") if d.name == name or d.name[len(name) + 1 :].isdigit()
+        d
+        for d in parent.glob(f"{escape(name)}*")
+        if d.name == name or d.name[len(name) + 1 :].isdigit()
     ]
     if not taken:
         return parent / name
@@ -152,9 +151,14 @@ def started(recipe: Recipe, study: str) -> Iterator[Path]:
     out = recipe.run.directory
     check_writable(out)
     with exclusive(out):
-        write_options(out / "options.json", study, record(recipe))
+        write_options(out / "options.json", study, record(recipe, changeable=True))
         print(f"Output folder: {out}", flush=True)
-        yield out
+        try:
+            yield out
+        except Exception:
+            if not (out / "results.json").exists():  # nothing to continue, and nothing in the way
+                (out / "options.json").unlink()
+            raise
 
 
 def write_report(out: Path, table: str) -> None:
@@ -166,44 +170,3 @@ def write_report(out: Path, table: str) -> None:
     """
     write_atomic(out / "table.md", lambda path: path.write_text(table))
     print(f"\n{table}\nResults, table and pictures: {out}", flush=True)
-
-
-def run_script(
-    script: Callable[[Sequence[str] | None], object], argv: Sequence[str] | None, name: str
-) -> int:
-    """Run a script; what a user can mend, and Ctrl-C, are told in one line.
-
-    Args:
-        script: takes the command line.
-        argv: see :func:`parse`.
-        name: of the script.
-
-    Returns:
-        The exit code.
-    """
-    # Policies are shared between scripts, so all of them compute alike. Small networks gain nothing from
-    # a second thread, and on a busy machine threads that wait for each other cost much.
-    torch.set_float32_matmul_precision("high")
-    torch.set_num_threads(1)
-    interrupted = False
-
-    def interrupt(number: int, frame: Any) -> None:
-        nonlocal interrupted
-        interrupted = True
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, interrupt)
-    try:
-        script(argv)
-    except BaseException as error:
-        if interrupted:  # whatever the libraries in between have made of it
-            print(f"\n{name}: interrupted; --resume continues", file=sys.stderr)
-            return 130
-        if not isinstance(error, ERRORS):
-            raise
-        told = error.args[0] if isinstance(error, KeyError) and error.args else error
-        print(f"{name}: error: {told}", file=sys.stderr)
-        return 2
-    finally:
-        signal.signal(signal.SIGINT, before)
-    return 0

@@ -161,7 +161,7 @@ def plot_learning_curves(
     """Training loss and success rate against the iteration.
 
     Args:
-        losses: per prior, one ``[(iteration, loss), ...]`` per seed.
+        losses: per source, as :func:`source_labels` names it, one ``[(iteration, loss), ...]`` per seed.
         rows: evaluations of one problem at one NFE.
         path: of the PNG.
 
@@ -170,14 +170,16 @@ def plot_learning_curves(
     """
     rows = list(rows)
     figure, (left, right) = new_figure(9.0, 3.6, columns=2)
-    for prior, seeds in losses.items():
+    by_source = grouped(rows, source_labels(rows))
+    colors = {source: prior_color(group[0]["prior"]) for source, group in by_source.items()}
+    for source, seeds in losses.items():
         for i, curve in enumerate(seeds):
-            label = prior_label(prior) if i == 0 else None
-            left.plot(*zip(*curve, strict=True), color=prior_color(prior), lw=1.0, label=label)
+            label = source if i == 0 else None
+            left.plot(*zip(*curve, strict=True), color=colors.get(source), lw=1.0, label=label)
     left.set_yscale("log")
     left.set_ylabel("flow-matching loss (own source)")
-    for prior in losses:
-        cells = grouped(select(rows, prior=prior), lambda row: row["checkpoint"])
+    for source, group in by_source.items():
+        cells = grouped(group, lambda row: row["checkpoint"])
         points = [success_summary(cells[checkpoint], 1) for checkpoint in sorted(cells)]
         right.errorbar(
             sorted(cells),
@@ -187,7 +189,7 @@ def plot_learning_curves(
             ms=4,
             lw=1.0,
             capsize=2,
-            color=prior_color(prior),
+            color=colors[source],
         )
     right.set_xlim(left.get_xlim())
     right.set_ylim(-0.02, 1.02)

@@ -102,15 +102,17 @@ class PriorSpaceRecipe(Recipe):
         """Refuse what cannot work, or has no effect, before any work."""
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
-        self.check_single(problem=True, chunk=True, nfe=True)
+        self.check_single(problem=True, chunk=True, sigma=True, nfe=True)
         base = prior_space_preset(self)
         if self.policies.run is not None:
             told = "--run brings its policies and their data"
-            parts = ["data", "network", "training", "sources"]
-            refuse_ignored(self, base, parts, told, but=["task", "prior"])
+            parts = ["data", "network", "training", "sources", "run"]
+            but = ["task", "prior", "seed", "preset", "device"]
+            refuse_ignored(self, base, parts, told, but=but)
         elif self.is_toy:
             told = "the toy has demonstrations and a time limit of its own"
             refuse_ignored(self, base, ["data"], told)
+            refuse_ignored(self, base, ["network"], told, only=["observation_steps"])
             for name, given in (
                 ("horizon", self.agents.horizon is not None),
                 ("play-on", self.evaluation.play_on),

@@ -54,6 +54,9 @@ class Problem:
         clip: bound of the normalised actions that are executed; ``None`` for none.
         environment: what a saved policy keeps of the environment, see
             :func:`~warmprior.envs.environment_of`.
+
+    Raises:
+        ValueError: if ``task`` or ``style`` is no name of a file.
     """
 
     task: str
@@ -65,6 +68,11 @@ class Problem:
     normalizer: Normalizer | None = None
     clip: float | None = None
     environment: Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        for part in (self.task, self.style):
+            if Path(part).name != part:
+                raise ValueError(f"task and style become names of files: {part!r} cannot")
 
     @property
     def name(self) -> str:
@@ -154,8 +162,8 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
             flush=True,
         )
     problems = []
-    for task in options.task or ("square",):
-        for style in options.data:
+    for task in dict.fromkeys(options.task or ("square",)):
+        for style in dict.fromkeys(options.data):
             if options.download:
                 path = download_robomimic(task, style, force=options.force_download)
                 source = "official"

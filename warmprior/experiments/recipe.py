@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_args, get_type_hints
@@ -162,7 +162,7 @@ class SourceOptions:
 
     Attributes:
         prior: by name (gaussian, past, preview, history, regression) or, your own, as
-            package.module:Class; gains are over the first.
+            package.module:Class, which Python has to find (PYTHONPATH); gains are over the first.
         chunk: chunk lengths H.
         sigma: residual noise of the warm priors, one policy each (default: past 0.5, preview 1.0).
         cold_probability: share of training samples without a mean; the paper's Algorithm 1 has none.
@@ -325,7 +325,7 @@ class Recipe:
         training: behaviour cloning.
         sources: what is compared.
         evaluation: how.
-        run: where and how to compute, which changes no result.
+        run: where and how to compute.
     """
 
     data: Annotated[DataOptions, Flat] = field(default_factory=DataOptions)
@@ -358,13 +358,19 @@ class Recipe:
             prior.allowed_nfes(self.evaluation.nfes)
 
     def check_single(
-        self, *, problem: bool = False, chunk: bool = False, nfe: bool = False
+        self,
+        *,
+        problem: bool = False,
+        chunk: bool = False,
+        sigma: bool = False,
+        nfe: bool = False,
     ) -> None:
         """Refuse several of what a study has one of.
 
         Keyword Args:
             problem: one task and style.
             chunk: one chunk length.
+            sigma: one residual noise.
             nfe: one number of network evaluations.
 
         Raises:
@@ -374,6 +380,7 @@ class Recipe:
             "task": self.data.task if problem else (),
             "data": self.data.data if problem else (),
             "chunk": self.sources.chunk if chunk else (),
+            "sigma": self.sources.sigma if sigma else (),
             "nfe": self.evaluation.nfe if nfe else (),
         }
         for name, values in given.items():
@@ -411,15 +418,21 @@ class MeasuredRecipe(Recipe):
         self.check_single(problem=True, chunk=True)
 
 
-CHANGEABLE = ("out", "resume", "envs")
-"""Run options that a continued run may change: they change no result."""
+OF_A_START = {"run": ("out", "resume"), "data": ("force_download",)}
+"""Options, by part, of one start of a run: they are not stored."""
+
+CHANGEABLE = {"run": ("envs", "logger")}
+"""Options, by part, that a continued run may change: they change no result."""
 
 
-def record(recipe: Any) -> dict[str, Any]:
-    """A recipe as JSON holds it, without what may change when it is continued.
+def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
+    """A recipe as JSON holds it: what it is identified by.
 
     Args:
-        recipe: a dataclass, such as :class:`Recipe`.
+        recipe: a :class:`Recipe`, or a part of one.
+
+    Keyword Args:
+        changeable: add what may change when it is continued.
 
     Examples:
         >>> record(EvaluationOptions())["nfe"]
@@ -435,8 +448,12 @@ def record(recipe: Any) -> dict[str, Any]:
         return str(value.resolve()) if isinstance(value, Path) else value
 
     tree = plain(asdict(recipe))
-    for name in CHANGEABLE:
-        tree.get("run", {}).pop(name, None)
+    if not isinstance(recipe, Recipe):
+        return tree
+    for left_out in (OF_A_START,) if changeable else (OF_A_START, CHANGEABLE):
+        for part, names in left_out.items():
+            for name in names:
+                tree[part].pop(name)
     return tree
 
 
@@ -497,7 +514,13 @@ def differences(kind: type, mine: dict[str, Any], theirs: dict[str, Any]) -> Ite
 
 
 def refuse_ignored(
-    recipe: Recipe, base: Recipe, parts: Iterable[str], told: str, *, but: Iterable[str] = ()
+    recipe: Recipe,
+    base: Recipe,
+    parts: Iterable[str],
+    told: str,
+    *,
+    but: Collection[str] = (),
+    only: Collection[str] | None = None,
 ) -> None:
     """Refuse options that were given and would have no effect.
 
@@ -509,15 +532,23 @@ def refuse_ignored(
 
     Keyword Args:
         but: options of theirs that have an effect.
+        only: options of theirs that have none; all others by default.
 
     Raises:
         ValueError: naming the options.
     """
+    mine, theirs = record(recipe), record(base)
+
+    def leaves(tree: dict[str, Any], part: str) -> dict[str, Any]:
+        return tree[part] if isinstance(tree[part], dict) else {part: tree[part]}
+
     given = {
         name
         for part in parts
-        for name, value in record(getattr(recipe, part)).items()
-        if value != record(getattr(base, part))[name] and name not in but
+        for name, value in leaves(mine, part).items()
+        if value != leaves(theirs, part)[name]
+        and name not in but
+        and (only is None or name in only)
     }
     if given:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(given))

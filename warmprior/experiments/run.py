@@ -16,6 +16,7 @@ from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.smoothness import smoothness
 from warmprior.diagnostics.source_leak import SourceLeak, source_leak
 from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.experiments.labels import source_labels
 from warmprior.experiments.problem import find_problems, observe
 from warmprior.experiments.progress import ComparisonProgress
 from warmprior.experiments.recipe import EvaluationOptions, HeldOutOptions, Recipe, record
@@ -69,7 +70,7 @@ class Contestant:
             "task": self.store.problem.task,
             "data": self.store.problem.style,
             "prior": self.prior.name,
-            "sigma": self.prior.sigma,
+            "sigma": float(self.prior.sigma),
             "chunk": self.prior.chunk_length,
             "seed": self.training.seed,
             "iterations": self.training.iterations,
@@ -206,6 +207,7 @@ class Comparison:
             stores = [Store(p, recipe.network, policies, logs, recipe.run) for p in problems]
         self.stores = list(stores)
         self.contestants = self._contestants()
+        self._order = {tuple(c.facts().values()): i for i, c in enumerate(self.contestants)}
         problems = [store.problem for store in self.stores]
         identity = {
             "study": study,
@@ -264,11 +266,11 @@ class Comparison:
         """What is compared, for figures."""
         return ", ".join(store.problem.name for store in self.stores)
 
-    def policies(self) -> dict[str, list[WarmPriorActor]]:
-        """The last policies, one per training seed, by the description of their prior."""
-        found: dict[str, list[WarmPriorActor]] = {}
-        for contestant in self.contestants:
-            found.setdefault(contestant.prior.describe(), []).append(contestant.policy())
+    def policies(self) -> dict[str, dict[int, WarmPriorActor]]:
+        """The last policies, by the description of their prior and their training seed."""
+        found: dict[str, dict[int, WarmPriorActor]] = {}
+        for c in self.contestants:
+            found.setdefault(c.prior.describe(), {})[c.training.seed] = c.policy()
         return found
 
     def observe(self, options: HeldOutOptions) -> tuple[SharedObservations, str]:
@@ -292,15 +294,16 @@ class Comparison:
         )
 
     def losses(self, store: Store) -> dict[str, list[Losses]]:
-        """Training curves on one problem, by prior name one ``[(iteration, loss), ...]`` per policy.
+        """Training curves on one problem, by source one ``[(iteration, loss), ...]`` per policy.
 
         Args:
             store: of the problem.
         """
-        curves: dict[str, list[Losses]] = {}
-        for c in self.contestants:
-            if c.store is store:
-                curves.setdefault(c.prior.name, []).append(store.train(c.prior, c.training))
+        mine = [c for c in self.contestants if c.store is store]
+        rows = [Row(c.facts(), {}) for c in mine]
+        label, curves = source_labels(rows), dict[str, list[Losses]]()
+        for c, row in zip(mine, rows, strict=True):
+            curves.setdefault(label(row), []).append(store.train(c.prior, c.training))
         return curves
 
     def run(self) -> Results:
@@ -351,7 +354,7 @@ class Comparison:
         at_once = self.trainings_at_once or len(following)
         to_train, ready = deque(_Train(n) for n in following), deque[_Leak | _Play]()
         worker = _Worker(self.contestants, self.recipe.evaluation)
-        outcomes: dict[_Play, Episode] = {}
+        outcomes: dict[tuple[int, int, int], list[Episode]] = {}
         leaks: dict[int, dict[int, SourceLeak]] = {}
         episodes = sum(isinstance(job, _Play) for jobs in following.values() for job in jobs)
         iterations = sum(self.contestants[n].training.iterations for n in following)
@@ -375,44 +378,45 @@ class Comparison:
                         ready.extend(following[job.number])
                         chosen.store.note_trained(chosen.prior, chosen.training, result)
                         self.results.save()
-                        told = f"{chosen.prior.describe()}, seed {chosen.training.seed}"
-                        progress.say(f"trained {chosen.store.problem.task}, {told}")
+                        progress.say(
+                            f"trained {chosen.store.problem.task}, {chosen.prior.describe()}, seed "
+                            f"{chosen.training.seed}, {chosen.training.iterations} iterations"
+                        )
                     elif isinstance(job, _Leak):
                         leaks[job.number] = result
                     else:
                         progress.played()
-                        outcomes[job] = result
+                        cell = job.number, job.checkpoint, job.nfe
+                        outcomes.setdefault(cell, []).append(result)
                     self._write_down(job.number, outcomes, leaks, progress)
                 progress.trained(sum(worker.iterations))
 
     def _write_down(
         self,
         number: int,
-        outcomes: dict[_Play, Episode],
+        outcomes: dict[tuple[int, int, int], list[Episode]],
         leaks: Mapping[int, Mapping[int, SourceLeak]],
         progress: ComparisonProgress,
     ) -> None:
         """Add the rows of a policy for which everything is there."""
-        chosen = self.contestants[number]
-        last, seeds = chosen.training.iterations, self.recipe.evaluation.episodes
+        chosen, count = self.contestants[number], self.recipe.evaluation.episodes
         for facts, checkpoint, nfe in self._rows(number):
-            jobs = [_Play(number, checkpoint, nfe, EVALUATION_SEED + i) for i in range(seeds)]
-            if any(job not in outcomes for job in jobs):
+            is_last = checkpoint == chosen.training.iterations
+            episodes = outcomes.get((number, checkpoint, nfe), [])
+            if len(episodes) < count or (is_last and number not in leaks):
                 continue
-            if checkpoint == last and number not in leaks:
-                continue
-            leak = leaks[number].get(nfe) if checkpoint == last else None
-            row = _outcome(facts, [outcomes.pop(job) for job in jobs], leak)
+            # Sums depend on the order: that of the seeds, not that in which the episodes ended.
+            episodes = sorted(outcomes.pop((number, checkpoint, nfe)), key=lambda e: e.seed)
+            leak = leaks[number].get(nfe) if is_last else None
+            row = _outcome(facts, episodes, leak)
             self.results.add(row, order=self._place)
             progress.say(_told(chosen, row))
 
     def _place(self, row: Row) -> tuple[int, int, int]:
         """Where a row stands among all."""
-        facts = [c.facts() for c in self.contestants]
-        mine = {name: row.facts.get(name) for name in facts[0]}
-        if mine not in facts:
-            return len(facts), 0, 0
-        return facts.index(mine), row["checkpoint"], self.nfes.index(row["nfe"])
+        mine = tuple(row.facts.get(name) for name in self.contestants[0].facts())
+        number = self._order.get(mine, len(self._order))
+        return number, row.get("checkpoint") or 0, -(row.get("nfe") or 0)
 
 
 def _outcome(facts: Mapping[str, Any], episodes: Sequence[Episode], leak: SourceLeak | None) -> Row:

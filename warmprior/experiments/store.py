@@ -229,15 +229,16 @@ def finished_problem(run: Path) -> dict[str, Any]:
 
 def finished_policies(
     run: Path, device: str = "cpu"
-) -> tuple[dict[str, Any], dict[str, list[WarmPriorActor]]]:
-    """The last policies of a finished comparison of sources, one per prior and training seed.
+) -> tuple[dict[str, Any], dict[str, dict[int, WarmPriorActor]]]:
+    """The last policies of a finished comparison of sources.
 
     Args:
         run: its folder.
         device: where to put them.
 
     Returns:
-        Facts of the problem (``task``, ``style`` and those of the data), and by prior the policies.
+        Facts of the problem (``task``, ``style`` and those of the data), and the policies by prior name and
+        training seed.
 
     Raises:
         FileNotFoundError: if there are no results, or a policy is missing.
@@ -251,7 +252,7 @@ def finished_policies(
             f"--run {run} compares {'; '.join(name for name, _ in told)} on {len(meta['problems'])} "
             "problem(s): name a run of one task and style, with one sigma and one chunk length"
         )
-    actors: dict[str, list[WarmPriorActor]] = {}
+    actors: dict[str, dict[int, WarmPriorActor]] = {}
     for prior, entry in entries:
         folder = policy_path(
             run.resolve().parent / "policies" / entry["folder"], entry["iterations"]
@@ -261,5 +262,5 @@ def finished_policies(
                 f"{folder} is missing: finish the run with --resume --out {run}"
             )
         actor = WarmPriorActor.from_pretrained(folder, prior=prior, device=device)
-        actors.setdefault(prior.name, []).append(actor)
+        actors.setdefault(prior.name, {})[entry["seed"]] = actor
     return meta["problems"][0], actors

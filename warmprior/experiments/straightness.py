@@ -31,7 +31,7 @@ RATIOS = {
 
 
 def straightness(
-    policies: Mapping[str, Sequence[WarmPriorActor]],
+    policies: Mapping[str, Mapping[int, WarmPriorActor]],
     observations: SharedObservations,
     *,
     n_steps: int = 100,
@@ -45,8 +45,8 @@ def straightness(
     mean that deployment meets, made from its own prediction one decision earlier.
 
     Args:
-        policies: by name the policies of one prior, one per training seed; the baseline first. Those
-            without a flow are left out.
+        policies: by name the policies of one prior, by training seed; the baseline first. Those without a
+            flow are left out.
         observations: the observations of all of them.
 
     Keyword Args:
@@ -65,18 +65,20 @@ def straightness(
         average is, if any seed is.
 
     Raises:
-        ValueError: if the numbers of training seeds or the chunk lengths differ, or no policy is a flow.
+        ValueError: if the training seeds or the chunk lengths differ, or no policy is a flow.
         FloatingPointError: if a path becomes NaN or infinite.
     """
-    policies = {name: actors for name, actors in policies.items() if actors[0].prior.is_flow}
-    counts = {name: len(actors) for name, actors in policies.items()}
+    priors = {name: next(iter(actors.values())).prior for name, actors in policies.items()}
+    policies = {name: actors for name, actors in policies.items() if priors[name].is_flow}
+    counts = {name: sorted(actors) for name, actors in policies.items()}
     if not counts:
         raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
-    if len(set(counts.values())) != 1:
-        raise ValueError(f"every policy needs the same number of training seeds, got {counts}")
+    seeds = next(iter(counts.values()))
+    if any(other != seeds for other in counts.values()):
+        raise ValueError(f"every policy needs the same training seeds, got {counts}")
     measured: dict[tuple[str, str], list[TensorDict]] = {}
     bounds: dict[tuple[str, str], list[Tensor]] = {}
-    jobs = [(name, actor) for name, actors in policies.items() for actor in actors]
+    jobs = [(name, actors[s]) for name, actors in policies.items() for s in seeds]
     for name, actor in tqdm(jobs, desc=description, disable=description is None):
         device = next(actor.parameters()).device
         # Of the earlier prediction: at deployment its noise and that of the next are independent.
@@ -96,12 +98,14 @@ def straightness(
     base = next(iter(policies))
     rows = []
     for (name, mean), per_seed in measured.items():
-        prior = policies[name][0].prior
-        facts: dict[str, Any] = {"policy": name, "prior": prior.name, "sigma": prior.sigma}
+        prior = priors[name]
+        facts: dict[str, Any] = {"policy": name, "prior": prior.name, "sigma": float(prior.sigma)}
         facts |= {"chunk": prior.chunk_length, "mean": mean}
         parts: list[tuple[int | None, TensorDict, TensorDict, Tensor]] = [
-            (s, values, measured[base, "training"][s], bounds[name, mean][s])
-            for s, values in enumerate(per_seed)
+            (s, *part)
+            for s, *part in zip(
+                seeds, per_seed, measured[base, "training"], bounds[name, mean], strict=True
+            )
         ]
         if len(per_seed) > 1:
             average, bases = _average(per_seed), _average(measured[base, "training"])

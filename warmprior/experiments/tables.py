@@ -138,14 +138,14 @@ def success_table(
 
     Keyword Args:
         top_k: checkpoints averaged per seed.
-        source: of the demonstrations: ``"official"`` stands beside the paper's as an equal.
+        source: of the demonstrations, if it is known: ``"official"`` stands beside the paper's as an equal.
         notes: further ones.
     """
     rows = select(rows, "success_rate")
     # In the order of the groups: all sources at one NFE side by side.
-    rows = sorted(rows, key=lambda row: -row["nfe"])
     label = source_labels(rows)
     base = label(rows[0])
+    rows = sorted(rows, key=lambda row: -row["nfe"])
 
     def measured(cell: list[Row]) -> str:
         same = {name: cell[0][name] for name in ("task", "data", "nfe")}
@@ -189,7 +189,7 @@ def success_table(
         lambda row: f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}",
         source_at_nfe(rows),
         {
-            f"measured ({source} data)": measured,
+            "measured" + (f" ({source} data)" if source else ""): measured,
             f"probability of being better than {base}": better,
             "paper (official data)": paper,
             f"spread over draws of the source / data's (bound {LEAK_BOUND:g})": _bounded(
@@ -200,7 +200,7 @@ def success_table(
             ),
         },
         head="Success rate (%)",
-        notes=[*_success_notes(rows, top_k, source), *notes],
+        notes=[*_success_notes(rows, top_k, source, base), *notes],
     )
 
 
@@ -216,7 +216,7 @@ def _bounded(measure: str, bound: float) -> Cell:
     return cell
 
 
-def _success_notes(rows: Sequence[Row], top_k: int, source: str | None) -> list[str]:
+def _success_notes(rows: Sequence[Row], top_k: int, source: str | None, base: str) -> list[str]:
     seeds = len({row["seed"] for row in rows})
     checkpoints = len({row["checkpoint"] for row in rows})
     chosen = (
@@ -227,7 +227,7 @@ def _success_notes(rows: Sequence[Row], top_k: int, source: str | None) -> list[
     chunks = ", ".join(str(chunk) for chunk in dict.fromkeys(row["chunk"] for row in rows))
     notes = [
         f"- H = {chunks}; {seeds} seed(s); {max(row['episodes'] for row in rows)} episodes per cell; "
-        f"{chosen} per seed. In parentheses the gain over the first column of each group, in bold the best.",
+        f"{chosen} per seed. In parentheses the gain over {base}, in bold the best of each group.",
         "- `*` marks gains above the sum of both seed standard deviations (one-sigma rule)."
         if seeds > 1
         else "- One seed has no spread: no gain is marked. success.png shows the episodes' posterior.",
@@ -240,10 +240,10 @@ def _success_notes(rows: Sequence[Row], top_k: int, source: str | None) -> list[
         )
     if len({row["prior"] for row in rows}) > 1:
         notes.append(
-            "- Probability: of a higher success rate than the first column's, given the episodes of all "
+            f"- Probability: of a higher success rate than {base}'s, given the episodes of all "
             "seeds' last checkpoints (Beta posteriors, uniform prior, episodes taken as independent)."
         )
-    if source != "official":
+    if source not in ("official", None):
         notes.append(
             "- The measured rows are from other demonstrations than the paper's, which are the official "
             "human ones: compare gains within a row, not numbers across rows."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import json
+import re
 import zlib
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -117,6 +118,8 @@ class Prior:
         super().__init_subclass__(**kwargs)
         if "name" not in cls.__dict__:
             return
+        if not re.fullmatch(r"[\w.+-]+", cls.name):
+            raise ValueError(f"a prior's name becomes that of files: {cls.name!r} cannot")
         taken = Prior._registry.get(cls.name)
         # The same class once more, as when a notebook's cell runs again, replaces itself.
         if taken is not None and _place(taken) != _place(cls):

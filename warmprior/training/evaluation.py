@@ -178,6 +178,9 @@ def acting_in_episode(
         nfe: as for :func:`evaluate`.
         policy_seed: of the policy's random draws, at least 0.
     """
+    for name, value in (("the seed", seed), ("policy_seed", policy_seed)):
+        if value < 0:
+            raise ValueError(f"{name} must be at least 0, got {value}")
     noise_seed = np.random.SeedSequence((policy_seed, seed)).generate_state(1, np.uint64)
     with torch_threads(1), _acting(policy, int(noise_seed[0]), nfe) as act:
         yield act

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 __all__ = ["TrainingConfig"]
@@ -24,6 +25,9 @@ class TrainingConfig:
         save_every: iterations between saves of the training state; ``None`` for ten per checkpoint.
         log_every: iterations per logged mean loss.
         seed: of initial weights, sampling, source, times and dropout.
+
+    Raises:
+        ValueError: for a number out of its range, naming it.
     """
 
     iterations: int = 200_000
@@ -40,9 +44,19 @@ class TrainingConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "batch_size", "checkpoints", "log_every"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        counts = ("iterations", "batch_size", "checkpoints", "log_every", "save_every")
+        for name, least in [*((name, 1) for name in counts), ("seed", 0)]:
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ValueError(f"{name} must be at least {least}, got {value}")
+        for name, low in (("learning_rate", ">"), ("eps", ">"), ("weight_decay", ">=")):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and (value > 0 or (value == 0 and low == ">="))):
+                raise ValueError(f"{name} must be a finite number {low} 0, got {value}")
+        shares = {"betas": self.betas, "warmup_ratio": (self.warmup_ratio,)}
+        for name, values in (shares | {"ema_rate": (self.ema_rate,)}).items():
+            if not all(0.0 <= value < 1.0 for value in values):
+                raise ValueError(f"{name} must lie in [0, 1), got {getattr(self, name)}")
 
     @property
     def checkpoint_iterations(self) -> list[int]:

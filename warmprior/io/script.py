@@ -1,0 +1,60 @@
+"""Scripts: what a user can mend, and Ctrl-C, are told in one line."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from warmprior.io.workers import WorkerError
+
+__all__ = ["ERRORS", "run_script"]
+
+ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError)
+"""What a user can mend: reported without a traceback."""
+
+
+def run_script(
+    script: Callable[[], object], name: str, *, errors: tuple[type[BaseException], ...] = ERRORS
+) -> int:
+    """Run a script.
+
+    Args:
+        script: what to run.
+        name: of the script.
+
+    Keyword Args:
+        errors: what to report without a traceback.
+
+    Returns:
+        The exit code: 0, 2 after an error, 130 after Ctrl-C.
+    """
+    # Policies are shared between scripts, so all of them compute alike. Small networks gain nothing from
+    # a second thread, and on a busy machine threads that wait for each other cost much.
+    torch.set_float32_matmul_precision("high")
+    torch.set_num_threads(1)
+    interrupted = False
+
+    def interrupt(number: int, frame: Any) -> None:
+        nonlocal interrupted
+        interrupted = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, interrupt)
+    try:
+        script()
+    except BaseException as error:
+        if interrupted:  # whatever the libraries in between have made of it
+            print(f"\n{name}: interrupted; --resume continues", file=sys.stderr)
+            return 130
+        if not isinstance(error, errors):
+            raise
+        told = error.args[0] if isinstance(error, KeyError) and error.args else error
+        print(f"{name}: error: {told}", file=sys.stderr)
+        return 2
+    finally:
+        signal.signal(signal.SIGINT, before)
+    return 0
