@@ -384,6 +384,37 @@ def test_trainings_share_a_device_only_where_they_may(tmp_path, monkeypatch, at_
     assert len(notes) == 6 and (all(apart) if at_once else not all(apart))
 
 
+class Unhashable(PastPrior):
+    """As a dataclass is that compares its fields."""
+
+    name = "unhashable"
+    __hash__ = None
+
+    def __eq__(self, other):
+        return self is other
+
+
+class Widening(PastPrior, torch.nn.Module):
+    """Its noise is learnt."""
+
+    name = "widening"
+
+    def __init__(self, chunk_length, *, sigma=0.5, cold_probability=0.0):
+        torch.nn.Module.__init__(self)
+        super().__init__(chunk_length, sigma=sigma, cold_probability=cold_probability)
+        self.scale = torch.nn.Parameter(torch.ones(()))
+
+    def sample(self, loc, warm, generator=None):
+        return loc + self.scale * (super().sample(loc, warm, generator) - loc)
+
+
+def test_priors_that_learn_or_cannot_be_hashed(tmp_path):
+    compared = comparison(tmp_path, 2, priors=[Unhashable(H), Widening(H)], seeds=1)
+    rows = compared.run().rows
+    assert [row["prior"] for row in rows] == ["unhashable"] * 4 + ["widening"] * 4
+    assert float(compared.contestants[1].policy().prior.scale) != 1.0
+
+
 def test_a_chunk_longer_than_every_demonstration_is_refused(tmp_path):
     with pytest.raises(ValueError, match="longest demonstration of drift own has, 40"):
         comparison(tmp_path, 1, priors=[PastPrior(41)])
@@ -398,6 +429,35 @@ def test_what_rows_could_not_tell_is_refused(tmp_path):
     twins = [PastPrior(3), PastPrior(3, cold_probability=0.5)]
     with pytest.raises(ValueError, match="rows tell policies apart by their task"):
         comparison(tmp_path, 1, priors=twins)
+
+
+def test_several_problems_in_one_run_are_what_each_is_alone(tmp_path):
+    """Other demonstrations, and an environment of its own for each; in one table and one store."""
+    other = replace(drift_problem(), task="early", identity="2", make_env=SolvedEarly)
+    recipe = Recipe(
+        network=NetworkOptions(hidden_dim=16),
+        training=TRAINING,
+        evaluation=EvaluationOptions(episodes=3, nfe=(1,)),
+        run=RunOptions(out=tmp_path / "both" / "out", envs=1, logger="none"),
+    )
+
+    def run(*problems, folder, resume=False):
+        options = replace(recipe.run, out=tmp_path / folder / "out", resume=resume)
+        stores = [
+            Store(p, recipe.network, tmp_path / folder / "policies", tmp_path / "logs", options)
+            for p in problems
+        ]
+        compared = Comparison(replace(recipe, run=options), stores=stores, priors=PRIORS[:2])
+        return compared.run().rows
+
+    rows = run(drift_problem(), other, folder="both")
+    alone = [
+        *run(drift_problem(), folder="first"),
+        *run(other, folder="second"),
+    ]
+    assert rows == alone
+    assert [row["task"] for row in rows] == ["drift"] * 4 + ["early"] * 4
+    assert run(drift_problem(), other, folder="both", resume=True) == rows
 
 
 class SolvedEarly(DriftEnv):

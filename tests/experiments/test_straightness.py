@@ -90,6 +90,14 @@ def test_ratios_follow_from_the_fields(monkeypatch):
     assert "paper (official data)" not in unknown
 
 
+def test_rows_tell_the_training_seeds(monkeypatch):
+    small_loss(monkeypatch)
+    policies = {"gaussian": {4: policy(turning(2.0)), 3: policy(turning(1.0))}}
+    rows = {row["seed"]: row["kappa"] for row in by_seed(policies, shared(), n_steps=10)}
+    assert set(rows) == {3, 4, None}
+    assert rows[4] == pytest.approx(4 * rows[3], rel=1e-4)  # each that of its own policy
+
+
 def test_an_average_over_seeds_leaves_none_out(monkeypatch):
     small_loss(monkeypatch)
     policies = {

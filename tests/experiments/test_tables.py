@@ -47,6 +47,26 @@ def test_gains_are_over_the_baseline_of_the_same_nfe():
     assert "One seed has no spread: no gain is marked" in text
 
 
+def test_gains_are_over_the_first_source_wherever_it_is():
+    rows = [
+        row(k, prior=prior, nfe=nfe)
+        for prior, wins in (
+            ("regression", {1: 2}),
+            ("gaussian", {9: 5, 1: 4}),
+            ("past", {9: 7, 1: 9}),
+        )
+        for nfe, k in wins.items()
+    ]
+    text = success_table(rows, top_k=1, source="scripted")
+    assert (
+        "| NFE 9: Base | NFE 9: WP-Past | NFE 1: Regression | NFE 1: Base | NFE 1: WP-Past |"
+        in text
+    )
+    # There is no regression at NFE 9, and so no gain.
+    assert lines(text)[0].endswith("| 50.0 | **70.0** | 20.0 | 40.0 (+20.0) | **90.0** (+70.0) |")
+    assert "the gain over Regression" in text
+
+
 def test_a_gain_within_the_spread_of_the_seeds_is_not_marked():
     rows = [
         row(k, prior=prior, seed=seed)
