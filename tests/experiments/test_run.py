@@ -262,7 +262,7 @@ def test_losses_are_those_of_the_workers_and_nothing_is_trained_again(
     iterations = [5, 10, 15, 20]
     monkeypatch.setattr(Store, "new_actor", lambda *args: pytest.fail("something was trained"))
     losses = finished.losses(finished.stores[0])
-    assert {name: len(curves) for name, curves in losses.items()} == {p.name: 2 for p in PRIORS}
+    assert {name: len(curves) for name, curves in losses.items()} == {p.label: 2 for p in PRIORS}
     assert all([i for i, _ in curve] == iterations for c in losses.values() for curve in c)
     monkeypatch.undo()
     again = comparison(undisturbed, 1, resume=True)

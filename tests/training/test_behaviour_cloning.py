@@ -256,6 +256,8 @@ def test_default_config_is_the_paper_s():
     assert (config.iterations, config.batch_size, config.learning_rate) == (200_000, 1024, 1e-4)
     assert (config.weight_decay, config.warmup_ratio, config.ema_rate) == (1e-5, 0.2, 0.995)
     assert config.checkpoint_iterations == [20_000 * i for i in range(1, 11)]
+    # No more than there are iterations.
+    assert TrainingConfig(iterations=3, checkpoints=4).checkpoint_iterations == [1, 2, 3]
 
 
 def test_average_starts_at_the_first_update(tmp_path):
