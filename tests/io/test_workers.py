@@ -127,7 +127,7 @@ def test_an_error_of_the_parent_ends_its_workers():
     with pytest.raises(KeyboardInterrupt), WorkerPool(2, None) as pool:
         for _ in range(2):
             pool.submit(partial(sleep_and_tell, 300))
-        processes = [p.pid for p in multiprocessing.active_children()]
+        processes = sorted(p.pid for p in multiprocessing.active_children())
         assert pool.wait(0.2) == []
         raise KeyboardInterrupt
     assert all(ended(pid) for pid in processes)
@@ -140,7 +140,7 @@ def test_a_killed_worker_is_an_error_and_not_a_hang(job):
     told = r"of 2 \(exit code -9\) died.*memory.*--envs"
     with pytest.raises(WorkerError, match=told) as raised, WorkerPool(2, None) as pool:
         pool.submit(job)
-        processes = [p.pid for p in multiprocessing.active_children()]
+        processes = sorted(p.pid for p in multiprocessing.active_children())
         if job is not kill_oneself:
             time.sleep(0.5)
             os.kill(processes[1], signal.SIGKILL)  # busy or idle
@@ -155,7 +155,7 @@ def test_a_killed_worker_is_an_error_and_not_a_hang(job):
 def hold_workers(pipe):
     with WorkerPool(2, None) as pool:
         pool.submit(partial(sleep_and_tell, 300))
-        pipe.send([p.pid for p in multiprocessing.active_children()])
+        pipe.send(sorted(p.pid for p in multiprocessing.active_children()))
         pool.wait()
 
 
