@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
@@ -15,7 +16,6 @@ from typing import Any
 import tyro
 
 from warmprior.experiments.recipe import Recipe, differences, record, refuse_ignored, restore
-from warmprior.experiments.results import write_options
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
 
 __all__ = ["numbered_folder", "parse", "started", "write_report"]
@@ -151,7 +151,9 @@ def started(recipe: Recipe, study: str) -> Iterator[Path]:
     out = recipe.run.directory
     check_writable(out)
     with exclusive(out):
-        write_options(out / "options.json", study, record(recipe, changeable=True))
+        tree = {"study": study, **record(recipe, changeable=True)}
+        text = json.dumps(tree, indent=1) + "\n"
+        write_atomic(out / "options.json", lambda path: path.write_text(text))
         print(f"Output folder: {out}", flush=True)
         try:
             yield out

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from warmprior.diagnostics.statistics import SeedSummary, summarize_seeds, top_k_mean
-from warmprior.io.files import as_json, read_json, write_atomic
+from warmprior.io.files import read_json, write_atomic
 from warmprior.training.checkpoint import check_identity
 
 __all__ = [
@@ -273,15 +273,3 @@ def _check(row: Row) -> None:
             raise ValueError(f"{successes} successes in {episodes} episodes")
         if not math.isclose(rate, successes / episodes):
             raise ValueError(f"its success_rate is {rate!r}, not {successes / episodes}")
-
-
-def write_options(path: Path, study: str, tree: Mapping[str, Any]) -> None:
-    """Write the options of a run atomically.
-
-    Args:
-        path: of the file.
-        study: which experiment they belong to.
-        tree: of the options.
-    """
-    text = json.dumps({"study": study, **as_json(tree)}, indent=1) + "\n"
-    write_atomic(path, lambda temporary: temporary.write_text(text))
