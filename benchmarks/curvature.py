@@ -36,7 +36,8 @@ from warmprior.experiments import (
     write_report,
 )
 from warmprior.experiments.navigation_figures import plot_flow_paths
-from warmprior.experiments.recipe import Flat, refuse_ignored
+from warmprior.experiments.recipe import Flat
+from warmprior.experiments.record import refuse_ignored
 from warmprior.experiments.results import facts_of_machine
 from warmprior.io.script import run_script
 

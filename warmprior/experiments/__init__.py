@@ -35,9 +35,8 @@ from warmprior.experiments.recipe import (
     Recipe,
     RunOptions,
     SourceOptions,
-    record,
-    restore,
 )
+from warmprior.experiments.record import record, restore
 from warmprior.experiments.results import Results, Row, grouped, mean_known, select, success_summary
 from warmprior.experiments.run import Comparison, Contestant
 from warmprior.experiments.store import Store, finished_policies

@@ -15,7 +15,8 @@ from typing import Any
 
 import tyro
 
-from warmprior.experiments.recipe import Recipe, differences, record, refuse_ignored, restore
+from warmprior.experiments.recipe import Recipe
+from warmprior.experiments.record import differences, record, refuse_ignored, restore
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
 
 __all__ = ["numbered_folder", "parse", "started", "write_report"]

@@ -14,13 +14,8 @@ from warmprior import keys
 from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.smoothness import executed_actions, smoothness
 from warmprior.envs.navigation1d import NavigationEnv, navigation_metrics, navigation_positions
-from warmprior.experiments.recipe import (
-    EvaluationOptions,
-    NetworkOptions,
-    Recipe,
-    SourceOptions,
-    refuse_ignored,
-)
+from warmprior.experiments.recipe import EvaluationOptions, NetworkOptions, Recipe, SourceOptions
+from warmprior.experiments.record import refuse_ignored
 from warmprior.modules import WarmPriorActor
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms import policy_transforms

@@ -21,8 +21,8 @@ from warmprior.experiments.recipe import (
     Recipe,
     SourceOptions,
     check_counts,
-    refuse_ignored,
 )
+from warmprior.experiments.record import refuse_ignored
 from warmprior.experiments.store import finished_problem
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior

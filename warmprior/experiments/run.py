@@ -19,7 +19,8 @@ from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.experiments.labels import source_labels
 from warmprior.experiments.problem import find_problems, observe
 from warmprior.experiments.progress import ComparisonProgress
-from warmprior.experiments.recipe import EvaluationOptions, HeldOutOptions, Recipe, record
+from warmprior.experiments.recipe import EvaluationOptions, HeldOutOptions, Recipe
+from warmprior.experiments.record import record
 from warmprior.experiments.results import Results, Row, facts_of_machine, played
 from warmprior.experiments.store import Losses, Store
 from warmprior.io.files import check_writable
