@@ -20,7 +20,7 @@ pytest.importorskip("h5py")
 
 import h5py
 
-from tests.training.test_evaluation import ended
+from tests.processes import ended
 from warmprior.data.scripted import episode as episode_module
 from warmprior.data.scripted import generate as generate_module
 from warmprior.data.scripted import generate_demonstrations

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.training.test_evaluation import ended
+from tests.processes import ended
 from warmprior.io import workers
 from warmprior.io.workers import WorkerError, WorkerPool
 

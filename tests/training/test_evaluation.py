@@ -8,7 +8,6 @@ import signal
 import threading
 import time
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
+from tests.processes import ended
 from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
     GaussianPrior,
@@ -317,11 +317,6 @@ def hold_environments(pipe):
     other.start()
     pipe.send([*(worker.pid for worker in env._workers), other.pid])
     time.sleep(60)
-
-
-def ended(pid):
-    state = Path(f"/proc/{pid}/stat")
-    return not state.exists() or state.read_text().split()[2] == "Z"
 
 
 def test_workers_end_with_a_killed_parent():
