@@ -114,7 +114,7 @@ def run(argv: Sequence[str] | None) -> None:
         comparison.results.add(*rows)
         top_k = recipe.evaluation.top_k
         plot_budget(rows, out / "budget.png", top_k=top_k, title=comparison.title)
-        write_report(out, make_table(rows, top_k))
+        write_report(out, make_table(rows, top_k), comparison.failures)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

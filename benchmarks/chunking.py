@@ -68,7 +68,7 @@ def run(argv: Sequence[str] | None) -> None:
         plot_success_bars(bars, out / "bars.png", top_k=top_k, title=title)
         shortest = last_checkpoints(select(rows, chunk=chunks[0]))
         plot_success(shortest, out / "violins.png", title=f"{title}, H = {chunks[0]}")
-        write_report(out, make_table(rows, top_k))
+        write_report(out, make_table(rows, top_k), comparison.failures)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

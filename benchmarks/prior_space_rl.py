@@ -43,7 +43,7 @@ from warmprior.experiments.prior_space import (
     agent_environment,
     prior_space_preset,
 )
-from warmprior.experiments.results import facts_of_machine, grouped, played
+from warmprior.experiments.results import facts_of_machine, grouped
 from warmprior.io.files import read_json, write_atomic
 from warmprior.io.script import run_script
 from warmprior.rl import PriorSpaceTraining
@@ -205,7 +205,8 @@ def run(argv: Sequence[str] | None) -> None:
 def evaluated(facts: dict[str, Any], point: dict[str, Any]) -> Row:
     """The row of one evaluation of an agent."""
     told = {name: point[name] for name in ("environment_steps", "evaluation")}
-    return played(facts | told, point["successes"], point["episodes"])
+    counted = ("episodes", "successes", "success_rate")
+    return Row(facts | told, {name: point[name] for name in counted})
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -18,6 +18,7 @@ from warmprior.experiments import (
     PRESETS,
     Comparison,
     Row,
+    flow_table,
     parse,
     plot_filmstrip,
     plot_learning_curves,
@@ -109,7 +110,7 @@ def run(argv: Sequence[str] | None) -> None:
             rows, top_k=recipe.evaluation.top_k, source=source, notes=notes(comparison)
         )
         draw(comparison, rows)
-        write_report(out, table)
+        write_report(out, f"{table}\n{flow_table(rows)}", comparison.failures)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -102,7 +102,7 @@ def run(argv: Sequence[str] | None) -> None:
             title=f"{problem.name}, H = {chunk}, NFE {nfe}, {recipe.evaluation.seeds} seed(s)",
             paper=(problem.task, problem.style, chunk, nfe) == ("square", "mh", 8, 1),
         )
-        write_report(out, text)
+        write_report(out, text, comparison.failures)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -12,6 +12,7 @@ from warmprior.diagnostics import (
     SeedSummary,
     bootstrap_ratio,
     exceeds_one_sigma,
+    paired_probability_better,
     probability_better,
     success_posterior,
     summarize_seeds,
@@ -96,6 +97,16 @@ def test_probability_better_agrees_with_sampling_and_stays_a_probability():
         assert 0 <= p <= 1 and p + q == pytest.approx(1.0)
     with pytest.raises(ValueError, match="successes"):
         probability_better(3, 2, 0, 0)
+
+
+@pytest.mark.parametrize(("wins", "losses"), [(0, 0), (7, 2), (0, 5), (40, 41), (900, 100)])
+def test_paired_probability_is_that_of_a_beta(wins, losses):
+    stats = pytest.importorskip("scipy.stats")
+    found = paired_probability_better(wins, losses)
+    assert found == pytest.approx(stats.beta(wins + 1, losses + 1).sf(0.5), abs=1e-12)
+    assert found + paired_probability_better(losses, wins) == pytest.approx(1.0)
+    with pytest.raises(ValueError, match="at least 0"):
+        paired_probability_better(-1, losses)
 
 
 def test_bootstrap_agrees_with_the_delta_method():

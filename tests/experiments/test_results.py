@@ -36,6 +36,7 @@ def test_rows_survive_and_resume(tmp_path):
     again = resumed(results.path)
     assert again.rows == results.rows
     assert again.find(FACTS)["successes"] == 4
+    assert again.find(FACTS).outcomes == "1111000000"
     assert again.find(FACTS | {"nfe": 3}) is None
     assert Results(results.path, META, IDENTITY).rows == []  # without resume
 
@@ -140,6 +141,9 @@ def test_rows_are_found_by_their_facts_and_measures():
         ("measures", {"inner_jump": -0.5}, "inner_jump"),
         ("measures", {"success_rate": 0.9}, "success_rate"),
         ("measures", {"success_rate": None}, "successes"),
+        (None, {"outcomes": "11111"}, "5 successes in 5 episodes"),
+        (None, {"outcomes": "12"}, "outcomes"),
+        (None, {"outcomes": [1, 0]}, "outcomes"),
         (None, {"unknown": 1}, "unknown"),
     ],
     ids=str,
@@ -165,7 +169,7 @@ def test_rows_that_contradict_each_other(tmp_path):
     stored["rows"].append(json.loads(json.dumps(stored["rows"][2])))  # once more does no harm
     results.path.write_text(json.dumps(stored))
     assert resumed(results.path).rows == results.rows
-    stored["rows"][-1]["measures"] |= {"successes": 9, "success_rate": 0.9}
+    stored["rows"][-1]["measures"]["mean_steps"] = 3.0
     results.path.write_text(json.dumps(stored))
     with pytest.raises(ValueError, match=r"results\.json.*row 18 contradicts row 2"):
         resumed(results.path)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import threading
 import time
+import warnings
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -16,16 +18,22 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from tests.training.cloning_parts import same
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
-from warmprior.diagnostics import SharedObservations, source_leak
+from warmprior.diagnostics import (
+    SharedObservations,
+    branching_bound,
+    curvature,
+    source_leak,
+)
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io import workers
 from warmprior.io.files import load_file
+from warmprior.io.script import PartialFailure
 from warmprior.modules import Normalizer
-from warmprior.training import TrainingConfig, WorkerError
+from warmprior.training import TrainingConfig, WorkerError, play_episode
 
 pytest.importorskip("tyro")
 
@@ -157,7 +165,10 @@ def stored(folder):
 
 
 def rows_of(folder):
-    return [{**row["facts"], **row["measures"]} for row in stored(folder)["rows"]]
+    return [
+        {**row["facts"], **row["measures"], "outcomes": row["outcomes"]}
+        for row in stored(folder)["rows"]
+    ]
 
 
 def weights(folder):
@@ -219,7 +230,7 @@ def test_rows_have_their_order_whatever_ends_first(undisturbed, tmp_path, capsys
     assert rows == rows_of(undisturbed)
     told = capsys.readouterr().out
     assert told.count("trained ") == 6 and told.count("played ") == 24
-    assert told.index("trained drift, preview") < told.index("trained drift, gaussian")
+    assert told.index("trained drift own, preview") < told.index("trained drift own, gaussian")
 
 
 def test_every_worker_plays_each_seed_once_per_cell(tmp_path):
@@ -293,40 +304,94 @@ def test_another_number_of_workers_continues(undisturbed, tmp_path):
     assert stored(tmp_path)["rows"] == whole[:3] + results["rows"] + whole[9:]
 
 
-def test_rows_tell_what_the_source_leaks(undisturbed):
+def test_rows_tell_what_was_measured_of_their_policy(undisturbed):
     """The same as measured here, on the policy that the row is about, if it is a last checkpoint."""
     (store,) = comparison(undisturbed, 1, resume=True).stores
     for row in rows_of(undisturbed):
         if row["checkpoint"] != TRAINING.iterations:
-            assert row["source_leak"] is None
+            assert row.get("source_leak") is None and row.get("kappa") is None
             continue
         prior = next(prior for prior in PRIORS if prior.name == row["prior"])
         shared = SharedObservations(store.problem.data, prior.chunk_length, observation_steps=2)
         order = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
-        windows = shared.subset(order.sort()[0]).windows(prior)
+        shared = shared.subset(order.sort()[0])
+        windows = shared.windows(prior)
         policy = store.load(prior, replace(TRAINING, seed=row["seed"]), row["checkpoint"])
         leak = source_leak(policy, windows, nfes=(1, 3), episodes=shared.episodes)[row["nfe"]]
         assert row["source_leak"] == pytest.approx(leak.leak)
         assert row["inner_step_ratio"] == pytest.approx(leak.inner_step_ratio)
+        generator = torch.Generator().manual_seed(0)
+        if prior.ever_warm:
+            windows = shared.deployed(policy, generator=generator)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            flow = curvature(policy, windows, generator=generator)
+        for name, key in (("kappa", "kappa_executed"), ("relative_curvature", "relative_executed")):
+            value = float(flow[key].nanmean())
+            told = math.nan if row[name] is None else row[name]  # it does not move
+            assert told == pytest.approx(value, nan_ok=True)
+        bound = branching_bound(windows, prior)["total_executed"].mean()
+        assert row["bound"] == pytest.approx(float(bound))
+
+
+def test_rows_tell_every_episode_in_the_order_of_the_seeds(undisturbed):
+    (store,) = comparison(undisturbed, 1, resume=True).stores
+    row = rows_of(undisturbed)[-1]
+    policy = store.load(PRIORS[2], replace(TRAINING, seed=row["seed"]), row["checkpoint"])
+    env = TransformedEnv(DriftEnv(), store.transforms(PRIORS[2])())
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + row["episodes"])
+    options = {"nfe": row["nfe"], "policy_seed": row["seed"]}
+    solved = [play_episode(policy, env, seed, **options).success for seed in seeds]
+    assert row["outcomes"] == "".join(str(int(s)) for s in solved)
+    assert 0 < sum(solved) < len(solved)
 
 
 class Diverging(Store):
     def train(self, prior, training, progress=None):
-        if prior.name == "past":
-            self.problem.data["action"].fill_(1e30)
-        elif prior.name == "preview":
-            time.sleep(300)
-        return super().train(prior, training, progress)
+        if prior.name != "past":
+            return super().train(prior, training, progress)
+        data = self.problem.data.clone()
+        data["action"].fill_(1e30)
+        problem = replace(self.problem, data=data)
+        broken = Store(problem, self.network, self.directory, self.logs, self.run)
+        return broken.train(prior, training, progress)
 
 
-def test_a_training_that_diverges_names_its_file_and_stops_the_others(tmp_path):
-    started = time.monotonic()
+def test_a_policy_that_fails_is_named_and_does_not_stop_the_others(undisturbed, tmp_path, capsys):
     # Moments would refuse such actions before any training.
     compared = comparison(tmp_path, 3, kind=Diverging, seeds=1, precondition=False)
-    with pytest.raises(FloatingPointError) as raised:
+    file = str(compared.contestants[1].folder / "state.safetensors")
+    rows = compared.run().rows
+    assert [row["prior"] for row in rows] == ["gaussian"] * 4 + ["preview"] * 4
+    assert [c.prior.name for c in compared.contestants] == ["gaussian", "preview"]
+    (failure,) = compared.failures
+    assert failure.startswith("drift") and "past" in failure and file in failure
+    assert f"FAILED {failure}" in capsys.readouterr().out
+    assert set(compared.policies()) == {prior.describe() for prior in (PRIORS[0], PRIORS[2])}
+    # A second attempt, in which nothing fails, adds what is missing.
+    again = comparison(tmp_path, 2, seeds=1, precondition=False, resume=True)
+    assert [row["prior"] for row in again.run().rows][4:8] == ["past"] * 4
+    assert again.failures == []
+
+
+class Stumbling(DriftEnv):
+    def _step(self, tensordict):
+        if self.seed_ == EVALUATION_SEED + 2:
+            raise AssertionError("the simulator stumbled")
+        return super()._step(tensordict)
+
+
+def test_where_everything_fails_the_run_does(tmp_path):
+    compared = comparison(tmp_path, 2, problem=drift_problem(Stumbling()), seeds=1)
+    with pytest.raises(PartialFailure, match=r"(?s)gaussian.*stumbled.*preview.*stumbled"):
         compared.run()
-    assert str(compared.contestants[1].folder / "state.safetensors") in str(raised.value)
-    assert time.monotonic() - started < 60
+
+
+def test_a_training_that_fails_is_told_when_all_others_are_done(tmp_path):
+    compared = comparison(tmp_path, 3, kind=Diverging, seeds=1, precondition=False)
+    with pytest.raises(PartialFailure, match="past"):
+        compared.train()
+    assert [c.path.is_dir() for c in compared.contestants] == [True, True]
 
 
 class Mortal(DriftEnv):

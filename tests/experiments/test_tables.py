@@ -8,8 +8,18 @@ from warmprior.diagnostics import probability_better
 
 pytest.importorskip("tyro")
 
-from tests.experiments.row_parts import compared, row
-from warmprior.experiments import Row, mean_cell, paper_success, success_cell, success_table, table
+from tests.experiments.row_parts import FACTS, compared, row
+from warmprior.experiments import (
+    Row,
+    flow_table,
+    mean_cell,
+    paper_success,
+    success_cell,
+    success_table,
+    table,
+)
+from warmprior.experiments.results import played
+from warmprior.experiments.tables import wins_and_losses
 
 
 def lines(text, start="| Square-PH"):
@@ -18,13 +28,14 @@ def lines(text, start="| Square-PH"):
 
 def test_table_shows_gains_marks_and_the_papers_row():
     text = success_table(compared(), top_k=1, source="scripted", notes=["- A note."])
-    measured, better, paper = lines(text)
+    measured, better, paired, paper = lines(text)
     assert measured == (
         "| Square-PH, measured (scripted data) | 50.0 | **80.0** (+30.0*) | 50.0 (+0.0) |"
     )
     # Of all seeds' last checkpoints: 15, 24 and 15 of 30.
     chance = f"{probability_better(24, 30, 15, 30):.2f}"
     assert better == f"| Square-PH, probability of being better than Base | - | {chance} | 0.50 |"
+    assert paired.endswith(" (probability) | - | 9 : 0 (1.00) | 1 : 1 (0.50) |")
     assert paper == "| Square-PH, paper (official data) | 83.6 | 86.6 (+3.0) | 87.3 (+3.7) |"
     head = "| Success rate (%) | NFE 1: Base | NFE 1: WP-Past | NFE 1: WP-Preview |"
     assert text.startswith(head)
@@ -99,6 +110,47 @@ def test_table_shows_what_the_source_leaks():
     text = success_table([leaking(old) for old in compared()], top_k=1, source="scripted")
     assert "spread over draws of the source / data's (bound 1) | - | 0.30 | - |" in text
     assert "step inside chunks / data's (bound 1.3) | - | 1.50 (!) | - |" in text
+
+
+def with_outcomes(outcomes, **facts):
+    return played(FACTS | facts, [c == "1" for c in outcomes])
+
+
+def test_episodes_of_the_same_seeds_are_compared():
+    """Pairs are of one training and one episode seed; what both or neither solve does not count."""
+    base = [with_outcomes("1100", seed=0), with_outcomes("0000", seed=1)]
+    mine = [
+        with_outcomes("0111", prior="past", seed=0),
+        with_outcomes("0011", prior="past", seed=1),
+    ]
+    text = success_table([*base, *mine], top_k=1, source=None)
+    # 4 wins, 1 loss: (C(6,0) + ... + C(6,4)) / 2^6 = 57 / 64
+    assert "only Base solves (probability) | - | 4 : 1 (0.89) |" in text
+    assert wins_and_losses(mine[::-1], base[:1]) == (2, 1)
+    assert wins_and_losses(mine, []) is None
+    assert wins_and_losses([Row(FACTS, {"success_rate": 0.5})], base) is None
+
+
+def test_flows_compare_with_the_first_sources_of_their_problem():
+    def flowing(kappa, bound, **facts):
+        return Row(FACTS | facts, {"success_rate": 1.0, "kappa": kappa, "bound": bound})
+
+    rows = [
+        flowing(kappa * scale, bound, task=task, prior=prior, nfe=nfe, seed=seed)
+        for task, scale in (("square", 1.0), ("stack", 10.0))
+        for prior, kappa, bound in (("gaussian", 2.0, 8.0), ("past", 1.0, None))
+        for seed in (0, 1)
+        for nfe in (9, 1)
+    ]
+    text = flow_table(rows)
+    assert text.count("curvature / Base's | 1.00 | 0.50 |") == 2
+    assert "Stack-PH, bound of the branching cost / Base's | 1.00 | - |" in text
+    assert "per squared" not in text  # nobody measured it
+
+
+def test_jumps_between_chunks_are_relative_to_the_steps_inside():
+    told = [row(5, measures={"boundary_jump": 0.6, "inner_jump": j}) for j in (0.2,)]
+    assert "jump between chunks / step inside | 3.00 |" in success_table(told, top_k=1, source=None)
 
 
 def test_policies_of_several_sigmas_have_columns_of_their_own():

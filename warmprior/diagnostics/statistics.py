@@ -16,6 +16,7 @@ __all__ = [
     "SeedSummary",
     "bootstrap_ratio",
     "exceeds_one_sigma",
+    "paired_probability_better",
     "probability_better",
     "success_posterior",
     "summarize_seeds",
@@ -115,6 +116,38 @@ def top_k_mean(rates: Sequence[float], k: int) -> float:
         raise ValueError(f"need at least one rate and k >= 1, got {len(rates)} rates and k={k}")
     best = sorted(rates, reverse=True)[:k]
     return math.fsum(best) / len(best)
+
+
+def paired_probability_better(wins: int, losses: int) -> float:
+    r"""Posterior probability that ``a`` beats ``b`` in an episode that only one of them solves.
+
+    Of the episodes that both play from the same seed, those with equal outcomes tell nothing about which
+    is better. Under a uniform prior the share of wins among the others is
+    :math:`\mathrm{Beta}(w + 1, l + 1)`, which exceeds one half with probability
+
+    .. math::
+        P = 2^{-(w + l + 1)} \sum_{i=0}^{w} \binom{w + l + 1}{i},
+
+    the sign test's Bayesian counterpart. It is sharper than :func:`probability_better` where episodes
+    differ in difficulty.
+
+    Args:
+        wins: ``w``, episodes that ``a`` alone solves.
+        losses: ``l``, episodes that ``b`` alone solves.
+
+    Raises:
+        ValueError: if one is negative.
+
+    Examples:
+        >>> paired_probability_better(3, 0)  # 15 / 16
+        0.9375
+        >>> paired_probability_better(4, 4)
+        0.5
+    """
+    if wins < 0 or losses < 0:
+        raise ValueError(f"need counts of at least 0, got {wins} and {losses}")
+    n = wins + losses + 1
+    return sum(math.comb(n, i) for i in range(wins + 1)) / 2**n
 
 
 @dataclass(frozen=True)

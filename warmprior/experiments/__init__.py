@@ -44,6 +44,7 @@ from warmprior.experiments.straightness import straightness
 from warmprior.experiments.study_figures import plot_budget, plot_chunk_lengths, plot_sigma
 from warmprior.experiments.tables import (
     curvature_table,
+    flow_table,
     mean_cell,
     success_cell,
     success_table,
@@ -72,6 +73,7 @@ __all__ = [
     "curvature_table",
     "find_problems",
     "finished_policies",
+    "flow_table",
     "grouped",
     "judge_navigation",
     "mean_cell",

@@ -18,6 +18,7 @@ import tyro
 from warmprior.experiments.recipe import Recipe
 from warmprior.experiments.record import differences, record, refuse_ignored, restore
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
+from warmprior.io.script import PartialFailure
 
 __all__ = ["numbered_folder", "parse", "started", "write_report"]
 
@@ -164,12 +165,19 @@ def started(recipe: Recipe, study: str) -> Iterator[Path]:
             raise
 
 
-def write_report(out: Path, table: str) -> None:
+def write_report(out: Path, table: str, failures: Sequence[str] = ()) -> None:
     """Write the table of a run and show it.
 
     Args:
         out: its folder.
         table: in Markdown.
+        failures: what is missing in it, and why (:attr:`Comparison.failures`).
+
+    Raises:
+        PartialFailure: if anything is, after the table is shown.
     """
     write_atomic(out / "table.md", lambda path: path.write_text(table))
     print(f"\n{table}\nResults, table and pictures: {out}", flush=True)
+    if failures:
+        told = "".join(f"\n- {failure}" for failure in failures)
+        raise PartialFailure(f"{len(failures)} failed (--resume tries again):{told}")

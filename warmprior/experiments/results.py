@@ -40,6 +40,8 @@ class Row:
     Attributes:
         facts: what was measured: task, prior, seed, ...
         measures: what came out; ``None`` where it is not known, as JSON has no NaN.
+        outcomes: of the episodes played, a character each in the order of their seeds: ``1`` if solved,
+            else ``0``. Rows of the same seeds compare episode by episode.
 
     Examples:
         >>> row = Row({"prior": "past"}, {"success_rate": 0.5, "kappa": float("nan")})
@@ -49,6 +51,7 @@ class Row:
 
     facts: Mapping[str, Fact]
     measures: Mapping[str, float | None]
+    outcomes: str = ""
 
     def __post_init__(self) -> None:
         known = {
@@ -65,17 +68,22 @@ class Row:
         return self.facts.get(name, self.measures.get(name))
 
 
-def played(facts: Mapping[str, Fact], successes: int, episodes: int, **measures: Any) -> Row:
+def played(facts: Mapping[str, Fact], outcomes: Sequence[bool], **measures: Any) -> Row:
     """The row of an evaluation by episodes.
 
     Args:
         facts: of the row.
-        successes: how many episodes succeeded.
-        episodes: how many were played.
+        outcomes: whether each episode succeeded, in the order of their seeds.
         measures: further ones.
+
+    Examples:
+        >>> row = played({"prior": "past"}, [True, False, True, True])
+        >>> row["success_rate"], row.outcomes
+        (0.75, '1011')
     """
+    episodes, successes = len(outcomes), sum(outcomes)
     counts = {"episodes": episodes, "successes": successes, "success_rate": successes / episodes}
-    return Row(facts, counts | measures)
+    return Row(facts, counts | measures, "".join("01"[solved] for solved in outcomes))
 
 
 def select(rows: Iterable[Row], measure: str | None = None, **facts: Fact) -> list[Row]:
@@ -211,9 +219,15 @@ class Results:
     def save(self) -> None:
         """Write the file atomically."""
         self.meta["wall_time_s"] = time.monotonic() - self._started
-        rows = [{"facts": dict(row.facts), "measures": dict(row.measures)} for row in self.rows]
+        rows = [_stored(row) for row in self.rows]
         text = json.dumps({"meta": self.meta, "rows": rows}, indent=1, allow_nan=False) + "\n"
         write_atomic(self.path, lambda temporary: temporary.write_text(text))
+
+
+def _stored(row: Row) -> dict[str, Any]:
+    """A row as JSON holds it."""
+    stored: dict[str, Any] = {"facts": dict(row.facts), "measures": dict(row.measures)}
+    return stored | {"outcomes": row.outcomes} if row.outcomes else stored
 
 
 def _read_rows(records: Sequence[Any]) -> list[Row]:
@@ -225,7 +239,7 @@ def _read_rows(records: Sequence[Any]) -> list[Row]:
     rows: list[Row] = []
     for i, stored in enumerate(records):
         try:
-            if set(stored) != {"facts", "measures"}:
+            if set(stored) | {"outcomes"} != {"facts", "measures", "outcomes"}:
                 raise ValueError(f"it has {sorted(stored)} instead of facts and measures")
             row = Row(**stored)
             _check(row)
@@ -273,3 +287,11 @@ def _check(row: Row) -> None:
             raise ValueError(f"{successes} successes in {episodes} episodes")
         if not math.isclose(rate, successes / episodes):
             raise ValueError(f"its success_rate is {rate!r}, not {successes / episodes}")
+    if not isinstance(row.outcomes, str) or row.outcomes.strip("01"):
+        raise ValueError(f"outcomes cannot be {row.outcomes!r}")
+    counted = len(row.outcomes), row.outcomes.count("1")
+    if row.outcomes and counted != (row.get("episodes"), row.get("successes")):
+        raise ValueError(
+            f"its outcomes are {counted[1]} successes in {counted[0]} episodes, its counts "
+            f"{row.get('successes')} in {row.get('episodes')}"
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import traceback
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +24,9 @@ from warmprior.experiments.recipe import EvaluationOptions, HeldOutOptions, Reci
 from warmprior.experiments.record import record
 from warmprior.experiments.results import Results, Row, facts_of_machine, played
 from warmprior.experiments.store import Losses, Store
+from warmprior.experiments.straightness import flow_measures
 from warmprior.io.files import check_writable
+from warmprior.io.script import ERRORS, PartialFailure
 from warmprior.io.workers import WorkerPool, available_cores
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
@@ -33,8 +36,8 @@ from warmprior.training.training_config import TrainingConfig
 
 __all__ = ["Comparison", "Contestant"]
 
-LEAK_WINDOWS = 512
-"""Observations on which the source leak of every policy is measured."""
+MEASURED_WINDOWS = 512
+"""Observations of the training data on which source leak and flow of every policy are measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +68,10 @@ class Contestant:
         """The last policy of averaged weights, trained if it is not yet."""
         return self.store.policy(self.prior, self.training)
 
+    def __str__(self) -> str:
+        problem = self.store.problem
+        return f"{problem.task} {problem.style}, {self.prior.describe()}, seed {self.training.seed}"
+
     def facts(self) -> dict[str, Any]:
         """What rows tell of it."""
         return {
@@ -87,11 +94,11 @@ class _Train:
 
 
 @dataclass(frozen=True)
-class _Leak:
+class _Measure:
     number: int
 
-    def __call__(self, worker: _Worker) -> dict[int, SourceLeak]:
-        return worker.leak(self.number)
+    def __call__(self, worker: _Worker) -> _Measures:
+        return worker.measure(self.number)
 
 
 @dataclass(frozen=True)
@@ -103,6 +110,44 @@ class _Play:
 
     def __call__(self, worker: _Worker) -> Episode:
         return worker.play(self)
+
+
+@dataclass(frozen=True)
+class _Measures:
+    """What is measured of a policy on its training data.
+
+    Attributes:
+        leaks: its source leak by NFE.
+        flow: of its flow and source; these hold at any NFE.
+    """
+
+    leaks: dict[int, SourceLeak]
+    flow: dict[str, float]
+
+
+Job = _Train | _Measure | _Play
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """Why a job came to nothing."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class _Attempt:
+    """A job whose failure is a result: it must not stop the others."""
+
+    job: Job
+
+    def __call__(self, worker: _Worker) -> Any:
+        try:
+            return self.job(worker)
+        except Exception as error:
+            if not isinstance(error, ERRORS):
+                traceback.print_exc()  # nothing that a user can mend
+            return _Failure(str(error) or repr(error))
 
 
 class _Worker:
@@ -139,7 +184,7 @@ class _Worker:
         seed = chosen.training.seed
         return play_episode(self._actor, self._env, job.episode_seed, nfe=job.nfe, policy_seed=seed)
 
-    def leak(self, number: int) -> dict[int, SourceLeak]:
+    def measure(self, number: int) -> _Measures:
         chosen = self.contestants[number]
         shared = SharedObservations(
             chosen.store.problem.data.to("cpu"),
@@ -147,12 +192,13 @@ class _Worker:
             observation_steps=chosen.store.network.observation_steps,
         )
         drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
-        shared = shared.subset(drawn[:LEAK_WINDOWS].sort()[0])
-        if len(shared.episodes.unique()) < 2:
-            return {}  # no two episodes with steps to compare
+        shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
         policy = chosen.store.load(chosen.prior, chosen.training)
-        windows = shared.windows(chosen.prior)
-        return source_leak(policy, windows, nfes=self.options.nfes, episodes=shared.episodes)
+        leaks = {}
+        if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
+            windows = shared.windows(policy.prior)
+            leaks = source_leak(policy, windows, nfes=self.options.nfes, episodes=shared.episodes)
+        return _Measures(leaks, flow_measures(policy, shared))
 
     def _prepare(self, chosen: Contestant, checkpoint: int) -> tuple[WarmPriorActor, EnvBase]:
         if self._store is not chosen.store:
@@ -177,8 +223,9 @@ class Comparison:
         priors: the sources, the baseline first; those of the recipe by default.
 
     Attributes:
-        contestants: the policies, in order.
+        contestants: the policies, in order; after a run without those that failed.
         results: the rows so far.
+        failures: what failed in the last run, and why.
 
     Raises:
         ValueError: if a prior allows none of the NFEs, is longer than every demonstration, rows could not
@@ -227,6 +274,7 @@ class Comparison:
         self.results = Results(
             self.directory / "results.json", meta, identity, resume=recipe.run.resume
         )
+        self.failures: list[str] = []
 
     def _contestants(self) -> list[Contestant]:
         found: dict[Path, Contestant] = {}  # two workers must not train the same policy
@@ -268,11 +316,16 @@ class Comparison:
         return ", ".join(store.problem.name for store in self.stores)
 
     def policies(self) -> dict[str, dict[int, WarmPriorActor]]:
-        """The last policies, by the description of their prior and their training seed."""
+        """The last policies, by the description of their prior and their training seed.
+
+        A prior of which a seed failed is left out: it would not compare with the others.
+        """
         found: dict[str, dict[int, WarmPriorActor]] = {}
         for c in self.contestants:
             found.setdefault(c.prior.describe(), {})[c.training.seed] = c.policy()
-        return found
+        return {
+            name: seeds for name, seeds in found.items() if len(seeds) == len(self.recipe.seeds)
+        }
 
     def observe(self, options: HeldOutOptions) -> tuple[SharedObservations, str]:
         """Held-out observations of the first problem, and what they are in words.
@@ -311,22 +364,29 @@ class Comparison:
         """Train what is missing and play what is missing, in worker processes.
 
         A policy is played as soon as it is trained and a worker is free. The rows and their order are the
-        same for any number of workers.
+        same for any number of workers. A policy whose training, measures or episodes fail does not stop the
+        others; it is told in :attr:`failures`, and tried again when the run is resumed.
 
         Returns:
             The results, also in ``results.json``.
 
         Raises:
-            FloatingPointError: if the loss of a training becomes NaN or infinite; the other trainings
-                stop, and continue from their last states when the run is resumed.
+            PartialFailure: if no policy is left.
             WorkerError: if a worker process dies, a ``RuntimeError``.
         """
         self._compute({n: self._evaluations(n) for n in range(len(self.contestants))})
         return self.results
 
     def train(self) -> None:
-        """Train what is missing, in worker processes, and play nothing."""
+        """Train what is missing, in worker processes, and play nothing.
+
+        Raises:
+            PartialFailure: if a training failed, once all others are done.
+            WorkerError: if a worker process dies, a ``RuntimeError``.
+        """
         self._compute({n: [] for n in range(len(self.contestants))})
+        if self.failures:
+            raise PartialFailure("; ".join(self.failures))
 
     def _rows(self, number: int) -> list[tuple[dict[str, Any], int, int]]:
         """Facts of a contestant's rows, with their checkpoint and NFE."""
@@ -337,26 +397,27 @@ class Comparison:
             for nfe in c.prior.allowed_nfes(self.nfes)
         ]
 
-    def _evaluations(self, number: int) -> list[_Leak | _Play]:
+    def _evaluations(self, number: int) -> list[_Measure | _Play]:
         """What the missing rows need of a policy."""
         missing = [row for row in self._rows(number) if self.results.find(row[0]) is None]
         last = self.contestants[number].training.iterations
         seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.recipe.evaluation.episodes)
-        # The leak of the last checkpoint alone, for it costs like many episodes.
-        leak = [_Leak(number)] if any(checkpoint == last for _, checkpoint, _ in missing) else []
+        # Of the last checkpoint alone, for it costs like many episodes.
+        measure = [_Measure(number)] if any(c == last for _, c, _ in missing) else []
         return [
-            *leak,
+            *measure,
             *(_Play(number, checkpoint, nfe, s) for _, checkpoint, nfe in missing for s in seeds),
         ]
 
-    def _compute(self, following: Mapping[int, Sequence[_Leak | _Play]]) -> None:
+    def _compute(self, following: Mapping[int, Sequence[_Measure | _Play]]) -> None:
         """Longest jobs first: trainings, then measures and episodes of what is trained."""
         self.results.save()
         at_once = self.trainings_at_once or len(following)
-        to_train, ready = deque(_Train(n) for n in following), deque[_Leak | _Play]()
+        to_train, ready = deque(_Train(n) for n in following), deque[_Measure | _Play]()
         worker = _Worker(self.contestants, self.recipe.evaluation)
         outcomes: dict[tuple[int, int, int], list[Episode]] = {}
-        leaks: dict[int, dict[int, SourceLeak]] = {}
+        measures: dict[int, _Measures] = {}
+        failed: dict[int, str] = {}
         episodes = sum(isinstance(job, _Play) for jobs in following.values() for job in jobs)
         iterations = sum(self.contestants[n].training.iterations for n in following)
         workers = min(self.num_workers, sum(1 + len(jobs) for jobs in following.values()))
@@ -368,35 +429,42 @@ class Comparison:
             while True:
                 while pool.idle and ((to_train and training < at_once) or ready):
                     starts = bool(to_train) and training < at_once
-                    pool.submit(to_train.popleft() if starts else ready.popleft())
+                    pool.submit(_Attempt(to_train.popleft() if starts else ready.popleft()))
                     training += starts
                 if not pool.running:
-                    return
-                for job, result in pool.wait(0.5):
+                    break
+                for attempt, result in pool.wait(0.5):
+                    job: Job = attempt.job
                     chosen = self.contestants[job.number]
-                    if isinstance(job, _Train):
-                        training -= 1
+                    training -= isinstance(job, _Train)
+                    if isinstance(result, _Failure):
+                        if job.number not in failed:
+                            failed[job.number] = f"{chosen}: {result.reason}"
+                            progress.say(f"FAILED {failed[job.number]}")
+                        ready = deque(j for j in ready if j.number != job.number)
+                    elif isinstance(job, _Train):
                         ready.extend(following[job.number])
                         chosen.store.note_trained(chosen.prior, chosen.training, result)
                         self.results.save()
-                        progress.say(
-                            f"trained {chosen.store.problem.task}, {chosen.prior.describe()}, seed "
-                            f"{chosen.training.seed}, {chosen.training.iterations} iterations"
-                        )
-                    elif isinstance(job, _Leak):
-                        leaks[job.number] = result
+                        progress.say(f"trained {chosen}, {chosen.training.iterations} iterations")
+                    elif isinstance(job, _Measure):
+                        measures[job.number] = result
                     else:
                         progress.played()
                         cell = job.number, job.checkpoint, job.nfe
                         outcomes.setdefault(cell, []).append(result)
-                    self._write_down(job.number, outcomes, leaks, progress)
+                    self._write_down(job.number, outcomes, measures, progress)
                 progress.trained(sum(worker.iterations))
+        self.failures = [failed[number] for number in sorted(failed)]
+        if len(failed) == len(self.contestants):
+            raise PartialFailure("; ".join(self.failures))
+        self.contestants = [c for n, c in enumerate(self.contestants) if n not in failed]
 
     def _write_down(
         self,
         number: int,
         outcomes: dict[tuple[int, int, int], list[Episode]],
-        leaks: Mapping[int, Mapping[int, SourceLeak]],
+        measures: Mapping[int, _Measures],
         progress: ComparisonProgress,
     ) -> None:
         """Add the rows of a policy for which everything is there."""
@@ -404,12 +472,12 @@ class Comparison:
         for facts, checkpoint, nfe in self._rows(number):
             is_last = checkpoint == chosen.training.iterations
             episodes = outcomes.get((number, checkpoint, nfe), [])
-            if len(episodes) < count or (is_last and number not in leaks):
+            if len(episodes) < count or (is_last and number not in measures):
                 continue
             # Sums depend on the order: that of the seeds, not that in which the episodes ended.
             episodes = sorted(outcomes.pop((number, checkpoint, nfe)), key=lambda e: e.seed)
-            leak = leaks[number].get(nfe) if is_last else None
-            row = _outcome(facts, episodes, leak)
+            measured = _of_nfe(measures[number], nfe) if is_last else {}
+            row = played(facts, [e.success for e in episodes], **_motion(episodes), **measured)
             self.results.add(row, order=self._place)
             progress.say(_told(chosen, row))
 
@@ -420,28 +488,34 @@ class Comparison:
         return number, row.get("checkpoint") or 0, -(row.get("nfe") or 0)
 
 
-def _outcome(facts: Mapping[str, Any], episodes: Sequence[Episode], leak: SourceLeak | None) -> Row:
+def _motion(episodes: Sequence[Episode]) -> dict[str, float | None]:
+    """How long episodes took and how smooth they were."""
     # Episodes of a single decision have no boundary between chunks.
     smooth = None
     if any(len(episode.decisions) > 1 for episode in episodes):
         smooth = smoothness(torch.cat([episode.decisions for episode in episodes]))
-    return played(
-        facts,
-        sum(episode.success for episode in episodes),
-        len(episodes),
-        mean_steps=sum(episode.steps for episode in episodes) / len(episodes),
-        boundary_jump=smooth and smooth.boundary_jump,
-        inner_jump=smooth and smooth.inner_jump,
-        source_leak=leak and leak.leak,
-        inner_step_ratio=leak and leak.inner_step_ratio,
-    )
+    return {
+        "mean_steps": sum(episode.steps for episode in episodes) / len(episodes),
+        "boundary_jump": None if smooth is None else smooth.boundary_jump,
+        "inner_jump": None if smooth is None else smooth.inner_jump,
+    }
+
+
+def _of_nfe(measured: _Measures, nfe: int) -> dict[str, float | None]:
+    """What is measured of a policy, as a row of this NFE tells it."""
+    leak = measured.leaks.get(nfe)
+    return {
+        "source_leak": None if leak is None else leak.leak,
+        "inner_step_ratio": None if leak is None else leak.inner_step_ratio,
+        **measured.flow,
+    }
 
 
 def _told(chosen: Contestant, row: Row) -> str:
     told = (
-        f"played {chosen.store.problem.task}, {chosen.prior.describe()}, seed {row['seed']}, iteration "
-        f"{row['checkpoint']}, NFE {row['nfe']}: {row['successes']} of {row['episodes']} solved"
+        f"played {chosen}, iteration {row['checkpoint']}, NFE {row['nfe']}: {row['successes']} of "
+        f"{row['episodes']} solved"
     )
-    if row["source_leak"] is not None:
+    if row.get("source_leak") is not None:
         told += f", source leak {row['source_leak']:.2f}"
     return told

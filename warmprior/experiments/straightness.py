@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -19,7 +20,7 @@ from warmprior.experiments.results import Row
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 
-__all__ = ["RATIOS", "straightness"]
+__all__ = ["RATIOS", "flow_measures", "straightness"]
 
 RATIOS = {
     "ratio": ("kappa", "whole prediction"),
@@ -28,6 +29,39 @@ RATIOS = {
     "ratio_one_step": ("one_step_error_executed", "error of one Euler step, executed H"),
 }
 """Ratios to the baseline: the entry of :func:`curvature` that each compares, and what it is in words."""
+
+
+def flow_measures(
+    policy: WarmPriorActor, observations: SharedObservations, *, n_steps: int = 100
+) -> dict[str, float]:
+    """How far a policy's source is from its targets and how straight the flow between them.
+
+    At the mean that decisions meet (:meth:`SharedObservations.deployed`), over the executed positions.
+
+    Args:
+        policy: the policy.
+        observations: those to average over.
+
+    Keyword Args:
+        n_steps: Euler steps.
+
+    Returns:
+        ``"kappa"`` and ``"relative_curvature"``, see :func:`~warmprior.diagnostics.curvature`; NaN where the
+        field does not move or is no flow. ``"bound"``, see
+        :func:`~warmprior.diagnostics.branching_bound`; NaN where it does not apply.
+    """
+    generator = torch.Generator(next(policy.parameters()).device).manual_seed(0)
+    batch = observations.windows(policy.prior)
+    if batch["prior", "warm"].any():
+        batch = observations.deployed(policy, generator=generator)
+    measured = dict.fromkeys(("kappa", "relative_curvature"), math.nan)
+    if policy.prior.is_flow:
+        with warnings.catch_warnings():  # that something does not move is told by its NaN
+            warnings.simplefilter("ignore")
+            found = curvature(policy, batch, n_steps, generator=generator)
+        for name, key in (("kappa", "kappa_executed"), ("relative_curvature", "relative_executed")):
+            measured[name] = float(found[key].nanmean())
+    return measured | {"bound": float(_bounds(policy.prior, batch)[1])}
 
 
 def straightness(

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from warmprior.diagnostics.source_leak import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.diagnostics.statistics import (
     exceeds_one_sigma,
+    paired_probability_better,
     probability_better,
     summarize_seeds,
 )
@@ -16,7 +17,7 @@ from warmprior.experiments.paper import PAPER_CURVATURE, paper_success
 from warmprior.experiments.results import Row, grouped, mean_known, select, success_summary
 from warmprior.experiments.straightness import RATIOS, pooled
 
-__all__ = ["curvature_table", "mean_cell", "success_cell", "success_table", "table"]
+__all__ = ["curvature_table", "flow_table", "mean_cell", "success_cell", "success_table", "table"]
 
 Cell = Callable[[list[Row]], str | None]
 """Makes a cell of the rows that belong to it; ``None`` where there is nothing to tell."""
@@ -173,6 +174,14 @@ def success_table(
         )
         return f"{probability_better(*counts):.2f}"
 
+    def paired(cell: list[Row]) -> str | None:
+        same = {name: cell[0][name] for name in ("task", "data", "nfe")}
+        sources = grouped(last_checkpoints(select(rows, **same)), label)
+        if label(cell[0]) == base or base not in sources:
+            return None
+        counts = wins_and_losses(sources[label(cell[0])], sources[base])
+        return counts and f"{counts[0]} : {counts[1]} ({paired_probability_better(*counts):.2f})"
+
     def paper(cell: list[Row]) -> str | None:
         row = cell[0]
         place = row["task"], row["data"]
@@ -186,11 +195,12 @@ def success_table(
 
     return table(
         rows,
-        lambda row: f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}",
+        problem_title,
         source_at_nfe(rows),
         {
             "measured" + (f" ({source} data)" if source else ""): measured,
             f"probability of being better than {base}": better,
+            f"episodes that only it : only {base} solves (probability)": paired,
             "paper (official data)": paper,
             f"spread over draws of the source / data's (bound {LEAK_BOUND:g})": _bounded(
                 "source_leak", LEAK_BOUND
@@ -198,10 +208,79 @@ def success_table(
             f"step inside chunks / data's (bound {INNER_STEP_BOUND:g})": _bounded(
                 "inner_step_ratio", INNER_STEP_BOUND
             ),
+            "jump between chunks / step inside": _jump,
         },
         head="Success rate (%)",
         notes=[*_success_notes(rows, top_k, source, base), *notes],
     )
+
+
+def wins_and_losses(mine: Iterable[Row], theirs: Iterable[Row]) -> tuple[int, int] | None:
+    """Episodes that only one of two sources solves, over the training seeds that both have.
+
+    Args:
+        mine: rows of one source, one per training seed.
+        theirs: of the other.
+
+    Returns:
+        Those that only the first solves and those that only the second does; ``None`` if the rows do not
+        tell the outcomes of the same episodes.
+    """
+    others = {row["seed"]: row.outcomes for row in theirs}
+    pairs = [(row.outcomes, others.get(row["seed"], "")) for row in mine]
+    pairs = [(a, b) for a, b in pairs if a and len(a) == len(b)]
+    if not pairs:
+        return None
+    episodes = [episode for a, b in pairs for episode in zip(a, b, strict=True)]
+    return episodes.count(("1", "0")), episodes.count(("0", "1"))
+
+
+def flow_table(rows: Sequence[Row]) -> str:
+    """What the sources do to the flow, beside the first one: a line per problem and measure.
+
+    Args:
+        rows: evaluations with one sigma and chunk length per prior; the baseline's first.
+    """
+    rows = last_checkpoints(select(rows, "kappa"))
+    # They hold at any NFE: those of the largest of each policy.
+    rows = [
+        group[0] for group in grouped(rows, lambda row: tuple(row.facts.values())[:-1]).values()
+    ]
+    label = source_labels(rows)
+    base = label(rows[0])
+
+    def relative(measure: str) -> Cell:
+        def cell(cell: list[Row]) -> str | None:
+            same = {name: cell[0][name] for name in ("task", "data")}
+            baseline = [row for row in select(rows, **same) if label(row) == base]
+            value, reference = mean_known(cell, measure), mean_known(baseline, measure)
+            return None if value is None or not reference else f"{value / reference:.2f}"
+
+        return cell
+
+    return table(
+        rows,
+        problem_title,
+        label,
+        {
+            f"curvature / {base}'s": relative("kappa"),
+            f"curvature per squared mean velocity / {base}'s": relative("relative_curvature"),
+            f"bound of the branching cost / {base}'s": relative("bound"),
+        },
+        head="Flow of the executed positions",
+        notes=["- At the mean that decisions meet, on observations of the training data."],
+    )
+
+
+def problem_title(row: Row) -> str:
+    """Task and style of a row, as tables show them."""
+    return f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}"
+
+
+def _jump(rows: list[Row]) -> str | None:
+    last = last_checkpoints(rows)
+    jump, step = mean_known(last, "boundary_jump"), mean_known(last, "inner_jump")
+    return f"{jump / step:.2f}" if jump is not None and step else None
 
 
 def _bounded(measure: str, bound: float) -> Cell:
@@ -241,7 +320,9 @@ def _success_notes(rows: Sequence[Row], top_k: int, source: str | None, base: st
     if len({row["prior"] for row in rows}) > 1:
         notes.append(
             f"- Probability: of a higher success rate than {base}'s, given the episodes of all "
-            "seeds' last checkpoints (Beta posteriors, uniform prior, episodes taken as independent)."
+            "seeds' last checkpoints (Beta posteriors, uniform prior, episodes taken as independent); "
+            "below it that of winning an episode which only one of the two solves, of the same training "
+            "and episode seeds."
         )
     if source not in ("official", None):
         notes.append(
@@ -266,7 +347,7 @@ def curvature_table(rows: Sequence[Row], *, task: str, data: str, source: str) -
     """
     chosen = pooled(rows)
     first = chosen[0]
-    title = f"{task.replace('_', '-').title()}-{data.upper()}"
+    title = problem_title(Row({"task": task, "data": data}, {}))
 
     def ratio(name: str, mean: str) -> Cell:
         def cell(rows: list[Row]) -> str | None:

@@ -11,9 +11,22 @@ import torch
 
 from warmprior.io.workers import WorkerError
 
-__all__ = ["ERRORS", "run_script"]
+__all__ = ["ERRORS", "PartialFailure", "run_script"]
 
-ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError)
+
+class PartialFailure(RuntimeError):
+    """Some of the work failed; the rest of it is done and written down."""
+
+
+ERRORS = (
+    ValueError,
+    KeyError,
+    OSError,
+    ImportError,
+    FloatingPointError,
+    WorkerError,
+    PartialFailure,
+)
 """What a user can mend: reported without a traceback."""
 
 
