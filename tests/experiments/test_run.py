@@ -469,7 +469,7 @@ class Widening(PastPrior, torch.nn.Module):
         super().__init__(chunk_length, sigma=sigma, cold_probability=cold_probability)
         self.scale = torch.nn.Parameter(torch.ones(()))
 
-    def sample(self, loc, warm, generator=None):
+    def sample(self, loc, warm, generator=None, observation=None):
         return loc + self.scale * (super().sample(loc, warm, generator) - loc)
 
 

@@ -37,7 +37,7 @@ class Anchor(PastPrior):
         super().__init__(chunk_length, **options)
         self.scale = gain
 
-    def sample(self, loc, warm, generator=None):
+    def sample(self, loc, warm, generator=None, observation=None):
         return super().sample(self.scale * loc, warm, generator)
 
 
@@ -54,7 +54,7 @@ class Learned(PastPrior, nn.Module):
         self.shift = nn.Parameter(torch.zeros(action_dim))
         self.register_buffer("offset", torch.zeros(()))
 
-    def sample(self, loc, warm, generator=None):
+    def sample(self, loc, warm, generator=None, observation=None):
         return super().sample(loc + self.shift + self.offset, warm, generator)
 
 
@@ -63,7 +63,7 @@ class Reversed(GaussianPrior):
 
     name = "reversed-of-the-tests"
 
-    def couple(self, a0, a1, generator=None):
+    def couple(self, a0, a1, generator=None, observation=None):
         return a0.flip(0), a1
 
 

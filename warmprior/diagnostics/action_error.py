@@ -63,7 +63,7 @@ def action_error(
     if generator is None:
         generator = torch.Generator(flat.loc.device).manual_seed(0)
     rows = windows.select(*policy.in_keys).reshape(len(flat)).to(flat.loc.device)
-    a0 = prior.sample(flat.loc, flat.warm, generator)
+    a0 = prior.start(flat.loc, flat.warm, generator, flat.observation)
     counted = flat.counted[:, : prior.chunk_length, 0]
     errors = {}
     with evaluation_mode(policy):

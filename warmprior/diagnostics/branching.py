@@ -77,7 +77,7 @@ def branching_cost(
     generator = policy.sampler.generator if generator is None else generator
     assert rows.target is not None
     with evaluation_mode(policy):
-        a0 = policy.prior.sample(rows.loc, rows.warm, generator)
+        a0 = policy.prior.sample(rows.loc, rows.warm, generator, rows.observation)
         within = torch.rand(n, generator=generator, dtype=a0.dtype, device=a0.device)
         stratum = torch.arange(draws, dtype=a0.dtype, device=a0.device).repeat_interleave(n)
         t = (stratum + within.repeat(draws)) / draws
@@ -137,7 +137,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
         >>> float(bound["mismatch"]), float(bound["noise"])  # both actions are 2 ahead of the mean
         (8.0, 0.5)
     """
-    if type(prior).sample is not Prior.sample:
+    if not prior.is_gaussian:
         raise ValueError(f"the bound is that of the Gaussian source of Eq. 1, which {prior} is not")
     needed = (keys.CHUNK, keys.LOC, keys.WARM)
     missing = [key for key in needed if batch.get(key, None) is None]

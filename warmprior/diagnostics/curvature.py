@@ -103,7 +103,7 @@ def curvature(
     with evaluation_mode(policy):
         # All sources are drawn at once: how the batch is split must not change them.
         generator = policy.sampler.generator if generator is None else generator
-        a0 = policy.prior.sample(rows.loc, rows.warm, generator)
+        a0 = policy.prior.sample(rows.loc, rows.warm, generator, rows.observation)
         for i in range(0, len(rows), split):
             s = slice(i, i + split)
             parts.append(_measure(policy, a0[s], rows.observation[s], n_steps))

@@ -52,7 +52,7 @@ def flow_paths(
     windows = flat_windows(policy, batch)
     with evaluation_mode(policy):
         generator = policy.sampler.generator if generator is None else generator
-        a0 = policy.prior.sample(windows.loc, windows.warm, generator)
+        a0 = policy.prior.sample(windows.loc, windows.warm, generator, windows.observation)
         field = field_of(policy, windows.observation)
         path = integrate(field, a0, nfe=n_steps, return_path=True)
     return path.view(*windows.shape, *path.shape[1:])
@@ -107,10 +107,11 @@ def forecast_mean(
     _, loc_key, warm_key = policy.in_keys
     data = previous.select(*policy.in_keys).to(windows.loc.device)
     with evaluation_mode(policy):
-        a0 = prior.sample(
+        a0 = prior.start(
             data.get(loc_key),
             data.get(warm_key),
             policy.sampler.generator if generator is None else generator,
+            data.get(policy.in_keys[0]),
         )
         chunk = policy.ode(data.set(policy.ode.in_keys[0], a0), nfe=nfe).get(policy.chunk_key)
         steps = torch.full((*data.batch_size, 1), k, device=chunk.device)

@@ -183,7 +183,7 @@ def source_leak(
         observation = observed(policy, windows).reshape(n, -1).to(device)
         data_spread = _data_spread(observation, target, counted, episodes.to(device), neighbours)
         for _ in range(draws):
-            a0 = prior.sample(flat.loc, flat.warm, generator)
+            a0 = prior.start(flat.loc, flat.warm, generator, flat.observation)
             for nfe in allowed:
                 chunk = predict(policy, rows, a0, nfe=nfe, split=split)
                 chunk = moments[nfe].add(chunk[:, :chunk_length])

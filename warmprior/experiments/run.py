@@ -289,7 +289,8 @@ class Comparison:
                             f"{store.problem.name} has, {longest}: choose a shorter chunk"
                         )
                     for seed in self.recipe.seeds:
-                        contestant = Contestant(store, prior, replace(training, seed=seed))
+                        chosen = replace(training, seed=seed)
+                        contestant = Contestant(store, store.sized(prior), chosen)
                         key = tuple(contestant.facts().values())
                         if told.setdefault(key, contestant.folder) != contestant.folder:
                             raise ValueError(
@@ -388,6 +389,17 @@ class Comparison:
         if self.failures:
             raise PartialFailure("; ".join(self.failures))
 
+    def _teachers(self) -> dict[int, int]:
+        """The contestant whose policy teaches another one, for those that are taught by one."""
+        numbers = {c.folder: n for n, c in enumerate(self.contestants)}
+        found = {}
+        for n, c in enumerate(self.contestants):
+            if c.prior.teacher is not None:
+                folder = c.store.folder(c.store.teacher(c.prior), c.training)
+                if folder in numbers:
+                    found[n] = numbers[folder]
+        return found
+
     def _rows(self, number: int) -> list[tuple[dict[str, Any], int, int]]:
         """Facts of a contestant's rows, with their checkpoint and NFE."""
         c = self.contestants[number]
@@ -421,22 +433,33 @@ class Comparison:
         episodes = sum(isinstance(job, _Play) for jobs in following.values() for job in jobs)
         iterations = sum(self.contestants[n].training.iterations for n in following)
         workers = min(self.num_workers, sum(1 + len(jobs) for jobs in following.values()))
-        training = 0
+        training, teachers, taught = 0, self._teachers(), set[int]()
+
+        def next_training() -> _Train | None:
+            """The first that needs no policy which is still to be trained."""
+            if training >= at_once:
+                return None
+            done = (job for job in to_train if teachers.get(job.number) in {None, *taught})
+            return next(done, None)
+
         with (
             ComparisonProgress(iterations, episodes) as progress,
             WorkerPool(workers, worker) as pool,
         ):
             while True:
-                while pool.idle and ((to_train and training < at_once) or ready):
-                    starts = bool(to_train) and training < at_once
-                    pool.submit(_Attempt(to_train.popleft() if starts else ready.popleft()))
-                    training += starts
+                while pool.idle and ((starts := next_training()) or ready):
+                    if starts is not None:
+                        to_train.remove(starts)
+                        training += 1
+                    pool.submit(_Attempt(starts or ready.popleft()))
                 if not pool.running:
                     break
                 for attempt, result in pool.wait(0.5):
                     job: Job = attempt.job
                     chosen = self.contestants[job.number]
-                    training -= isinstance(job, _Train)
+                    if isinstance(job, _Train):
+                        training -= 1
+                        taught.add(job.number)
                     if isinstance(result, _Failure):
                         if job.number not in failed:
                             failed[job.number] = f"{chosen}: {result.reason}"

@@ -19,6 +19,7 @@ from warmprior.experiments.problem import Problem
 from warmprior.experiments.recipe import NetworkOptions, RunOptions
 from warmprior.io.files import check_writable, digest_of, read_json
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.learned import LearnedPrior
 from warmprior.modules.prior import Prior
 from warmprior.training.behaviour_cloning import (
     STATE_FORMAT,
@@ -26,6 +27,15 @@ from warmprior.training.behaviour_cloning import (
     policy_path,
     precondition,
 )
+from warmprior.training.checkpoint import (
+    check_identity,
+    load_state,
+    module_tensors,
+    restore_module,
+    restoring,
+    save_state,
+)
+from warmprior.training.prior_learning import learn_prior
 from warmprior.training.threads import torch_threads
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms import MeanObservation, policy_transforms
@@ -33,6 +43,9 @@ from warmprior.transforms import MeanObservation, policy_transforms
 __all__ = ["Store", "finished_policies", "finished_problem"]
 
 Losses = list[tuple[int, float]]
+
+LEARNING_SHARE = 0.25
+"""Gradient steps of priors that learn before the flow, per step of the flow."""
 
 
 @dataclass
@@ -64,15 +77,28 @@ class Store:
     def __post_init__(self) -> None:
         check_writable(self.directory)
 
-    def new_actor(self, prior: Prior, seed: int) -> WarmPriorActor:
-        """An untrained policy; its initial weights depend on the seed alone."""
-        torch.manual_seed(seed)
-        if isinstance(prior, nn.Module):  # it learns: every policy has its own
-            prior = Prior.from_config(prior.config())
-        problem = self.problem
-        action_dim = problem.data["action"].shape[-1]
-        width = problem.data["observation"].shape[-1] + MeanObservation.width(prior, action_dim)
-        network = self.network.make(action_dim, width, prior.prediction_length)
+    def sized(self, prior: Prior) -> Prior:
+        """A prior for the widths of this problem, see :meth:`Prior.sized`."""
+        return prior.sized(*self._widths(prior), self.network.observation_steps)
+
+    def _widths(self, prior: Prior) -> tuple[int, int]:
+        """``d_a``, and ``d_o`` of what the network sees."""
+        action_dim = self.problem.data["action"].shape[-1]
+        width = self.problem.data["observation"].shape[-1]
+        return action_dim, width + MeanObservation.width(prior, action_dim)
+
+    def new_actor(self, prior: Prior, training: TrainingConfig) -> WarmPriorActor:
+        """A policy whose flow is untrained; its initial weights depend on the seed alone.
+
+        What the prior needs before is done: it learns, or its teacher is trained.
+
+        Args:
+            prior: its source distribution.
+            training: its recipe, with its seed.
+        """
+        prior, problem = self._prepared(self.sized(prior), training), self.problem
+        torch.manual_seed(training.seed)
+        network = self.network.make(*self._widths(prior), prior.prediction_length)
         if self.network.precondition:
             steps = self.network.observation_steps
             network = precondition(network, problem.data, prior, observation_steps=steps)
@@ -86,6 +112,39 @@ class Store:
         )
         return actor.to(self.run.device)
 
+    def _prepared(self, prior: Prior, training: TrainingConfig) -> Prior:
+        if prior.teacher is not None:
+            prior = copy.copy(prior)
+            prior.learn_from(self.policy(self.teacher(prior), training))
+        if isinstance(prior, nn.Module):  # it learns: every policy has its own
+            prior = Prior.from_config(prior.config())
+        if isinstance(prior, LearnedPrior):
+            self._learn(prior, training)
+        return prior
+
+    def teacher(self, prior: Prior) -> Prior:
+        """The prior whose policy teaches another one, see :attr:`Prior.teacher`."""
+        assert prior.teacher is not None
+        return Prior.make(prior.teacher, prior.chunk_length)
+
+    def _learn(self, prior: LearnedPrior, training: TrainingConfig) -> None:
+        """Let a prior learn, or take what it learnt when the training was begun."""
+        path = self.folder(prior, training) / "prior.safetensors"
+        if path.exists():
+            tensors, facts = load_state(path)
+            check_identity(path, facts, prior.config())
+            with restoring(path):
+                restore_module(prior, tensors)
+            return
+        learn_prior(
+            prior,
+            self.problem.data,
+            iterations=max(1, round(LEARNING_SHARE * training.iterations)),
+            observation_steps=self.network.observation_steps,
+            seed=training.seed,
+        )
+        save_state(path, module_tensors(prior), prior.config())
+
     def folder(self, prior: Prior, training: TrainingConfig) -> Path:
         """Where a policy lies, or will lie.
 
@@ -96,7 +155,7 @@ class Store:
         digest = digest_of(
             self.problem.identity,
             asdict(training),
-            prior.config(),
+            self.sized(prior).config(),
             asdict(self.network),
             self.run.device,
             self.run.compile,
@@ -138,7 +197,7 @@ class Store:
                 nullcontext() if logger is None else closing(logger),
             ):
                 cloning = BehaviourCloning(
-                    self.new_actor(prior, training.seed),
+                    self.new_actor(prior, training),
                     self.problem.data.to(self.run.device),
                     training,
                     folder,
@@ -185,7 +244,7 @@ class Store:
             FileNotFoundError: if it is not trained that far.
         """
         path = policy_path(self.folder(prior, training), checkpoint or training.iterations)
-        return WarmPriorActor.from_pretrained(path, prior=prior)
+        return WarmPriorActor.from_pretrained(path, prior=self.sized(prior))
 
     def transforms(self, prior: Prior) -> partial[Any]:
         """Builder of the environment transforms that these policies need."""

@@ -3,11 +3,19 @@
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.baselines import HistoryPrior, RegressionPrior
 from warmprior.modules.chi_transformer import ChiTransformer
+from warmprior.modules.couplings import OTPrior, ReflowPrior
 from warmprior.modules.interpolant import (
     Interpolant,
     LinearInterpolant,
     PolynomialInterpolant,
     TrigonometricInterpolant,
+)
+from warmprior.modules.learned import (
+    CVAEPrior,
+    ForecastPrior,
+    LeapPrior,
+    LearnedPrior,
+    StepPrior,
 )
 from warmprior.modules.mlp import VelocityMLP
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
@@ -19,21 +27,28 @@ from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.modules.sampler import PriorSampler
 
 __all__ = [
+    "CVAEPrior",
     "ChiTransformer",
+    "ForecastPrior",
     "GaussianPrior",
     "HistoryPrior",
     "Interpolant",
+    "LeapPrior",
+    "LearnedPrior",
     "LinearInterpolant",
     "Normalizer",
     "ODEActor",
+    "OTPrior",
     "PastPrior",
     "PolynomialInterpolant",
     "PreconditionedNetwork",
     "PreviewPrior",
     "Prior",
     "PriorSampler",
+    "ReflowPrior",
     "RegressionPrior",
     "SourceMoments",
+    "StepPrior",
     "TimestepEmbedding",
     "TrigonometricInterpolant",
     "VelocityMLP",

@@ -119,11 +119,18 @@ class WarmPriorActor(TensorDictModuleBase):
                 f"the network was built for prediction_length={built_for}, but {prior} needs "
                 f"{prior.prediction_length}"
             )
-        self.sampler = PriorSampler(prior, loc_key=loc_key, warm_key=warm_key, generator=generator)
+        self.sampler = PriorSampler(
+            prior,
+            observation_key=observation_key,
+            loc_key=loc_key,
+            warm_key=warm_key,
+            generator=generator,
+        )
         self.ode = ODEActor(
             network,
             nfe=nfe,
             max_nfe=None if prior.is_flow else 1,
+            start_time=prior.start_time,
             solver=solver,
             clip=clip,
             observation_key=observation_key,

@@ -38,7 +38,13 @@ class RegressionPrior(GaussianPrior):
     def __init__(self, chunk_length: int) -> None:
         super().__init__(chunk_length, sigma=0.0)
 
-    def sample(self, loc: Tensor, warm: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def sample(
+        self,
+        loc: Tensor,
+        warm: Tensor,
+        generator: torch.Generator | None = None,
+        observation: Tensor | None = None,
+    ) -> Tensor:
         """The point 0; nothing is drawn."""
         return torch.zeros_like(loc)
 
@@ -73,6 +79,8 @@ class HistoryPrior(PastPrior):
     def __init__(self, chunk_length: int, *, cold_probability: float = 0.0) -> None:
         super().__init__(chunk_length, sigma=1.0, cold_probability=cold_probability)
 
-    def sample(self, loc: Tensor, warm: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def distribution(
+        self, loc: Tensor, warm: Tensor, observation: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Standard normal everywhere."""
-        return super().sample(loc, torch.zeros_like(warm), generator)
+        return super().distribution(loc, torch.zeros_like(warm), observation)

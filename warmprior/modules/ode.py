@@ -75,6 +75,7 @@ def integrate(
     *,
     nfe: int,
     solver: Solver = "euler",
+    start_time: float = 0.0,
     return_path: bool = False,
 ) -> Tensor:
     r"""Solve :math:`\dot a_t = v(t, a_t)` from ``t=0`` to ``t=1`` on a uniform grid.
@@ -87,13 +88,15 @@ def integrate(
         nfe: number of calls of ``velocity``, a multiple of the solver's stages (Euler 1, midpoint and
             Heun 2, RK4 4).
         solver: ``"euler"`` (the paper's), ``"midpoint"``, ``"heun"`` or ``"rk4"``.
+        start_time: another time to start from, in [0, 1).
         return_path: return every grid point instead of the last.
 
     Returns:
         ``a_1`` ``[B, ...]``, or the path ``[B, steps + 1, ...]`` from ``a_0`` to ``a_1``.
 
     Raises:
-        ValueError: for an unknown solver or an ``nfe`` that it cannot spend.
+        ValueError: for an unknown solver, an ``nfe`` that it cannot spend, or a ``start_time`` outside
+            [0, 1).
 
     Examples:
         >>> import torch
@@ -102,14 +105,17 @@ def integrate(
         2.7083...
     """
     steps = _steps(nfe, solver)
+    if not 0.0 <= start_time < 1.0:
+        raise ValueError(f"start_time must be in [0, 1), got {start_time}")
     tableau = SOLVERS[solver]
-    h = 1.0 / steps
+    h = (1.0 - start_time) / steps
     a = a0
     path = [a0]
     for step in range(steps):
         slopes: list[Tensor] = []
         for node, row in zip(tableau.c, tableau.a, strict=True):
-            t = torch.full(a.shape[:1], (step + node) * h, dtype=a.dtype, device=a.device)
+            time = start_time + (step + node) * h
+            t = torch.full(a.shape[:1], time, dtype=a.dtype, device=a.device)
             slopes.append(velocity(t, _combine(a, h, row, slopes)))
         a = _combine(a, h, tableau.b, slopes)
         if return_path:
@@ -128,6 +134,7 @@ class ODEActor(TensorDictModuleBase):
         nfe: number of network evaluations per chunk; per call: ``actor(data, nfe=3)``. 9 by default, or
             ``max_nfe``.
         max_nfe: the most for which the trained field means anything.
+        start_time: see :func:`integrate`.
         solver: see :func:`integrate`.
         clip: the chunk is clamped to ``[-clip, clip]``; ``None`` (default) leaves it as integrated.
             Set it where the normalised data span ``[-1, 1]``, so that what the environment executes
@@ -160,6 +167,7 @@ class ODEActor(TensorDictModuleBase):
         *,
         nfe: int | None = None,
         max_nfe: int | None = None,
+        start_time: float = 0.0,
         solver: Solver = "euler",
         clip: float | None = None,
         noise_key: NestedKey = keys.NOISE,
@@ -174,6 +182,7 @@ class ODEActor(TensorDictModuleBase):
                 stages = len(SOLVERS[solver].b)
                 nfe = max(nfe - nfe % stages, stages)
         self.max_nfe = max_nfe
+        self.start_time = start_time
         self.solver = solver
         self.check_nfe(nfe)
         if clip is not None and not clip > 0:
@@ -213,6 +222,7 @@ class ODEActor(TensorDictModuleBase):
             a0.reshape(-1, *a0.shape[-2:]),
             nfe=nfe,
             solver=self.solver,
+            start_time=self.start_time,
             return_path=self.path_key is not None,
         )
         chunk = path_or_chunk

@@ -143,8 +143,17 @@ class SourceMoments(nn.Module):
                 f"the windows have {batch[keys.CHUNK].shape[-2]} positions, but {prior} predicts "
                 f"{prior.prediction_length}: sample them with this very prior"
             )
-        a1 = batch[keys.CHUNK].double()
-        a0 = prior.sample(batch[keys.LOC], batch[keys.WARM], generator).double()
+        observation = batch.get(keys.OBSERVATION, None)
+        a0 = prior.sample(batch[keys.LOC], batch[keys.WARM], generator, observation)
+        sizes = [part.numel() for part in batches]  # paired as training does it, batch by batch
+        parts = zip(
+            a0.split(sizes),
+            batch[keys.CHUNK].split(sizes),
+            [None] * len(sizes) if observation is None else observation.split(sizes),
+            strict=True,
+        )
+        pairs = [prior.couple(source, target, generator, seen) for source, target, seen in parts]
+        a0, a1 = (torch.cat(part).double() for part in zip(*pairs, strict=True))
         weight = (~batch[keys.IS_PAD]).unsqueeze(-1).double()
         count = weight.sum(0)
 

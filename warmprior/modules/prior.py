@@ -33,12 +33,13 @@ class Prior:
     The same object serves the replay buffer (:meth:`training_mean`), the environment
     (:meth:`next_mean`) and the actor (:meth:`sample`), so the three cannot disagree. It holds no
     state of an episode. A subclass sets :attr:`name`, and overrides the two means; overriding
-    :meth:`sample` gives any other source, and :meth:`couple` another pairing of source and data. What
-    else benchmarks, figures and agents need to know of it, it tells by the attributes below.
+    :meth:`distribution` gives another Gaussian, :meth:`sample` any other source, and :meth:`couple` another
+    pairing of source and data. What else benchmarks, figures and agents need to know of it, it tells by the
+    attributes below.
 
     The constructor's arguments are recorded, so that :meth:`config` is complete for any subclass. One
     that is an ``nn.Module`` as well (call ``nn.Module.__init__`` first) is trained, saved and frozen with
-    the policy.
+    the policy; see :class:`~warmprior.LearnedPrior` for those that learn before the flow.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
@@ -91,6 +92,12 @@ class Prior:
     conditions_network: ClassVar[bool] = False
     """Whether the network sees the mean as well, in an observation that :class:`~warmprior.MeanObservation`
     extends in environments and replay buffers."""
+    start_time: float = 0.0
+    """Time at which samplers start to integrate, see :meth:`start`."""
+    least_batch: ClassVar[int] = 1
+    """Windows per training step that :meth:`couple` needs."""
+    teacher: ClassVar[str | None] = None
+    """Name of the prior whose trained policy :meth:`couple` needs; it is handed to :meth:`learn_from`."""
     _registry: ClassVar[dict[str, type[Prior]]] = {}
     _arguments: dict[str, Any]
 
@@ -234,13 +241,25 @@ class Prior:
     @property
     def is_gaussian(self) -> bool:
         """Whether the source is that of Eq. 1, drawn independently of the data given the mean."""
-        mine = type(self)
-        return mine.sample is Prior.sample and mine.couple is Prior.couple
+        return all(
+            getattr(type(self), name) is getattr(Prior, name)
+            for name in ("distribution", "sample", "couple", "start")
+        )
 
     @property
     def prediction_length(self) -> int:
         """``P``, the number of actions that the network predicts."""
         return self.chunk_length * self.prediction_chunks
+
+    def sized(self, action_dim: int, observation_dim: int, observation_steps: int) -> Prior:
+        """The prior for data of these widths: itself, unless it has networks of its own.
+
+        Args:
+            action_dim: ``d_a``.
+            observation_dim: ``d_o`` of what the network sees.
+            observation_steps: ``To``.
+        """
+        return self
 
     def training_mean(
         self, history: Tensor, history_valid: Tensor, target: Tensor
@@ -273,22 +292,70 @@ class Prior:
         """
         raise NotImplementedError
 
-    def sample(self, loc: Tensor, warm: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """Draw the source ``a_0`` (Eq. 1).
+    def distribution(
+        self, loc: Tensor, warm: Tensor, observation: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the source (Eq. 1).
 
         Args:
-            loc: mean, ``[*B, P, d_a]``; ignored on cold positions.
+            loc: mean of the window or decision, ``[*B, P, d_a]``; ignored on cold positions.
             warm: bool ``[*B, P, 1]``.
+            observation: what the network sees, ``[*B, To, d_o]``; the paper's sources make no use of it.
+
+        Returns:
+            Both, each broadcastable to ``[*B, P, d_a]``.
+        """
+        one = torch.ones((), dtype=loc.dtype, device=loc.device)
+        return torch.where(warm, loc, 0.0), torch.where(warm, self.sigma * one, one)
+
+    def sample(
+        self,
+        loc: Tensor,
+        warm: Tensor,
+        generator: torch.Generator | None = None,
+        observation: Tensor | None = None,
+    ) -> Tensor:
+        """Draw the source ``a_0`` from :meth:`distribution`.
+
+        Args:
+            loc: see :meth:`distribution`.
+            warm: see :meth:`distribution`.
             generator: source of randomness on ``loc``'s device; PyTorch's global one by default.
+            observation: see :meth:`distribution`.
 
         Returns:
             ``a_0``, ``[*B, P, d_a]``.
         """
         eps = torch.randn(loc.shape, generator=generator, dtype=loc.dtype, device=loc.device)
-        return torch.where(warm, loc + self.sigma * eps, eps)
+        mean, scale = self.distribution(loc, warm, observation)
+        return mean + scale * eps
+
+    def start(
+        self,
+        loc: Tensor,
+        warm: Tensor,
+        generator: torch.Generator | None = None,
+        observation: Tensor | None = None,
+    ) -> Tensor:
+        """Where samplers start to integrate, at :attr:`start_time`: by default a draw of the source.
+
+        Args:
+            loc: see :meth:`distribution`.
+            warm: see :meth:`distribution`.
+            generator: see :meth:`sample`.
+            observation: see :meth:`distribution`.
+
+        Returns:
+            A point at :attr:`start_time`, ``[*B, P, d_a]``.
+        """
+        return self.sample(loc, warm, generator, observation)
 
     def couple(
-        self, a0: Tensor, a1: Tensor, generator: torch.Generator | None = None
+        self,
+        a0: Tensor,
+        a1: Tensor,
+        generator: torch.Generator | None = None,
+        observation: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Pair the sources and targets of a batch; as they come by default.
 
@@ -299,11 +366,20 @@ class Prior:
             a0: source samples, ``[*B, P, d_a]``.
             a1: targets, ``[*B, P, d_a]``.
             generator: source of randomness on their device; PyTorch's global one by default.
+            observation: what the network sees, ``[*B, To, d_o]``.
 
         Returns:
             Both, paired.
         """
         return a0, a1
+
+    def learn_from(self, policy: Any) -> None:
+        """Take the trained policy of the :attr:`teacher` prior, for :meth:`couple`.
+
+        Args:
+            policy: a :class:`~warmprior.WarmPriorActor` of the same data.
+        """
+        raise ValueError(f"{self.name} has no teacher")
 
     def allowed_nfes(self, nfes: Sequence[int]) -> list[int]:
         """Those numbers of network evaluations per chunk for which the trained field means anything.

@@ -14,12 +14,14 @@ __all__ = ["PriorSampler"]
 
 
 class PriorSampler(TensorDictModuleBase):
-    """Draws the source ``a_0`` of the flow: ``(loc, warm) -> noise``.
+    """Draws where the flow starts: ``(observation, loc, warm) -> noise``, see :meth:`Prior.start`.
 
     Args:
         prior: the source distribution.
 
     Keyword Args:
+        observation_key: key of the observation, ``[*B, To, d_o]``; without one the prior is given none,
+            as the paper's sources need none.
         loc_key: key of the mean, ``[*B, P, d_a]``.
         warm_key: key of the warm mask, bool ``[*B, P, 1]``.
         noise_key: key written, ``[*B, P, d_a]``.
@@ -44,6 +46,7 @@ class PriorSampler(TensorDictModuleBase):
         self,
         prior: Prior,
         *,
+        observation_key: NestedKey | None = None,
         loc_key: NestedKey = keys.LOC,
         warm_key: NestedKey = keys.WARM,
         noise_key: NestedKey = keys.NOISE,
@@ -52,6 +55,7 @@ class PriorSampler(TensorDictModuleBase):
         super().__init__()
         self.prior = prior
         self.generator = generator
+        self.observation_key = observation_key
         self.in_keys = [loc_key, warm_key]
         self.out_keys = [noise_key]
 
@@ -67,4 +71,7 @@ class PriorSampler(TensorDictModuleBase):
                 "writes them in an environment, ActionWindow in a replay buffer"
             )
         generator = self.generator if generator is None else generator
-        return tensordict.set(self.out_keys[0], self.prior.sample(loc, warm, generator))
+        observation = None
+        if self.observation_key is not None:
+            observation = tensordict.get(self.observation_key, None)
+        return tensordict.set(self.out_keys[0], self.prior.start(loc, warm, generator, observation))

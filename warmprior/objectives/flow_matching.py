@@ -163,8 +163,8 @@ class FlowMatchingLoss(LossModule):
         device = weight.device
         a1, loc, warm, observation = (v.to(device) for v in (a1, loc, warm, observation))
         batch = a1.shape[:-2]
-        a0 = self.prior.sample(loc, warm, self.generator)
-        a0, a1 = self.prior.couple(a0, a1, self.generator)
+        a0 = self.prior.sample(loc, warm, self.generator, observation)
+        a0, a1 = self.prior.couple(a0, a1, self.generator, observation)
         t = a1.new_zeros(batch)
         if self.prior.is_flow:
             t = torch.rand(batch, generator=self.generator, device=a1.device, dtype=a1.dtype)

@@ -120,6 +120,11 @@ class BehaviourCloning:
         compile: bool = False,
     ) -> None:
         actor.check_saveable()  # before hours are spent on what would be lost
+        if config.batch_size < actor.prior.least_batch:
+            raise ValueError(
+                f"{actor.prior.name} needs batches of at least {actor.prior.least_batch}, got "
+                f"{config.batch_size}"
+            )
         self.actor = actor
         self.config = config
         self.directory = Path(directory)
@@ -157,9 +162,9 @@ class BehaviourCloning:
             betas=config.betas,
             eps=config.eps,
         )
-        if isinstance(actor.prior, nn.Module):
-            learned = {"params": list(actor.prior.parameters()), "weight_decay": 0.0}
-            self.optimizer.add_param_group(learned)
+        learning = _learning(actor.prior)
+        if learning:
+            self.optimizer.add_param_group({"params": learning, "weight_decay": 0.0})
         self.schedule = warmup_cosine(self.optimizer, config.iterations, config.warmup_ratio)
         self.iteration = 0
         self.losses: list[tuple[int, float]] = []
@@ -372,6 +377,13 @@ class BehaviourCloning:
         self.iteration, self.losses = iteration, losses
 
 
+def _learning(prior: Prior) -> list[nn.Parameter]:
+    """Parameters of a prior that are trained with the flow; those of a LearnedPrior are fixed by then."""
+    if not isinstance(prior, nn.Module):
+        return []
+    return [parameter for parameter in prior.parameters() if parameter.requires_grad]
+
+
 def policy_path(directory: Path, iteration: int) -> Path:
     """Where a training in ``directory`` keeps the policy of one iteration."""
     return directory / f"policy_{iteration:06d}"
@@ -387,7 +399,7 @@ def _fixed_identity(part: object) -> dict[str, str]:
     """Digest of what is not trained, such as moments: it is part of what a network, or a prior, is."""
     if not isinstance(part, nn.Module):
         return {}
-    trained = {name for name, _ in part.named_parameters(remove_duplicate=False)}
+    trained = {n for n, p in part.named_parameters(remove_duplicate=False) if p.requires_grad}
     state = part.state_dict()
     fixed = {name: value.tolist() for name, value in state.items() if name not in trained}
     digest = hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]

@@ -1,0 +1,143 @@
+"""Standard normal sources that are paired with the data in another way than at random."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from warmprior.io.extras import require
+from warmprior.modules.priors import GaussianPrior
+
+__all__ = ["OTPrior", "ReflowPrior"]
+
+
+class OTPrior(GaussianPrior):
+    r"""OT-CFM: source and data of a batch are paired by optimal transport.
+
+    The permutation :math:`\pi` of the sources minimises
+
+    .. math::
+        \sum_j \|a_0^{\pi(j)} - a_1^j\|^2 + w \|o^{\pi(j)} - o^j\|^2
+
+    (Tong et al., 2024; Pooladian et al., 2023), exactly, in groups of at most 256. At decisions the source
+    is drawn at any observation, so pairs across observations bias the policy; ``w`` makes them dear. At
+    ``w = 0`` the observation is ignored; at a large one everything stays where it is.
+
+    Args:
+        chunk_length: ``H``.
+
+    Keyword Args:
+        observation_weight: ``w``, for observations in the data's normalised units.
+
+    Raises:
+        ValueError: if the weight is negative, or a batch has fewer than two windows.
+        ImportError: if scipy is missing.
+
+    Examples:
+        >>> import torch
+        >>> prior = OTPrior(1, observation_weight=0.0)
+        >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
+        >>> [x.flatten().tolist() for x in prior.couple(a0, a1)]
+        [[1.0, 0.0], [5.0, 4.0]]
+    """
+
+    name = "ot"
+    label = "OT-CFM"
+    color = "#5e4fa2"
+    least_batch = 2
+    GROUP: ClassVar[int] = 256
+
+    def __init__(self, chunk_length: int, *, observation_weight: float = 10.0) -> None:
+        if not observation_weight >= 0:
+            raise ValueError(f"observation_weight must be at least 0, got {observation_weight}")
+        require("scipy", "sim")
+        self.observation_weight = observation_weight
+        super().__init__(chunk_length)
+
+    def couple(
+        self,
+        a0: Tensor,
+        a1: Tensor,
+        generator: torch.Generator | None = None,
+        observation: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Permute the sources within the batch."""
+        from scipy.optimize import linear_sum_assignment
+
+        source, target = a0.reshape(-1, *a0.shape[-2:]), a1.reshape(-1, *a1.shape[-2:])
+        if len(source) < 2:
+            raise ValueError(f"{self.name} pairs within a batch: it needs at least 2 windows")
+        if observation is None and self.observation_weight:
+            raise ValueError(f"{self.name} needs the observations, or observation_weight=0")
+        paired = []
+        for i in range(0, len(source), self.GROUP):
+            group = slice(i, i + self.GROUP)
+            cost = _squared_distances(target[group], source[group])
+            if self.observation_weight:
+                assert observation is not None
+                seen = observation.reshape(len(source), -1)[group]
+                cost = cost + self.observation_weight * _squared_distances(seen, seen)
+            order = torch.as_tensor(linear_sum_assignment(cost.double().cpu().numpy())[1])
+            paired.append(source[group][order.to(source.device)])
+        return torch.cat(paired).view_as(a0), a1
+
+
+def _squared_distances(x: Tensor, y: Tensor) -> Tensor:
+    return torch.cdist(x.flatten(1), y.flatten(1)).square()
+
+
+class ReflowPrior(GaussianPrior):
+    r"""2-rectified flow: the target of every source is where a trained policy's flow leads it.
+
+    The teacher is the policy of :class:`GaussianPrior` (the 1-rectified flow) of the same recipe and seed.
+    Pairs :math:`(a_0, \hat a_1)`, with :math:`\hat a_1` the end of its flow at the window's observation, are
+    drawn anew for every batch (Liu et al., 2023): a step costs ``teacher_nfe`` more forward passes.
+
+    Args:
+        chunk_length: ``H``.
+
+    Keyword Args:
+        teacher_nfe: the teacher's Euler steps.
+
+    Raises:
+        ValueError: if ``teacher_nfe < 1``, or it is trained without a teacher.
+    """
+
+    name = "reflow"
+    label = "2-rectified flow"
+    color = "#3288bd"
+    teacher = "gaussian"
+
+    def __init__(self, chunk_length: int, *, teacher_nfe: int = 9) -> None:
+        if teacher_nfe < 1:
+            raise ValueError(f"teacher_nfe must be at least 1, got {teacher_nfe}")
+        super().__init__(chunk_length)
+        self.teacher_nfe = teacher_nfe
+        self.policy: Any = None
+
+    def learn_from(self, policy: Any) -> None:
+        """Take the teacher."""
+        if policy.prior.name != self.teacher:
+            raise ValueError(f"{self.name} learns from {self.teacher}, not from {policy.prior}")
+        self.policy = policy.eval().requires_grad_(False)
+
+    @torch.no_grad()
+    def couple(
+        self,
+        a0: Tensor,
+        a1: Tensor,
+        generator: torch.Generator | None = None,
+        observation: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Replace the targets by the ends of the teacher's flow."""
+        if self.policy is None:
+            raise ValueError(
+                f"{self.name} has no teacher: hand a trained policy of {self.teacher} to learn_from"
+            )
+        ode = self.policy.ode
+        noise_key, observation_key = ode.in_keys
+        data = TensorDict({noise_key: a0, observation_key: observation}, a0.shape[:-2])
+        return a0, ode(data, nfe=self.teacher_nfe)[ode.out_keys[0]]

@@ -1,0 +1,439 @@
+"""Sources that learn from the demonstrations before the flow does."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Self
+
+import torch
+from torch import Tensor, nn
+from torchrl.modules import MLP
+
+from warmprior.modules.priors import PastPrior
+
+__all__ = ["CVAEPrior", "ForecastPrior", "LeapPrior", "LearnedPrior", "StepPrior"]
+
+SCALE_FLOOR = 0.02
+"""Smallest standard deviation of a learned Gaussian source, in normalised action units."""
+
+
+class LearnedPrior(PastPrior, nn.Module):
+    r"""Base class of priors with a network :math:`f_\phi(o, \mu)` of observation and last ``H`` actions.
+
+    It learns by a loss of its own, on the windows that the flow will be trained on
+    (:func:`~warmprior.training.learn_prior`), and is fixed from then on: the flow, and the moments that it
+    is preconditioned with, see one and the same source. The mean that it starts from,
+    :math:`\mu`, is that of :class:`PastPrior`. Subclasses set ``outputs`` and override
+    :meth:`learning_loss` and :meth:`distribution` (or :meth:`sample`).
+
+    Args:
+        chunk_length: ``H``.
+
+    Keyword Args:
+        action_dim: ``d_a``; like the other widths it is filled in by :meth:`sized`.
+        observation_dim: ``d_o``.
+        observation_steps: ``To``.
+        hidden_dim: width of the network's two hidden layers.
+        sigma: see the subclass.
+        cold_probability: see :class:`Prior`.
+
+    Raises:
+        ValueError: if only some of the widths are given, or one is below 1.
+    """
+
+    sees_history: ClassVar[bool] = True
+    """Whether the network is given the last actions, beside the observation."""
+    action_dim: int
+    observation_dim: int
+    observation_steps: int
+
+    def __init__(
+        self,
+        chunk_length: int,
+        *,
+        action_dim: int | None = None,
+        observation_dim: int | None = None,
+        observation_steps: int | None = None,
+        hidden_dim: int = 256,
+        sigma: float | None = None,
+        cold_probability: float = 0.0,
+    ) -> None:
+        nn.Module.__init__(self)
+        super().__init__(chunk_length, sigma=sigma, cold_probability=cold_probability)
+        given = (action_dim, observation_dim, observation_steps)
+        widths = [width for width in given if width is not None]
+        if len(widths) not in (0, 3) or any(width < 1 for width in widths):
+            raise ValueError(
+                f"{type(self).__name__} needs action_dim, observation_dim and observation_steps, each at "
+                f"least 1, or none of them, got {given}"
+            )
+        self.hidden_dim, self.is_sized = hidden_dim, bool(widths)
+        if self.is_sized:
+            self.action_dim, self.observation_dim, self.observation_steps = widths
+            self.build()
+            self.requires_grad_(False)
+
+    @property
+    def chunk_dim(self) -> int:
+        """Numbers in a chunk, ``P d_a``."""
+        return self.prediction_length * self.action_dim
+
+    @property
+    def seen_dim(self) -> int:
+        """Numbers that the network is given."""
+        history = self.chunk_length * self.action_dim + 1 if self.sees_history else 0
+        return self.observation_steps * self.observation_dim + history
+
+    def build(self) -> None:
+        """Make the networks, once the widths are known."""
+        raise NotImplementedError
+
+    def mlp(self, inputs: int, outputs: int) -> MLP:
+        """A network of the prior's width.
+
+        Args:
+            inputs: its number of inputs.
+            outputs: its number of outputs.
+        """
+        return MLP(inputs, outputs, num_cells=[self.hidden_dim] * 2, activation_class=nn.GELU)
+
+    def sized(self, action_dim: int, observation_dim: int, observation_steps: int) -> Self:
+        """The prior with fresh networks for data of these widths; itself if it has them already."""
+        widths: dict[str, Any] = {
+            "action_dim": action_dim,
+            "observation_dim": observation_dim,
+            "observation_steps": observation_steps,
+        }
+        if self.is_sized:
+            mine = {name: getattr(self, name) for name in widths}
+            if mine != widths:
+                raise ValueError(f"{self.name} was built for {mine}, but the data have {widths}")
+            return self
+        return type(self)(**(self._resolved() | widths))
+
+    def seen(self, loc: Tensor, warm: Tensor, observation: Tensor | None) -> Tensor:
+        """What the network is given, ``[*B, seen_dim]``.
+
+        Raises:
+            ValueError: if there is no observation, or the networks were not built.
+        """
+        if not self.is_sized:
+            raise ValueError(
+                f"{self.name} has no networks yet: take prior.sized(d_a, d_o, To), and learn_prior to "
+                "train it"
+            )
+        if observation is None:
+            raise ValueError(
+                f"{self.name} needs the observation: give the sampler its observation_key"
+            )
+        parts = [observation.flatten(-2)]
+        if self.sees_history:
+            known = warm[..., 0, :].to(loc.dtype)
+            parts += [torch.where(warm, loc, 0.0).flatten(-2), known]
+        return torch.cat(parts, -1)
+
+    def learning_loss(
+        self,
+        a1: Tensor,
+        counted: Tensor,
+        loc: Tensor,
+        warm: Tensor,
+        observation: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """What the prior's networks minimise.
+
+        Args:
+            a1: targets, ``[B, P, d_a]``.
+            counted: positions inside the episode, bool ``[B, P, 1]``.
+            loc: mean of :class:`PastPrior`, ``[B, P, d_a]``.
+            warm: bool ``[B, P, 1]``.
+            observation: ``[B, To, d_o]``.
+            generator: source of randomness on their device.
+
+        Returns:
+            A scalar.
+        """
+        raise NotImplementedError
+
+    def calibrate(
+        self, a1: Tensor, counted: Tensor, loc: Tensor, warm: Tensor, observation: Tensor
+    ) -> None:
+        """Correct the source by its error on windows that it did not learn from; nothing by default.
+
+        Args:
+            a1: see :meth:`learning_loss`.
+            counted: see :meth:`learning_loss`.
+            loc: see :meth:`learning_loss`.
+            warm: see :meth:`learning_loss`.
+            observation: see :meth:`learning_loss`.
+        """
+
+
+def _mean(values: Tensor, counted: Tensor) -> Tensor:
+    """Mean over the coordinates inside the episode."""
+    counted = counted.expand_as(values)
+    return (values * counted).sum() / counted.sum().clamp_min(1)
+
+
+class ForecastPrior(LearnedPrior):
+    r"""A learned Gaussian source: mean and scale from observation and last actions, calibrated.
+
+    .. math::
+        a_0 = \mu_\phi(o, h) + s_\phi(o, h) \varepsilon, \qquad
+        \min_\phi E\left[\log s_\phi + \tfrac12 (a_1 - \mu_\phi)^2 / s_\phi^2\right],
+
+    per position and dimension. Afterwards :math:`s_\phi` is multiplied, per position and dimension, by the
+    root mean square of :math:`(a_1 - \mu_\phi) / s_\phi` on episodes that were held out: a source that errs
+    more than it thinks is widened until it errs as it says. ``sigma`` multiplies the result.
+
+    Args:
+        chunk_length: ``H``.
+
+    Examples:
+        >>> import torch
+        >>> prior = ForecastPrior(4).sized(action_dim=2, observation_dim=3, observation_steps=1)
+        >>> loc, warm = torch.zeros(5, 4, 2), torch.ones(5, 4, 1, dtype=torch.bool)
+        >>> mean, scale = prior.distribution(loc, warm, torch.zeros(5, 1, 3))
+        >>> mean.shape, bool((scale > 0).all())
+        (torch.Size([5, 4, 2]), True)
+    """
+
+    name = "forecast"
+    label = "WP-Forecast"
+    color = "#7b3294"
+    default_sigma = 1.0
+    calibration: Tensor
+
+    def build(self) -> None:
+        """One network for mean and scale, and the calibration."""
+        self.network = self.mlp(self.seen_dim, 2 * self.chunk_dim)
+        shape = (self.prediction_length, self.action_dim)
+        self.register_buffer("calibration", torch.ones(shape))
+
+    def _gaussian(
+        self, loc: Tensor, warm: Tensor, observation: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and scale before the calibration."""
+        out = self.network(self.seen(loc, warm, observation))
+        mean, raw = out.unflatten(-1, (2, self.prediction_length, self.action_dim)).unbind(-3)
+        return mean, SCALE_FLOOR + nn.functional.softplus(raw)
+
+    def distribution(
+        self, loc: Tensor, warm: Tensor, observation: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The learned mean and the calibrated scale."""
+        mean, scale = self._gaussian(loc, warm, observation)
+        return mean, self.sigma * self.calibration * scale
+
+    def learning_loss(
+        self,
+        a1: Tensor,
+        counted: Tensor,
+        loc: Tensor,
+        warm: Tensor,
+        observation: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Negative log-likelihood per coordinate, without its constant."""
+        mean, scale = self._gaussian(loc, warm, observation)
+        return _mean(scale.log() + 0.5 * ((a1 - mean) / scale).square(), counted)
+
+    def calibrate(
+        self, a1: Tensor, counted: Tensor, loc: Tensor, warm: Tensor, observation: Tensor
+    ) -> None:
+        """Scale by the root mean square of the standardised error."""
+        mean, scale = self._gaussian(loc, warm, observation)
+        squared = ((a1 - mean) / scale).square() * counted
+        known = counted.sum(0).clamp_min(1)
+        found = torch.where(counted.any(0), squared.sum(0) / known, 1.0)
+        self.calibration.copy_(found.sqrt())
+
+
+class LeapPrior(ForecastPrior):
+    """A learnable prior: the Gaussian source of :class:`ForecastPrior` from the observation alone.
+
+    Args:
+        chunk_length: ``H``.
+    """
+
+    name = "leap"
+    label = "Learnable prior"
+    color = "#b8a9c9"
+    sees_history = False
+
+
+class CVAEPrior(LearnedPrior):
+    r"""BRIDGER's learned source: the decoder of a conditional variational autoencoder.
+
+    .. math::
+        a_0 = g_\phi(o, z) + \sigma \varepsilon, \quad z \sim N(0, I), \qquad
+        \min_\phi E\left[\|a_1 - g_\phi(o, z)\|^2 + \beta \, KL(q_\phi(z | o, a_1) \| N(0, I))\right]
+
+    (Chen et al., 2024). The flow from it is that of every other prior; BRIDGER's own path adds noise between
+    the ends and is sampled as a stochastic differential equation.
+
+    Args:
+        chunk_length: ``H``.
+
+    Keyword Args:
+        latent_dim: width of ``z``.
+        beta: weight of the divergence, per coordinate of the chunk.
+        sigma: noise of the source around the decoder's output.
+    """
+
+    name = "cvae"
+    label = "CVAE source"
+    color = "#c51b7d"
+    default_sigma = 0.1
+    sees_history = False
+    latent_dim: int
+    beta: float
+
+    def __init__(
+        self, chunk_length: int, *, latent_dim: int = 8, beta: float = 0.01, **options: Any
+    ) -> None:
+        if latent_dim < 1 or not beta > 0:
+            raise ValueError(f"need latent_dim >= 1 and beta > 0, got {latent_dim} and {beta}")
+        self.__dict__.update(latent_dim=latent_dim, beta=beta)
+        super().__init__(chunk_length, **options)
+
+    def build(self) -> None:
+        """Encoder and decoder."""
+        self.encoder = self.mlp(self.seen_dim + self.chunk_dim, 2 * self.latent_dim)
+        self.decoder = self.mlp(self.seen_dim + self.latent_dim, self.chunk_dim)
+
+    def _decode(self, seen: Tensor, z: Tensor) -> Tensor:
+        out = self.decoder(torch.cat([seen, z], -1))
+        return out.unflatten(-1, (self.prediction_length, self.action_dim))
+
+    def sample(
+        self,
+        loc: Tensor,
+        warm: Tensor,
+        generator: torch.Generator | None = None,
+        observation: Tensor | None = None,
+    ) -> Tensor:
+        """Decode a draw of ``z``, and add noise."""
+        seen = self.seen(loc, warm, observation)
+        like: dict[str, Any] = {"dtype": loc.dtype, "device": loc.device}
+        z = torch.randn(*seen.shape[:-1], self.latent_dim, generator=generator, **like)
+        eps = torch.randn(loc.shape, generator=generator, **like)
+        return self._decode(seen, z) + self.sigma * eps
+
+    def learning_loss(
+        self,
+        a1: Tensor,
+        counted: Tensor,
+        loc: Tensor,
+        warm: Tensor,
+        observation: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Squared error of the reconstruction and divergence of the code."""
+        seen = self.seen(loc, warm, observation)
+        found = self.encoder(torch.cat([seen, (a1 * counted).flatten(-2)], -1))
+        mean, log_variance = found.chunk(2, -1)
+        eps = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
+        z = mean + (0.5 * log_variance).exp() * eps
+        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
+        error = _mean((a1 - self._decode(seen, z)).square(), counted)
+        return error + self.beta * divergence / self.chunk_dim * self.latent_dim
+
+
+class StepPrior(LearnedPrior):
+    r"""STEP: a forecast enters the flow of a standard normal source at an intermediate time.
+
+    The flow is trained as ever, from N(0, I). At decisions a forecaster :math:`f_\phi(o, h)`, trained by mean
+    squared error, gives
+
+    .. math::
+        a_{t_s} = (1 - t_s) \varepsilon + t_s f_\phi(o, h),
+
+    from which the flow is integrated to ``t = 1`` (Li et al., 2026). Where the forecast stays where the last
+    chunk was (root mean square distance per coordinate below ``stall``), the robot may be stuck, and the
+    noise is multiplied by ``1 + stall_noise`` (velocity-aware noise).
+
+    Args:
+        chunk_length: ``H``.
+
+    Keyword Args:
+        start_time: :math:`t_s`.
+        stall: see above, in normalised action units.
+        stall_noise: see above.
+    """
+
+    name = "step"
+    label = "STEP"
+    color = "#35978f"
+    stall: float
+    stall_noise: float
+
+    def __init__(
+        self,
+        chunk_length: int,
+        *,
+        start_time: float = 0.5,
+        stall: float = 0.02,
+        stall_noise: float = 0.1,
+        action_dim: int | None = None,
+        observation_dim: int | None = None,
+        observation_steps: int | None = None,
+        hidden_dim: int = 256,
+    ) -> None:
+        if not 0.0 < start_time < 1.0 or not stall >= 0 or not math.isfinite(stall_noise):
+            raise ValueError(
+                f"need 0 < start_time < 1, stall >= 0 and a finite stall_noise, got {start_time}, {stall} "
+                f"and {stall_noise}"
+            )
+        self.__dict__.update(start_time=start_time, stall=stall, stall_noise=stall_noise)
+        super().__init__(
+            chunk_length,
+            action_dim=action_dim,
+            observation_dim=observation_dim,
+            observation_steps=observation_steps,
+            hidden_dim=hidden_dim,
+            sigma=1.0,
+        )
+
+    def build(self) -> None:
+        """The forecaster."""
+        self.network = self.mlp(self.seen_dim, self.chunk_dim)
+
+    def forecast(self, loc: Tensor, warm: Tensor, observation: Tensor | None) -> Tensor:
+        """The forecast chunk, ``[*B, P, d_a]``."""
+        out = self.network(self.seen(loc, warm, observation))
+        return out.unflatten(-1, (self.prediction_length, self.action_dim))
+
+    def distribution(
+        self, loc: Tensor, warm: Tensor, observation: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Standard normal: that of the training."""
+        return super().distribution(loc, torch.zeros_like(warm), observation)
+
+    def start(
+        self,
+        loc: Tensor,
+        warm: Tensor,
+        generator: torch.Generator | None = None,
+        observation: Tensor | None = None,
+    ) -> Tensor:
+        """Noise and forecast, mixed as on the path at ``start_time``."""
+        eps = torch.randn(loc.shape, generator=generator, dtype=loc.dtype, device=loc.device)
+        forecast = self.forecast(loc, warm, observation)
+        moved = (forecast - loc).square().mean((-1, -2), keepdim=True).sqrt()
+        stuck = warm[..., :1, :] & (moved < self.stall)
+        eps = torch.where(stuck, (1 + self.stall_noise) * eps, eps)
+        return (1 - self.start_time) * eps + self.start_time * forecast
+
+    def learning_loss(
+        self,
+        a1: Tensor,
+        counted: Tensor,
+        loc: Tensor,
+        warm: Tensor,
+        observation: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Mean squared error."""
+        return _mean((a1 - self.forecast(loc, warm, observation)).square(), counted)
