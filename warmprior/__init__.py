@@ -9,6 +9,7 @@ name; parts of them need the extra ``warmprior[sim]``.
 from importlib.metadata import version
 
 from warmprior.modules import (
+    A2APrior,
     ChiTransformer,
     CVAEPrior,
     ForecastPrior,
@@ -62,6 +63,7 @@ from warmprior.transforms import (
 __version__ = version("warmprior")
 
 __all__ = [
+    "A2APrior",
     "ActionHistory",
     "ActionWindow",
     "BoxTanhNormal",

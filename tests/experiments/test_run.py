@@ -21,7 +21,14 @@ from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 
 from tests.training.cloning_parts import same
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior import (
+    ForecastPrior,
+    GaussianPrior,
+    PastPrior,
+    PreviewPrior,
+    ReflowPrior,
+    StepPrior,
+)
 from warmprior.diagnostics import (
     SharedObservations,
     branching_bound,
@@ -45,6 +52,7 @@ from warmprior.experiments import (
     Recipe,
     RunOptions,
     Store,
+    store,
 )
 
 H = 4
@@ -478,6 +486,40 @@ def test_priors_that_learn_or_cannot_be_hashed(tmp_path):
     rows = compared.run().rows
     assert [row["prior"] for row in rows] == ["unhashable"] * 4 + ["widening"] * 4
     assert float(compared.contestants[1].policy().prior.scale) != 1.0
+
+
+def test_priors_that_learn_before_the_flow_learn_once(tmp_path, monkeypatch):
+    priors = [ForecastPrior(H), StepPrior(H)]
+    compared = comparison(tmp_path, 2, priors=priors, seeds=1)
+    compared.run()
+    forecast = compared.contestants[0]
+    assert forecast.prior.is_sized and (forecast.folder / "prior.safetensors").exists()
+    learnt = forecast.policy().prior
+    loaded = forecast.store.load(priors[0], forecast.training).prior
+    assert all(
+        torch.equal(a, b) for a, b in zip(*(p.buffers() for p in (learnt, loaded)), strict=True)
+    )
+    fresh = ForecastPrior(H).sized(ACTION_DIM, OBSERVATION_DIM, 2).state_dict()
+    assert any(not torch.equal(learnt.state_dict()[name], fresh[name]) for name in fresh)
+    rows = rows_of(tmp_path)
+    monkeypatch.setattr(store, "learn_prior", lambda *args, **kwargs: pytest.fail("learnt again"))
+    again = comparison(tmp_path, 1, priors=priors, seeds=1, resume=True)
+    again.run()
+    assert rows_of(tmp_path) == rows
+
+
+def test_a_student_waits_for_its_teacher(tmp_path, capsys):
+    """Whatever the order; and without the teacher in the comparison, it is trained on the way."""
+    priors = [ReflowPrior(H, teacher_nfe=2), GaussianPrior(H)]
+    compared = comparison(tmp_path / "both", 3, priors=priors, seeds=1)
+    compared.run()
+    told = capsys.readouterr().out
+    assert told.index("trained drift own, gaussian") < told.index("trained drift own, reflow")
+    comparison(tmp_path / "one", 2, priors=priors[:1], seeds=1).run()
+    both, one = rows_of(tmp_path / "both"), rows_of(tmp_path / "one")
+    assert [row["prior"] for row in both] == ["reflow"] * 4 + ["gaussian"] * 4 and both[:4] == one
+    reflow, gaussian = (c.policy().network.state_dict() for c in compared.contestants)
+    assert any(not torch.equal(reflow[name], gaussian[name]) for name in reflow)
 
 
 def test_a_chunk_longer_than_every_demonstration_is_refused(tmp_path):

@@ -17,8 +17,10 @@ from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
     ActionHistory,
     ChunkStep,
+    ForecastPrior,
     GaussianPrior,
     HistoryPrior,
+    ObservationStack,
     PastPrior,
     PreviewPrior,
     PriorAnchor,
@@ -94,6 +96,20 @@ def test_everywhere(place, prior_class, execute):
     finally:
         env.close(raise_if_closed=False)
         again.close(raise_if_closed=False)
+
+
+def test_a_learned_mean_is_the_anchor_from_the_first_decision_on():
+    width = CountingEnv(LENGTHS[0]).reset()["observation"].shape[-1]
+    prior = ForecastPrior(H).sized(ACTION_DIM, width, 1)
+    parts = Compose(ObservationStack(1), *history(prior), PriorAnchor(prior))
+    env = TransformedEnv(CountingEnv(LENGTHS[0]), parts)
+    check_env_specs(env)
+    data = env.rollout(3)
+    for part in (data, data["next"]):
+        loc, warm = part["prior", "loc"], part["prior", "warm"]
+        mean, _ = prior.distribution(loc, warm, part["observation"])
+        torch.testing.assert_close(part["prior", "anchor"], mean)
+        assert mean.any()
 
 
 def test_noise_is_standard_normal():

@@ -11,6 +11,7 @@ from warmprior.modules.interpolant import (
     TrigonometricInterpolant,
 )
 from warmprior.modules.learned import (
+    A2APrior,
     CVAEPrior,
     ForecastPrior,
     LeapPrior,
@@ -27,6 +28,7 @@ from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.modules.sampler import PriorSampler
 
 __all__ = [
+    "A2APrior",
     "CVAEPrior",
     "ChiTransformer",
     "ForecastPrior",

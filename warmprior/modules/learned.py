@@ -11,7 +11,7 @@ from torchrl.modules import MLP
 
 from warmprior.modules.priors import PastPrior
 
-__all__ = ["CVAEPrior", "ForecastPrior", "LeapPrior", "LearnedPrior", "StepPrior"]
+__all__ = ["A2APrior", "CVAEPrior", "ForecastPrior", "LeapPrior", "LearnedPrior", "StepPrior"]
 
 SCALE_FLOOR = 0.02
 """Smallest standard deviation of a learned Gaussian source, in normalised action units."""
@@ -42,7 +42,9 @@ class LearnedPrior(PastPrior, nn.Module):
     """
 
     sees_history: ClassVar[bool] = True
-    """Whether the network is given the last actions, beside the observation."""
+    """Whether the network is given the last actions."""
+    sees_observation: ClassVar[bool] = True
+    """Whether the network is given the observation."""
     action_dim: int
     observation_dim: int
     observation_steps: int
@@ -80,9 +82,15 @@ class LearnedPrior(PastPrior, nn.Module):
 
     @property
     def seen_dim(self) -> int:
-        """Numbers that the network is given."""
-        history = self.chunk_length * self.action_dim + 1 if self.sees_history else 0
-        return self.observation_steps * self.observation_dim + history
+        """Numbers that the network is given.
+
+        Raises:
+            ValueError: if the widths are not known.
+        """
+        self._check_sized()
+        history = self.chunk_length * self.action_dim + 1
+        observed = self.observation_steps * self.observation_dim
+        return self.sees_history * history + self.sees_observation * observed
 
     def build(self) -> None:
         """Make the networks, once the widths are known."""
@@ -117,20 +125,25 @@ class LearnedPrior(PastPrior, nn.Module):
         Raises:
             ValueError: if there is no observation, or the networks were not built.
         """
+        self._check_sized()
+        parts = []
+        if self.sees_observation:
+            if observation is None:
+                raise ValueError(
+                    f"{self.name} needs the observation: give the sampler its observation_key"
+                )
+            parts.append(observation.flatten(-2))
+        if self.sees_history:
+            known = warm[..., 0, :].to(loc.dtype)
+            parts += [torch.where(warm, loc, 0.0).flatten(-2), known]
+        return torch.cat(parts, -1)
+
+    def _check_sized(self) -> None:
         if not self.is_sized:
             raise ValueError(
                 f"{self.name} has no networks yet: take prior.sized(d_a, d_o, To), and learn_prior to "
                 "train it"
             )
-        if observation is None:
-            raise ValueError(
-                f"{self.name} needs the observation: give the sampler its observation_key"
-            )
-        parts = [observation.flatten(-2)]
-        if self.sees_history:
-            known = warm[..., 0, :].to(loc.dtype)
-            parts += [torch.where(warm, loc, 0.0).flatten(-2), known]
-        return torch.cat(parts, -1)
 
     def learning_loss(
         self,
@@ -203,6 +216,7 @@ class ForecastPrior(LearnedPrior):
     label = "WP-Forecast"
     color = "#7b3294"
     default_sigma = 1.0
+    always_warm = True
     calibration: Tensor
 
     def build(self) -> None:
@@ -215,7 +229,8 @@ class ForecastPrior(LearnedPrior):
         self, loc: Tensor, warm: Tensor, observation: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Mean and scale before the calibration."""
-        out = self.network(self.seen(loc, warm, observation))
+        seen = self.seen(loc, warm, observation)
+        out = self.network(seen)
         mean, raw = out.unflatten(-1, (2, self.prediction_length, self.action_dim)).unbind(-3)
         return mean, SCALE_FLOOR + nn.functional.softplus(raw)
 
@@ -263,6 +278,49 @@ class LeapPrior(ForecastPrior):
     sees_history = False
 
 
+class A2APrior(LearnedPrior):
+    r"""A2A in action space: a deterministic source :math:`a_0 = f_\phi(h)` made of the last actions alone.
+
+    A2A (Jia et al., 2026) encodes a history into the source of a flow between latent codes of chunks, without
+    any noise. Here the code of a chunk is the chunk itself, the history that of :class:`PastPrior`, and
+    :math:`f_\phi` learns by mean squared error to be near the target before the flow does.
+
+    Args:
+        chunk_length: ``H``.
+    """
+
+    name = "a2a"
+    label = "A2A (action space)"
+    color = "#bf812d"
+    default_sigma = 0.0
+    always_warm = True
+    sees_observation = False
+
+    def build(self) -> None:
+        """The encoder."""
+        self.network = self.mlp(self.seen_dim, self.chunk_dim)
+
+    def distribution(
+        self, loc: Tensor, warm: Tensor, observation: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """The encoded history, and ``sigma`` around it, 0 by default."""
+        seen = self.seen(loc, warm, observation)
+        mean = self.network(seen).unflatten(-1, (self.prediction_length, self.action_dim))
+        return mean, torch.full_like(mean[..., :1], self.sigma)
+
+    def learning_loss(
+        self,
+        a1: Tensor,
+        counted: Tensor,
+        loc: Tensor,
+        warm: Tensor,
+        observation: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Mean squared error."""
+        return _mean((a1 - self.distribution(loc, warm)[0]).square(), counted)
+
+
 class CVAEPrior(LearnedPrior):
     r"""BRIDGER's learned source: the decoder of a conditional variational autoencoder.
 
@@ -302,6 +360,11 @@ class CVAEPrior(LearnedPrior):
         """Encoder and decoder."""
         self.encoder = self.mlp(self.seen_dim + self.chunk_dim, 2 * self.latent_dim)
         self.decoder = self.mlp(self.seen_dim + self.latent_dim, self.chunk_dim)
+
+    @property
+    def moves_source(self) -> bool:
+        """No: the source is no Gaussian, and an agent searches around zero."""
+        return False
 
     def _decode(self, seen: Tensor, z: Tensor) -> Tensor:
         out = self.decoder(torch.cat([seen, z], -1))
@@ -402,14 +465,19 @@ class StepPrior(LearnedPrior):
 
     def forecast(self, loc: Tensor, warm: Tensor, observation: Tensor | None) -> Tensor:
         """The forecast chunk, ``[*B, P, d_a]``."""
-        out = self.network(self.seen(loc, warm, observation))
-        return out.unflatten(-1, (self.prediction_length, self.action_dim))
+        seen = self.seen(loc, warm, observation)
+        return self.network(seen).unflatten(-1, (self.prediction_length, self.action_dim))
 
     def distribution(
         self, loc: Tensor, warm: Tensor, observation: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Standard normal: that of the training."""
         return super().distribution(loc, torch.zeros_like(warm), observation)
+
+    @property
+    def moves_source(self) -> bool:
+        """No: the forecast enters at decisions alone, and an agent searches around zero."""
+        return False
 
     def start(
         self,

@@ -84,6 +84,8 @@ class Prior:
     """Predicted actions ``P`` per executed ones ``H``."""
     default_sigma: ClassVar[float] = 1.0
     """``sigma`` where none is given."""
+    always_warm: ClassVar[bool] = False
+    """Whether there is a mean where the window or decision has none, as in the first chunk of an episode."""
     ever_warm: ClassVar[bool] = True
     """Whether there is ever a mean. Otherwise ``sigma`` and ``cold_probability`` are without effect."""
     is_flow: ClassVar[bool] = True

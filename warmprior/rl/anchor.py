@@ -44,13 +44,15 @@ class PriorAnchor(Transform):
         prior: the policy's source distribution.
 
     Keyword Args:
-        cold: ``"noise"`` draws the prior's own cold source, N(0, I); ``"zero"`` puts zero. By default
+        cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default
             noise for priors with a mean and zero for the others (:class:`~warmprior.GaussianPrior`,
             :class:`~warmprior.HistoryPrior`), which gives vanilla DSRL: :math:`a_0 = \Delta`.
         seed: of the noise until ``env.set_seed`` is called. By default it is drawn from PyTorch's global
             generator with the first noise, and differs between the workers of a batched environment,
             whose generators are alike.
         seed_offset: mixed with the seed.
+        observation_key: what the policy's network sees, ``[*B, To, d_o]``, for priors whose mean depends on
+            it.
         loc_key: the mean, ``[*B, P, d_a]``.
         warm_key: its mask, bool ``[*B, P, 1]``.
         anchor_key: where the anchor is written, ``[*B, P, d_a]``.
@@ -79,6 +81,7 @@ class PriorAnchor(Transform):
         cold: Literal["noise", "zero"] | None = None,
         seed: int | None = None,
         seed_offset: int = 0,
+        observation_key: NestedKey = keys.OBSERVATION,
         loc_key: NestedKey = keys.LOC,
         warm_key: NestedKey = keys.WARM,
         anchor_key: NestedKey = keys.ANCHOR,
@@ -90,6 +93,7 @@ class PriorAnchor(Transform):
         self.follows_mean = prior.moves_source
         self.cold = cold or ("noise" if self.follows_mean else "zero")
         self.seed_offset = seed_offset
+        self.observation_key = unravel_key(observation_key)
         self.loc_key, self.warm_key = unravel_key(loc_key), unravel_key(warm_key)
         self.anchor_key = unravel_key(anchor_key)
         self.generator: torch.Generator | None = None
@@ -159,12 +163,16 @@ class PriorAnchor(Transform):
                 drawn = int(torch.randint(2**62, ()))
                 self.set_seed(f"{drawn}/{multiprocessing.current_process().name}")
             # Drawn on the CPU: one seed gives one noise on every device.
-            zero = torch.zeros(loc.shape, dtype=loc.dtype)
-            nothing = torch.zeros(warm.shape, dtype=torch.bool)
-            cold = self.prior.sample(zero, nothing, self.generator).to(loc.device)
+            cold = torch.randn(loc.shape, generator=self.generator, dtype=loc.dtype)
+            cold = cold.to(loc.device)
         else:
             cold = torch.zeros_like(loc)
-        anchor = torch.where(warm, loc, cold) if self.follows_mean else cold
+        anchor = cold
+        if self.follows_mean:
+            observation = next_tensordict.get(self.observation_key, None)
+            with torch.no_grad():
+                mean, _ = self.prior.distribution(loc, warm, observation)
+            anchor = torch.where(warm | self.prior.always_warm, mean, cold)
         return next_tensordict.set(self.anchor_key, anchor)
 
     def _reset(
