@@ -4,6 +4,7 @@ from warmprior.diagnostics.action_error import action_error
 from warmprior.diagnostics.branching import branching_bound, branching_cost
 from warmprior.diagnostics.curvature import curvature
 from warmprior.diagnostics.history_shift import HistoryShift
+from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revision
 from warmprior.diagnostics.paths import flow_paths, forecast_mean
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.smoothness import (
@@ -26,6 +27,7 @@ from warmprior.diagnostics.statistics import (
 
 __all__ = [
     "HistoryShift",
+    "MeanError",
     "SeedSummary",
     "SharedObservations",
     "Smoothness",
@@ -40,6 +42,8 @@ __all__ = [
     "executed_actions",
     "flow_paths",
     "forecast_mean",
+    "mean_error",
+    "mean_revision",
     "paired_probability_better",
     "probability_better",
     "smoothness",

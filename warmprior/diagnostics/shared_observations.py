@@ -119,6 +119,22 @@ class SharedObservations:
         windows = self.windows(policy.prior).to(met.device).update(met)
         return MeanObservation()(windows) if policy.prior.conditions_network else windows
 
+    def met(
+        self, policy: WarmPriorActor, *, generator: torch.Generator | None = None
+    ) -> TensorDictBase:
+        """Windows as decisions meet them: :meth:`deployed`, if anything of the source is ever warm.
+
+        Args:
+            policy: the policy.
+
+        Keyword Args:
+            generator: see :func:`forecast_mean`.
+        """
+        windows = self.windows(policy.prior)
+        if windows[keys.WARM].any():
+            return self.deployed(policy, generator=generator)
+        return windows
+
     def subset(self, index: Tensor) -> SharedObservations:
         """Some of the observations.
 

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torchrl.envs import EnvBase, TransformedEnv
 
+from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revision
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.smoothness import smoothness
 from warmprior.diagnostics.source_leak import SourceLeak, source_leak
@@ -118,10 +119,12 @@ class _Measures:
 
     Attributes:
         leaks: its source leak by NFE.
+        means: the error of its mean by NFE.
         flow: of its flow and source; these hold at any NFE.
     """
 
     leaks: dict[int, SourceLeak]
+    means: dict[int, MeanError]
     flow: dict[str, float]
 
 
@@ -198,7 +201,11 @@ class _Worker:
         if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
             windows = shared.windows(policy.prior)
             leaks = source_leak(policy, windows, nfes=self.options.nfes, episodes=shared.episodes)
-        return _Measures(leaks, flow_measures(policy, shared))
+        generator = torch.Generator().manual_seed(0)
+        met = shared.met(policy, generator=generator)
+        nfes = policy.prior.allowed_nfes(self.options.nfes)
+        means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in nfes}
+        return _Measures(leaks, means, flow_measures(policy, met, generator=generator))
 
     def _prepare(self, chosen: Contestant, checkpoint: int) -> tuple[WarmPriorActor, EnvBase]:
         if self._store is not chosen.store:
@@ -500,7 +507,8 @@ class Comparison:
             # Sums depend on the order: that of the seeds, not that in which the episodes ended.
             episodes = sorted(outcomes.pop((number, checkpoint, nfe)), key=lambda e: e.seed)
             measured = _of_nfe(measures[number], nfe) if is_last else {}
-            row = played(facts, [e.success for e in episodes], **_motion(episodes), **measured)
+            motion = _motion(episodes, chosen.prior)
+            row = played(facts, [e.success for e in episodes], **motion, **measured)
             self.results.add(row, order=self._place)
             progress.say(_told(chosen, row))
 
@@ -511,23 +519,27 @@ class Comparison:
         return number, row.get("checkpoint") or 0, -(row.get("nfe") or 0)
 
 
-def _motion(episodes: Sequence[Episode]) -> dict[str, float | None]:
-    """How long episodes took and how smooth they were."""
+def _motion(episodes: Sequence[Episode], prior: Prior) -> dict[str, float | None]:
+    """How long episodes took, how smooth they were, and how far decisions were from their mean."""
+    rollout = torch.cat([episode.decisions for episode in episodes])
     # Episodes of a single decision have no boundary between chunks.
     smooth = None
     if any(len(episode.decisions) > 1 for episode in episodes):
-        smooth = smoothness(torch.cat([episode.decisions for episode in episodes]))
+        smooth = smoothness(rollout)
     return {
         "mean_steps": sum(episode.steps for episode in episodes) / len(episodes),
         "boundary_jump": None if smooth is None else smooth.boundary_jump,
         "inner_jump": None if smooth is None else smooth.inner_jump,
+        "mean_revision": mean_revision(rollout, prior),
     }
 
 
 def _of_nfe(measured: _Measures, nfe: int) -> dict[str, float | None]:
     """What is measured of a policy, as a row of this NFE tells it."""
-    leak = measured.leaks.get(nfe)
+    leak, mean = measured.leaks.get(nfe), measured.means[nfe]
     return {
+        "mean_error": mean.target,
+        "mean_revision_data": mean.revision,
         "source_leak": None if leak is None else leak.leak,
         "inner_step_ratio": None if leak is None else leak.inner_step_ratio,
         **measured.flow,

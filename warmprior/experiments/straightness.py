@@ -32,28 +32,29 @@ RATIOS = {
 
 
 def flow_measures(
-    policy: WarmPriorActor, observations: SharedObservations, *, n_steps: int = 100
+    policy: WarmPriorActor,
+    batch: TensorDictBase,
+    *,
+    n_steps: int = 100,
+    generator: torch.Generator | None = None,
 ) -> dict[str, float]:
     """How far a policy's source is from its targets and how straight the flow between them.
 
-    At the mean that decisions meet (:meth:`SharedObservations.deployed`), over the executed positions.
+    Over the executed positions.
 
     Args:
         policy: the policy.
-        observations: those to average over.
+        batch: windows ``[*B]`` of its prior, see :meth:`SharedObservations.met`.
 
     Keyword Args:
         n_steps: Euler steps.
+        generator: source of randomness on the policy's device; the policy's own by default.
 
     Returns:
         ``"kappa"`` and ``"relative_curvature"``, see :func:`~warmprior.diagnostics.curvature`; NaN where the
         field does not move or is no flow. ``"bound"``, see
         :func:`~warmprior.diagnostics.branching_bound`; NaN where it does not apply.
     """
-    generator = torch.Generator(next(policy.parameters()).device).manual_seed(0)
-    batch = observations.windows(policy.prior)
-    if batch["prior", "warm"].any():
-        batch = observations.deployed(policy, generator=generator)
     measured = dict.fromkeys(("kappa", "relative_curvature"), math.nan)
     if policy.prior.is_flow:
         with warnings.catch_warnings():  # that something does not move is told by its NaN
