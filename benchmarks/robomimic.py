@@ -110,7 +110,7 @@ def run(argv: Sequence[str] | None) -> None:
             rows, top_k=recipe.evaluation.top_k, source=source, notes=notes(comparison)
         )
         draw(comparison, rows)
-        write_report(out, f"{table}\n{flow_table(rows)}", comparison.failures)
+        write_report(out, f"{table}\n{flow_table(comparison.timed())}", comparison.failures)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -50,7 +50,8 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
     assert [row["prior"] for row in result["rows"]] == ["gaussian", "past", "preview"]
     row = result["rows"][0]
     fields = (
-        "task data prior sigma chunk nfe seed iterations checkpoint episodes successes success_rate"
+        "task data prior options sigma chunk nfe seed iterations checkpoint episodes successes "
+        "success_rate"
     )
     assert set(fields.split()) <= set(row)
     assert (row["task"], row["data"], row["chunk"], row["iterations"]) == ("lift", "ph", 8, 30)

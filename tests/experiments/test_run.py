@@ -508,6 +508,23 @@ def test_priors_that_learn_before_the_flow_learn_once(tmp_path, monkeypatch):
     assert rows_of(tmp_path) == rows
 
 
+def test_times_of_trainings_are_told_beside_the_rows(tmp_path):
+    compared = comparison(tmp_path, 2, priors=PRIORS[:2], seeds=1)
+    assert compared.timed() == []
+    compared.run()
+    first = compared.timed()
+    assert [replace(row, measures={}) for row in first] == [
+        replace(row, measures={}) for row in compared.results.rows
+    ]
+    assert all(row["training_seconds"] > 0 for row in first)
+    assert len({row["training_seconds"] for row in first}) == 2
+    again = comparison(tmp_path, 1, priors=PRIORS[:2], seeds=1, resume=True)
+    again.run()
+    assert again.timed() == first  # nothing was trained
+    (compared.contestants[0].folder / "training_time.json").unlink()
+    assert compared.timed()[0]["training_seconds"] is None
+
+
 def test_a_student_waits_for_its_teacher(tmp_path, capsys):
     """Whatever the order; and without the teacher in the comparison, it is trained on the way."""
     priors = [ReflowPrior(H, teacher_nfe=2), GaussianPrior(H)]

@@ -154,6 +154,36 @@ def test_sample_moments():
     assert abs(cold.std() - 1.0) < 5 / math.sqrt(40_000)
 
 
+@pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])
+def test_correlated_noise_shares_its_variance_over_the_warm_positions(correlation):
+    """Variance ``sigma^2``; covariance ``c sigma^2`` between warm positions of one dimension alone."""
+    prior = PreviewPrior(3, sigma=0.5, correlation=correlation)
+    loc = torch.full((40_000, 6, 2), 2.0)
+    warm = (torch.arange(6) < 3)[:, None].expand(40_000, 6, 1)
+    a0 = prior.sample(loc, warm, torch.Generator().manual_seed(0))
+    assert torch.allclose(a0[:, :3].mean(0), loc[0, :3], atol=0.02)
+    found = torch.cov(a0.transpose(1, 2).flatten(1).T)  # by dimension, then position
+    block = 0.25 * ((1 - correlation) * torch.eye(3) + correlation)
+    expected = torch.block_diag(block, torch.eye(3), block, torch.eye(3))
+    assert torch.allclose(found, expected, atol=0.03)
+    # What of it reaches the average over the chunk.
+    average = float(a0[:, :3].mean(1).var())
+    assert average == pytest.approx(0.25 * (correlation + (1 - correlation) / 3), rel=0.04)
+
+
+def test_white_noise_is_what_it_was_before_there_was_another():
+    """Same draws and the same configuration, from which policies have their names."""
+    prior, g = PastPrior(4), torch.Generator().manual_seed(0)
+    assert (
+        "correlation" not in prior.config()
+        and PastPrior(4, correlation=0.5).config()["correlation"]
+    )
+    loc, warm = torch.rand(5, 4, 2), torch.rand(5, 4, 1) < 0.5
+    a0 = prior.sample(loc, warm, g)
+    eps = torch.randn(5, 4, 2, generator=torch.Generator().manual_seed(0))
+    assert torch.equal(a0, torch.where(warm, loc + 0.5 * eps, eps))
+
+
 def test_withhold_share_and_whole_samples():
     prior = PreviewPrior(4, cold_probability=0.3)
     warm = torch.zeros(100, 100, 8, 1, dtype=torch.bool)

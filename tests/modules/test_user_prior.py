@@ -225,8 +225,43 @@ def test_arguments_are_recorded_as_given():
 
 def test_what_make_cannot_build_is_told():
     place = f"{__name__}:Anchor"
-    with pytest.raises(ValueError, match=r"Anchor cannot be built from .* alone \(.*gain"):
+    with pytest.raises(ValueError, match=r"Anchor cannot be built from chunk_length.*\(.*gain"):
         Prior.make(place, H)
+    assert Prior.make(f"{place},gain=0.5,offsets=[1.0]", H).options == "gain=0.5,offsets=[1.0]"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("past,correlation", "name,option=value, got 'correlation'"),
+        ("past,=1", "name,option=value"),
+        (
+            "past,age=3",
+            r"PastPrior cannot be built.*age.*it takes chunk_length, sigma",
+        ),
+        ("past,correlation=2", r"correlation must be in \[0, 1\], got 2"),
+        ("regression,correlation=0.5", "RegressionPrior cannot be built"),
+        ("nope,age=3", "unknown prior 'nope'"),
+    ],
+)
+def test_options_that_do_not_fit(name, message):
+    with pytest.raises(ValueError, match=message):
+        Prior.make(name, H)
+
+
+def test_options_are_told_as_they_are_given():
+    for text in (
+        "past",
+        "preview,correlation=0.25",
+        "reflow,teacher_nfe=3",
+        "step,start_time=0.75",
+    ):
+        prior = Prior.make(text, H, sigma=0.4)
+        name, _, options = text.partition(",")
+        assert (prior.name, prior.options) == (name, options)
+        assert Prior.make(f"{prior.name},{prior.options}".strip(","), H).options == options
+        assert prior.options in prior.describe()
+        assert Prior.from_config(prior.config()).options == options
 
 
 def test_a_training_with_other_buffers_is_another(tmp_path):

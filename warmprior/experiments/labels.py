@@ -28,7 +28,7 @@ def prior_color(name: str) -> str | None:
 
 
 def source_labels(rows: Iterable[Row]) -> Callable[[Row], str]:
-    """A function that names the source of a row, with sigma and H where these tell rows apart.
+    """A function that names the source of a row: its options, and sigma and H where these tell rows apart.
 
     Args:
         rows: all that are shown together.
@@ -45,7 +45,7 @@ def source_labels(rows: Iterable[Row]) -> Callable[[Row], str]:
     several_chunks = len({row["chunk"] for row in rows}) > 1
 
     def label(row: Row) -> str:
-        text = prior_label(row["prior"])
+        text = ", ".join(filter(None, (prior_label(row["prior"]), row.get("options"))))
         if len(sigmas[row["prior"]]) > 1:
             text += f", sigma {row['sigma']:g}"
         return f"{text}, H {row['chunk']}" if several_chunks else text

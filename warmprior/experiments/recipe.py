@@ -158,8 +158,9 @@ class SourceOptions:
     """The source distributions to compare.
 
     Attributes:
-        prior: by name (gaussian, past, preview, history, regression) or, your own, as
-            package.module:Class, which Python has to find (PYTHONPATH); gains are over the first.
+        prior: by name (gaussian, past, preview, forecast, history, regression, ot, reflow, step, cvae, a2a,
+            leap) or, your own, as package.module:Class, which Python has to find (PYTHONPATH); options
+            follow as in preview,correlation=0.5. Gains are over the first.
         chunk: chunk lengths H.
         sigma: residual noise of the warm priors, one policy each (default: past 0.5, preview 1.0).
         cold_probability: share of training samples without a mean; the paper's Algorithm 1 has none.

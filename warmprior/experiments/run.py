@@ -79,6 +79,7 @@ class Contestant:
             "task": self.store.problem.task,
             "data": self.store.problem.style,
             "prior": self.prior.name,
+            "options": self.prior.options,
             "sigma": float(self.prior.sigma),
             "chunk": self.prior.chunk_length,
             "seed": self.training.seed,
@@ -301,8 +302,8 @@ class Comparison:
                         key = tuple(contestant.facts().values())
                         if told.setdefault(key, contestant.folder) != contestant.folder:
                             raise ValueError(
-                                "rows tell policies apart by their task, prior, sigma, chunk length, "
-                                f"iterations and seed: they would not tell {prior} from another "
+                                "rows tell policies apart by their task, prior, options, sigma, chunk "
+                                f"length, iterations and seed: they would not tell {prior} from another "
                                 f"{prior.name}. Compare these in runs of their own"
                             )
                         found.setdefault(contestant.folder, contestant)
@@ -367,6 +368,22 @@ class Comparison:
         for c, row in zip(mine, rows, strict=True):
             curves.setdefault(label(row), []).append(store.train(c.prior, c.training))
         return curves
+
+    def timed(self) -> list[Row]:
+        """The rows, with the processor time of their policies' trainings as ``"training_seconds"``.
+
+        It is no part of the results, which are the same on every machine.
+        """
+        seconds = {
+            tuple(c.facts().values()): c.store.training_seconds(c.prior, c.training)
+            for c in self.contestants
+        }
+        names = tuple(self.contestants[0].facts())
+        return [
+            replace(row, measures={**row.measures, "training_seconds": seconds.get(mine)})
+            for row in self.results.rows
+            for mine in [tuple(row.facts.get(name) for name in names)]
+        ]
 
     def run(self) -> Results:
         """Train what is missing and play what is missing, in worker processes.

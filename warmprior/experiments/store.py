@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import json
+import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, field
@@ -17,7 +19,7 @@ from torchrl.record.loggers import get_logger
 
 from warmprior.experiments.problem import Problem
 from warmprior.experiments.recipe import NetworkOptions, RunOptions
-from warmprior.io.files import check_writable, digest_of, read_json
+from warmprior.io.files import check_writable, digest_of, read_json, write_atomic
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.learned import LearnedPrior
 from warmprior.modules.prior import Prior
@@ -43,6 +45,8 @@ from warmprior.transforms import MeanObservation, policy_transforms
 __all__ = ["Store", "finished_policies", "finished_problem"]
 
 Losses = list[tuple[int, float]]
+
+TIME = "training_time.json"
 
 LEARNING_SHARE = 0.25
 """Gradient steps of priors that learn before the flow, per step of the flow."""
@@ -190,6 +194,7 @@ class Store:
         folder = self.folder(prior, training)
         if folder not in self._losses:
             logger = self._logger(folder.name)
+            started, known = time.process_time(), policy_path(folder, training.iterations).is_dir()
             on_cpu = torch.device(self.run.device).type == "cpu"
             with (
                 torch_threads(1 if on_cpu else None),
@@ -206,9 +211,27 @@ class Store:
                     compile=self.run.compile,
                 )
                 told = f"train {prior.describe()}, seed {training.seed}"
+                whole = cloning.iteration == 0
                 cloning.run(told if progress is None else None, progress)
+            if whole and not known:
+                seconds = time.process_time() - started
+                text = json.dumps({"seconds": seconds}) + "\n"
+                write_atomic(folder / TIME, lambda path: path.write_text(text))
             self.note_trained(prior, training, cloning.losses)
         return self._losses[folder]
+
+    def training_seconds(self, prior: Prior, training: TrainingConfig) -> float | None:
+        """Processor time of a policy's training, with all that its prior needed before.
+
+        Args:
+            prior: its source distribution.
+            training: its recipe.
+
+        Returns:
+            ``None`` if it is not trained, or was not in one go.
+        """
+        path = self.folder(prior, training) / TIME
+        return read_json(path)["seconds"] if path.is_file() else None
 
     def note_trained(self, prior: Prior, training: TrainingConfig, losses: Losses) -> None:
         """Take note of a policy that another process trained.

@@ -92,7 +92,7 @@ def straightness(
 
     Returns:
         One row per policy, training seed and mean, and one with ``seed = None`` for the average over
-        several seeds. Facts: ``policy``, ``prior``, ``sigma``, ``chunk``, ``seed``, ``mean``
+        several seeds. Facts: ``policy``, ``prior``, ``options``, ``sigma``, ``chunk``, ``seed``, ``mean``
         (``"training"`` or ``"deployed"``). Measures: ``observations``; the means of :func:`curvature`'s
         entries; ``bound`` and ``bound_executed`` (:func:`branching_bound` at this mean, where it
         applies); and per ratio of :data:`RATIOS` its value and 95% interval (``ratio``, ``ratio_low``,
@@ -134,8 +134,8 @@ def straightness(
     rows = []
     for (name, mean), per_seed in measured.items():
         prior = priors[name]
-        facts: dict[str, Any] = {"policy": name, "prior": prior.name, "sigma": float(prior.sigma)}
-        facts |= {"chunk": prior.chunk_length, "mean": mean}
+        facts: dict[str, Any] = {"policy": name, "prior": prior.name, "options": prior.options}
+        facts |= {"sigma": float(prior.sigma), "chunk": prior.chunk_length, "mean": mean}
         parts: list[tuple[int | None, TensorDict, TensorDict, Tensor]] = [
             (s, *part)
             for s, *part in zip(

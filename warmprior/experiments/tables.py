@@ -239,7 +239,8 @@ def flow_table(rows: Sequence[Row]) -> str:
     """What the sources do to the flow, beside the first one: a line per problem and measure.
 
     Args:
-        rows: evaluations with one sigma and chunk length per prior; the baseline's first.
+        rows: evaluations with one sigma and chunk length per prior; the baseline's first. With the times of
+            :meth:`Comparison.timed` it tells these as well.
     """
     rows = last_checkpoints(select(rows, "kappa"))
     # They hold at any NFE: those of the largest of each policy.
@@ -266,6 +267,7 @@ def flow_table(rows: Sequence[Row]) -> str:
             f"curvature / {base}'s": relative("kappa"),
             f"curvature per squared mean velocity / {base}'s": relative("relative_curvature"),
             f"bound of the branching cost / {base}'s": relative("bound"),
+            f"training time / {base}'s": relative("training_seconds"),
             "mean to demonstrated action": mean_cell("mean_error", ".3f"),
             "mean to prediction, demonstrated states": mean_cell("mean_revision_data", ".3f"),
             "mean to prediction, rollouts": mean_cell("mean_revision", ".3f"),

@@ -45,6 +45,7 @@ class LearnedPrior(PastPrior, nn.Module):
     """Whether the network is given the last actions."""
     sees_observation: ClassVar[bool] = True
     """Whether the network is given the observation."""
+    untold = PastPrior.untold | {"action_dim", "observation_dim", "observation_steps"}
     action_dim: int
     observation_dim: int
     observation_steps: int

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import json
+import math
 import re
 import zlib
 from collections.abc import Mapping, Sequence
@@ -49,9 +50,13 @@ class Prior:
             deterministic limit.
         cold_probability: share of training samples whose mean is withheld, so that the network also
             learns the cold start. ``0`` is the paper's Algorithm 1.
+        correlation: share of the residual noise's variance that all warm positions of a dimension have in
+            common, in [0, 1]. ``0`` is the paper's white noise, which averages out over the chunk: a network
+            that averages sees through it.
 
     Raises:
-        ValueError: if ``chunk_length < 1``, ``sigma < 0`` or ``cold_probability`` is not in [0, 1].
+        ValueError: if ``chunk_length < 1``, ``sigma < 0``, or ``cold_probability`` or ``correlation`` is not
+            in [0, 1].
 
     Examples:
         >>> import torch
@@ -110,18 +115,28 @@ class Prior:
         return self
 
     def __init__(
-        self, chunk_length: int, *, sigma: float | None = None, cold_probability: float = 0.0
+        self,
+        chunk_length: int,
+        *,
+        sigma: float | None = None,
+        cold_probability: float = 0.0,
+        correlation: float = 0.0,
     ) -> None:
         if chunk_length < 1:
             raise ValueError(f"chunk_length must be at least 1, got {chunk_length}")
         sigma = self.default_sigma if sigma is None else float(sigma)
         if not sigma >= 0 or sigma == float("inf"):
             raise ValueError(f"sigma must be a finite number >= 0, got {sigma}")
-        if not 0.0 <= cold_probability <= 1.0:
-            raise ValueError(f"cold_probability must be in [0, 1], got {cold_probability}")
+        for name, share in {
+            "cold_probability": cold_probability,
+            "correlation": correlation,
+        }.items():
+            if not 0.0 <= share <= 1.0:
+                raise ValueError(f"{name} must be in [0, 1], got {share}")
         self.chunk_length = int(chunk_length)
         self.sigma = sigma
         self.cold_probability = float(cold_probability)
+        self.correlation = float(correlation)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
@@ -151,6 +166,8 @@ class Prior:
     def find(name: str) -> type[Prior]:
         """The class of that name, or at a place such as ``"mypackage.priors:Anchor"``, which is imported.
 
+        Options after it, see :meth:`make`, play no role.
+
         Importing runs code: this is for what a user typed, and never for what a file says.
 
         Args:
@@ -163,6 +180,7 @@ class Prior:
             >>> Prior.find("past").label
             'WP-Past'
         """
+        name = name.partition(",")[0]
         module, colon, attribute = name.partition(":")
         if not colon:
             if name in Prior._registry:
@@ -190,7 +208,7 @@ class Prior:
         """One prior of a comparison: what its constructor takes of the options that compare sources.
 
         Args:
-            name: see :meth:`find`.
+            name: see :meth:`find`; with further arguments as in ``"preview,correlation=0.5"``.
             chunk_length: ``H``.
 
         Keyword Args:
@@ -203,16 +221,20 @@ class Prior:
         Examples:
             >>> [Prior.make(name, 8, sigma=0.3) for name in ("past", "regression")]
             [PastPrior(chunk_length=8, sigma=0.3, cold_probability=0.0), RegressionPrior(chunk_length=8)]
+            >>> Prior.make("past,correlation=0.5", 8).correlation
+            0.5
         """
         found = Prior.find(name)
         options: dict[str, Any] = {"sigma": sigma, "cold_probability": cold_probability}
         taken = {key: value for key, value in options.items() if found.takes(key)}
+        taken |= _parsed(name)
+        signature = inspect.signature(found.__init__)
         try:
-            inspect.signature(found).bind(chunk_length, **taken)
+            signature.bind(None, chunk_length, **taken)
         except TypeError as error:
             raise ValueError(
-                f"{found.__name__} cannot be built from chunk_length, sigma and cold_probability alone "
-                f"({error}): give its other arguments defaults, or make a subclass that does"
+                f"{found.__name__} cannot be built from chunk_length, {', '.join(taken)} ({error}): it takes "
+                f"{', '.join(list(signature.parameters)[1:])}. Give arguments of your own defaults"
             ) from error
         return found(chunk_length, **taken)
 
@@ -328,7 +350,12 @@ class Prior:
         Returns:
             ``a_0``, ``[*B, P, d_a]``.
         """
-        eps = torch.randn(loc.shape, generator=generator, dtype=loc.dtype, device=loc.device)
+        like: dict[str, Any] = {"dtype": loc.dtype, "device": loc.device, "generator": generator}
+        eps = torch.randn(loc.shape, **like)
+        if self.correlation:
+            common = torch.randn((*loc.shape[:-2], 1, loc.shape[-1]), **like)
+            own, shared = math.sqrt(1.0 - self.correlation), math.sqrt(self.correlation)
+            eps = torch.where(warm, own * eps + shared * common, eps)
         mean, scale = self.distribution(loc, warm, observation)
         return mean + scale * eps
 
@@ -467,6 +494,25 @@ class Prior:
             )
         return Prior._registry[name](**kwargs)
 
+    untold: ClassVar[frozenset[str]] = frozenset({"chunk_length", "sigma", "cold_probability"})
+    """Arguments that :attr:`options` leaves out, since others tell them."""
+
+    @property
+    def options(self) -> str:
+        """The other arguments that are not at their defaults, as :meth:`make` takes them.
+
+        Examples:
+            >>> Prior.make("past,correlation=0.5", 8, sigma=0.3).options
+            'correlation=0.5'
+        """
+        parameters = inspect.signature(type(self).__init__).parameters
+        return ",".join(
+            f"{name}={json.dumps(value)}"
+            for name, value in self._resolved().items()
+            if name not in self.untold
+            and not (name in parameters and parameters[name].default == value)
+        )
+
     def describe(self) -> str:
         """The prior in a few words, for progress bars and figures.
 
@@ -474,21 +520,47 @@ class Prior:
             >>> Prior.from_config({"name": "past", "chunk_length": 8}).describe()
             'past, sigma 0.5, H 8'
         """
-        return f"{self.name}, sigma {float(self.sigma):g}, H {self.chunk_length}"
+        told = f", {self.options}" if self.options else ""
+        return f"{self.name}, sigma {float(self.sigma):g}, H {self.chunk_length}{told}"
 
     def _resolved(self) -> dict[str, Any]:
         """The constructor's arguments, with the default that was put in for ``None``."""
-        own = {"chunk_length": int, "sigma": float, "cold_probability": float}
-        return {
+        own = {
+            "chunk_length": int,
+            "sigma": float,
+            "cold_probability": float,
+            "correlation": float,
+        }
+        resolved = {
             name: own[name](getattr(self, name) if value is None else value)
             if name in own
             else value
             for name, value in self._arguments.items()
         }
+        # It came later: configurations, and what is named by them, stay as they were without it.
+        if resolved.get("correlation") == 0.0:
+            del resolved["correlation"]
+        return resolved
 
     def __repr__(self) -> str:
         told = (f"{key}={value!r}" for key, value in self._resolved().items())
         return f"{type(self).__name__}({', '.join(told)})"
+
+
+def _parsed(name: str) -> dict[str, Any]:
+    """Options behind the name of a prior, such as ``"preview,correlation=0.5"``."""
+    options = {}
+    for part in name.split(",")[1:]:
+        key, equals, text = part.partition("=")
+        if not equals or not key.strip().isidentifier():
+            raise ValueError(
+                f"options of a prior are written as name,option=value, got {part!r} in {name!r}"
+            )
+        try:
+            options[key.strip()] = json.loads(text)
+        except json.JSONDecodeError:
+            options[key.strip()] = text
+    return options
 
 
 def _check_named(cls: type[Prior]) -> None:
