@@ -65,7 +65,7 @@ def with_errors(comparison: Comparison, observations: SharedObservations) -> lis
     errors = {}
     for contestant in comparison.contestants:
         windows = observations.windows(contestant.prior)
-        found = action_error(contestant.policy(), windows, nfes=comparison.nfes)
+        found = action_error(comparison.player(contestant), windows, nfes=comparison.nfes)
         for nfe, error in found.items():
             errors[(*contestant.facts().values(), nfe)] = error
     names = (*comparison.contestants[0].facts(), "nfe")

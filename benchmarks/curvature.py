@@ -150,7 +150,7 @@ def run(argv: Sequence[str] | None) -> None:
         argv,
         study="curvature",
         description=__doc__,
-        unused=("episodes", "nfe", "top_k", "play_on", "checkpoints"),
+        unused=("episodes", "nfe", "top_k", "play_on", "grid", "checkpoints"),
     )
     with started(recipe, "curvature") as out:
         folder = recipe.policies.run

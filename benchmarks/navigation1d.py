@@ -35,6 +35,7 @@ from warmprior.experiments.navigation1d import (
     judge_navigation,
     play_navigation,
 )
+from warmprior.experiments.record import variation_notes
 from warmprior.io.script import run_script
 
 COLUMNS = {
@@ -56,7 +57,7 @@ def judge(comparison: Comparison) -> list[Row]:
     rollouts = comparison.recipe.evaluation.episodes
     rows = []
     for contestant in comparison.contestants:
-        actor, seed = contestant.policy().to("cpu"), contestant.training.seed
+        actor, seed = comparison.player(contestant).to("cpu"), contestant.training.seed
         for nfe in contestant.prior.allowed_nfes(comparison.nfes):
             measures = judge_navigation(actor, seed, nfe=nfe, rollouts=rollouts)
             rows.append(Row(contestant.facts() | {"nfe": nfe}, measures))
@@ -74,7 +75,7 @@ def curvatures(comparison: Comparison, observations: SharedObservations) -> list
     return rows
 
 
-def make_table(rows: Sequence[Row]) -> str:
+def make_table(rows: Sequence[Row], notes: Sequence[str] = ()) -> str:
     """A line per policy and number of network evaluations; curvature is that of the first."""
     played = select(rows, "collision_rate")
     label, first = source_labels(played), max(row["nfe"] for row in played)
@@ -88,6 +89,7 @@ def make_table(rows: Sequence[Row]) -> str:
         None,
         {name: mean_cell(measure, ".3f") for name, measure in COLUMNS.items()},
         head="policy",
+        notes=notes,
     )
 
 
@@ -101,7 +103,7 @@ def draw(comparison: Comparison, rows: Sequence[Row], observations: SharedObserv
     for contestant in comparison.contestants:
         if contestant.training.seed != seed:
             continue
-        prior, actor = contestant.prior, contestant.policy().to("cpu")
+        prior, actor = contestant.prior, comparison.player(contestant).to("cpu")
         nfe = max(prior.allowed_nfes(comparison.nfes))
         (row,) = select(rows, "collision_rate", **contestant.facts(), nfe=nfe)
         text = [f"collides {row['collision_rate']:.0%}"]
@@ -141,7 +143,7 @@ def run(argv: Sequence[str] | None) -> None:
         rows = [*judge(comparison), *curvatures(comparison, observations)]
         comparison.results.add(*rows)
         draw(comparison, rows, observations)
-        write_report(out, make_table(rows))
+        write_report(out, make_table(rows, variation_notes(recipe)))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -155,7 +155,7 @@ def run(argv: Sequence[str] | None) -> None:
         study="rl",
         description=__doc__,
         preset=prior_space_preset,
-        unused=("top_k", "checkpoints"),
+        unused=("top_k", "checkpoints", "grid"),
     )
     with started(recipe, "rl") as out:
         problem, frozen = kept_policies(recipe, out)

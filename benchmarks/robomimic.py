@@ -30,6 +30,7 @@ from warmprior.experiments import (
     success_table,
     write_report,
 )
+from warmprior.experiments.record import variation_notes
 from warmprior.experiments.store import Store
 from warmprior.io.script import run_script
 from warmprior.training import record_filmstrip
@@ -41,15 +42,16 @@ TRAINED_AFTER = {"preview": 40_000}
 def notes(comparison: Comparison) -> list[str]:
     recipe, paper = comparison.recipe, PRESETS["paper"]
     iterations = recipe.training.iterations
+    variations = variation_notes(recipe)
     if recipe.network == paper.network and iterations >= paper.training.iterations:
-        return []
+        return variations
     names = dict.fromkeys(prior.name for prior in comparison.priors)
     short = [prior_label(n) for n in names if iterations < TRAINED_AFTER.get(n, 0)]
     told = (
         "Success still rises with more iterations than these (docs/evidence.md, 'Training budget')."
     )
     lines = [f"- {', '.join(short)}: short of training. {told}"] if short else []
-    return [*lines, "- Network and training budget are smaller than the paper's."]
+    return [*variations, *lines, "- Network and training budget are smaller than the paper's."]
 
 
 def draw(comparison: Comparison, rows: Sequence[Row]) -> None:
@@ -84,7 +86,7 @@ def film(comparison: Comparison, store: Store, end: str) -> None:
     for name, contestant in reversed(first.items()):
         nfe = min(contestant.prior.allowed_nfes(comparison.nfes))
         strip = record_filmstrip(
-            contestant.policy(),
+            comparison.player(contestant),
             seed=EVALUATION_SEED,
             nfe=nfe,
             policy_seed=contestant.training.seed,

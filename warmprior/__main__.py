@@ -12,7 +12,7 @@ from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 
-UNPLAYED = ("episodes", "nfe", "top_k", "play_on")
+UNPLAYED = ("episodes", "nfe", "top_k", "play_on", "grid")
 """Options of what is not played."""
 
 
@@ -49,6 +49,8 @@ def evaluate(args: argparse.Namespace) -> None:
     actor = _policy(args)
     nfe = actor.ode.nfe if args.nfe is None else args.nfe
     actor.ode.check_nfe(nfe)
+    if args.grid is not None:
+        actor = actor.replace(grid=args.grid)
     if args.video is not None:  # known now rather than after the episodes
         check_video(args.video)
     options = {"terminate_on_success": not args.play_on}
@@ -127,6 +129,7 @@ def make_parser() -> argparse.ArgumentParser:
 
     add("--episodes", type=int, default=50, help="how many (%(default)s)")
     add("--nfe", type=int, help="network evaluations per chunk (default: the policy's)")
+    add("--grid", help="uniform, dense-jump or dense-jump:TIME (default: the policy's)")
     add("--first-seed", type=int, default=EVALUATION_SEED, help="of the simulator (%(default)s)")
     add("--policy-seed", type=int, default=0, help="of the source samples (%(default)s)")
     add("--play-on", action="store_true", help="up to the time limit, also after success")

@@ -10,7 +10,9 @@ import torch
 import tyro
 
 from warmprior.envs.tasks import get_task
+from warmprior.io.options import LATER
 from warmprior.modules import ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior.modules.grid import check_grid
 from warmprior.modules.prior import Prior
 from warmprior.training.training_config import TrainingConfig
 
@@ -216,6 +218,8 @@ class EvaluationOptions:
         nfe: network evaluations per chunk.
         top_k: best checkpoints averaged per seed.
         play_on: go on after success, up to the time limit; solved is solved at any step.
+        grid: of the integration: uniform, or dense-jump (one last step from half way; dense-jump:0.7 from
+            there).
     """
 
     seeds: int = 1
@@ -223,12 +227,14 @@ class EvaluationOptions:
     nfe: tuple[int, ...] = (9, 3, 1)
     top_k: int = 1
     play_on: bool = False
+    grid: str = field(default="uniform", metadata=LATER)
 
     def __post_init__(self) -> None:
         check_counts(self, "seeds", most=1_000)
         check_counts(self, "episodes", "nfe", "top_k")
         if not self.nfe:
             raise ValueError("--nfe needs at least one number of network evaluations")
+        check_grid(self.grid)
 
     @property
     def environment(self) -> dict[str, Any]:
@@ -354,6 +360,7 @@ class Recipe:
         self.data.check()
         for prior in self.sources.priors():
             prior.allowed_nfes(self.evaluation.nfes)
+            self.training.check_prior(prior)
 
     def check_single(
         self,

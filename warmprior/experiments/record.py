@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from warmprior.experiments.recipe import Flat, Recipe
+from warmprior.io.options import told, variations
 
-__all__ = ["differences", "record", "refuse_ignored", "restore"]
+__all__ = ["differences", "record", "refuse_ignored", "restore", "variation_notes"]
 
 OF_A_START = {"run": ("out", "resume"), "data": ("force_download",)}
 """Options, by part, of one start of a run: they are not stored."""
@@ -19,7 +20,7 @@ CHANGEABLE = {"run": ("envs", "logger")}
 
 
 def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
-    """A recipe as JSON holds it: what it is identified by.
+    """A recipe as JSON holds it: what it is identified by, see :func:`~warmprior.io.options.told`.
 
     Args:
         recipe: a :class:`Recipe`, or a part of one.
@@ -41,7 +42,7 @@ def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
         # The same file from another working directory.
         return str(value.resolve()) if isinstance(value, Path) else value
 
-    tree = plain(asdict(recipe))
+    tree = plain(told(recipe))
     if not isinstance(recipe, Recipe):
         return tree
     for left_out in (OF_A_START,) if changeable else (OF_A_START, CHANGEABLE):
@@ -140,11 +141,26 @@ def refuse_ignored(
     given = {
         name
         for part in parts
-        for name, value in leaves(mine, part).items()
-        if value != leaves(theirs, part)[name]
+        for name in leaves(mine, part).keys() | leaves(theirs, part).keys()
+        if leaves(mine, part).get(name) != leaves(theirs, part).get(name)
         and name not in but
         and (only is None or name in only)
     }
     if given:
         options = ", ".join(f"--{name.replace('_', '-')}" for name in sorted(given))
         raise ValueError(f"{told}: leave out {options}")
+
+
+def variation_notes(recipe: Any) -> list[str]:
+    """What tables say of options beside the paper's recipe, if there are any.
+
+    Args:
+        recipe: of all rows of the table.
+
+    Examples:
+        >>> from warmprior.experiments import EvaluationOptions, Recipe
+        >>> variation_notes(Recipe(evaluation=EvaluationOptions(grid="dense-jump")))
+        ['- Beside the paper, for all sources: --grid dense-jump.']
+    """
+    given = [f"--{name.replace('_', '-')} {value}" for name, value in variations(recipe).items()]
+    return [f"- Beside the paper, for all sources: {', '.join(given)}."] if given else []

@@ -197,7 +197,7 @@ class _Worker:
         )
         drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
         shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
-        policy = chosen.store.load(chosen.prior, chosen.training)
+        policy = self._load(chosen)
         leaks = {}
         if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
             windows = shared.windows(policy.prior)
@@ -208,13 +208,17 @@ class _Worker:
         means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in nfes}
         return _Measures(leaks, means, flow_measures(policy, met, generator=generator))
 
+    def _load(self, chosen: Contestant, checkpoint: int | None = None) -> WarmPriorActor:
+        policy = chosen.store.load(chosen.prior, chosen.training, checkpoint)
+        return policy.replace(grid=self.options.grid)
+
     def _prepare(self, chosen: Contestant, checkpoint: int) -> tuple[WarmPriorActor, EnvBase]:
         if self._store is not chosen.store:
             if self._store is not None:
                 self._simulator.close(raise_if_closed=False)
             self._simulator = chosen.store.problem.make_env(**self.options.environment)
             self._store = chosen.store
-        policy = chosen.store.load(chosen.prior, chosen.training, checkpoint)
+        policy = self._load(chosen, checkpoint)
         # The policy's own prior, which may have learnt.
         transforms = chosen.store.transforms(policy.prior)()
         return policy, TransformedEnv(self._simulator, transforms)
@@ -323,6 +327,14 @@ class Comparison:
     def title(self) -> str:
         """What is compared, for figures."""
         return ", ".join(store.problem.name for store in self.stores)
+
+    def player(self, contestant: Contestant) -> WarmPriorActor:
+        """The last policy of averaged weights, as it is played here.
+
+        Args:
+            contestant: one of :attr:`contestants`.
+        """
+        return contestant.policy().replace(grid=self.recipe.evaluation.grid)
 
     def policies(self) -> dict[str, dict[int, WarmPriorActor]]:
         """The last policies, by the description of their prior and their training seed.

@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +20,7 @@ from torchrl.record.loggers import get_logger
 from warmprior.experiments.problem import Problem
 from warmprior.experiments.recipe import NetworkOptions, RunOptions
 from warmprior.io.files import check_writable, digest_of, read_json, write_atomic
+from warmprior.io.options import told
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.learned import LearnedPrior
 from warmprior.modules.prior import Prior
@@ -158,9 +159,9 @@ class Store:
         """
         digest = digest_of(
             self.problem.identity,
-            asdict(training),
+            told(training),
             self.sized(prior).config(),
-            asdict(self.network),
+            told(self.network),
             self.run.device,
             self.run.compile,
             version("torch"),

@@ -61,6 +61,7 @@ class WarmPriorActor(TensorDictModuleBase):
         nfe: network evaluations per chunk; per call: ``actor(data, nfe=1)``. 9 by default, or 1 where the
             prior's field is no flow (:attr:`Prior.is_flow`).
         solver: see :func:`~warmprior.modules.ode.integrate`.
+        grid: likewise.
         clip: see :class:`ODEActor`.
         normalizer: the normaliser of the data, kept here so that it is saved with the policy; its
             :meth:`~warmprior.Normalizer.env_transforms` go next to the base environment.
@@ -76,8 +77,8 @@ class WarmPriorActor(TensorDictModuleBase):
         path_key: if given, the integration path is written there.
 
     Raises:
-        ValueError: if the network was built for another prediction length than the prior's, or ``nfe``
-            exceeds what the prior allows.
+        ValueError: if the network was built for another prediction length than the prior's, ``nfe``
+            exceeds what the prior allows, or there is no such grid.
 
     Examples:
         >>> import torch
@@ -100,6 +101,7 @@ class WarmPriorActor(TensorDictModuleBase):
         *,
         nfe: int | None = None,
         solver: Solver = "euler",
+        grid: str = "uniform",
         clip: float | None = None,
         normalizer: Normalizer | None = None,
         environment: Mapping[str, Any] | None = None,
@@ -132,6 +134,7 @@ class WarmPriorActor(TensorDictModuleBase):
             max_nfe=None if prior.is_flow else 1,
             start_time=prior.start_time,
             solver=solver,
+            grid=grid,
             clip=clip,
             observation_key=observation_key,
             chunk_key=chunk_key,
@@ -186,6 +189,7 @@ class WarmPriorActor(TensorDictModuleBase):
             "prior": self.prior,
             "nfe": self.ode.nfe,
             "solver": self.ode.solver,
+            "grid": self.ode.grid,
             "clip": self.ode.clip,
             "normalizer": self.normalizer,
             "environment": self.environment,
@@ -222,6 +226,7 @@ class WarmPriorActor(TensorDictModuleBase):
             "actor": {
                 "nfe": self.ode.nfe,
                 "solver": self.ode.solver,
+                "grid": self.ode.grid,
                 "clip": self.ode.clip,
                 **self._keys(),
             },

@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior import keys
+from warmprior.modules.grid import check_grid, grid_parts
 from warmprior.modules.network import network_observation, velocity_field
 
 __all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "integrate"]
@@ -75,10 +76,11 @@ def integrate(
     *,
     nfe: int,
     solver: Solver = "euler",
+    grid: str = "uniform",
     start_time: float = 0.0,
     return_path: bool = False,
 ) -> Tensor:
-    r"""Solve :math:`\dot a_t = v(t, a_t)` from ``t=0`` to ``t=1`` on a uniform grid.
+    r"""Solve :math:`\dot a_t = v(t, a_t)` from ``t=0`` to ``t=1``.
 
     Args:
         velocity: ``(t [B], a_t [B, ...]) -> velocity [B, ...]``.
@@ -88,6 +90,8 @@ def integrate(
         nfe: number of calls of ``velocity``, a multiple of the solver's stages (Euler 1, midpoint and
             Heun 2, RK4 4).
         solver: ``"euler"`` (the paper's), ``"midpoint"``, ``"heun"`` or ``"rk4"``.
+        grid: where the steps lie: ``"uniform"`` or ``"dense-jump"``, see
+            :func:`~warmprior.modules.grid.grid_parts`.
         start_time: another time to start from, in [0, 1).
         return_path: return every grid point instead of the last.
 
@@ -95,8 +99,8 @@ def integrate(
         ``a_1`` ``[B, ...]``, or the path ``[B, steps + 1, ...]`` from ``a_0`` to ``a_1``.
 
     Raises:
-        ValueError: for an unknown solver, an ``nfe`` that it cannot spend, or a ``start_time`` outside
-            [0, 1).
+        ValueError: for an unknown solver or grid, an ``nfe`` that the solver cannot spend, or a
+            ``start_time`` outside [0, 1).
 
     Examples:
         >>> import torch
@@ -108,18 +112,19 @@ def integrate(
     if not 0.0 <= start_time < 1.0:
         raise ValueError(f"start_time must be in [0, 1), got {start_time}")
     tableau = SOLVERS[solver]
-    h = (1.0 - start_time) / steps
     a = a0
     path = [a0]
-    for step in range(steps):
-        slopes: list[Tensor] = []
-        for node, row in zip(tableau.c, tableau.a, strict=True):
-            time = start_time + (step + node) * h
-            t = torch.full(a.shape[:1], time, dtype=a.dtype, device=a.device)
-            slopes.append(velocity(t, _combine(a, h, row, slopes)))
-        a = _combine(a, h, tableau.b, slopes)
-        if return_path:
-            path.append(a)
+    for begin, end, count in grid_parts(grid, steps, start_time=start_time):
+        h = (end - begin) / count
+        for step in range(count):
+            slopes: list[Tensor] = []
+            for node, row in zip(tableau.c, tableau.a, strict=True):
+                time = begin + (step + node) * h
+                t = torch.full(a.shape[:1], time, dtype=a.dtype, device=a.device)
+                slopes.append(velocity(t, _combine(a, h, row, slopes)))
+            a = _combine(a, h, tableau.b, slopes)
+            if return_path:
+                path.append(a)
     return torch.stack(path, dim=1) if return_path else a
 
 
@@ -136,6 +141,7 @@ class ODEActor(TensorDictModuleBase):
         max_nfe: the most for which the trained field means anything.
         start_time: see :func:`integrate`.
         solver: see :func:`integrate`.
+        grid: see :func:`integrate`.
         clip: the chunk is clamped to ``[-clip, clip]``; ``None`` (default) leaves it as integrated.
             Set it where the normalised data span ``[-1, 1]``, so that what the environment executes
             is what the prior remembers.
@@ -146,7 +152,7 @@ class ODEActor(TensorDictModuleBase):
 
     Raises:
         ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend or that exceeds ``max_nfe``, or
-            an unknown solver.
+            an unknown solver or grid.
         KeyError: if an input key is missing.
 
     Examples:
@@ -169,6 +175,7 @@ class ODEActor(TensorDictModuleBase):
         max_nfe: int | None = None,
         start_time: float = 0.0,
         solver: Solver = "euler",
+        grid: str = "uniform",
         clip: float | None = None,
         noise_key: NestedKey = keys.NOISE,
         observation_key: NestedKey = keys.OBSERVATION,
@@ -185,10 +192,12 @@ class ODEActor(TensorDictModuleBase):
         self.start_time = start_time
         self.solver = solver
         self.check_nfe(nfe)
+        check_grid(grid)
         if clip is not None and not clip > 0:
             raise ValueError(f"clip must be > 0 or None, got {clip}")
         self.network = network
         self.nfe = nfe
+        self.grid = grid
         self.clip = clip
         self.path_key = path_key
         self.in_keys = [noise_key, observation_key]
@@ -222,6 +231,7 @@ class ODEActor(TensorDictModuleBase):
             a0.reshape(-1, *a0.shape[-2:]),
             nfe=nfe,
             solver=self.solver,
+            grid=self.grid,
             start_time=self.start_time,
             return_path=self.path_key is not None,
         )

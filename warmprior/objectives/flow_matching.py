@@ -2,21 +2,67 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 from torchrl.objectives.common import LossModule
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import network_observation, velocity_field
+from warmprior.modules.ode import integrate
+from warmprior.modules.prior import Prior
+from warmprior.objectives.times import TIMES, Times
 
-__all__ = ["FlowMatchingLoss"]
+__all__ = ["FlowMatchingLoss", "Objective", "check_objective"]
+
+Objective = Literal["velocity", "l1"]
+
+TEACHER_STEPS = 9
+"""Steps from the start to the end of the flow that self-distillation learns to make in one: the paper's."""
+
+DISTILLED_SHARE = 0.25
+"""Of a batch, that of shortcut models: each of these windows costs ten forward passes more."""
+
+
+def check_objective(
+    *, times: str, objective: str, self_distillation: float, prior: Prior | None = None
+) -> None:
+    """Whether there is a loss of these options, and whether a prior's field can be trained by it.
+
+    Keyword Args:
+        times: name of the distribution of the times.
+        objective: see :class:`FlowMatchingLoss`.
+        self_distillation: see :class:`FlowMatchingLoss`.
+        prior: the source distribution.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    choices = {"times": (times, TIMES), "objective": (objective, get_args(Objective))}
+    for name, (value, known) in choices.items():
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    if not (self_distillation >= 0 and math.isfinite(self_distillation)):
+        raise ValueError(f"self_distillation must be a finite weight >= 0, got {self_distillation}")
+    if prior is None or prior.is_flow:
+        return
+    needs = {
+        "objective": objective != "velocity" and objective,
+        "self_distillation": self_distillation,
+    }
+    for name, asked in needs.items():
+        if asked:
+            raise ValueError(
+                f"{prior.name} is trained at t = 0 alone and has no flow, which {name} = {asked} is for: "
+                f"leave out {prior.name}, or the option"
+            )
 
 
 class FlowMatchingLoss(LossModule):
@@ -28,10 +74,46 @@ class FlowMatchingLoss(LossModule):
     :math:`v_\theta(t, a_t, o)` on :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's
     end do not count.
 
+    What else is done for few integration steps are options, with any prior; on the straight path only:
+
+    **The L1 objective** compares predicted samples instead of velocities (L1 Flow, Song et al., 2025,
+    arXiv:2511.17898). The sample that a velocity predicts is :math:`\hat a_1 = a_t + (1 - t) v`, so a
+    coordinate costs
+
+    .. math::
+        |\hat a_1 - a_1| = (1 - t) \, |v_\theta(t, a_t, o) - (a_1 - a_0)|,
+
+    and their two-step sampler, half an integration step and then the predicted sample, is Euler's method
+    with NFE 2. Their network gives :math:`\hat a_1`, ours the velocity of the same sample.
+
+    **Self-distillation** trains the sampler of one step, :math:`v_\theta(s, a_s, o)` at the time :math:`s`
+    at which the prior's samplers start (:attr:`Prior.start_time`), on where the flow of averaged weights
+    :math:`\bar\theta` ends,
+
+    .. math::
+        \left\| v_\theta(s, a_s, o) - \frac{\hat a_1 - a_s}{1 - s} \right\|^2, \qquad
+        \hat a_1 = \Phi^{\bar\theta}_{s + h \to 1}(a_{s + h}), \qquad h = \frac{1 - s}{9},
+
+    where :math:`\Phi` is the flow by Euler's method with steps of :math:`h` and :math:`a_{s+h}` lies on the
+    data's own path, so that the jump is never its own teacher. It replaces the velocity at the one time
+    :math:`s`; at all others the network stays a flow. Its idea, and that target, are those of the self-
+    consistency of One-Step Flow Policy (Li et al., 2026, arXiv:2603.12480) for the interval from the start
+    to the end. What differs: a velocity network is told no interval, so only that interval is learnt and the
+    teacher makes it in steps, as in progressive distillation, instead of learning every interval at once
+    (so there is no schedule that contracts the intervals either); there is no self-guidance; and
+    the warm start is the prior's. A quarter of the batch is distilled, as in shortcut models (Frans et al.,
+    2025); a training step takes about twice the time.
+
     Args:
         actor_network: the policy whose velocity network is trained; its prior gives the source.
 
     Keyword Args:
+        times: how training times are distributed: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
+            ``"logit-normal"`` (:mod:`warmprior.objectives.times`), or a function of their signature.
+        objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
+        self_distillation: weight of the self-distillation; 0 is none.
+        teacher: the network of averaged weights that self-distillation learns from; by default the trained
+            one as it is. It is neither trained nor saved with the loss.
         interpolant: the path; by default the one that the network is preconditioned for
             (:class:`~warmprior.PreconditionedNetwork`), or the straight line.
         reduction: ``"mean"`` over unpadded coordinates (Algorithm 1 divided by their number),
@@ -46,8 +128,9 @@ class FlowMatchingLoss(LossModule):
         moved to the network's, where the generator has to be.
 
     Raises:
-        ValueError: for an unknown ``reduction``, a curved path with a prior whose field is used for
-            a single step, or another path than the network is preconditioned for.
+        ValueError: for an unknown ``reduction``, ``times`` or ``objective``, or a negative weight; for a
+            curved path with an option or a prior that needs the straight one; for an option that needs a flow with a
+            prior whose field is none; or for another path than the network is preconditioned for.
 
     Examples:
         >>> import torch
@@ -61,6 +144,9 @@ class FlowMatchingLoss(LossModule):
         >>> loss_module = FlowMatchingLoss(actor)
         >>> batch = window_replay_buffer(data, prior, batch_size=16).sample()
         >>> loss_module(batch)["loss_flow_matching"].backward()
+        >>> loss_module = FlowMatchingLoss(actor, times="u-shaped", self_distillation=1.0)
+        >>> sorted(loss_module(batch).keys())
+        ['loss_flow_matching', 'loss_self_distillation']
     """
 
     @dataclass
@@ -83,6 +169,10 @@ class FlowMatchingLoss(LossModule):
         self,
         actor_network: WarmPriorActor,
         *,
+        times: str | Times = "uniform",
+        objective: Objective = "velocity",
+        self_distillation: float = 0.0,
+        teacher: nn.Module | None = None,
         interpolant: Interpolant | None = None,
         reduction: str = "mean",
         generator: torch.Generator | None = None,
@@ -94,6 +184,16 @@ class FlowMatchingLoss(LossModule):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
         self.convert_to_functional(actor_network.network, "velocity_network")
         self.prior = actor_network.prior
+        check_objective(
+            times="uniform" if callable(times) else times,
+            objective=objective,
+            self_distillation=self_distillation,
+            prior=self.prior,
+        )
+        self.times = times if callable(times) else TIMES[times]
+        self.objective = objective
+        self.self_distillation = float(self_distillation)
+        self.__dict__["teacher"] = teacher  # no part of this module: it is another's to save
         built_for = getattr(actor_network.network, "interpolant", None)
         if interpolant is None:
             interpolant = LinearInterpolant() if built_for is None else built_for
@@ -103,11 +203,16 @@ class FlowMatchingLoss(LossModule):
                 f"{interpolant.config()}: give both the same interpolant"
             )
         self.interpolant = interpolant
-        if not self.prior.is_flow and not isinstance(self.interpolant, LinearInterpolant):
-            raise ValueError(
-                f"{self.prior} is evaluated with one step, which ends at the data only on a straight "
-                f"path: use LinearInterpolant, not {type(self.interpolant).__name__}"
+        if not isinstance(self.interpolant, LinearInterpolant):
+            told = (
+                f"only on a straight path: use LinearInterpolant, not {type(interpolant).__name__}"
             )
+            if not self.prior.is_flow:
+                raise ValueError(
+                    f"{self.prior} is evaluated with one step, which ends at the data {told}"
+                )
+            if objective != "velocity" or self_distillation:
+                raise ValueError(f"a velocity predicts the sample {told}")
         self.reduction = reduction
         self.generator = actor_network.sampler.generator if generator is None else generator
         observation, loc, warm = actor_network.in_keys
@@ -131,7 +236,10 @@ class FlowMatchingLoss(LossModule):
     @property
     def out_keys(self) -> list[NestedKey]:
         """Keys of the result."""
-        return ["loss_flow_matching"] if self._out_keys is None else self._out_keys
+        if self._out_keys is not None:
+            return self._out_keys
+        distilled = ["loss_self_distillation"] if self.self_distillation else []
+        return ["loss_flow_matching", *distilled]
 
     @out_keys.setter
     def out_keys(self, value: list[NestedKey]) -> None:
@@ -144,7 +252,9 @@ class FlowMatchingLoss(LossModule):
             tensordict: a batch of windows, see the class docstring.
 
         Returns:
-            TensorDict with ``"loss_flow_matching"``, reduced as configured.
+            TensorDict with ``"loss_flow_matching"`` and, with self-distillation, its weighted
+            ``"loss_self_distillation"``, reduced as configured. Unreduced, the latter is of the distilled
+            windows, ``[n, P, d_a]``.
 
         Raises:
             KeyError: if a needed key is missing.
@@ -167,30 +277,75 @@ class FlowMatchingLoss(LossModule):
         a0, a1 = self.prior.couple(a0, a1, self.generator, observation)
         t = a1.new_zeros(batch)
         if self.prior.is_flow:
-            t = torch.rand(batch, generator=self.generator, device=a1.device, dtype=a1.dtype)
+            t = self.times(batch, self.generator, a1.dtype, a1.device)
         observation = network_observation(observation, batch)
-        a_t, velocity = self.interpolant(a0, a1, t)
+        errors: list[Tensor] = []
         interrupt: KeyboardInterrupt | None = None
         with self.velocity_network_params.to_module(
             self.velocity_network, preserve_module_state=False
         ):
-            field = velocity_field(self.velocity_network, observation)
             try:
-                predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:]))
+                errors.append(self._velocity_error(a0, a1, t, observation))
+                if self.self_distillation:
+                    errors.append(self._jump_error(a0, a1, observation))
             except KeyboardInterrupt as key:
                 interrupt = key  # leaving the context with it would make a RuntimeError of it
         if interrupt is not None:
             raise interrupt
-        error = (predicted.reshape(a1.shape) - velocity).square()
         pad = tensordict.get(k.pad_mask, None)
         if pad is not None:
             pad = pad.to(device)
+        losses = [self._reduced(errors[0], pad)]
+        for error in errors[1:]:
+            part = None if pad is None else pad.reshape(-1, pad.shape[-1])[: len(error)]
+            losses.append(self.self_distillation * self._reduced(error, part))
+        return TensorDict(dict(zip(self.out_keys, losses, strict=True)), batch_size=[])
+
+    def _velocity_error(
+        self, a0: Tensor, a1: Tensor, t: Tensor, observation: Tensor | TensorDictBase
+    ) -> Tensor:
+        """Error at times ``t`` ``[*B]`` of the path, ``[*B, P, d_a]``."""
+        a_t, velocity = self.interpolant(a0, a1, t)
+        field = velocity_field(self.velocity_network, observation)
+        predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:]))
+        return self._distance(predicted.reshape(a1.shape), velocity, t)
+
+    def _jump_error(self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase) -> Tensor:
+        """Error of the single step from the start to the end, of the first windows, ``[n, P, d_a]``."""
+        a0, a1 = (a.detach().reshape(-1, *a.shape[-2:]) for a in (a0, a1))
+        n = max(1, round(DISTILLED_SHARE * len(a0)))
+        a0, a1, observation = a0[:n], a1[:n], observation[:n]
+        begin = self.prior.start_time
+        near = begin + (1.0 - begin) / TEACHER_STEPS
+        start, _ = self.interpolant(a0, a1, a0.new_full((n,), begin))
+        with torch.no_grad():
+            point, _ = self.interpolant(a0, a1, a0.new_full((n,), near))
+            teacher = self.velocity_network if self.teacher is None else self.teacher
+            end = integrate(
+                velocity_field(teacher, observation),
+                point,
+                nfe=TEACHER_STEPS - 1,
+                start_time=near,
+            )
+        t = a0.new_full((n,), begin)
+        jump = velocity_field(self.velocity_network, observation)(t, start)
+        return self._distance(jump, (end - start) / (1.0 - begin), t)
+
+    def _distance(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
+        """What the objective makes of predicted velocities at times ``t`` ``[*B]``, ``[*B, P, d_a]``."""
+        if self.objective == "l1":
+            return (1 - t)[..., None, None] * (predicted - velocity).abs()
+        return (predicted - velocity).square()
+
+    def _reduced(self, error: Tensor, pad: Tensor | None) -> Tensor:
+        """Errors ``[*B, P, d_a]`` where they count."""
+        if pad is not None:
             error = error.masked_fill(pad.unsqueeze(-1), 0.0)
         if self.reduction == "none":
-            return TensorDict({self.out_keys[0]: error}, batch_size=[])
+            return error
         loss = error.sum()
         if self.reduction == "mean":
             count = error.numel() if pad is None else (~pad).sum() * error.shape[-1]
             # A batch that is padding only has no error, and must not become NaN.
             loss = loss / torch.as_tensor(count, device=loss.device).clamp_min(1)
-        return TensorDict({self.out_keys[0]: loss}, batch_size=[])
+        return loss

@@ -6,7 +6,6 @@ import hashlib
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,6 +16,7 @@ from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
 from warmprior.io.files import exclusive
+from warmprior.io.options import told
 from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled
@@ -149,12 +149,19 @@ class BehaviourCloning:
             generator=self.generator,
             **renamed,
         )
-        self.loss_module = FlowMatchingLoss(actor, generator=self.generator)
         #: The network, and the prior where it learns as well.
         self.trained = nn.ModuleDict({"network": actor.network})
         if isinstance(actor.prior, nn.Module):
             self.trained["prior"] = actor.prior
         self.ema = ema_of(self.trained, config.ema_rate)
+        self.loss_module = FlowMatchingLoss(
+            actor,
+            times=config.times,
+            objective=config.objective,
+            self_distillation=config.self_distillation,
+            teacher=cast(Any, self.ema.module)["network"],
+            generator=self.generator,
+        )
         self.optimizer = make_optimizer(
             actor.network,
             learning_rate=config.learning_rate,
@@ -170,7 +177,7 @@ class BehaviourCloning:
         self.losses: list[tuple[int, float]] = []
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
-            "config": asdict(config) | {"betas": list(config.betas)},
+            "config": told(config) | {"betas": list(config.betas)},
             "prior": actor.prior.config() | _fixed_identity(actor.prior),
             "network": _network_identity(actor.network),
             "data": _data_digest(data.select(observation_key, ACTION, EPISODE)),
@@ -199,7 +206,8 @@ class BehaviourCloning:
         Returns:
             The loss, a detached scalar.
         """
-        loss = self.loss_module(self.replay_buffer.sample())["loss_flow_matching"]
+        losses = self.loss_module(self.replay_buffer.sample())
+        loss = torch.stack([losses[key] for key in self.loss_module.out_keys]).sum()
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()

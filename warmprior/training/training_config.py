@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from warmprior.io.options import LATER
+from warmprior.modules.prior import Prior
+from warmprior.objectives.flow_matching import Objective, check_objective
+from warmprior.objectives.times import TimesName
 
 __all__ = ["TrainingConfig"]
 
@@ -25,6 +30,9 @@ class TrainingConfig:
         save_every: iterations between saves of the training state; ``None`` for ten per checkpoint.
         log_every: iterations per logged mean loss.
         seed: of initial weights, sampling, source, times and dropout.
+        times: how the times of the loss are distributed.
+        objective: the loss: squared error of velocities, or L1 error of predicted samples (L1 Flow).
+        self_distillation: weight of learning in one step where the flow of averaged weights ends.
 
     Raises:
         ValueError: for a number out of its range, naming it.
@@ -42,6 +50,9 @@ class TrainingConfig:
     save_every: int | None = None
     log_every: int = 100
     seed: int = 0
+    times: TimesName = field(default="uniform", metadata=LATER)
+    objective: Objective = field(default="velocity", metadata=LATER)
+    self_distillation: float = field(default=0.0, metadata=LATER)
 
     def __post_init__(self) -> None:
         counts = ("iterations", "batch_size", "checkpoints", "log_every", "save_every")
@@ -57,6 +68,26 @@ class TrainingConfig:
         for name, values in (shares | {"ema_rate": (self.ema_rate,)}).items():
             if not all(0.0 <= value < 1.0 for value in values):
                 raise ValueError(f"{name} must lie in [0, 1), got {getattr(self, name)}")
+        self._check_objective()
+
+    def check_prior(self, prior: Prior) -> None:
+        """Refuse a prior that cannot be trained by this recipe.
+
+        Args:
+            prior: the source distribution.
+
+        Raises:
+            ValueError: naming the option.
+        """
+        self._check_objective(prior)
+
+    def _check_objective(self, prior: Prior | None = None) -> None:
+        check_objective(
+            times=self.times,
+            objective=self.objective,
+            self_distillation=self.self_distillation,
+            prior=prior,
+        )
 
     @property
     def checkpoint_iterations(self) -> list[int]:

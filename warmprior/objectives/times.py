@@ -1,0 +1,86 @@
+"""At which times a flow is trained."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+__all__ = ["TIMES", "Times", "TimesName", "logit_normal_times", "u_shaped_times", "uniform_times"]
+
+Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
+"""Draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
+
+TimesName = Literal["uniform", "u-shaped", "logit-normal"]
+
+STEEPNESS = 4.0
+"""``a`` of :func:`u_shaped_times`: the ends are 3.8 times as dense as the middle."""
+
+
+def uniform_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """All times alike, as in Algorithm 1.
+
+    Args:
+        shape: of the result.
+        generator: source of randomness on ``device``.
+        dtype: of the result.
+        device: of the result.
+    """
+    return torch.rand(shape, generator=generator, dtype=dtype, device=device)
+
+
+def u_shaped_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""More often near both ends.
+
+    The density is :math:`p(t) \propto e^{at} + e^{a(1-t)}` with :math:`a = 4` (Lee et al., 2024, "Improving
+    the training of rectified flows"). Their text writes the second term :math:`e^{-at}`, which would be no U
+    on [0, 1]; this is what their code draws from. By the inverse of
+
+    .. math::
+        F(t) = \frac12 + \frac{\sinh(a(t - \frac12))}{2 \sinh\frac a2}.
+
+    Args:
+        shape: of the result.
+        generator: source of randomness on ``device``.
+        dtype: of the result.
+        device: of the result.
+
+    Examples:
+        >>> import torch
+        >>> t = u_shaped_times(torch.Size([9999]), torch.Generator().manual_seed(0), torch.float64,
+        ...                    torch.device("cpu"))
+        >>> [round(((t > i / 4) & (t < (i + 1) / 4)).double().mean().item(), 1) for i in range(4)]
+        [0.3, 0.2, 0.2, 0.3]
+    """
+    u = torch.rand(shape, generator=generator, dtype=dtype, device=device)
+    t = 0.5 + torch.asinh((2 * u - 1) * math.sinh(STEEPNESS / 2)) / STEEPNESS
+    return t.clamp(0.0, 1.0)  # rounding may leave the interval
+
+
+def logit_normal_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""More often in the middle: :math:`\log\frac t{1-t} \sim N(0, 1)` (Esser et al., 2024).
+
+    Args:
+        shape: of the result.
+        generator: source of randomness on ``device``.
+        dtype: of the result.
+        device: of the result.
+    """
+    return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
+
+
+TIMES: dict[str, Times] = {
+    "uniform": uniform_times,
+    "u-shaped": u_shaped_times,
+    "logit-normal": logit_normal_times,
+}
+"""Those that have a name."""
