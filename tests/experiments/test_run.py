@@ -151,11 +151,14 @@ def comparison(
     logger="none",
     precondition=True,
     play_on=False,
+    grid="uniform",
 ):
     recipe = Recipe(
         network=NetworkOptions(hidden_dim=16, precondition=precondition),
         training=training,
-        evaluation=EvaluationOptions(seeds=seeds, episodes=episodes, nfe=(3, 1), play_on=play_on),
+        evaluation=EvaluationOptions(
+            seeds=seeds, episodes=episodes, nfe=(3, 1), play_on=play_on, grid=grid
+        ),
         run=RunOptions(out=folder / "out", resume=resume, envs=envs, logger=logger),
     )
     store = kind(

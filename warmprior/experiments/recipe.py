@@ -361,6 +361,8 @@ class Recipe:
         for prior in self.sources.priors():
             prior.allowed_nfes(self.evaluation.nfes)
             self.training.check_prior(prior)
+        if self.evaluation.grid != "uniform" and max(self.evaluation.nfe) == 1:
+            raise ValueError("--grid has no effect at NFE 1, which is one step on every grid")
 
     def check_single(
         self,

@@ -96,13 +96,13 @@ class FlowMatchingLoss(LossModule):
 
     where :math:`\Phi` is the flow by Euler's method with steps of :math:`h` and :math:`a_{s+h}` lies on the
     data's own path, so that the jump is never its own teacher. It replaces the velocity at the one time
-    :math:`s`; at all others the network stays a flow. Its idea, and that target, are those of the self-
-    consistency of One-Step Flow Policy (Li et al., 2026, arXiv:2603.12480) for the interval from the start
-    to the end. What differs: a velocity network is told no interval, so only that interval is learnt and the
-    teacher makes it in steps, as in progressive distillation, instead of learning every interval at once
-    (so there is no schedule that contracts the intervals either); there is no self-guidance; and
-    the warm start is the prior's. A quarter of the batch is distilled, as in shortcut models (Frans et al.,
-    2025); a training step takes about twice the time.
+    :math:`s`; at all others the network stays a flow. Idea and target are those of the self-consistency of
+    One-Step Flow Policy (Li et al., 2026, arXiv:2603.12480), for the interval from the start to the end.
+    What differs: a velocity network is told no interval, so this is the only one that is learnt, and the
+    teacher makes it in steps, as in progressive distillation, instead of in one that it has to learn as well
+    (so no schedule contracts it, either). There is no self-guidance, and the warm start is the prior's. A
+    quarter of the batch is distilled, as in shortcut models (Frans et al., 2025); a training step takes about
+    twice the time.
 
     Args:
         actor_network: the policy whose velocity network is trained; its prior gives the source.
@@ -129,8 +129,8 @@ class FlowMatchingLoss(LossModule):
 
     Raises:
         ValueError: for an unknown ``reduction``, ``times`` or ``objective``, or a negative weight; for a
-            curved path with an option or a prior that needs the straight one; for an option that needs a flow with a
-            prior whose field is none; or for another path than the network is preconditioned for.
+            curved path with an option or a prior that needs the straight one; for an option that needs a flow
+            with a prior whose field is none; or for another path than the network is preconditioned for.
 
     Examples:
         >>> import torch

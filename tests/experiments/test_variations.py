@@ -1,0 +1,182 @@
+"""Options that came after policies had been trained and runs begun: those are found, and continued."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from dataclasses import replace
+from importlib.metadata import version
+
+import pytest
+import torch
+
+pytest.importorskip("tyro")
+
+from tests.experiments.test_run import PRIORS, TRAINING, comparison, drift_problem, rows_of
+from warmprior import PastPrior
+from warmprior.experiments import (
+    NAVIGATION_PRESETS,
+    PRESETS,
+    EvaluationOptions,
+    NetworkOptions,
+    Store,
+    parse,
+    record,
+    restore,
+    started,
+)
+from warmprior.io.files import digest_of
+from warmprior.training.behaviour_cloning import STATE_FORMAT
+
+LATER = ["--times", "u-shaped", "--objective", "l1", "--self-distillation", "0.5"]
+
+
+def read(*argv, presets=PRESETS, **options):
+    return parse(presets, [*map(str, argv)], study="a-study", **options)
+
+
+def test_policies_of_before_are_found_again(tmp_path):
+    """The name of their folder, of what determined it when there were no other options."""
+    problem = drift_problem()
+    store = Store(problem, NetworkOptions(hidden_dim=16), tmp_path, tmp_path / "logs")
+    training = {
+        "iterations": 20,
+        "batch_size": 16,
+        "learning_rate": 1e-2,
+        "weight_decay": 1e-5,
+        "betas": (0.9, 0.999),
+        "eps": 1e-8,
+        "warmup_ratio": 0.2,
+        "ema_rate": 0.995,
+        "checkpoints": 2,
+        "save_every": None,
+        "log_every": 5,
+        "seed": 3,
+    }
+    network = {"network": "mlp", "hidden_dim": 16, "precondition": True, "observation_steps": 2}
+    prior = PastPrior(4)
+    digest = digest_of(
+        problem.identity,
+        training,
+        prior.config(),
+        network,
+        "cpu",
+        False,
+        version("torch"),
+        version("warmprior"),
+        STATE_FORMAT,
+    )
+    config = replace(TRAINING, seed=3)
+    assert store.folder(prior, config).name == f"drift-own-past-seed3-{digest[:10]}"
+    others = [{"times": "u-shaped"}, {"objective": "l1"}, {"self_distillation": 0.5}]
+    names = {store.folder(prior, replace(config, **other)).name for other in [{}, *others]}
+    assert len(names) == 4
+
+
+def test_the_record_of_a_recipe_is_that_of_before_until_an_option_is_used():
+    for presets in (PRESETS, NAVIGATION_PRESETS):
+        for preset in presets.values():
+            tree = record(preset)
+            assert not {"times", "objective", "self_distillation"} & tree["training"].keys()
+            assert "grid" not in tree["evaluation"]
+            used = replace(
+                preset,
+                training=replace(preset.training, times="logit-normal", self_distillation=1.0),
+                evaluation=replace(preset.evaluation, grid="dense-jump:0.7"),
+            )
+            tree = json.loads(json.dumps(record(used)))
+            assert tree["training"]["times"] == "logit-normal"
+            assert tree["evaluation"]["grid"] == "dense-jump:0.7"
+            assert restore(type(preset), tree) == used
+
+
+def test_a_continued_run_has_its_options(tmp_path):
+    def begin(recipe):
+        with started(recipe, "a-study") as out:
+            (out / "results.json").write_text("{}")
+
+    plain, later = ["--out", tmp_path / "plain"], ["--out", tmp_path / "later"]
+    begin(read(*plain))
+    begin(read(*LATER, "--grid", "dense-jump", *later))
+    assert read("--resume", *plain).training.times == "uniform"
+    again = read("--resume", *later)
+    assert again.training.self_distillation == 0.5 and again.evaluation.grid == "dense-jump"
+    assert read("--resume", *LATER, *later) == again
+    with pytest.raises(ValueError, match=r"was started with no --times: leave"):
+        read("--resume", "--times", "u-shaped", *plain)
+    with pytest.raises(ValueError, match=r"was started with --grid dense-jump: leave"):
+        read("--resume", "--grid", "uniform", *later)
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ("--self-distillation -1", "self_distillation must be a finite weight >= 0, got -1"),
+        ("--grid sparse", "unknown grid 'sparse'; choose one of uniform, dense-jump"),
+        ("--grid dense-jump:2", r"the jump of a grid must start in \(0, 1\), got 'dense-jump:2'"),
+        ("--grid dense-jump --nfe 1", "--grid has no effect at NFE 1"),
+        ("--objective l1 --prior past regression --nfe 1", "leave out regression"),
+        ("--self-distillation 1 --prior regression --nfe 1", "leave out regression"),
+    ],
+)
+def test_what_cannot_work_is_refused_before_any_work(argv, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        read(*argv.split(), "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_unknown_names_are_told_with_the_choices(tmp_path, capsys):
+    for name in ("times", "objective"):
+        with pytest.raises(SystemExit):
+            read(f"--{name}", "nobodys", "--out", tmp_path / "out")
+    told = capsys.readouterr().err
+    assert "u-shaped" in told and "l1" in told
+
+
+def test_options_without_effect_are_refused(tmp_path):
+    """In either direction: also the default, where a preset has another."""
+    given = ["--grid", "dense-jump", "--out", tmp_path / "out"]
+    with pytest.raises(ValueError, match="makes no use of it: leave out --grid"):
+        read(*given, unused=("grid",))
+    presets = {"quick": replace(PRESETS["quick"], evaluation=EvaluationOptions(grid="dense-jump"))}
+    with pytest.raises(ValueError, match="makes no use of it: leave out --grid"):
+        read("--grid", "uniform", "--out", tmp_path / "out", presets=presets, unused=("grid",))
+
+
+def test_policies_are_played_and_measured_on_the_grid(tmp_path):
+    """One step is the same on each; more are not, on the same policies."""
+    rows = {}
+    for i, grid in enumerate(("uniform", "dense-jump:0.9")):
+        compared = comparison(tmp_path / str(i), 1, priors=PRIORS[1:2], seeds=1, grid=grid)
+        compared.run()
+        player = compared.player(compared.contestants[0])
+        assert player.ode.grid == grid
+        rows[grid] = [row for row in rows_of(tmp_path / str(i)) if row["checkpoint"] == 20]
+    uniform, jump = ({row["nfe"]: row for row in found} for found in rows.values())
+    # All but what is of the flow from the mean that the policy's own predictions, of NFE 9, lead to.
+    flow = {"kappa", "relative_curvature", "bound"}
+    assert all(uniform[1][name] == jump[1][name] for name in uniform[1].keys() - flow)
+    for measure in ("boundary_jump", "source_leak"):
+        assert uniform[3][measure] != jump[3][measure]
+    with pytest.raises(ValueError, match="belongs to another recipe"):
+        comparison(tmp_path / "1", 1, priors=PRIORS[1:2], seeds=1, resume=True)
+
+
+def test_tables_name_them(tmp_path):
+    pytest.importorskip("robosuite")
+    robomimic = importlib.import_module("robomimic")
+    compared = comparison(tmp_path, 1)
+    assert not [line for line in robomimic.notes(compared) if "Beside the paper" in line]
+    compared.recipe = read(*LATER, "--grid", "dense-jump", "--out", tmp_path / "out")
+    told = "--times u-shaped, --objective l1, --self-distillation 0.5, --grid dense-jump"
+    assert f"- Beside the paper, for all sources: {told}." in robomimic.notes(compared)
+
+
+def test_every_source_learns_with_all_of_them(tmp_path):
+    training = replace(TRAINING, times="u-shaped", objective="l1", self_distillation=0.5)
+    compared = comparison(tmp_path, 1, training=training, seeds=1, episodes=1, grid="dense-jump")
+    compared.run()
+    assert not compared.failures
+    assert {row["prior"] for row in rows_of(tmp_path)} == {prior.name for prior in PRIORS}
+    for c in compared.contestants:
+        assert all(bool(torch.isfinite(p).all()) for p in c.policy().parameters())

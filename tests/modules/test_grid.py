@@ -1,0 +1,151 @@
+"""Integration grids: by hand, and against fields whose solution every grid finds."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.modules.test_ode import STAGES, Counting, batch
+from warmprior import GaussianPrior, ODEActor, VelocityMLP, WarmPriorActor, integrate
+from warmprior.modules.grid import grid_parts
+
+JUMPS = ["dense-jump", "dense-jump:0.8"]
+
+
+def test_dense_jump_by_hand():
+    """Three steps of 0.2, then one of 0.4: the published schedule, t = linspace(0, 0.6, 4) and 1."""
+    a0, weight = torch.randn(3, 4, 2), torch.randn(2, 2)
+
+    def velocity(t, a):
+        return torch.tanh(a @ weight) * (1 + t)[:, None, None]
+
+    a = a0.clone()
+    for t, length in ((0.0, 0.2), (0.2, 0.2), (0.4, 0.2), (0.6, 0.4)):
+        a = a + length * velocity(torch.full((3,), t), a)
+    torch.testing.assert_close(integrate(velocity, a0, nfe=4, grid="dense-jump:0.6"), a)
+
+
+@pytest.mark.parametrize("solver", STAGES)
+@pytest.mark.parametrize("start_time", [0.0, 0.3])
+def test_times_of_every_solver(solver, start_time):
+    nodes = {"euler": (0.0,), "midpoint": (0, 0.5), "heun": (0, 1), "rk4": (0, 0.5, 0.5, 1)}[solver]
+    network = Counting()
+    actor = ODEActor(
+        network,
+        nfe=4 * STAGES[solver],
+        solver=solver,
+        grid="dense-jump",
+        start_time=start_time,
+        path_key="path",
+    )
+    path = actor(batch(5))["path"]
+    half = start_time + 0.5 * (1 - start_time)
+    points = [start_time + (half - start_time) * k / 3 for k in range(4)] + [1.0]
+    expected = [b + node * (e - b) for b, e in pairwise(points) for node in nodes]
+    assert network.times == pytest.approx(expected, abs=1e-6)
+    assert path.shape == (5, 5, 4, 2)
+
+
+@pytest.mark.parametrize("grid", ["uniform", *JUMPS])
+@pytest.mark.parametrize("start_time", [0.0, 0.25])
+def test_linear_fields_are_solved_on_every_grid(grid, start_time):
+    a0, a1 = torch.randn(2, 6, 3, 2, dtype=torch.float64)
+
+    def to_a_point(t, a):  # straight lines: Euler's method makes no error
+        return (a1 - a) / (1 - t)[:, None, None]
+
+    for nfe in (1, 2, 5):
+        found = integrate(to_a_point, a0, nfe=nfe, grid=grid, start_time=start_time)
+        torch.testing.assert_close(found, a1)
+
+    def speeding_up(t, a):  # of second order in time
+        return (2 * t)[:, None, None] * a1
+
+    for solver in ("midpoint", "heun", "rk4"):
+        found = integrate(speeding_up, a0, nfe=8, solver=solver, grid=grid, start_time=start_time)
+        torch.testing.assert_close(found, a0 + (1 - start_time**2) * a1)
+
+
+@pytest.mark.parametrize("solver", STAGES)
+@pytest.mark.parametrize("grid", JUMPS)
+def test_one_step_is_the_same_on_every_grid(solver, grid):
+    data = batch(5)
+    chunks = [
+        ODEActor(Counting(), nfe=STAGES[solver], solver=solver, grid=g)(data.clone())
+        for g in ("uniform", grid)
+    ]
+    assert torch.equal(*(c["vla_action", "chunk"] for c in chunks))
+
+
+def test_the_default_is_uniform_to_the_last_bit():
+    """The times and steps of the only grid that there was."""
+    for steps in range(1, 40):
+        for start_time in (0.0, 0.3, 0.5):
+            (part,) = grid_parts("uniform", steps, start_time=start_time)
+            assert part == (start_time, 1.0, steps)
+    network = Counting()
+    ODEActor(network, nfe=9)(batch(2))
+    assert network.times == [float(torch.tensor(step * (1.0 / 9))) for step in range(9)]
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        ("dense", "unknown grid 'dense'; choose one of uniform, dense-jump"),
+        ("uniform:0.5", "unknown grid"),
+        (None, "unknown grid None"),
+        (["dense-jump"], "unknown grid"),
+        ("dense-jump:0", r"must start in \(0, 1\), got 'dense-jump:0'"),
+        ("dense-jump:1.0", r"must start in \(0, 1\)"),
+        ("dense-jump:nan", r"must start in \(0, 1\)"),
+        ("dense-jump:half", r"must start in \(0, 1\)"),
+        ("dense-jump:", r"must start in \(0, 1\)"),
+    ],
+)
+def test_bad_grids(grid, message):
+    with pytest.raises(ValueError, match=message):
+        ODEActor(Counting(), grid=grid)
+    with pytest.raises(ValueError, match=message):
+        integrate(lambda t, a: a, torch.ones(1, 1), nfe=1, grid=grid)
+
+
+def policy(**options):
+    torch.manual_seed(0)
+    network = VelocityMLP(2, 3, 4, hidden_dim=8)
+    return WarmPriorActor(network, GaussianPrior(4), nfe=3, **options)
+
+
+def chunk(actor):
+    data = TensorDict({"observation": torch.ones(6, 2, 3)}, [6])
+    data["prior", "loc"] = torch.zeros(6, 4, 2)
+    data["prior", "warm"] = torch.zeros(6, 4, 1, dtype=torch.bool)
+    return actor(data, generator=torch.Generator().manual_seed(0))["vla_action", "chunk"]
+
+
+def test_policies_keep_their_grid(tmp_path):
+    actor = policy(grid="dense-jump:0.7")
+    actor.save_pretrained(tmp_path)
+    again = WarmPriorActor.from_pretrained(tmp_path)
+    assert again.ode.grid == actor.replace(nfe=3).ode.grid == "dense-jump:0.7"
+    assert torch.equal(chunk(again), chunk(actor))
+    assert torch.equal(chunk(again.replace(grid="uniform")), chunk(policy()))
+    assert not torch.equal(chunk(again), chunk(policy()))
+
+
+def test_policies_of_before_there_were_grids_are_loaded(tmp_path):
+    policy().save_pretrained(tmp_path)
+    path = tmp_path / "config.json"
+    config = json.loads(path.read_text())
+    assert config["actor"].pop("grid") == "uniform"
+    del config["sha256"]  # that of the file as it is now
+    path.write_text(json.dumps(config))
+    again = WarmPriorActor.from_pretrained(tmp_path)
+    assert again.ode.grid == "uniform" and torch.equal(chunk(again), chunk(policy()))
+    config["actor"]["grid"] = "dense-jump:7"
+    path.write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"config\.json .*must start in \(0, 1\)"):
+        WarmPriorActor.from_pretrained(tmp_path)

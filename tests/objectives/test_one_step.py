@@ -1,0 +1,245 @@
+"""The L1 objective and self-distillation: written down by hand, and what they make of two modes."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from tests.objectives.test_flow_matching import actor_for, sample
+from warmprior import (
+    FlowMatchingLoss,
+    GaussianPrior,
+    PastPrior,
+    PolynomialInterpolant,
+    PreviewPrior,
+    Prior,
+    RegressionPrior,
+    WarmPriorActor,
+)
+
+H = 3
+PRIORS = [GaussianPrior(H), PastPrior(H, sigma=0.4), PreviewPrior(H)]
+
+
+class LatePrior(GaussianPrior):
+    """One whose samplers start on the way."""
+
+    name = "late-for-this-test"
+    start_time = 0.4
+
+
+del Prior._registry[LatePrior.name]
+
+
+def losses_of(actor, data, **options):
+    generator = torch.Generator().manual_seed(2)
+    return FlowMatchingLoss(actor, generator=generator, **options)(data)
+
+
+def ends(prior, data):
+    """The source and target that the loss draws first, and the times after them."""
+    generator = torch.Generator().manual_seed(2)
+    a0 = prior.sample(data["prior", "loc"], data["prior", "warm"], generator)
+    return a0, data["vla_action", "chunk"], torch.rand(len(data), generator=generator)
+
+
+@pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: prior.name)
+def test_l1_compares_predicted_samples(prior):
+    actor, data = actor_for(prior), sample(prior, 10)
+    a0, a1, t = ends(prior, data)
+    errors = torch.zeros_like(a1)
+    for b in range(10):
+        a_t = (1 - t[b]) * a0[b] + t[b] * a1[b]
+        velocity = actor.network(t[b : b + 1], a_t[None], data["observation"][b : b + 1])[0]
+        errors[b] = (a_t + (1 - t[b]) * velocity - a1[b]).abs()
+    counted = ~data["action_is_pad"]
+    loss = losses_of(actor, data, objective="l1")
+    assert list(loss.keys()) == ["loss_flow_matching"]
+    torch.testing.assert_close(loss["loss_flow_matching"], errors[counted].mean())
+    unreduced = losses_of(actor, data, objective="l1", reduction="none")["loss_flow_matching"]
+    torch.testing.assert_close(unreduced, errors * counted[..., None])
+
+
+def test_two_euler_steps_are_the_sampler_of_l1_flow():
+    prior = GaussianPrior(H)
+    actor, data = actor_for(prior), sample(prior, 5)
+    a0 = ends(prior, data)[0]
+
+    def predicted_sample(t, a):
+        return a + (1 - t) * actor.network(torch.full((5,), t), a, data["observation"])
+
+    half = a0 + 0.5 * (predicted_sample(0.0, a0) - a0)
+    found = actor(data, nfe=2, generator=torch.Generator().manual_seed(2))["vla_action", "chunk"]
+    torch.testing.assert_close(found, predicted_sample(0.5, half))
+
+
+@pytest.mark.parametrize("prior", [*PRIORS, LatePrior(H)], ids=lambda prior: prior.name)
+@pytest.mark.parametrize("objective", ["velocity", "l1"])
+def test_self_distillation_by_hand(prior, objective):
+    """One step to where one of the data's and eight of the teacher's lead, of the first quarter."""
+    actor, data = actor_for(prior), sample(prior, 12)
+    teacher = copy.deepcopy(actor.network)
+    with torch.no_grad():
+        for p in teacher.parameters():
+            p.add_(0.05 * torch.randn_like(p))
+    a0, a1, _ = ends(prior, data)
+    s, n = prior.start_time, 3
+    start = (1 - s) * a0[:n] + s * a1[:n]
+    h = (1 - s) / 9
+    observation = data["observation"][:n]
+    a = start + h * (a1 - a0)[:n]
+    with torch.no_grad():
+        for k in range(1, 9):
+            a = a + h * teacher(torch.full((n,), s + k * h), a, observation)
+    jump = actor.network(torch.full((n,), s), start, observation)
+    if objective == "l1":
+        errors = (start + (1 - s) * jump - a).abs()
+    else:
+        errors = (jump - (a - start) / (1 - s)).square()
+    counted = ~data["action_is_pad"][:n]
+    expected = 0.7 * errors[counted].mean()
+    gradients = torch.autograd.grad(expected, list(actor.network.parameters()))
+
+    options = {"objective": objective, "self_distillation": 0.7, "teacher": teacher}
+    found = losses_of(actor, data, **options)
+    torch.testing.assert_close(found["loss_self_distillation"], expected, rtol=1e-4, atol=1e-6)
+    found["loss_self_distillation"].backward()
+    for parameter, gradient in zip(actor.network.parameters(), gradients, strict=True):
+        torch.testing.assert_close(parameter.grad, gradient, rtol=1e-3, atol=1e-6)
+    assert all(p.grad is None for p in teacher.parameters())
+    # The other loss is what it is without.
+    alone = losses_of(actor, data, objective=objective)["loss_flow_matching"]
+    assert torch.equal(found["loss_flow_matching"], alone)
+    unreduced = losses_of(actor, data, reduction="none", **options)["loss_self_distillation"]
+    torch.testing.assert_close(unreduced, 0.7 * errors * counted[..., None], rtol=1e-4, atol=1e-5)
+
+
+def test_without_a_teacher_the_network_teaches_itself_and_no_gradient_flows_back():
+    prior = PastPrior(H)
+    actor, data = actor_for(prior), sample(prior, 12)
+    found = losses_of(actor, data, self_distillation=1.0)
+    twin = losses_of(actor, data, self_distillation=1.0, teacher=copy.deepcopy(actor.network))
+    assert torch.equal(found["loss_self_distillation"], twin["loss_self_distillation"])
+    parameters = list(actor.network.parameters())
+    mine, theirs = (
+        torch.autograd.grad(loss["loss_self_distillation"], parameters) for loss in (found, twin)
+    )
+    assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=True))
+
+
+def test_the_teacher_is_no_part_of_the_loss():
+    actor = actor_for(PastPrior(H))
+    plain = FlowMatchingLoss(actor)
+    loss = FlowMatchingLoss(actor, self_distillation=1.0, teacher=copy.deepcopy(actor.network))
+    assert loss.state_dict().keys() == plain.state_dict().keys()
+    assert len(list(loss.parameters())) == len(list(plain.parameters()))
+    assert loss.out_keys == ["loss_flow_matching", "loss_self_distillation"]
+
+
+@pytest.mark.parametrize("shape", [(), (6,), (2, 3)])
+def test_batch_shapes(shape):
+    prior = PastPrior(H)
+    actor, data = actor_for(prior), sample(prior, *shape)
+    found = losses_of(actor, data, self_distillation=1.0)["loss_self_distillation"]
+    flat = losses_of(actor, data.reshape(-1), self_distillation=1.0)["loss_self_distillation"]
+    assert found.shape == () and torch.equal(found, flat)
+
+
+def test_a_straight_flow_is_at_rest():
+    """Where every step leads to the same end, there is nothing left to distil."""
+
+    class ToTheObserved(nn.Module):
+        def forward(self, t, a, observation):
+            return (observation[:, :1, :2] - a) / (1 - t)[:, None, None]
+
+    prior = GaussianPrior(H)
+    data = sample(prior, 8)
+    data["vla_action", "chunk"] = data["observation"][:, :1, :2].expand(8, H, 2).contiguous()
+    found = losses_of(WarmPriorActor(ToTheObserved(), prior), data, self_distillation=1.0)
+    assert found["loss_flow_matching"] < 1e-10 and found["loss_self_distillation"] < 1e-10
+
+
+def test_one_step_learns_to_reach_one_of_two_modes():
+    """A flow's own first step goes to their mean; the distilled one to the mode that the flow leads to."""
+
+    def trained(**options):
+        prior = GaussianPrior(1)
+        torch.manual_seed(0)
+        network = nn.Sequential(
+            nn.Linear(3, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1)
+        )
+
+        class Field(nn.Module):
+            def __init__(self):
+                super().__init__()
+                self.network = network
+
+            def forward(self, t, a, observation):
+                # A feature fast enough to tell t = 0 from what follows, as time embeddings have.
+                seen = torch.stack([t, (-50 * t).exp(), a.flatten()], -1)
+                return self.network(seen).unflatten(-1, (1, 1))
+
+        actor = WarmPriorActor(Field(), prior)
+        generator = torch.Generator().manual_seed(0)
+        loss = FlowMatchingLoss(actor, generator=generator, **options)
+        optimizer = torch.optim.Adam(loss.parameters(), 5e-3)
+        data = TensorDict({"observation": torch.zeros(256, 1, 1)}, [256])
+        data["prior", "loc"] = torch.zeros(256, 1, 1)
+        data["prior", "warm"] = torch.zeros(256, 1, 1, dtype=torch.bool)
+        for _ in range(300):
+            side = torch.randint(0, 2, (256, 1, 1), generator=generator)
+            data["vla_action", "chunk"] = 2.0 * side - 1.0
+            total = sum(loss(data).values())
+            optimizer.zero_grad()
+            total.backward()
+            optimizer.step()
+        with torch.no_grad():
+            return [
+                actor(data, nfe=nfe, generator=torch.Generator().manual_seed(1))[
+                    "vla_action", "chunk"
+                ]
+                for nfe in (1, 18)
+            ]
+
+    one, many = trained()
+    assert one.abs().mean() < 0.4 and many.abs().mean() > 0.8
+    one, many = trained(self_distillation=1.0)
+    assert many.abs().mean() > 0.8
+    assert one.abs().mean() > 0.7 and ((one > 0) == (many > 0)).float().mean() > 0.9
+    assert 0.4 < (one > 0).float().mean() < 0.6
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"times": "nobodys"},
+            "times must be one of uniform, u-shaped, logit-normal, got 'nobodys'",
+        ),
+        ({"objective": "l2"}, "objective must be one of velocity, l1, got 'l2'"),
+        ({"self_distillation": -1.0}, "self_distillation must be a finite weight >= 0, got -1.0"),
+        ({"self_distillation": float("nan")}, "self_distillation must be a finite weight"),
+        ({"objective": "l1", "interpolant": PolynomialInterpolant()}, "straight path.*Polynomial"),
+        (
+            {"self_distillation": 1, "interpolant": PolynomialInterpolant()},
+            "only on a straight path",
+        ),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(ValueError, match=message):
+        FlowMatchingLoss(actor_for(PastPrior(H)), **options)
+
+
+@pytest.mark.parametrize("options", [{"objective": "l1"}, {"self_distillation": 0.5}])
+def test_regression_has_no_flow_for_them(options):
+    actor = actor_for(RegressionPrior(H))
+    FlowMatchingLoss(actor, times="u-shaped")  # of no effect beside others
+    with pytest.raises(
+        ValueError, match=r"regression is trained at t = 0 alone.*leave out regression"
+    ):
+        FlowMatchingLoss(actor, **options)

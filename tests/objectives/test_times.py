@@ -1,0 +1,99 @@
+"""Training times against their densities, written down and integrated here."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from tests.objectives.test_flow_matching import actor_for, loss_of, sample
+from warmprior import FlowMatchingLoss, PastPrior
+from warmprior.objectives.times import TIMES
+
+N = 200_000
+CPU = torch.device("cpu")
+
+
+def draw(name, *shape, seed=0, dtype=torch.float64):
+    return TIMES[name](torch.Size(shape), torch.Generator().manual_seed(seed), dtype, CPU)
+
+
+def density(name, t):
+    if name == "uniform":
+        return torch.ones_like(t)
+    if name == "u-shaped":
+        return torch.exp(4 * t) + torch.exp(4 * (1 - t))
+    z = torch.log(t / (1 - t))
+    return torch.exp(-(z**2) / 2) / (t * (1 - t)) / math.sqrt(2 * math.pi)
+
+
+@pytest.mark.parametrize("name", TIMES)
+def test_distribution_and_moments(name):
+    width = 1e-5
+    centres = torch.arange(width / 2, 1, width, dtype=torch.float64)
+    mass = density(name, centres)
+    mass = mass / mass.sum()
+    t = draw(name, N).sort()[0]
+    # Kolmogorov-Smirnov: the largest distance of the two distribution functions, at 0.1% of chance.
+    exact = mass.cumsum(0)[(t / width).long().clamp_max(len(mass) - 1)]
+    empirical = torch.arange(1, N + 1, dtype=torch.float64) / N
+    assert (exact - empirical).abs().max() < 1.95 / math.sqrt(N)
+    for power in (1, 2, 4):
+        assert (t**power).mean() == pytest.approx(float((mass * centres**power).sum()), abs=3e-3)
+
+
+def test_shapes_of_the_densities():
+    shares = {
+        name: torch.histc(draw(name, N), bins=5, min=0.0, max=1.0) / N
+        for name in ("u-shaped", "logit-normal")
+    }
+    u, middle = shares["u-shaped"], shares["logit-normal"]
+    assert u[0] > 1.5 * u[1] > 1.5 * u[2] and middle[2] > 1.5 * middle[0]
+    for share in shares.values():  # symmetric
+        torch.testing.assert_close(share, share.flip(0), atol=5e-3, rtol=0.0)
+
+
+def test_uniform_is_the_draw_that_it_was():
+    generator = torch.Generator().manual_seed(3)
+    expected = torch.rand((4, 5), generator=generator, device=CPU, dtype=torch.float32)
+    assert torch.equal(draw("uniform", 4, 5, seed=3, dtype=torch.float32), expected)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("name", TIMES)
+def test_shape_type_and_generator(name, dtype):
+    t = draw(name, 2, 3, dtype=dtype)
+    assert t.shape == (2, 3) and t.dtype == dtype
+    assert torch.equal(t, draw(name, 2, 3, dtype=dtype)) and not torch.equal(
+        t, draw(name, 2, 3, seed=1)
+    )
+    assert draw(name).shape == ()
+
+
+def test_rounding_stays_in_the_interval(monkeypatch):
+    ends = torch.tensor([0.0, 1 - 2**-24, 0.5])
+    monkeypatch.setattr(torch, "rand", lambda *args, **options: ends)
+    t = draw("u-shaped", 3, dtype=torch.float32)
+    assert t.tolist() == pytest.approx([0.0, 1.0, 0.5], abs=1e-6)
+    assert t.min() >= 0 and t.max() <= 1
+
+
+def test_the_loss_is_given_them():
+    prior = PastPrior(3)
+    actor, data = actor_for(prior), sample(prior, 6)
+    losses = {name: loss_of(actor, data, times=name) for name in TIMES}
+    assert torch.equal(losses["uniform"], loss_of(actor, data))
+    assert len({loss.item() for loss in losses.values()}) == 3
+
+    def constant(shape, generator, dtype, device):
+        return torch.full(shape, 0.25, dtype=dtype, device=device)
+
+    # By hand: the same source, at that time.
+    loss = FlowMatchingLoss(actor, times=constant, generator=torch.Generator().manual_seed(2))
+    a1 = data["vla_action", "chunk"]
+    a0 = prior.sample(data["prior", "loc"], data["prior", "warm"], torch.Generator().manual_seed(2))
+    predicted = actor.network(torch.full((6,), 0.25), 0.75 * a0 + 0.25 * a1, data["observation"])
+    counted = ~data["action_is_pad"]
+    expected = (predicted - (a1 - a0)).square()[counted].mean()
+    torch.testing.assert_close(loss(data)["loss_flow_matching"], expected)
