@@ -63,6 +63,19 @@ def test_video_has_a_frame_per_control_step(saved, tmp_path, capsys):
     assert far > abs(frames[0].astype(int) - frames[1]).mean()
 
 
+def test_another_grid_is_played(saved, capsys, monkeypatch):
+    played = []
+
+    def play(actor, env, **options):
+        played.append((actor.ode.grid, options["nfe"]))
+        return [saved[1]]
+
+    monkeypatch.setattr("warmprior.training.evaluation.evaluate", play)
+    for extra in ([], ["--grid", "dense-jump:0.7"]):
+        assert main(["evaluate", str(saved[0]), "--nfe", "3", *extra]) == 0
+    assert played == [("uniform", 3), ("dense-jump:0.7", 3)]
+
+
 def test_info(saved, capsys):
     assert main(["info", str(saved[0])]) == 0
     told = capsys.readouterr().out
@@ -77,6 +90,7 @@ def test_what_a_user_can_mend_is_told_in_one_line(saved, tmp_path, capsys):
         (["evaluate", str(tmp_path / "missing")], "no policy at"),
         (["evaluate", str(bare)], "keeps no description of a robosuite environment"),
         (["evaluate", str(saved[0]), "--nfe", "0"], "nfe"),
+        (["evaluate", str(saved[0]), "--grid", "sparse"], "unknown grid 'sparse'"),
         (["evaluate", str(saved[0]), "--episodes", "0"], "episodes must be at least 1"),
         (["evaluate", str(saved[0]), "--prior", "no.such:Prior"], "no prior at no.such:Prior"),
         (["info", str(tmp_path / "missing")], "no policy at"),

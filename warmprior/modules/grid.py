@@ -5,7 +5,7 @@ from __future__ import annotations
 __all__ = ["check_grid", "grid_parts"]
 
 JUMP = 0.5
-"""Where the dense steps of ``dense-jump`` end: later, fields were seen to pull towards training actions."""
+"""Where the dense steps of ``dense-jump`` end; Chen et al. saw fields pull towards training actions later."""
 
 
 def check_grid(grid: str) -> None:

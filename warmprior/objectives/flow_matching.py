@@ -74,7 +74,7 @@ class FlowMatchingLoss(LossModule):
     :math:`v_\theta(t, a_t, o)` on :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's
     end do not count.
 
-    What else is done for few integration steps are options, with any prior; on the straight path only:
+    What else is done for few integration steps are options, with any prior. Two need the straight path:
 
     **The L1 objective** compares predicted samples instead of velocities (L1 Flow, Song et al., 2025,
     arXiv:2511.17898). The sample that a velocity predicts is :math:`\hat a_1 = a_t + (1 - t) v`, so a
