@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 
-from warmprior.io.options import LATER, told, variations
+from warmprior.io.options import LATER, identity_of, variations
 
 
 @dataclass
@@ -21,8 +21,8 @@ class Outer:
 
 
 def test_later_options_are_left_out_at_their_defaults_alone():
-    assert told(Outer()) == {"inner": {"width": 1}, "names": ("a",)}
+    assert identity_of(Outer()) == {"inner": {"width": 1}, "names": ("a",)}
     assert variations(Outer(inner=Inner(width=5), names=())) == {}
     changed = Outer(inner=Inner(depth=3), speed=0.0)
-    assert told(changed) == asdict(changed)
+    assert identity_of(changed) == asdict(changed)
     assert variations(changed) == {"depth": 3, "speed": 0.0}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from warmprior.experiments.recipe import Flat, Recipe
-from warmprior.io.options import told, variations
+from warmprior.io.options import identity_of, variations
 
 __all__ = ["differences", "record", "refuse_ignored", "restore", "variation_notes"]
 
@@ -20,7 +20,7 @@ CHANGEABLE = {"run": ("envs", "logger")}
 
 
 def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
-    """A recipe as JSON holds it: what it is identified by, see :func:`~warmprior.io.options.told`.
+    """A recipe as JSON holds it: what it is identified by, see :func:`~warmprior.io.options.identity_of`.
 
     Args:
         recipe: a :class:`Recipe`, or a part of one.
@@ -42,7 +42,7 @@ def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
         # The same file from another working directory.
         return str(value.resolve()) if isinstance(value, Path) else value
 
-    tree = plain(told(recipe))
+    tree = plain(identity_of(recipe))
     if not isinstance(recipe, Recipe):
         return tree
     for left_out in (OF_A_START,) if changeable else (OF_A_START, CHANGEABLE):

@@ -20,7 +20,7 @@ from torchrl.record.loggers import get_logger
 from warmprior.experiments.problem import Problem
 from warmprior.experiments.recipe import NetworkOptions, RunOptions
 from warmprior.io.files import check_writable, digest_of, read_json, write_atomic
-from warmprior.io.options import told
+from warmprior.io.options import identity_of
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.learned import LearnedPrior
 from warmprior.modules.prior import Prior
@@ -159,9 +159,9 @@ class Store:
         """
         digest = digest_of(
             self.problem.identity,
-            told(training),
+            identity_of(training),
             self.sized(prior).config(),
-            told(self.network),
+            identity_of(self.network),
             self.run.device,
             self.run.compile,
             version("torch"),

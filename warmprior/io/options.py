@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-__all__ = ["LATER", "told", "variations"]
+__all__ = ["LATER", "identity_of", "variations"]
 
 LATER = {"later": True}
 """Metadata of a dataclass field that earlier versions did not have, and by whose default nothing changes.
 
-While it has its default, :func:`told` leaves it out: what was trained before is found again, and runs that
-were begun before are continued.
+While it has its default, :func:`identity_of` leaves it out: what was trained before is found again, and runs
+that were begun before are continued.
 """
 
 
-def told(options: Any) -> dict[str, Any]:
+def identity_of(options: Any) -> dict[str, Any]:
     """The fields of a dataclass, and of those in it, but for later ones that have their defaults.
 
     Args:
@@ -27,11 +27,11 @@ def told(options: Any) -> dict[str, Any]:
         ... class Options:
         ...     steps: int = 3
         ...     speed: float = field(default=1.0, metadata=LATER)
-        >>> told(Options()), told(Options(speed=2.0))
+        >>> identity_of(Options()), identity_of(Options(speed=2.0))
         ({'steps': 3}, {'steps': 3, 'speed': 2.0})
     """
     return {
-        f.name: told(value) if is_dataclass(value) else value
+        f.name: identity_of(value) if is_dataclass(value) else value
         for f in fields(options)
         if (value := getattr(options, f.name)) != f.default or "later" not in f.metadata
     }

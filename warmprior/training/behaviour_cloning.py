@@ -16,7 +16,7 @@ from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
 from warmprior.io.files import exclusive
-from warmprior.io.options import told
+from warmprior.io.options import identity_of
 from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled
@@ -177,7 +177,7 @@ class BehaviourCloning:
         self.losses: list[tuple[int, float]] = []
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
-            "config": told(config) | {"betas": list(config.betas)},
+            "config": identity_of(config) | {"betas": list(config.betas)},
             "prior": actor.prior.config() | _fixed_identity(actor.prior),
             "network": _network_identity(actor.network),
             "data": _data_digest(data.select(observation_key, ACTION, EPISODE)),
