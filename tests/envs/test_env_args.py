@@ -17,7 +17,7 @@ from warmprior.envs.env_args import (
     delta_conventions,
     modernize_env_args,
 )
-from warmprior.envs.rotation import (
+from warmprior.rotation import (
     matrix_to_rotation_6d,
     matrix_to_rotvec,
     quaternion_to_matrix,

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from warmprior.envs.rotation import (
+from warmprior.rotation import (
     matrix_to_rotation_6d,
     quaternion_to_matrix,
     rotation_6d_to_rotvec,
