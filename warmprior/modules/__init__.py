@@ -17,6 +17,7 @@ from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMomen
 from warmprior.modules.prior import Prior
 from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.modules.sampler import PriorSampler
+from warmprior.modules.trend import ObservationTrend
 
 __all__ = [
     "ChiTransformer",
@@ -26,6 +27,7 @@ __all__ = [
     "LinearInterpolant",
     "Normalizer",
     "ODEActor",
+    "ObservationTrend",
     "PastPrior",
     "PolynomialInterpolant",
     "PreconditionedNetwork",

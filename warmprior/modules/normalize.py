@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -65,13 +65,22 @@ class Normalizer(nn.Module):
 
     @classmethod
     def fit(
-        cls, data: TensorDictBase, keys: tuple[NestedKey, ...] = (keys.OBSERVATION, keys.ACTION)
+        cls,
+        data: TensorDictBase,
+        keys: tuple[NestedKey, ...] = (keys.OBSERVATION, keys.ACTION),
+        *,
+        least: Mapping[NestedKey, Tensor] | None = None,
     ) -> Normalizer:
         """Take the minimum and maximum over all steps of a dataset.
 
         Args:
             data: flat steps ``[N]`` with raw ``[N, d]`` entries.
             keys: the entries to normalise.
+
+        Keyword Args:
+            least: half of the smallest range per key, ``[d]``, raw units. Dimensions that vary by less keep
+                this scale, around the middle of what they span: else small changes that mean nothing, such
+                as those of a rotation that hardly turns, would weigh as much as the rest.
 
         Raises:
             KeyError: if a key is missing.
@@ -82,10 +91,12 @@ class Normalizer(nn.Module):
         missing = [key for key in keys if data.get(key, None) is None]
         if missing:
             raise KeyError(f"cannot fit a normaliser: the data lack {missing}")
-        return cls(
-            {key: data[key].amin(0).clone() for key in keys},
-            {key: data[key].amax(0).clone() for key in keys},
-        )
+        low = {key: data[key].amin(0).clone() for key in keys}
+        high = {key: data[key].amax(0).clone() for key in keys}
+        for key, half in (least or {}).items():
+            lacking = (half.to(low[key]) - (high[key] - low[key]) / 2).clamp_min(0)
+            low[key], high[key] = low[key] - lacking, high[key] + lacking
+        return cls(low, high)
 
     def loc(self, key: NestedKey) -> Tensor:
         """Middle of the range of ``key``, ``[d]``, raw units."""
