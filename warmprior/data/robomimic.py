@@ -295,6 +295,14 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
         return modernize_env_args(self._env_args)
 
     @property
+    def recorded_env_args(self) -> dict[str, Any]:
+        """The environment of the data, for robosuite 1.5, fit for the actions as they were recorded.
+
+        That is what :attr:`env_args` is where the actions are not absolute.
+        """
+        return modernize_env_args(self._index.env_args)
+
+    @property
     def task(self) -> TaskSpec | None:
         """The task of :data:`warmprior.envs.TASKS` recorded here, or ``None`` if it is another."""
         return self._index.task

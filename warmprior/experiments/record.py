@@ -17,6 +17,10 @@ OF_A_START = {"run": ("out", "resume"), "data": ("force_download",)}
 CHANGEABLE = {"run": ("envs", "logger")}
 """Options, by part, that a continued run may change: they change no result."""
 
+LATER = {"data": {"actions": "delta"}}
+"""Options, by part, that came later, with what held before: a record does not tell it, so that runs from
+before can be continued."""
+
 
 def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
     """A recipe as JSON holds it: what it is identified by.
@@ -47,6 +51,10 @@ def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
     for left_out in (OF_A_START,) if changeable else (OF_A_START, CHANGEABLE):
         for part, names in left_out.items():
             for name in names:
+                tree[part].pop(name)
+    for part, names in LATER.items():
+        for name, before in names.items():
+            if tree[part][name] == before:
                 tree[part].pop(name)
     return tree
 
@@ -141,7 +149,7 @@ def refuse_ignored(
         name
         for part in parts
         for name, value in leaves(mine, part).items()
-        if value != leaves(theirs, part)[name]
+        if value != leaves(theirs, part).get(name)
         and name not in but
         and (only is None or name in only)
     }

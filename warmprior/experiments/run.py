@@ -70,6 +70,7 @@ class Contestant:
         return {
             "task": self.store.problem.task,
             "data": self.store.problem.style,
+            **self.store.problem.space,
             "prior": self.prior.name,
             "sigma": float(self.prior.sigma),
             "chunk": self.prior.chunk_length,

@@ -75,7 +75,9 @@ class Store:
         network = self.network.make(action_dim, width, prior.prediction_length)
         if self.network.precondition:
             steps = self.network.observation_steps
-            network = precondition(network, problem.data, prior, observation_steps=steps)
+            network = precondition(
+                network, problem.data, prior, observation_steps=steps, trend=problem.trend
+            )
         actor = WarmPriorActor(
             network,
             prior,
@@ -193,6 +195,7 @@ class Store:
             policy_transforms,
             prior,
             normalizer=self.problem.normalizer,
+            actions=self.problem.actions,
             observation_steps=self.network.observation_steps,
         )
 

@@ -11,7 +11,7 @@ from warmprior.diagnostics.statistics import (
     probability_better,
     summarize_seeds,
 )
-from warmprior.experiments.labels import source_labels
+from warmprior.experiments.labels import source_labels, with_actions
 from warmprior.experiments.paper import PAPER_CURVATURE, paper_success
 from warmprior.experiments.results import Row, grouped, mean_known, select, success_summary
 from warmprior.experiments.straightness import RATIOS, pooled
@@ -186,7 +186,7 @@ def success_table(
 
     return table(
         rows,
-        lambda row: f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}",
+        lambda row: with_actions(_problem_label(row["task"], row["data"]), row.get("actions")),
         source_at_nfe(rows),
         {
             "measured" + (f" ({source} data)" if source else ""): measured,
@@ -251,7 +251,9 @@ def _success_notes(rows: Sequence[Row], top_k: int, source: str | None, base: st
     return notes
 
 
-def curvature_table(rows: Sequence[Row], *, task: str, data: str, source: str) -> str:
+def curvature_table(
+    rows: Sequence[Row], *, task: str, data: str, source: str, actions: str | None = None
+) -> str:
     """The layout of the paper's Table 2, with the paper's own numbers in a line of their own.
 
     The paper's are for ``H = 8`` and relative to the Gaussian source; otherwise they are left out.
@@ -263,10 +265,11 @@ def curvature_table(rows: Sequence[Row], *, task: str, data: str, source: str) -
         task: short task name.
         data: ``"ph"`` or ``"mh"``.
         source: what the observations are, in words.
+        actions: of the policies, where they are not the recorded ones.
     """
     chosen = pooled(rows)
     first = chosen[0]
-    title = f"{task.replace('_', '-').title()}-{data.upper()}"
+    title = with_actions(_problem_label(task, data), actions)
 
     def ratio(name: str, mean: str) -> Cell:
         def cell(rows: list[Row]) -> str | None:
@@ -313,6 +316,10 @@ def curvature_table(rows: Sequence[Row], *, task: str, data: str, source: str) -
             "it does not.",
         ],
     )
+
+
+def _problem_label(task: str, data: str) -> str:
+    return f"{task.replace('_', '-').title()}-{data.upper()}"
 
 
 def _interval(low: float, high: float) -> str:
