@@ -43,6 +43,7 @@ from warmprior.rl import (
     make_prior_space_critic,
 )
 from warmprior.transforms import (
+    AbsoluteActions,
     ActionHistory,
     ActionWindow,
     ChunkStep,
@@ -56,6 +57,7 @@ from warmprior.transforms import (
 __version__ = version("warmprior")
 
 __all__ = [
+    "AbsoluteActions",
     "ActionHistory",
     "ActionWindow",
     "BoxTanhNormal",

@@ -171,6 +171,15 @@ def test_absolute_actions_keep_dtype_and_batch_shape():
     assert absolute_to_env_action(out).shape == (2, 3, 7)
 
 
+def test_absolute_actions_do_not_depend_on_the_sign_of_a_quaternion():
+    actions, quaternion = torch.rand(20, 7), torch.from_numpy(_quaternions(20, 0)).float()
+    position = torch.zeros(20, 3)
+    torch.testing.assert_close(
+        absolute_actions(actions, position, quaternion),
+        absolute_actions(actions, position, -quaternion),
+    )
+
+
 @pytest.mark.parametrize("shapes", [((8,), (3,), (4,)), ((7,), (6,), (4,)), ((14,), (6,), (4,))])
 def test_absolute_actions_refuse_wrong_widths(shapes):
     with pytest.raises(ValueError, match="column"):

@@ -52,8 +52,8 @@ def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
         for part, names in left_out.items():
             for name in names:
                 tree[part].pop(name)
-    for part, names in LATER.items():
-        for name, before in names.items():
+    for part, held in LATER.items():
+        for name, before in held.items():
             if tree[part][name] == before:
                 tree[part].pop(name)
     return tree

@@ -59,8 +59,8 @@ class AbsoluteActions(Transform):
         >>> transform = AbsoluteActions([0.05] * 3 + [0.5] * 3)
         >>> here = torch.eye(3, 4)[None]  # at the origin, turned by nothing
         >>> action = torch.tensor([0.02, 0.0, 0.3, 1, 0, 0, 0, 1, 0, -1])
-        >>> transform.inv(TensorDict({"action": action, "eef_pose": here}))["action"].tolist()[:3]
-        [0.4000000059604645, 0.0, 1.0]
+        >>> transform.inv(TensorDict({"action": action, "eef_pose": here}))["action"]
+        tensor([ 0.4000,  0.0000,  1.0000,  0.0000,  0.0000,  0.0000, -1.0000])
     """
 
     def __init__(
