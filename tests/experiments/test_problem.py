@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("robosuite")
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
-from warmprior import GaussianPrior, ObservationTrend
+from warmprior import GaussianPrior, PoseTrend
 from warmprior.data import DatasetError
 from warmprior.experiments import NetworkOptions, Recipe, RunOptions, Store, robosuite_problem
 from warmprior.experiments.recipe import DataOptions
@@ -54,7 +54,7 @@ def test_absolute_actions(path, tmp_path):
     assert absolute.actions.one_step.tolist() == pytest.approx(least)
     prior = GaussianPrior(8)
     networks = [store(p, tmp_path).new_actor(prior, 0).network for p in (delta, absolute)]
-    assert networks[0].trend is None and isinstance(networks[1].trend, ObservationTrend)
+    assert networks[0].trend is None and isinstance(networks[1].trend, PoseTrend)
 
 
 def test_files_without_poses_are_named(tmp_path):

@@ -313,6 +313,24 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
         return self._index.observation_keys
 
     @property
+    def pose_columns(self) -> Tensor:
+        """Where in ``"observation"`` each gripper's position and quaternion are, int64 ``[arms, 7]``.
+
+        Raises:
+            KeyError: if they were not read.
+        """
+        first = dict(
+            zip(self.observation_keys, np.cumsum([0, *self._index.observation_dims]), strict=False)
+        )
+        columns: list[list[int]] = []
+        while not columns or f"robot{len(columns)}_eef_pos" in first:
+            position, quaternion = (
+                first[f"robot{len(columns)}_eef_{end}"] for end in ("pos", "quat")
+            )
+            columns.append([*range(position, position + 3), *range(quaternion, quaternion + 4)])
+        return torch.tensor(columns)
+
+    @property
     def num_episodes(self) -> int:
         """The number of demos read."""
         return len(self._index.demos)

@@ -26,6 +26,7 @@ from warmprior.experiments.recipe import DataOptions, HeldOutOptions
 from warmprior.io.files import file_digest
 from warmprior.keys import ACTION
 from warmprior.modules.normalize import Normalizer
+from warmprior.modules.trend import RestingAction
 
 __all__ = [
     "Problem",
@@ -54,8 +55,8 @@ class Problem:
         normalizer: between raw and normalised units; ``None`` if they are the same.
         actions: between the policies' actions, in raw units, and the environment's; ``None`` if they are the
             same. See :func:`~warmprior.policy_transforms`.
-        trend: whether networks are to learn only what a linear prediction from the observation leaves, see
-            :class:`~warmprior.modules.ObservationTrend`.
+        rest: for absolute actions, to let networks learn only what does not follow from where the grippers
+            are, see :class:`~warmprior.PoseTrend`.
         clip: bound of the normalised actions that are executed; ``None`` for none.
         environment: what a saved policy keeps of the environment, see
             :func:`~warmprior.envs.environment_of`.
@@ -72,7 +73,7 @@ class Problem:
     facts: dict[str, Any] = field(default_factory=dict)
     normalizer: Normalizer | None = None
     actions: Transform | None = None
-    trend: bool = False
+    rest: RestingAction | None = None
     clip: float | None = None
     environment: Mapping[str, Any] | None = None
 
@@ -142,7 +143,7 @@ def robosuite_problem(
         },
         normalizer=normalizer,
         actions=transform,
-        trend=actions == "absolute",
+        rest=None if transform is None else RestingAction(dataset.pose_columns, normalizer),
         # The normalised demonstrations span [-1, 1]: what leaves it is executed, and remembered, at the
         # bound.
         clip=1.0,

@@ -76,7 +76,11 @@ class Store:
         if self.network.precondition:
             steps = self.network.observation_steps
             network = precondition(
-                network, problem.data, prior, observation_steps=steps, trend=problem.trend
+                network,
+                problem.data,
+                prior,
+                observation_steps=steps,
+                rest=copy.deepcopy(problem.rest),
             )
         actor = WarmPriorActor(
             network,

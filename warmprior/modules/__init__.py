@@ -17,7 +17,7 @@ from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMomen
 from warmprior.modules.prior import Prior
 from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.modules.sampler import PriorSampler
-from warmprior.modules.trend import ObservationTrend
+from warmprior.modules.trend import PoseTrend, RestingAction
 
 __all__ = [
     "ChiTransformer",
@@ -27,14 +27,15 @@ __all__ = [
     "LinearInterpolant",
     "Normalizer",
     "ODEActor",
-    "ObservationTrend",
     "PastPrior",
     "PolynomialInterpolant",
+    "PoseTrend",
     "PreconditionedNetwork",
     "PreviewPrior",
     "Prior",
     "PriorSampler",
     "RegressionPrior",
+    "RestingAction",
     "SourceMoments",
     "TimestepEmbedding",
     "TrigonometricInterpolant",

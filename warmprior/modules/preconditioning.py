@@ -13,7 +13,7 @@ from warmprior import keys
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
-from warmprior.modules.trend import ObservationTrend
+from warmprior.modules.trend import PoseTrend
 
 __all__ = ["PreconditionedNetwork", "SourceMoments"]
 
@@ -107,7 +107,7 @@ class SourceMoments(nn.Module):
         prior: Prior,
         *,
         samples: int = 16_384,
-        trend: ObservationTrend | None = None,
+        trend: PoseTrend | None = None,
         generator: torch.Generator | None = None,
     ) -> SourceMoments:
         """Estimate them from training windows and draws of the prior.
@@ -119,7 +119,7 @@ class SourceMoments(nn.Module):
         Keyword Args:
             samples: windows to draw from a buffer, in its batches; windows given as a tensordict are
                 used once each.
-            trend: of the observation; the moments are those of what it leaves.
+            trend: of the pose; the moments are those of what it leaves.
             generator: source of randomness of the source samples, on the windows' device; the buffer
                 draws from its own.
 
@@ -193,9 +193,8 @@ class PreconditionedNetwork(VelocityNetwork):
     Keyword Args:
         moments: of the prior's source and the targets; where they are missing, those of independent
             standard normal ends, to be replaced by loading a state dict.
-        trend: what follows linearly from the observation, :math:`E[a_0 | o]` and :math:`E[a_1 | o]` in
-            place of the means above; the moments are then of what it leaves. None by default. Or its
-            ``config()``.
+        trend: what follows from where the grippers are, :math:`E[a_0 | o]` and :math:`E[a_1 | o]` in place
+            of the means above; the moments are then of what it leaves. None by default. Or its ``config()``.
         interpolant: the path, that of the loss; linear by default. Or its ``config()``.
 
     Raises:
@@ -217,7 +216,7 @@ class PreconditionedNetwork(VelocityNetwork):
         network: VelocityNetwork | dict[str, Any],
         *,
         moments: SourceMoments | None = None,
-        trend: ObservationTrend | dict[str, Any] | None = None,
+        trend: PoseTrend | dict[str, Any] | None = None,
         interpolant: Interpolant | dict[str, Any] | None = None,
     ) -> None:
         if isinstance(network, dict):
@@ -245,16 +244,12 @@ class PreconditionedNetwork(VelocityNetwork):
                 f"the moments are of chunks (P, d_a) = {tuple(self.moments.covariance.shape)}, but the "
                 f"network was built for {shape}"
             )
-        self.trend = ObservationTrend.zero(**trend) if isinstance(trend, dict) else trend
-        if self.trend is not None:
-            sizes = tuple(self.trend.config().values())
-            steps, width, *chunk = sizes
-            fits = steps == network.observation_steps and width <= network.observation_dim
-            if not fits or tuple(chunk) != shape:
-                raise ValueError(
-                    f"the trend is of (To, d_o, P, d_a) = {sizes}, but the network was built for "
-                    f"{(network.observation_steps, network.observation_dim, *shape)}"
-                )
+        self.trend = PoseTrend.zero(**trend) if isinstance(trend, dict) else trend
+        if self.trend is not None and tuple(self.trend.target.shape) != shape:
+            raise ValueError(
+                f"the trend is of chunks (P, d_a) = {tuple(self.trend.target.shape)}, but the network "
+                f"was built for {shape}"
+            )
 
     def config(self) -> dict[str, Any]:
         """JSON-serialisable class name and constructor arguments; the moments are buffers."""

@@ -1,4 +1,4 @@
-"""The part of a prior's source and of its targets that follows linearly from the observation."""
+"""The part of a prior's source and of its targets that follows from where the grippers are."""
 
 from __future__ import annotations
 
@@ -9,81 +9,137 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from warmprior import keys
+from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
+from warmprior.rotation import HAND_TO_SITE, matrix_to_rotation_6d, quaternion_to_matrix
 
-__all__ = ["ObservationTrend"]
+__all__ = ["PoseTrend", "RestingAction"]
 
 DRAWS = 16
-"""Of the source, per window."""
+"""Of the source, per window: their mean has little noise, which belongs to no observation."""
 
-RIDGE = 1e-4
-"""Variance of the noise that the coefficients are made robust to: a standard deviation of 0.01, half a
-percent of the normalised range. What varies less cannot be relied on at deployment."""
+VARIANCE_FLOOR = 1e-4
+"""Of a resting action: one that varies less tells nothing about others."""
+
+_POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, rotation and gripper
 
 
-class ObservationTrend(nn.Module):
-    r"""Best linear predictions of source :math:`a_0` and target :math:`a_1` from the observation.
-
-    Absolute poses lie near the observed one: most of their variance is that of where the robot is. A network
-    that has to find this by itself spends its precision on it, and what it hands on of the source's noise is
-    a share of the whole range, many times what a pose changes in a step. With a trend,
-    :class:`PreconditionedNetwork` learns the remainder.
-
-    The predictions are ridge regressions on all ``To`` steps of the observation, one per chunk position and
-    action dimension, for normalised inputs. They say nothing of the mean, which :class:`SourceMoments` has.
+class RestingAction(nn.Module):
+    r"""The absolute action that asks every gripper to stay where the observation says it is.
 
     Args:
-        centre: ``[To, d_o]``, mean observation.
-        source: ``[To * d_o, P, d_a]``, coefficients of :math:`a_0 - E[a_0]`.
-        target: ``[To * d_o, P, d_a]``, coefficients of :math:`a_1 - E[a_1]`.
-
-    Raises:
-        ValueError: if the shapes differ, or an entry is NaN or infinite.
+        columns: int64 ``[arms, 7]``, where in the observation each gripper's position and the
+            ``(x, y, z, w)`` quaternion of its hand are, as robomimic's files have them.
+        normalizer: of the observations ``[d_o]`` and the actions ``[10 * arms]``; an identity by default,
+            to be replaced by loading a state dict.
 
     Examples:
         >>> import torch
-        >>> trend = ObservationTrend(torch.zeros(1, 2), torch.zeros(2, 4, 1), torch.ones(2, 4, 1))
-        >>> source, target = trend(torch.tensor([[[0.5, 0.25]]]))
-        >>> target.flatten().tolist()
-        [0.75, 0.75, 0.75, 0.75]
+        >>> rest = RestingAction(torch.arange(7)[None])
+        >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
+        >>> rest(observation).tolist()[:3], rest(observation).shape
+        ([0.1..., 0.2..., 0.3...], torch.Size([10]))
+    """
+
+    columns: Tensor
+    loc: Tensor
+    scale: Tensor
+    action_loc: Tensor
+    action_scale: Tensor
+
+    def __init__(self, columns: Tensor, normalizer: Normalizer | None = None) -> None:
+        super().__init__()
+        if columns.ndim != 2 or columns.shape[1] != _POSE:
+            raise ValueError(f"columns must be [arms, {_POSE}], got {list(columns.shape)}")
+        width = _ABSOLUTE * len(columns)
+        affine = [torch.zeros(columns.shape), torch.ones(columns.shape)]
+        affine += [torch.zeros(width), torch.ones(width)]
+        if normalizer is not None:
+            loc, scale = normalizer.loc(keys.OBSERVATION), normalizer.scale(keys.OBSERVATION)
+            affine = [loc[columns], scale[columns]]
+            affine += [normalizer.loc(keys.ACTION), normalizer.scale(keys.ACTION)]
+        self.register_buffer("columns", columns)
+        for name, value in zip(("loc", "scale", "action_loc", "action_scale"), affine, strict=True):
+            self.register_buffer(name, value.clone())
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The action, ``[*B, 10 * arms]`` in normalised units; 0 for the gripper.
+
+        Args:
+            observation: ``[*B, d_o]``, normalised; further entries at its end are not looked at.
+        """
+        pose = observation[..., self.columns] * self.scale + self.loc
+        hand = quaternion_to_matrix(pose[..., 3:])
+        site = hand @ quaternion_to_matrix(hand.new_tensor(HAND_TO_SITE))
+        still = pose.new_zeros(*pose.shape[:-1], 1)
+        action = torch.cat((pose[..., :3], matrix_to_rotation_6d(site), still), -1).flatten(-2)
+        normalised = (action - self.action_loc) / self.action_scale
+        normalised.unflatten(-1, (-1, _ABSOLUTE))[..., -1] = 0.0
+        return normalised
+
+
+class PoseTrend(nn.Module):
+    r"""Best linear predictions of source :math:`a_0` and target :math:`a_1` from the resting action.
+
+    Absolute poses lie near the present one: most of their variance is that of where the robot is. A network
+    that has to find this by itself spends its precision on it, and what it hands on of the source's noise is
+    a share of the whole range, many times what a pose changes in a step. With a trend,
+    :class:`PreconditionedNetwork` learns the remainder: where to go from here, as with deltas.
+
+    Every action dimension is predicted from the same dimension of the resting action at the last observation
+    alone: a regression on the whole observation fits better, but leads astray where no demonstration was.
+
+    Args:
+        rest: the resting action of an observation.
+        centre: ``[d_a]``, its mean.
+        source: ``[P, d_a]``, slopes of :math:`a_0 - E[a_0]`.
+        target: ``[P, d_a]``, slopes of :math:`a_1 - E[a_1]`.
+
+    Raises:
+        ValueError: if the shapes differ, or an entry is NaN or infinite.
     """
 
     centre: Tensor
     source: Tensor
     target: Tensor
 
-    def __init__(self, centre: Tensor, source: Tensor, target: Tensor) -> None:
+    def __init__(self, rest: RestingAction, centre: Tensor, source: Tensor, target: Tensor) -> None:
         super().__init__()
         shapes = [tuple(value.shape) for value in (centre, source, target)]
-        fits = centre.ndim == 2 and source.ndim == 3 and len(source) == centre.numel()
-        if not fits or source.shape != target.shape:
+        width = len(rest.action_loc)
+        if source.ndim != 2 or shapes != [(width,), (len(source), width), (len(source), width)]:
             raise ValueError(
-                f"a trend needs [To, d_o] and twice [To * d_o, P, d_a], got the shapes {shapes}"
+                f"a trend of {width} actions needs [d_a] and twice [P, d_a], got the shapes {shapes}"
             )
+        self.rest = rest
         for name, value in (("centre", centre), ("source", source), ("target", target)):
             if not torch.isfinite(value).all():
                 raise ValueError(f"the trend's {name} holds NaN or infinity: check the data")
             self.register_buffer(name, value.clone())
 
     @classmethod
-    def zero(
-        cls, observation_steps: int, observation_dim: int, prediction_length: int, action_dim: int
-    ) -> ObservationTrend:
+    def zero(cls, arms: int, prediction_length: int) -> PoseTrend:
         """No trend, to be replaced by loading a state dict."""
-        inputs = observation_steps * observation_dim
-        none = torch.zeros(inputs, prediction_length, action_dim)
-        return cls(torch.zeros(observation_steps, observation_dim), none, none)
+        rest = RestingAction(torch.zeros(arms, _POSE, dtype=torch.int64))
+        none = torch.zeros(prediction_length, _ABSOLUTE * arms)
+        return cls(rest, none[0], none, none)
 
     @classmethod
     @torch.no_grad()
     def fit(
-        cls, windows: TensorDictBase, prior: Prior, *, generator: torch.Generator | None = None
-    ) -> ObservationTrend:
+        cls,
+        windows: TensorDictBase,
+        prior: Prior,
+        rest: RestingAction,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> PoseTrend:
         """Estimate it from training windows and draws of the prior.
 
         Args:
             windows: ``[N]``, see :class:`~warmprior.ActionWindow`, with observations ``[N, To, d_o]``.
             prior: the source distribution that these windows were made for.
+            rest: the resting action of an observation.
 
         Keyword Args:
             generator: source of randomness of the source samples, on the windows' device.
@@ -91,42 +147,28 @@ class ObservationTrend(nn.Module):
         Returns:
             The trend over the positions that are not padded, as float32; none where all are.
         """
-        observation = windows[keys.OBSERVATION].double()
-        centre = observation.mean(0)
-        inputs = (observation - centre).flatten(1)
-        ends = windows[keys.LOC], windows[keys.WARM]
-        # The mean of several draws: their noise belongs to no observation.
-        draws = [prior.sample(*ends, generator).double() for _ in range(DRAWS)]
-        source = torch.stack(draws).mean(0)
-        target, weight = windows[keys.CHUNK].double(), (~windows[keys.IS_PAD]).double()
-        ridge = RIDGE * torch.eye(inputs.shape[1], dtype=inputs.dtype, device=inputs.device)
-        coefficients = []
-        for position in range(weight.shape[1]):
-            # Padded windows do not count: an episode's end would pull the trend to the repeated action.
-            share = weight[:, position, None] / weight[:, position].sum().clamp_min(1)
-            mean = (share * inputs).sum(0)
-            scaled = share * (inputs - mean)
-            values = torch.cat((source[:, position], target[:, position]), -1)
-            covariance = (inputs - mean).mT @ scaled
-            coefficients.append(torch.linalg.solve(covariance + ridge, scaled.mT @ values))
-        both = torch.stack(coefficients, 1).float()
-        return cls(centre.float(), *both.chunk(2, -1))
+        resting = rest(windows[keys.OBSERVATION][:, -1].float()).double()
+        centre = resting.mean(0)
+        mean = windows[keys.LOC], windows[keys.WARM]
+        draws = [prior.sample(*mean, generator).double() for _ in range(DRAWS)]
+        ends = torch.stack((torch.stack(draws).mean(0), windows[keys.CHUNK].double()))
+        # Padded positions do not count: they would pull the trend to the episode's last action.
+        weight = (~windows[keys.IS_PAD]).double().unsqueeze(-1)
+        weight = weight / weight.sum(0).clamp_min(1)
+        deviation = resting.unsqueeze(1) - (weight * resting.unsqueeze(1)).sum(0)
+        variance = (weight * deviation.square()).sum(0)
+        slopes = (weight * deviation * ends).sum(1) / variance.clamp_min(VARIANCE_FLOOR)
+        return cls(rest, centre.float(), *slopes.float())
 
     def config(self) -> dict[str, Any]:
         """JSON-serialisable arguments of :meth:`zero`; the values themselves are buffers."""
-        names = ("observation_steps", "observation_dim", "prediction_length", "action_dim")
-        return dict(zip(names, (*self.centre.shape, *self.source.shape[1:]), strict=True))
+        return {"arms": len(self.rest.columns), "prediction_length": len(self.source)}
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """What source and target deviate from their means by, each ``[B, P, d_a]``.
 
         Args:
-            observation: ``[B, To, d]`` whose first ``d_o`` entries per step are those of the trend; others
-                are not looked at.
+            observation: ``[B, To, d_o]``, normalised; the last step counts.
         """
-        inputs = (observation[..., : self.centre.shape[1]] - self.centre).flatten(1)
-        shape = self.source.shape[1:]
-        source, target = (
-            (inputs @ w.flatten(1)).unflatten(1, shape) for w in (self.source, self.target)
-        )
-        return source, target
+        deviation = (self.rest(observation[:, -1]) - self.centre).unsqueeze(1)
+        return deviation * self.source, deviation * self.target

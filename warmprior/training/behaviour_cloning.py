@@ -24,7 +24,7 @@ from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
-from warmprior.modules.trend import ObservationTrend
+from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
     check_identity,
@@ -47,7 +47,7 @@ from warmprior.transforms.window import window_replay_buffer
 __all__ = ["BehaviourCloning", "precondition"]
 
 TREND_BATCHES = 16
-"""Of 1,024 windows, to which an :class:`ObservationTrend` is fitted."""
+"""Of 1,024 windows, to which a :class:`PoseTrend` is fitted."""
 
 STATE_FORMAT = 4
 """Part of every state's identity; raised whenever the same options give other weights."""
@@ -59,7 +59,7 @@ def precondition(
     prior: Prior,
     *,
     observation_steps: int = 2,
-    trend: bool = False,
+    rest: RestingAction | None = None,
     interpolant: Interpolant | None = None,
 ) -> PreconditionedNetwork:
     """Wrap a network in what is known of a prior's source and the demonstrations before any training.
@@ -71,7 +71,7 @@ def precondition(
 
     Keyword Args:
         observation_steps: ``To``.
-        trend: also of what follows linearly from the observation, as absolute poses mostly do.
+        rest: for absolute actions, to take off what follows from where the grippers are.
         interpolant: the path, that of the loss; linear by default.
 
     Returns:
@@ -81,12 +81,12 @@ def precondition(
     windows = window_replay_buffer(
         data, prior, batch_size=1024, observation_steps=observation_steps, generator=generator
     )
-    fitted = None
-    if trend:
+    trend = None
+    if rest is not None:
         batch = torch.cat([windows.sample() for _ in range(TREND_BATCHES)])
-        fitted = ObservationTrend.fit(batch, prior, generator=generator)
-    moments = SourceMoments.fit(windows, prior, trend=fitted, generator=generator)
-    return PreconditionedNetwork(network, moments=moments, trend=fitted, interpolant=interpolant)
+        trend = PoseTrend.fit(batch, prior, rest, generator=generator)
+    moments = SourceMoments.fit(windows, prior, trend=trend, generator=generator)
+    return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=interpolant)
 
 
 class BehaviourCloning:
