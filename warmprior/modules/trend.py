@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from warmprior import keys
 from warmprior.modules.normalize import Normalizer
@@ -51,16 +52,20 @@ class RestingAction(nn.Module):
         super().__init__()
         if columns.ndim != 2 or columns.shape[1] != _POSE:
             raise ValueError(f"columns must be [arms, {_POSE}], got {list(columns.shape)}")
-        width = _ABSOLUTE * len(columns)
-        affine = [torch.zeros(columns.shape), torch.ones(columns.shape)]
-        affine += [torch.zeros(width), torch.ones(width)]
+        shapes = columns.shape, (len(columns), _ABSOLUTE)
+        affine = [make(shape) for shape in shapes for make in (torch.zeros, torch.ones)]
         if normalizer is not None:
-            loc, scale = normalizer.loc(keys.OBSERVATION), normalizer.scale(keys.OBSERVATION)
-            affine = [loc[columns], scale[columns]]
-            affine += [normalizer.loc(keys.ACTION), normalizer.scale(keys.ACTION)]
+            ends = normalizer.loc, normalizer.scale
+            affine = [end(keys.OBSERVATION)[columns] for end in ends]
+            affine += [end(keys.ACTION).unflatten(0, (-1, _ABSOLUTE)) for end in ends]
         self.register_buffer("columns", columns)
         for name, value in zip(("loc", "scale", "action_loc", "action_scale"), affine, strict=True):
             self.register_buffer(name, value.clone())
+
+    @property
+    def width(self) -> int:
+        """``d_a``."""
+        return self.action_loc.numel()
 
     def forward(self, observation: Tensor) -> Tensor:
         """The action, ``[*B, 10 * arms]`` in normalised units; 0 for the gripper.
@@ -71,11 +76,9 @@ class RestingAction(nn.Module):
         pose = observation[..., self.columns] * self.scale + self.loc
         hand = quaternion_to_matrix(pose[..., 3:])
         site = hand @ quaternion_to_matrix(hand.new_tensor(HAND_TO_SITE))
-        still = pose.new_zeros(*pose.shape[:-1], 1)
-        action = torch.cat((pose[..., :3], matrix_to_rotation_6d(site), still), -1).flatten(-2)
-        normalised = (action - self.action_loc) / self.action_scale
-        normalised.unflatten(-1, (-1, _ABSOLUTE))[..., -1] = 0.0
-        return normalised
+        action = torch.cat((pose[..., :3], matrix_to_rotation_6d(site)), -1)
+        normalised = (action - self.action_loc[:, :-1]) / self.action_scale[:, :-1]
+        return pad(normalised, (0, 1)).flatten(-2)
 
 
 class PoseTrend(nn.Module):
@@ -106,7 +109,7 @@ class PoseTrend(nn.Module):
     def __init__(self, rest: RestingAction, centre: Tensor, source: Tensor, target: Tensor) -> None:
         super().__init__()
         shapes = [tuple(value.shape) for value in (centre, source, target)]
-        width = len(rest.action_loc)
+        width = rest.width
         if source.ndim != 2 or shapes != [(width,), (len(source), width), (len(source), width)]:
             raise ValueError(
                 f"a trend of {width} actions needs [d_a] and twice [P, d_a], got the shapes {shapes}"
