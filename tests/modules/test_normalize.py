@@ -142,10 +142,10 @@ def test_errors():
         Normalizer(one, {"b": torch.zeros(2)})
 
 
-def test_least_ranges_keep_small_variations_small():
+def test_units_of_their_own():
     action = torch.tensor([[1.0, -2.0, 5.0], [1.2, 2.0, 5.0]])
     data = TensorDict({"action": action}, [2])
-    normalizer = Normalizer.fit(data, ("action",), least={"action": torch.tensor([0.5, 0.5, 0.5])})
+    normalizer = Normalizer.fit(data, ("action",), units={"action": torch.tensor([0.5, 0.0, 0.5])})
     expected = torch.tensor([[-0.2, -1.0, 0.0], [0.2, 1.0, 0.0]])
     torch.testing.assert_close(normalizer.normalize(data)["action"], expected)
     torch.testing.assert_close(normalizer.scale("action"), torch.tensor([0.5, 2.0, 0.5]))

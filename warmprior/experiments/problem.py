@@ -123,14 +123,17 @@ def robosuite_problem(
         dataset.recorded_env_args, style, observation_steps, actions
     )
     make_env, transform = robosuite_parts(description)
-    least = None if transform is None else {ACTION: transform.one_step}
-    normalizer, digest = Normalizer.fit(dataset.data, least=least), file_digest(path)
+    # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and
+    # positions, which range far, do not weigh little beside the gripper in the loss.
+    units = None if transform is None else {ACTION: transform.one_step}
+    normalizer, digest = Normalizer.fit(dataset.data, units=units), file_digest(path)
+    data = normalizer.normalize(dataset.data.exclude("next"))
     # Of the recorded actions nothing is said: policies and rows from before there was a choice have these.
     space = {} if actions == "delta" else {"actions": actions}
     return Problem(
         task=task_of(dataset),
         style=style,
-        data=normalizer.normalize(dataset.data.exclude("next")),
+        data=data,
         make_env=make_env,
         identity=" ".join([digest, *space.values()]),
         facts={
@@ -144,9 +147,8 @@ def robosuite_problem(
         normalizer=normalizer,
         actions=transform,
         rest=None if transform is None else RestingAction(dataset.pose_columns, normalizer),
-        # The normalised demonstrations span [-1, 1]: what leaves it is executed, and remembered, at the
-        # bound.
-        clip=1.0,
+        # What leaves the span of the normalised demonstrations is executed, and remembered, at the bound.
+        clip=1.0 if transform is None else float(data[ACTION].abs().max()),
         environment=description,
     )
 

@@ -69,7 +69,7 @@ class Normalizer(nn.Module):
         data: TensorDictBase,
         keys: tuple[NestedKey, ...] = (keys.OBSERVATION, keys.ACTION),
         *,
-        least: Mapping[NestedKey, Tensor] | None = None,
+        units: Mapping[NestedKey, Tensor] | None = None,
     ) -> Normalizer:
         """Take the minimum and maximum over all steps of a dataset.
 
@@ -78,9 +78,8 @@ class Normalizer(nn.Module):
             keys: the entries to normalise.
 
         Keyword Args:
-            least: half of the smallest range per key, ``[d]``, raw units. Dimensions that vary by less keep
-                this scale, around the middle of what they span: else small changes that mean nothing, such
-                as those of a rotation that hardly turns, would weigh as much as the rest.
+            units: per key what 1 stands for, ``[d]``, raw units, around the middle of what the data span; 0
+                where half of that is 1. With units of their own, dimensions may leave ``[-1, 1]``.
 
         Raises:
             KeyError: if a key is missing.
@@ -93,9 +92,10 @@ class Normalizer(nn.Module):
             raise KeyError(f"cannot fit a normaliser: the data lack {missing}")
         low = {key: data[key].amin(0).clone() for key in keys}
         high = {key: data[key].amax(0).clone() for key in keys}
-        for key, half in (least or {}).items():
-            lacking = (half.to(low[key]) - (high[key] - low[key]) / 2).clamp_min(0)
-            low[key], high[key] = low[key] - lacking, high[key] + lacking
+        for key, unit in (units or {}).items():
+            middle, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
+            half = torch.where(unit > 0, unit.to(half), half)
+            low[key], high[key] = middle - half, middle + half
         return cls(low, high)
 
     def loc(self, key: NestedKey) -> Tensor:

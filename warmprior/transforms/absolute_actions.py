@@ -96,7 +96,7 @@ class AbsoluteActions(Transform):
     def one_step(self) -> Tensor:
         """How far one control step can move each number of an action, ``[10 * arms]``; 0 for the gripper.
 
-        What demonstrations vary by less is not worth blowing up (see :meth:`Normalizer.fit`).
+        In these units (see :meth:`Normalizer.fit`) poses and deltas compare.
         """
         position, turn = self.scale[:3], self.scale[3:].amin()
         return torch.cat((position, turn.expand(6), turn.new_zeros(1))).repeat(self.arms)
