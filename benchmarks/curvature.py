@@ -35,6 +35,7 @@ from warmprior.experiments import (
     straightness,
     write_report,
 )
+from warmprior.experiments.labels import with_actions
 from warmprior.experiments.navigation_figures import plot_flow_paths
 from warmprior.experiments.recipe import Flat
 from warmprior.experiments.record import refuse_ignored
@@ -134,7 +135,9 @@ def draw(recipe: CurvatureRecipe, measured: Measured, rows: Sequence[Row]) -> No
         windows = few.windows(actor.prior)
         path = flow_paths(actor, windows, recipe.held_out.steps, generator=generator)
         paths[label(group[0])] = path[..., 0, recipe.coordinate].cpu()
-    title = f"{measured.facts['task']} {measured.facts['style']}: action coordinate {recipe.coordinate} "
+    facts = measured.facts
+    told = with_actions(f"{facts['task']} {facts['style']}", facts.get("actions"))
+    title = f"{told}: action coordinate {recipe.coordinate} "
     plot_flow_paths(
         paths,
         recipe.run.directory / "flow_paths.png",
@@ -165,8 +168,15 @@ def run(argv: Sequence[str] | None) -> None:
         measured.results.meta["observations"] = measured.source
         measured.results.add(*rows)
         draw(recipe, measured, rows)
-        task, style = measured.facts["task"], measured.facts["style"]
-        write_report(out, curvature_table(rows, task=task, data=style, source=measured.source))
+        facts = measured.facts
+        told = curvature_table(
+            rows,
+            task=facts["task"],
+            data=facts["style"],
+            actions=facts.get("actions"),
+            source=measured.source,
+        )
+        write_report(out, told)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

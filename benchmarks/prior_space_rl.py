@@ -37,6 +37,7 @@ from warmprior.experiments import (
     write_report,
 )
 from warmprior.experiments.figures import agent_label
+from warmprior.experiments.labels import with_actions
 from warmprior.experiments.prior_space import (
     PRIOR_SPACE_PRESETS,
     PriorSpaceRecipe,
@@ -184,6 +185,7 @@ def run(argv: Sequence[str] | None) -> None:
             facts = {
                 "task": problem["task"],
                 "data": problem["style"],
+                **{name: problem[name] for name in ("actions",) if name in problem},
                 "algorithm": algorithm,
                 "prior": name,
                 "sigma": actor.prior.sigma,
@@ -195,7 +197,8 @@ def run(argv: Sequence[str] | None) -> None:
             results.add(*(evaluated(facts, point) for point in training.curve))
         complete = [row for row in results.rows if (*agent_of(row), row["seed"]) not in diverged]
         if complete:
-            title = f"{problem['task']} {problem['style']}, NFE {recipe.evaluation.nfe[0]}"
+            told = with_actions(f"{problem['task']} {problem['style']}", problem.get("actions"))
+            title = f"{told}, NFE {recipe.evaluation.nfe[0]}"
             draw(complete, out, title, recipe.rl.warmup_steps)
             write_report(out, make_table(complete))
         if diverged:

@@ -24,12 +24,14 @@ from warmprior.modules import (
     OTPrior,
     PastPrior,
     PolynomialInterpolant,
+    PoseTrend,
     PreconditionedNetwork,
     PreviewPrior,
     Prior,
     PriorSampler,
     ReflowPrior,
     RegressionPrior,
+    RestingAction,
     SourceMoments,
     StepPrior,
     TrigonometricInterpolant,
@@ -50,6 +52,7 @@ from warmprior.rl import (
     make_prior_space_critic,
 )
 from warmprior.transforms import (
+    AbsoluteActions,
     ActionHistory,
     ActionWindow,
     ChunkStep,
@@ -64,6 +67,7 @@ __version__ = version("warmprior")
 
 __all__ = [
     "A2APrior",
+    "AbsoluteActions",
     "ActionHistory",
     "ActionWindow",
     "BoxTanhNormal",
@@ -86,6 +90,7 @@ __all__ = [
     "ObservationStack",
     "PastPrior",
     "PolynomialInterpolant",
+    "PoseTrend",
     "PreconditionedNetwork",
     "PreviewPrior",
     "Prior",
@@ -96,6 +101,7 @@ __all__ = [
     "ReflowPrior",
     "RegressionPrior",
     "ResidualSampler",
+    "RestingAction",
     "SourceMoments",
     "StepPrior",
     "TrigonometricInterpolant",

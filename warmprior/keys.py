@@ -12,6 +12,7 @@ constant                key                                    shape and dtype
 :data:`OBSERVATION`     ``"observation"``                      ``[*B, To, d_o]`` float
 :data:`CONDITIONED`     ``("prior", "observation")``           ``[*B, To, d_o + P * d_a + 1]`` float
 :data:`ACTION`          ``"action"``                           ``[*B, d_a]`` float
+:data:`EEF_POSE`        ``"eef_pose"``                         ``[*B, arms, 3, 4]`` float, raw
 :data:`LOC`             ``("prior", "loc")``                   ``[*B, P, d_a]`` float
 :data:`WARM`            ``("prior", "warm")``                  ``[*B, P, 1]`` bool
 :data:`ANCHOR`          ``("prior", "anchor")``                ``[*B, P, d_a]`` float
@@ -32,6 +33,9 @@ In prior-space reinforcement learning :data:`ANCHOR` is the centre of the agent'
 action, so that the source is always ``noise = anchor + delta``. An environment that decodes by itself tells
 what it made of a step's action under ``("next", "decoded", "noise")`` and ``("next", "decoded", "chunk")``;
 without ``"next"`` they are those of the step before.
+
+:data:`EEF_POSE` holds the grippers' rotations and, in the last column, positions in metres, both in the
+world. Environments tell it where the actions of policies are absolute poses.
 """
 
 from __future__ import annotations
@@ -40,6 +44,7 @@ from torchrl.data.vla import ACTION_CHUNK_KEY, ACTION_IS_PAD_KEY, ACTION_KEY, OB
 
 OBSERVATION = OBSERVATION_KEY
 ACTION = ACTION_KEY
+EEF_POSE = "eef_pose"
 CONDITIONED = ("prior", "observation")
 LOC = ("prior", "loc")
 WARM = ("prior", "warm")

@@ -323,6 +323,7 @@ SHORT = {
         ("--chunk 4", "--run brings its policies and their data: leave out --chunk"),
         ("--sigma 0.2", "--run brings its policies and their data: leave out --sigma"),
         ("--data mh", "leave out --data"),
+        ("--actions absolute", "leave out --actions"),
         ("--iterations 3", "leave out --iterations"),
         ("--hidden-dim 3", "leave out --hidden-dim"),
     ],

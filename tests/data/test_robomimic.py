@@ -138,6 +138,9 @@ def test_absolute_actions(tmp_path, task, frame):
     parts = replay.env_args["env_kwargs"]["controller_configs"]["body_parts"]
     assert parts["right"]["input_type"] == "absolute"
     assert parts["right"]["input_ref_frame"] == "world"
+    assert replay.recorded_env_args == modernize_env_args(meta)
+    replay.recorded_env_args["env_kwargs"].clear()
+    assert replay.recorded_env_args["env_kwargs"]
 
 
 def test_absolute_actions_need_matching_robots(tmp_path):

@@ -17,7 +17,7 @@ from warmprior.envs.env_args import (
     delta_conventions,
     modernize_env_args,
 )
-from warmprior.envs.rotation import (
+from warmprior.rotation import (
     matrix_to_rotation_6d,
     matrix_to_rotvec,
     quaternion_to_matrix,
@@ -169,6 +169,15 @@ def test_absolute_actions_keep_dtype_and_batch_shape():
     out = absolute_actions(torch.zeros(2, 3, 7), torch.zeros(2, 3, 3), torch.ones(2, 3, 4))
     assert out.shape == (2, 3, 10) and out.dtype == torch.float32
     assert absolute_to_env_action(out).shape == (2, 3, 7)
+
+
+def test_absolute_actions_do_not_depend_on_the_sign_of_a_quaternion():
+    actions, quaternion = torch.rand(20, 7), torch.from_numpy(_quaternions(20, 0)).float()
+    position = torch.zeros(20, 3)
+    torch.testing.assert_close(
+        absolute_actions(actions, position, quaternion),
+        absolute_actions(actions, position, -quaternion),
+    )
 
 
 @pytest.mark.parametrize("shapes", [((8,), (3,), (4,)), ((7,), (6,), (4,)), ((14,), (6,), (4,))])

@@ -140,3 +140,13 @@ def test_errors():
         Normalizer(one, two)
     with pytest.raises(ValueError, match=r"low has the keys \['a'\], high has \['b'\]"):
         Normalizer(one, {"b": torch.zeros(2)})
+
+
+def test_units_of_their_own():
+    action = torch.tensor([[1.0, -2.0, 5.0], [1.2, 2.0, 5.0]])
+    data = TensorDict({"action": action}, [2])
+    normalizer = Normalizer.fit(data, ("action",), units={"action": torch.tensor([0.5, 0.0, 0.5])})
+    expected = torch.tensor([[-0.2, -1.0, 0.0], [0.2, 1.0, 0.0]])
+    torch.testing.assert_close(normalizer.normalize(data)["action"], expected)
+    torch.testing.assert_close(normalizer.scale("action"), torch.tensor([0.5, 2.0, 0.5]))
+    torch.testing.assert_close(normalizer.loc("action"), torch.tensor([1.1, 0.0, 5.0]))

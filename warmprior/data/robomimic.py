@@ -295,6 +295,14 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
         return modernize_env_args(self._env_args)
 
     @property
+    def recorded_env_args(self) -> dict[str, Any]:
+        """The environment of the data, for robosuite 1.5, fit for the actions as they were recorded.
+
+        That is what :attr:`env_args` is where the actions are not absolute.
+        """
+        return modernize_env_args(self._index.env_args)
+
+    @property
     def task(self) -> TaskSpec | None:
         """The task of :data:`warmprior.envs.TASKS` recorded here, or ``None`` if it is another."""
         return self._index.task
@@ -303,6 +311,24 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
     def observation_keys(self) -> tuple[str, ...]:
         """The keys whose values stand side by side in ``"observation"``."""
         return self._index.observation_keys
+
+    @property
+    def pose_columns(self) -> Tensor:
+        """Where in ``"observation"`` each gripper's position and quaternion are, int64 ``[arms, 7]``.
+
+        Raises:
+            KeyError: if they were not read.
+        """
+        first = dict(
+            zip(self.observation_keys, np.cumsum([0, *self._index.observation_dims]), strict=False)
+        )
+        columns: list[list[int]] = []
+        while not columns or f"robot{len(columns)}_eef_pos" in first:
+            position, quaternion = (
+                first[f"robot{len(columns)}_eef_{end}"] for end in ("pos", "quat")
+            )
+            columns.append([*range(position, position + 3), *range(quaternion, quaternion + 4)])
+        return torch.tensor(columns)
 
     @property
     def num_episodes(self) -> int:

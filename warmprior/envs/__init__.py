@@ -21,8 +21,8 @@ from warmprior.envs.navigation1d import (
 from warmprior.envs.navigation_goal import GoalNavigationEnv
 from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.robosuite import RobosuiteEnv, RobosuiteWrapper
-from warmprior.envs.rotation import rotation_6d_to_rotvec
 from warmprior.envs.tasks import TASKS, TaskSpec, get_task
+from warmprior.rotation import rotation_6d_to_rotvec
 
 __all__ = [
     "TASKS",

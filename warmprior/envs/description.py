@@ -5,20 +5,31 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Literal
 
 from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose
 
+from warmprior.envs.env_args import delta_conventions
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.policy import policy_transforms
 
-__all__ = ["environment_description", "environment_name", "environment_of", "environment_parts"]
+__all__ = [
+    "environment_description",
+    "environment_name",
+    "environment_of",
+    "environment_parts",
+    "robosuite_parts",
+]
 
 
 def environment_description(
-    env_args: Mapping[str, Any], style: str, observation_steps: int
+    env_args: Mapping[str, Any],
+    style: str,
+    observation_steps: int,
+    actions: Literal["delta", "absolute"] = "delta",
 ) -> dict[str, Any]:
     """What :func:`environment_of` needs, for :class:`~warmprior.WarmPriorActor` to keep.
 
@@ -26,11 +37,36 @@ def environment_description(
         env_args: see :class:`RobosuiteEnv`.
         style: likewise.
         observation_steps: ``To``.
+        actions: those of the policy: the environment's own pose deltas, or absolute poses (see
+            :class:`~warmprior.transforms.AbsoluteActions`).
     """
-    return {
+    description: dict[str, Any] = {
         "robosuite": {"env_args": dict(env_args), "style": style},
         "observation_steps": observation_steps,
     }
+    return description if actions == "delta" else description | {"actions": actions}
+
+
+def robosuite_parts(
+    description: Mapping[str, Any],
+) -> tuple[Callable[..., RobosuiteEnv], AbsoluteActions | None]:
+    """What builds the environment, and what turns a policy's actions into its own.
+
+    Args:
+        description: see :func:`environment_description`.
+
+    Returns:
+        A function of further options of :class:`RobosuiteEnv`, and a transform that goes next to the
+        environment; ``None`` where the actions are its own.
+
+    Raises:
+        ValueError: if the environment takes no pose deltas, from which absolute actions are made.
+    """
+    make_env = partial(RobosuiteEnv, **description["robosuite"])
+    if description.get("actions", "delta") == "delta":
+        return make_env, None
+    conventions = delta_conventions(description["robosuite"]["env_args"])
+    return partial(make_env, eef_pose=True), AbsoluteActions(*conventions)
 
 
 def environment_parts(
@@ -53,15 +89,17 @@ def environment_parts(
             f"the policy keeps no description of a robosuite environment, but {description}: build the "
             "environment yourself, with policy_transforms(actor.prior, normalizer=actor.normalizer)"
         )
+    make_env, actions = robosuite_parts(description)
     normalizer = copy.deepcopy(actor.normalizer)
     transforms = partial(
         policy_transforms,
         actor.prior,
         # The environments' stays on the CPU, wherever the policy goes.
         normalizer=None if normalizer is None else normalizer.to("cpu"),
+        actions=actions,
         observation_steps=description["observation_steps"],
     )
-    return partial(RobosuiteEnv, **description["robosuite"]), transforms
+    return make_env, transforms
 
 
 def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
@@ -95,7 +133,8 @@ def _describes_robosuite(description: Any) -> bool:
     """Whether it is what :func:`environment_description` gives."""
     return (
         isinstance(description, Mapping)
-        and set(description) == {"robosuite", "observation_steps"}
+        and set(description) - {"actions"} == {"robosuite", "observation_steps"}
+        and description.get("actions", "delta") in ("delta", "absolute")
         and isinstance(description["robosuite"], Mapping)
         and set(description["robosuite"]) == {"env_args", "style"}
         and isinstance(description["robosuite"]["env_args"], Mapping)

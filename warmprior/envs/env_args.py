@@ -16,7 +16,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from warmprior.envs.rotation import (
+from warmprior.rotation import (
+    HAND_TO_SITE,
     matrix_to_rotation_6d,
     quaternion_to_matrix,
     rotation_6d_to_rotvec,
@@ -33,9 +34,6 @@ __all__ = [
 _ARMS = ("right", "left")
 _RENAMED = {"damping": "damping_ratio", "damping_limits": "damping_ratio_limits"}
 _OUTPUT_MAX = (0.05, 0.05, 0.05, 0.5, 0.5, 0.5)
-# The gripper site, which the controller moves, is the hand body (robot0_eef_quat) turned by -90
-# degrees about its own z axis.
-_HAND_TO_SITE = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
 
 
 def _modernize_part(part: dict[str, Any], *, old: bool, absolute: bool) -> None:
@@ -224,7 +222,7 @@ def absolute_actions(
     arms = delta.shape[-2]
     position = _per_arm("eef_pos", eef_pos, 3, arms)
     hand = quaternion_to_matrix(_per_arm("eef_quat", eef_quat, 4, arms))
-    rotation = hand @ quaternion_to_matrix(hand.new_tensor(_HAND_TO_SITE))
+    rotation = hand @ quaternion_to_matrix(hand.new_tensor(HAND_TO_SITE))
     scale = torch.as_tensor(output_max, dtype=torch.float64, device=delta.device)
     step = (delta[..., :6].clamp(-1, 1) * scale).unflatten(-1, (2, 3))
     if base_rotation is not None:

@@ -37,6 +37,7 @@ class RobosuiteWrapper(_EnvWrapper):
     ==================  =============================================================
     ``"observation"``   ``[d_o]`` float32: ``low_dim_keys``, concatenated
     ``"pixels"``        ``[h, w, 3]`` uint8, the right way up; only ``from_pixels``
+    ``"eef_pose"``      ``[arms, 3, 4]`` float32; only ``eef_pose``
     ``"success"``       ``[1]`` bool
     ``"action"``        ``[d_a]`` float32 in ``[-1, 1]``, the simulator's own units
     ``"reward"``        ``[1]`` float32: 1 where the task is solved, 0 elsewhere
@@ -60,6 +61,8 @@ class RobosuiteWrapper(_EnvWrapper):
         from_pixels: render ``camera`` at every step.
         camera: the camera rendered.
         camera_size: side of the image in pixels, or its height and width.
+        eef_pose: tell the grippers' poses in the world: rotation and, in the last column, position in
+            metres (see :class:`~warmprior.transforms.AbsoluteActions`).
         seed: of the first episodes.
         seed_offset: added to every seed.
         seed_stride: between the seeds of consecutive episodes.
@@ -92,6 +95,7 @@ class RobosuiteWrapper(_EnvWrapper):
         from_pixels: bool = False,
         camera: str = "agentview",
         camera_size: int | tuple[int, int] = 84,
+        eef_pose: bool = False,
         seed: int = 0,
         seed_offset: int = 0,
         seed_stride: int = 1,
@@ -114,6 +118,7 @@ class RobosuiteWrapper(_EnvWrapper):
         self.horizon = horizon
         self.control_loop = control_loop
         self.from_pixels, self.camera, self.camera_size = from_pixels, camera, size
+        self.eef_pose = eef_pose
         self.terminate_on_success = terminate_on_success
         self._seed, self._offset, self._stride = seed, seed_offset, seed_stride
         self._episode, self._elapsed = 0, 0
@@ -200,6 +205,9 @@ class RobosuiteWrapper(_EnvWrapper):
             self.observation_spec["pixels"] = Bounded(
                 0, 255, shape=(*self.camera_size, 3), dtype=torch.uint8, device=self.device
             )
+        if self.eef_pose:
+            shape = (len(env.robots), 3, 4)
+            self.observation_spec[keys.EEF_POSE] = Unbounded(shape, device=self.device)
         limit = torch.tensor(action_limits(env))
         self.action_spec = Bounded(-limit, limit, device=self.device)
         self.reward_spec = Bounded(0.0, 1.0, shape=(1,), device=self.device)
@@ -232,6 +240,10 @@ class RobosuiteWrapper(_EnvWrapper):
         }
         if self.from_pixels:
             out["pixels"] = torch.from_numpy(self.render_frame())
+        if self.eef_pose:
+            arms = range(len(self._env.robots))
+            poses = [np.column_stack(self._loop.eef(arm)[::-1]) for arm in arms]
+            out[keys.EEF_POSE] = torch.from_numpy(np.stack(poses).astype(np.float32))
         result = TensorDict(out, [])
         return result if self.device is None else result.to(self.device)
 
@@ -266,6 +278,7 @@ class RobosuiteEnv(RobosuiteWrapper):
         from_pixels: as for the wrapper.
         camera: ``None`` for the task's first.
         camera_size: as for the wrapper.
+        eef_pose: as for the wrapper.
         seed: ``None`` for 0.
         seed_offset: as for the wrapper.
         seed_stride: as for the wrapper.
@@ -297,6 +310,7 @@ class RobosuiteEnv(RobosuiteWrapper):
         from_pixels: bool = False,
         camera: str | None = None,
         camera_size: int | tuple[int, int] = 84,
+        eef_pose: bool = False,
         seed: int | None = None,
         seed_offset: int = 0,
         seed_stride: int = 1,
@@ -328,6 +342,7 @@ class RobosuiteEnv(RobosuiteWrapper):
             from_pixels=from_pixels,
             camera=camera or "agentview",
             camera_size=camera_size,
+            eef_pose=eef_pose,
             seed=seed or 0,
             seed_offset=seed_offset,
             seed_stride=seed_stride,

@@ -7,7 +7,21 @@ from collections.abc import Callable, Iterable
 from warmprior.experiments.results import Row
 from warmprior.modules.prior import Prior
 
-__all__ = ["prior_color", "prior_label", "source_labels"]
+__all__ = ["prior_color", "prior_label", "source_labels", "with_actions"]
+
+
+def with_actions(told: str, actions: str | None) -> str:
+    """Add the space of the actions to what is told of a problem, where it is not the recorded one.
+
+    Args:
+        told: of the problem.
+        actions: as facts of a problem and its rows have them.
+
+    Examples:
+        >>> with_actions("square ph", None), with_actions("square ph", "absolute")
+        ('square ph', 'square ph, absolute actions')
+    """
+    return told if actions is None else f"{told}, {actions} actions"
 
 
 def prior_label(name: str) -> str:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Transform
 
 from warmprior.data import (
     RobomimicExperienceReplay,
@@ -19,12 +19,14 @@ from warmprior.data import (
     generate_demonstrations,
 )
 from warmprior.diagnostics.shared_observations import SharedObservations
-from warmprior.envs import RobosuiteEnv
-from warmprior.envs.description import environment_description
+from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
+from warmprior.experiments.labels import with_actions
 from warmprior.experiments.recipe import DataOptions, HeldOutOptions
 from warmprior.io.files import file_digest
+from warmprior.keys import ACTION
 from warmprior.modules.normalize import Normalizer
+from warmprior.modules.trend import RestingAction
 
 __all__ = [
     "Problem",
@@ -51,6 +53,10 @@ class Problem:
         identity: of the data, which is part of the identity of every policy trained on them.
         facts: what results tell about the data, as JSON.
         normalizer: between raw and normalised units; ``None`` if they are the same.
+        actions: between the policies' actions, in raw units, and the environment's; ``None`` if they are the
+            same. See :func:`~warmprior.policy_transforms`.
+        rest: for absolute actions, to let networks learn only what does not follow from where the grippers
+            are, see :class:`~warmprior.PoseTrend`.
         clip: bound of the normalised actions that are executed; ``None`` for none.
         environment: what a saved policy keeps of the environment, see
             :func:`~warmprior.envs.environment_of`.
@@ -66,6 +72,8 @@ class Problem:
     identity: str
     facts: dict[str, Any] = field(default_factory=dict)
     normalizer: Normalizer | None = None
+    actions: Transform | None = None
+    rest: RestingAction | None = None
     clip: float | None = None
     environment: Mapping[str, Any] | None = None
 
@@ -78,11 +86,22 @@ class Problem:
     def name(self) -> str:
         """Task and style, for titles."""
         source = self.facts.get("source")
-        return f"{self.task} {self.style}" + (f" ({source} data)" if source else "")
+        told = f"{self.task} {self.style}" + (f" ({source} data)" if source else "")
+        return with_actions(told, self.facts.get("actions"))
+
+    @property
+    def space(self) -> dict[str, str]:
+        """The space of the actions, as rows and results tell it: nothing of the recorded one."""
+        return {name: self.facts[name] for name in ("actions",) if name in self.facts}
 
 
 def robosuite_problem(
-    path: Path, style: str = "ph", *, source: str = "file", observation_steps: int = 2
+    path: Path,
+    style: str = "ph",
+    *,
+    source: str = "file",
+    observation_steps: int = 2,
+    actions: Literal["delta", "absolute"] = "delta",
 ) -> Problem:
     """The problem of a robomimic HDF5 file, in its own simulator.
 
@@ -93,30 +112,44 @@ def robosuite_problem(
     Keyword Args:
         source: where the file comes from: ``"scripted"``, ``"official"`` or ``"file"``.
         observation_steps: ``To`` of the policies.
+        actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
 
     Raises:
         DatasetError: if the file cannot be read.
+        ValueError: if it has no pose deltas to make absolute poses of.
     """
-    dataset = RobomimicExperienceReplay(path)
-    normalizer, digest = Normalizer.fit(dataset.data), file_digest(path)
+    dataset = RobomimicExperienceReplay(path, absolute_actions=actions == "absolute")
+    description = environment_description(
+        dataset.recorded_env_args, style, observation_steps, actions
+    )
+    make_env, transform = robosuite_parts(description)
+    # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and
+    # positions, which range far, do not weigh little beside the gripper in the loss.
+    units = None if transform is None else {ACTION: transform.one_step}
+    normalizer, digest = Normalizer.fit(dataset.data, units=units), file_digest(path)
+    data = normalizer.normalize(dataset.data.exclude("next"))
+    # Of the recorded actions nothing is said: policies and rows from before there was a choice have these.
+    space = {} if actions == "delta" else {"actions": actions}
     return Problem(
         task=task_of(dataset),
         style=style,
-        data=normalizer.normalize(dataset.data.exclude("next")),
-        make_env=partial(RobosuiteEnv, env_args=dataset.env_args, style=style),
-        identity=digest,
+        data=data,
+        make_env=make_env,
+        identity=" ".join([digest, *space.values()]),
         facts={
             "source": source,
             "file": path.name,
             "sha256": digest,
             "demonstrations": dataset.num_episodes,
             "steps": len(dataset.data),
+            **space,
         },
         normalizer=normalizer,
-        # The normalised demonstrations span [-1, 1]: what leaves it is executed, and remembered, at the
-        # bound.
-        clip=1.0,
-        environment=environment_description(dataset.env_args, style, observation_steps),
+        actions=transform,
+        rest=None if transform is None else RestingAction(dataset.pose_columns, normalizer),
+        # What leaves the span of the normalised demonstrations is executed, and remembered, at the bound.
+        clip=1.0 if transform is None else float(data[ACTION].abs().max()),
+        environment=description,
     )
 
 
@@ -146,7 +179,10 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
     options.check()
     if options.dataset is not None:
         found = robosuite_problem(
-            options.dataset, options.data[0], observation_steps=observation_steps
+            options.dataset,
+            options.data[0],
+            observation_steps=observation_steps,
+            actions=options.actions,
         )
         if options.task not in ((), (found.task,)):
             raise ValueError(
@@ -171,7 +207,13 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
                 path = generate_demonstrations(task, style, options.count(style))
                 source = "scripted"
             problems.append(
-                robosuite_problem(path, style, source=source, observation_steps=observation_steps)
+                robosuite_problem(
+                    path,
+                    style,
+                    source=source,
+                    observation_steps=observation_steps,
+                    actions=options.actions,
+                )
             )
     return problems
 
@@ -217,7 +259,7 @@ def observe(
         n = max(20, int(-(-options.observations // usable)))
         path = generate_demonstrations(task, style, n, HELD_OUT_SEED)
         told = f"{n} newly generated demonstrations"
-    dataset = RobomimicExperienceReplay(path)
+    dataset = RobomimicExperienceReplay(path, absolute_actions=facts.get("actions") == "absolute")
     if task_of(dataset) != task:
         raise ValueError(
             f"--validation {path} holds demonstrations of {task_of(dataset)}, but these policies are for "

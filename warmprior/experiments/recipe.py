@@ -65,6 +65,7 @@ class DataOptions:
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
         demonstrations: scripted demonstrations to generate; two numbers for ph and mh.
+        actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
     """
 
     task: tuple[str, ...] = ()
@@ -73,6 +74,7 @@ class DataOptions:
     download: bool = False
     force_download: bool = False
     demonstrations: tuple[int, ...] = (150,)
+    actions: Literal["delta", "absolute"] = field(default="delta", metadata=LATER)
 
     def __post_init__(self) -> None:
         check_counts(self, "demonstrations")
@@ -344,7 +346,8 @@ class Recipe:
         """Of the problems, in names of folders."""
         file = self.data.dataset
         tasks = self.data.task or ("square" if file is None else file.stem,)
-        return "-".join([*tasks, *self.data.data])
+        space = [] if self.data.actions == "delta" else [self.data.actions]
+        return "-".join([*tasks, *self.data.data, *space])
 
     @property
     def seeds(self) -> range:

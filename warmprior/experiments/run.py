@@ -78,6 +78,7 @@ class Contestant:
         return {
             "task": self.store.problem.task,
             "data": self.store.problem.style,
+            **self.store.problem.space,
             "prior": self.prior.name,
             "options": self.prior.options,
             "sigma": float(self.prior.sigma),

@@ -106,7 +106,13 @@ class Store:
         network = self.network.make(*self._widths(prior), prior.prediction_length)
         if self.network.precondition:
             steps = self.network.observation_steps
-            network = precondition(network, problem.data, prior, observation_steps=steps)
+            network = precondition(
+                network,
+                problem.data,
+                prior,
+                observation_steps=steps,
+                rest=copy.deepcopy(problem.rest),
+            )
         actor = WarmPriorActor(
             network,
             prior,
@@ -276,6 +282,7 @@ class Store:
             policy_transforms,
             prior,
             normalizer=self.problem.normalizer,
+            actions=self.problem.actions,
             observation_steps=self.network.observation_steps,
         )
 

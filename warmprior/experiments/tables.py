@@ -12,7 +12,7 @@ from warmprior.diagnostics.statistics import (
     probability_better,
     summarize_seeds,
 )
-from warmprior.experiments.labels import source_labels
+from warmprior.experiments.labels import source_labels, with_actions
 from warmprior.experiments.paper import PAPER_CURVATURE, paper_success
 from warmprior.experiments.results import Row, grouped, mean_known, select, success_summary
 from warmprior.experiments.straightness import RATIOS, pooled
@@ -281,8 +281,9 @@ def flow_table(rows: Sequence[Row]) -> str:
 
 
 def problem_title(row: Row) -> str:
-    """Task and style of a row, as tables show them."""
-    return f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}"
+    """Task, style and, where it is not the recorded one, space of the actions, as tables show them."""
+    title = f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}"
+    return with_actions(title, row.get("actions"))
 
 
 def _jump(rows: list[Row]) -> str | None:
@@ -340,7 +341,9 @@ def _success_notes(rows: Sequence[Row], top_k: int, source: str | None, base: st
     return notes
 
 
-def curvature_table(rows: Sequence[Row], *, task: str, data: str, source: str) -> str:
+def curvature_table(
+    rows: Sequence[Row], *, task: str, data: str, source: str, actions: str | None = None
+) -> str:
     """The layout of the paper's Table 2, with the paper's own numbers in a line of their own.
 
     The paper's are for ``H = 8`` and relative to the Gaussian source; otherwise they are left out.
@@ -352,10 +355,11 @@ def curvature_table(rows: Sequence[Row], *, task: str, data: str, source: str) -
         task: short task name.
         data: ``"ph"`` or ``"mh"``.
         source: what the observations are, in words.
+        actions: of the policies, where they are not the recorded ones.
     """
     chosen = pooled(rows)
     first = chosen[0]
-    title = problem_title(Row({"task": task, "data": data}, {}))
+    title = problem_title(Row({"task": task, "data": data, "actions": actions}, {}))
 
     def ratio(name: str, mean: str) -> Cell:
         def cell(rows: list[Row]) -> str | None:

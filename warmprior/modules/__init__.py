@@ -26,6 +26,7 @@ from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMomen
 from warmprior.modules.prior import Prior
 from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.modules.sampler import PriorSampler
+from warmprior.modules.trend import PoseTrend, RestingAction
 
 __all__ = [
     "A2APrior",
@@ -43,12 +44,14 @@ __all__ = [
     "OTPrior",
     "PastPrior",
     "PolynomialInterpolant",
+    "PoseTrend",
     "PreconditionedNetwork",
     "PreviewPrior",
     "Prior",
     "PriorSampler",
     "ReflowPrior",
     "RegressionPrior",
+    "RestingAction",
     "SourceMoments",
     "StepPrior",
     "TimestepEmbedding",

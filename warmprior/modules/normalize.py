@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -65,13 +65,21 @@ class Normalizer(nn.Module):
 
     @classmethod
     def fit(
-        cls, data: TensorDictBase, keys: tuple[NestedKey, ...] = (keys.OBSERVATION, keys.ACTION)
+        cls,
+        data: TensorDictBase,
+        keys: tuple[NestedKey, ...] = (keys.OBSERVATION, keys.ACTION),
+        *,
+        units: Mapping[NestedKey, Tensor] | None = None,
     ) -> Normalizer:
         """Take the minimum and maximum over all steps of a dataset.
 
         Args:
             data: flat steps ``[N]`` with raw ``[N, d]`` entries.
             keys: the entries to normalise.
+
+        Keyword Args:
+            units: per key what 1 stands for, ``[d]``, raw units, around the middle of what the data span; 0
+                where half of that is 1. With units of their own, dimensions may leave ``[-1, 1]``.
 
         Raises:
             KeyError: if a key is missing.
@@ -82,10 +90,13 @@ class Normalizer(nn.Module):
         missing = [key for key in keys if data.get(key, None) is None]
         if missing:
             raise KeyError(f"cannot fit a normaliser: the data lack {missing}")
-        return cls(
-            {key: data[key].amin(0).clone() for key in keys},
-            {key: data[key].amax(0).clone() for key in keys},
-        )
+        low = {key: data[key].amin(0).clone() for key in keys}
+        high = {key: data[key].amax(0).clone() for key in keys}
+        for key, unit in (units or {}).items():
+            middle, half = (high[key] + low[key]) / 2, (high[key] - low[key]) / 2
+            half = torch.where(unit > 0, unit.to(half), half)
+            low[key], high[key] = middle - half, middle + half
+        return cls(low, high)
 
     def loc(self, key: NestedKey) -> Tensor:
         """Middle of the range of ``key``, ``[d]``, raw units."""

@@ -13,6 +13,7 @@ from warmprior import keys
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
+from warmprior.modules.trend import PoseTrend
 
 __all__ = ["PreconditionedNetwork", "SourceMoments"]
 
@@ -106,6 +107,7 @@ class SourceMoments(nn.Module):
         prior: Prior,
         *,
         samples: int = 16_384,
+        trend: PoseTrend | None = None,
         generator: torch.Generator | None = None,
     ) -> SourceMoments:
         """Estimate them from training windows and draws of the prior.
@@ -117,6 +119,7 @@ class SourceMoments(nn.Module):
         Keyword Args:
             samples: windows to draw from a buffer, in its batches; windows given as a tensordict are
                 used once each.
+            trend: of the pose; the moments are those of what it leaves.
             generator: source of randomness of the source samples, on the windows' device; the buffer
                 draws from its own.
 
@@ -154,6 +157,9 @@ class SourceMoments(nn.Module):
         )
         pairs = [prior.couple(source, target, generator, seen) for source, target, seen in parts]
         a0, a1 = (torch.cat(part).double() for part in zip(*pairs, strict=True))
+        if trend is not None:
+            source, target = trend(batch[keys.OBSERVATION].float())
+            a0, a1 = a0 - source, a1 - target
         weight = (~batch[keys.IS_PAD]).unsqueeze(-1).double()
         count = weight.sum(0)
 
@@ -196,11 +202,13 @@ class PreconditionedNetwork(VelocityNetwork):
     Keyword Args:
         moments: of the prior's source and the targets; where they are missing, those of independent
             standard normal ends, to be replaced by loading a state dict.
+        trend: what follows from where the grippers are, :math:`E[a_0 | o]` and :math:`E[a_1 | o]` in place
+            of the means above; the moments are then of what it leaves. None by default. Or its ``config()``.
         interpolant: the path, that of the loss; linear by default. Or its ``config()``.
 
     Raises:
-        ValueError: if the moments do not have the network's chunk shape, or the path has no finite velocity
-            at its ends.
+        ValueError: if the moments or the trend do not have the network's shapes, or the path has no finite
+            velocity at its ends.
 
     Examples:
         >>> import torch
@@ -217,6 +225,7 @@ class PreconditionedNetwork(VelocityNetwork):
         network: VelocityNetwork | dict[str, Any],
         *,
         moments: SourceMoments | None = None,
+        trend: PoseTrend | dict[str, Any] | None = None,
         interpolant: Interpolant | dict[str, Any] | None = None,
     ) -> None:
         if isinstance(network, dict):
@@ -244,14 +253,21 @@ class PreconditionedNetwork(VelocityNetwork):
                 f"the moments are of chunks (P, d_a) = {tuple(self.moments.covariance.shape)}, but the "
                 f"network was built for {shape}"
             )
+        self.trend = PoseTrend.zero(**trend) if isinstance(trend, dict) else trend
+        if self.trend is not None and tuple(self.trend.target.shape) != shape:
+            raise ValueError(
+                f"the trend is of chunks (P, d_a) = {tuple(self.trend.target.shape)}, but the network "
+                f"was built for {shape}"
+            )
 
     def config(self) -> dict[str, Any]:
         """JSON-serialisable class name and constructor arguments; the moments are buffers."""
-        return {
+        config = {
             "name": type(self).__name__,
             "network": self.network.config(),
             "interpolant": self.interpolant.config(),
         }
+        return config if self.trend is None else config | {"trend": self.trend.config()}
 
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
         """The groups of the network inside."""
@@ -264,6 +280,9 @@ class PreconditionedNetwork(VelocityNetwork):
         moments = self.moments
         m0, m1, c = moments.source_mean, moments.target_mean, moments.covariance
         v0, v1, q = moments.source_variance, moments.target_variance, moments.conditional_deviation
+        if self.trend is not None:
+            source, target = self.trend(observation)
+            m0, m1 = m0 + source, m1 + target
         s0 = v0.sqrt()
         # Along the source, and across: a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
         along, across = _combination(s0, alpha, c / s0, beta), beta * q

@@ -24,6 +24,7 @@ from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
+from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
     check_identity,
@@ -45,6 +46,9 @@ from warmprior.transforms.window import window_replay_buffer
 
 __all__ = ["BehaviourCloning", "precondition"]
 
+TREND_BATCHES = 16
+"""Of 1,024 windows, to which a :class:`PoseTrend` is fitted."""
+
 STATE_FORMAT = 4
 """Part of every state's identity; raised whenever the same options give other weights."""
 
@@ -55,6 +59,7 @@ def precondition(
     prior: Prior,
     *,
     observation_steps: int = 2,
+    rest: RestingAction | None = None,
     interpolant: Interpolant | None = None,
 ) -> PreconditionedNetwork:
     """Wrap a network in what is known of a prior's source and the demonstrations before any training.
@@ -66,6 +71,7 @@ def precondition(
 
     Keyword Args:
         observation_steps: ``To``.
+        rest: for absolute actions, to take off what follows from where the grippers are.
         interpolant: the path, that of the loss; linear by default.
 
     Returns:
@@ -75,8 +81,12 @@ def precondition(
     windows = window_replay_buffer(
         data, prior, batch_size=1024, observation_steps=observation_steps, generator=generator
     )
-    moments = SourceMoments.fit(windows, prior, generator=generator)
-    return PreconditionedNetwork(network, moments=moments, interpolant=interpolant)
+    trend = None
+    if rest is not None:
+        batch = torch.cat([windows.sample() for _ in range(TREND_BATCHES)])
+        trend = PoseTrend.fit(batch, prior, rest, generator=generator)
+    moments = SourceMoments.fit(windows, prior, trend=trend, generator=generator)
+    return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=interpolant)
 
 
 class BehaviourCloning:

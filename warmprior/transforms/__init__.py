@@ -1,5 +1,6 @@
 """Transforms of replay buffers and environments."""
 
+from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.mean_observation import MeanObservation
@@ -8,6 +9,7 @@ from warmprior.transforms.stack import ObservationStack
 from warmprior.transforms.window import ActionWindow, window_replay_buffer, window_transforms
 
 __all__ = [
+    "AbsoluteActions",
     "ActionHistory",
     "ActionWindow",
     "ChunkStep",

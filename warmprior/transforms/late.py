@@ -10,12 +10,14 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform, TransformedEnv
 
+from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.inner_step import InnerStep
 from warmprior.transforms.stack import ObservationStack
 
 __all__ = ["LateTransforms", "advance"]
 
 _REACH: dict[type[Transform], Callable[[Any], int]] = {
+    AbsoluteActions: lambda transform: 1,
     ActionScaling: lambda transform: 1,
     ObservationNorm: lambda transform: 1,
     ObservationStack: lambda transform: transform.steps,
@@ -41,6 +43,11 @@ class LateTransforms:
         self._transforms = step.transforms
         self._action_key = action_key
         self._reach = 1 + sum(_REACH[type(t)](t) - 1 for t in self._transforms)
+        # Actions are inverted from the last transform to the first: those after the last one that looks at
+        # the state can take all of them at once.
+        looking = (i for i, t in enumerate(self._transforms) if isinstance(t, AbsoluteActions))
+        first = 1 + max(looking, default=-1)
+        self._one_by_one, self._at_once = self._transforms[:first], self._transforms[first:]
 
     @classmethod
     def of(
@@ -61,7 +68,8 @@ class LateTransforms:
         if isinstance(base, TransformedEnv) or any(type(t) not in _REACH for t in transforms):
             return None
         written = _roots(key for t in transforms for key in t.out_keys)
-        needed = _roots([action_key, *read, *base.state_spec.keys(True, True)])
+        looked_at = [t.pose_key for t in transforms if isinstance(t, AbsoluteActions)]
+        needed = _roots([action_key, *read, *looked_at, *base.state_spec.keys(True, True)])
         inverse = [(list(t.in_keys_inv), list(t.out_keys_inv)) for t in transforms]
         if written & needed or any(
             keys not in ([], [action_key]) for pair in inverse for keys in pair
@@ -92,6 +100,8 @@ class LateTransforms:
             # Without the constructor's checks: the entries come out of tensordicts of this batch size.
             entries = current | {self._action_key: action}
             inputs = TensorDict._new_unsafe(entries, batch_size=batch, device=device)
+            for transform in reversed(self._one_by_one):
+                inputs = transform._inv_call(inputs)
             results.append(self._step.bare(inputs))
         if len(results) > 1:
             results[-1] = self._transformed(first, results[1:])
@@ -100,7 +110,7 @@ class LateTransforms:
     def _inverse(self, actions: Tensor) -> tuple[Tensor, ...]:
         # Elementwise: all of them at once, time first, so that what a transform has per row broadcasts.
         actions = actions.movedim(-2, 0)
-        for transform in reversed(self._transforms):
+        for transform in reversed(self._at_once):
             if transform.in_keys_inv:
                 actions = transform._inv_apply_transform(actions)
         return actions.unbind(0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tensordict.utils import NestedKey
-from torchrl.envs.transforms import Compose
+from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
 from warmprior.modules.normalize import Normalizer
@@ -20,6 +20,7 @@ def policy_transforms(
     prior: Prior,
     *,
     normalizer: Normalizer | None = None,
+    actions: Transform | None = None,
     observation_steps: int = 2,
     execute: int | None = None,
     gamma: float = 1.0,
@@ -31,16 +32,18 @@ def policy_transforms(
 ) -> Compose:
     """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
 
-    In this order: normalisation of observations and denormalisation of actions, a stack of the last
-    ``To`` observations (the first one repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`,
-    and :class:`MeanObservation` where the prior conditions the network. It works around a single
-    environment, and inside or outside of batched ones.
+    In this order: what makes actions the environment's own, normalisation of observations and
+    denormalisation of actions, a stack of the last ``To`` observations (the first one repeated at the
+    start), :class:`ChunkStep`, :class:`ActionHistory`, and :class:`MeanObservation` where the prior
+    conditions the network. It works around a single environment, and inside or outside of batched ones.
 
     Args:
         prior: the policy's source distribution.
 
     Keyword Args:
         normalizer: the normaliser of the training data; none if the environment is normalised already.
+        actions: between the policy's actions, in raw units, and the environment's, such as
+            :class:`AbsoluteActions`; a copy of it is used. None if they are the same.
         observation_steps: ``To``.
         execute: actions executed per decision; all ``H`` by default.
         gamma: discount per control step inside a chunk.
@@ -57,7 +60,8 @@ def policy_transforms(
         >>> env.reset()["observation"].shape
         torch.Size([2, 3])
     """
-    per_step = [] if normalizer is None else normalizer.env_transforms()
+    per_step = [] if actions is None else [actions.clone()]
+    per_step += [] if normalizer is None else normalizer.env_transforms()
     return Compose(
         *per_step,
         ObservationStack(observation_steps, observation_key=observation_key),

@@ -1,0 +1,107 @@
+"""Environments of saved policies, in both spaces of actions."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+pytest.importorskip("robosuite")
+
+from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from warmprior.data import RobomimicExperienceReplay, generate_demonstrations
+from warmprior.envs import RobosuiteEnv, environment_description, environment_of
+from warmprior.envs.description import environment_name, environment_parts, robosuite_parts
+from warmprior.envs.simulator import task_env_args
+
+Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+
+
+def actor(tmp_path, actions="absolute"):
+    environment = environment_description(task_env_args("lift"), "ph", 2, actions)
+    network = VelocityMLP(10 if actions == "absolute" else 7, 19, 4, hidden_dim=16)
+    WarmPriorActor(network, PastPrior(4), nfe=1, environment=environment).save_pretrained(tmp_path)
+    return WarmPriorActor.from_pretrained(tmp_path)
+
+
+def test_recorded_actions_need_no_words():
+    description = environment_description(task_env_args("lift"), "ph", 2)
+    assert set(description) == {"robosuite", "observation_steps"}
+
+
+@pytest.mark.parametrize("actions", ["delta", "absolute"])
+def test_a_saved_policy_knows_the_space_of_its_actions(tmp_path, actions):
+    policy = actor(tmp_path, actions)
+    env = environment_of(policy, horizon=6)
+    assert environment_name(policy) == "Lift"
+    check_env_specs(env)
+    rollout = env.rollout(3, policy)
+    assert rollout["next", "executed_steps"].flatten().tolist() == [4, 2]
+    assert rollout["vla_action", "chunk"].shape[-1] == (10 if actions == "absolute" else 7)
+    assert ("eef_pose" in rollout.keys()) == (actions == "absolute")  # noqa: SIM118
+
+
+@pytest.mark.parametrize("batched", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
+def test_batched(tmp_path, batched):
+    make_env, make_transforms = environment_parts(actor(tmp_path))
+    env = TransformedEnv(batched(2, partial(make_env, horizon=6)), make_transforms())
+    try:
+        check_env_specs(env)
+    finally:
+        env.close(raise_if_closed=False)
+
+
+@pytest.mark.parametrize("task", ["lift", "transport"])
+def test_the_pose_is_that_of_the_controller(task):
+    env = RobosuiteEnv(task, eef_pose=True)
+    pose = env.rollout(2)["next", "eef_pose"][-1]
+    raw = env._env._get_observations(force_update=True)
+    for arm, robot in enumerate(env._env.robots):
+        controller = robot.part_controllers["right"]
+        controller.update(force=True)
+        np.testing.assert_allclose(pose[arm, :, :3], controller.ref_ori_mat, atol=1e-6)
+        np.testing.assert_allclose(pose[arm, :, 3], raw[f"robot{arm}_eef_pos"], atol=1e-6)
+        hand = Rotation.from_quat(raw[f"robot{arm}_eef_quat"])
+        site = hand * Rotation.from_euler("z", -90, degrees=True)
+        np.testing.assert_allclose(pose[arm, :, :3], site.as_matrix(), atol=1e-5)
+
+
+def test_unknown_spaces_are_refused(tmp_path):
+    policy = actor(tmp_path)
+    policy.environment = {**policy.environment, "actions": "velocity"}
+    with pytest.raises(ValueError, match="keeps no description"):
+        environment_of(policy)
+
+
+def solved(path, actions):
+    """Which recorded demonstrations solve the task again, from the start that their seed gives."""
+    import h5py
+
+    data = RobomimicExperienceReplay(path, absolute_actions=actions == "absolute")
+    make_env, transform = robosuite_parts(
+        environment_description(data.recorded_env_args, "ph", 2, actions)
+    )
+    env = make_env() if transform is None else TransformedEnv(make_env(), transform)
+    outcomes = []
+    with h5py.File(path) as file:
+        seeds = [file[f"data/demo_{i}"].attrs["seed"] for i in range(data.num_episodes)]
+    for episode, seed in enumerate(seeds):
+        env.set_seed(int(seed), static_seed=True)
+        td = env.reset()
+        for action in data.data["action"][data.data["episode"] == episode]:
+            td = env.step(td.set("action", action))["next"]
+            if td["done"]:
+                break
+        outcomes.append(bool(td["success"]))
+    env.close()
+    return outcomes
+
+
+@pytest.mark.parametrize("task", ["lift", pytest.param("square", marks=pytest.mark.slow)])
+def test_demonstrations_replay_in_both_spaces(tmp_path, task):
+    path = generate_demonstrations(task, n=3, path=tmp_path / "file.hdf5", progress=False)
+    assert solved(path, "absolute") == solved(path, "delta") == [True] * 3

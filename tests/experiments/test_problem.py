@@ -1,0 +1,68 @@
+"""Problems in both spaces of actions."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("robosuite")
+
+from tests.data.synthetic import env_args_15, write_robomimic_file
+from warmprior import GaussianPrior, PoseTrend
+from warmprior.data import DatasetError
+from warmprior.experiments import NetworkOptions, Recipe, RunOptions, Store, robosuite_problem
+from warmprior.experiments.recipe import DataOptions
+from warmprior.experiments.record import record, restore
+from warmprior.io.files import file_digest
+from warmprior.transforms import AbsoluteActions
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "lift.hdf5"
+    write_robomimic_file(path, lengths=(30, 20), task="lift")
+    return path
+
+
+def store(problem, folder):
+    network = NetworkOptions(hidden_dim=16)
+    return Store(problem, network, folder / "policies", folder / "logs", RunOptions(logger="none"))
+
+
+def test_recorded_actions_are_identified_as_ever(path):
+    """By their file alone: policies from before there was a choice have no other identity."""
+    problem = robosuite_problem(path)
+    assert problem.identity == file_digest(path)
+    assert "actions" not in problem.facts and problem.name == "lift ph (file data)"
+    assert "actions" not in record(Recipe())["data"]
+    absolute = record(Recipe(data=DataOptions(actions="absolute")))
+    assert absolute["data"]["actions"] == "absolute"
+    assert restore(Recipe, absolute).data.actions == "absolute"
+    assert restore(Recipe, record(Recipe())) == Recipe()
+    assert restore(Recipe, absolute).name == "square-ph-absolute"
+
+
+def test_absolute_actions(path, tmp_path):
+    delta, absolute = (robosuite_problem(path, actions=name) for name in ("delta", "absolute"))
+    assert absolute.identity != delta.identity
+    assert absolute.name == "lift ph (file data), absolute actions"
+    assert absolute.data["action"].shape == (50, 10)
+    assert isinstance(absolute.actions, AbsoluteActions) and delta.actions is None
+    # In the units of deltas, and what is executed spans what was recorded.
+    units = [0.05] * 3 + [0.5] * 6
+    assert absolute.normalizer.scale("action")[:9].tolist() == pytest.approx(units)
+    assert absolute.data["action"][:, 9].abs().max() <= 1
+    assert absolute.clip == absolute.data["action"].abs().max() and delta.clip == 1.0
+    prior = GaussianPrior(8)
+    networks = [store(p, tmp_path).new_actor(prior, 0).network for p in (delta, absolute)]
+    assert networks[0].trend is None and isinstance(networks[1].trend, PoseTrend)
+
+
+def test_files_without_poses_are_named(tmp_path):
+    import h5py
+
+    path = tmp_path / "lift.hdf5"
+    write_robomimic_file(path, lengths=(30,), task="lift", env_args=env_args_15("lift"))
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/obs/robot0_eef_quat"]
+    with pytest.raises(DatasetError, match=r"lift\.hdf5.*no 'obs/robot0_eef_quat'"):
+        robosuite_problem(path, actions="absolute")

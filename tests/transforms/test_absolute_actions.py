@@ -1,0 +1,260 @@
+"""Absolute poses in environments that take deltas; scipy and a kinematic gripper are the references."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from warmprior import GaussianPrior
+from warmprior.modules.normalize import Normalizer
+from warmprior.transforms import AbsoluteActions, policy_transforms
+
+Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
+
+SCALE = [0.05, 0.05, 0.05, 0.5, 0.5, 0.5]
+H, HORIZON = 4, 10
+
+
+def absolute(pose, delta, scale=SCALE, base=None):
+    """What the controller makes of a delta, by hand: ``[10]`` from ``[3, 4]`` and ``[7]``."""
+    base = base or Rotation.identity()
+    goal = pose[:, 3] + base.apply(np.multiply(delta[:3], scale[:3]))
+    turn = base * Rotation.from_rotvec(np.multiply(delta[3:6], scale[3:])) * base.inv()
+    rotation = (turn * Rotation.from_matrix(pose[:, :3])).as_matrix()
+    return np.concatenate([goal, rotation[0], rotation[1], delta[6:]])
+
+
+def pose_of(position, rotation):
+    return np.concatenate([rotation.as_matrix(), np.reshape(position, (3, 1))], 1)
+
+
+def floats(least, most, n):
+    return st.lists(st.floats(least, most, width=32), min_size=n, max_size=n)
+
+
+@st.composite
+def rotations(draw):
+    """Any rotation, half turns and nearly half turns often among them."""
+    axis = np.array(draw(floats(-1, 1, 3)))
+    length = np.linalg.norm(axis)
+    axis = np.array([0.0, 0.0, 1.0]) if length < 1e-3 else axis / length
+    near = st.sampled_from([0.0, 1e-9, 1e-7, 1e-4, 1e-2]).map(lambda short: np.pi - short)
+    return Rotation.from_rotvec(axis * draw(st.one_of(st.floats(-np.pi, np.pi), near)))
+
+
+@given(
+    deltas=floats(-1, 1, 14),
+    positions=floats(-2, 2, 6),
+    hands=st.tuples(rotations(), rotations()),
+    yaws=floats(-3, 3, 2),
+    scale=floats(0.125, 0.75, 6),
+)
+def test_round_trip(deltas, positions, hands, yaws, scale):
+    bases = [Rotation.from_euler("z", yaw) for yaw in yaws]
+    poses = [pose_of(positions[3 * a : 3 * a + 3], hands[a]) for a in range(2)]
+    targets = [
+        absolute(poses[a], np.array(deltas[7 * a : 7 * a + 7]), scale, bases[a]) for a in range(2)
+    ]
+    transform = AbsoluteActions(
+        scale, torch.from_numpy(np.stack([base.as_matrix() for base in bases]))
+    )
+    data = {
+        "action": torch.from_numpy(np.concatenate(targets)),
+        "eef_pose": torch.from_numpy(np.stack(poses)),
+    }
+    found = transform.inv(TensorDict(data))["action"]
+    assert found.dtype == torch.float64
+    np.testing.assert_allclose(found.numpy(), deltas, rtol=0, atol=1e-6)
+
+
+@given(position=floats(-1, 1, 3), here=floats(-1, 1, 3), target=rotations(), now=rotations())
+def test_far_targets_are_approached_at_full_speed(position, here, target, now):
+    turn = (target * now.inv()).as_rotvec()
+    if np.linalg.norm(turn) > np.pi - 1e-3:
+        return  # half a turn may go either way
+    matrix = target.as_matrix()
+    action = np.concatenate([position, 3 * matrix[0], matrix[1] - 2 * matrix[0], [7.0]])
+    data = {
+        "action": torch.from_numpy(action),
+        "eef_pose": torch.from_numpy(pose_of(here, now))[None],
+    }
+    found = AbsoluteActions(SCALE).inv(TensorDict(data))["action"].numpy()
+    move = np.subtract(position, here) / SCALE[:3]
+    expected = np.concatenate([move, turn / SCALE[3:], [7.0]]).clip(-1, 1)
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+class Gripper(EnvBase):
+    """Moves exactly as it is told, from a start that its seed decides."""
+
+    def __init__(self, horizon=HORIZON, seed=0):
+        super().__init__(batch_size=[])
+        self.horizon, self.start = horizon, seed
+        self.observation_spec = Composite(
+            observation=Unbounded((4,)), eef_pose=Unbounded((1, 3, 4))
+        )
+        self.action_spec = Bounded(-1, 1, (7,))
+        self.reward_spec = Unbounded((1,))
+        flags = ("done", "terminated", "truncated")
+        self.done_spec = Composite(
+            {key: Categorical(2, dtype=torch.bool, shape=(1,)) for key in flags}
+        )
+
+    def _read(self):
+        pose = torch.from_numpy(pose_of(self.position, self.rotation)).float()
+        done = torch.tensor([self.steps >= self.horizon])
+        gripper = torch.tensor([self.fingers], dtype=torch.float32)
+        return TensorDict(
+            {
+                "observation": torch.cat([pose[:, 3], gripper]),
+                "eef_pose": pose[None],
+                "done": done,
+                "terminated": done.clone(),
+                "truncated": torch.zeros(1, dtype=torch.bool),
+            }
+        )
+
+    def _reset(self, tensordict=None, **kwargs):
+        rng = np.random.default_rng(self.start)
+        self.start += 1
+        self.position, self.rotation = rng.normal(size=3), Rotation.random(random_state=self.start)
+        self.steps, self.fingers = 0, 0.0
+        return self._read()
+
+    def _step(self, tensordict):
+        action = tensordict["action"].double().numpy()
+        assert action.shape == (7,) and np.abs(action).max() <= 1
+        self.position = self.position + action[:3] * SCALE[:3]
+        self.rotation = Rotation.from_rotvec(action[3:6] * SCALE[3:]) * self.rotation
+        self.fingers, self.steps = float(action[6]), self.steps + 1
+        return self._read().set("reward", torch.zeros(1))
+
+    def _set_seed(self, seed):
+        self.start = seed
+
+
+def transforms(*more, prior=None):
+    low, high = torch.full((10,), -3.0), torch.full((10,), 5.0)
+    seen = torch.ones(4)
+    normalizer = Normalizer(
+        {"action": low, "observation": -2 * seen}, {"action": high, "observation": seen}
+    )
+    made = policy_transforms(
+        prior or GaussianPrior(H), normalizer=normalizer, actions=AbsoluteActions(SCALE)
+    )
+    for transform in more:
+        made.insert(0, transform)
+    return made
+
+
+def single(horizon=HORIZON):
+    return TransformedEnv(Gripper(horizon), transforms())
+
+
+PLACES = {
+    "single": single,
+    "serial, inside": lambda: SerialEnv(2, [single, partial(single, 6)]),
+    "serial, outside": lambda: TransformedEnv(
+        SerialEnv(2, [Gripper, partial(Gripper, 6)]), transforms()
+    ),
+    "parallel, inside": lambda: ParallelEnv(2, single, mp_start_method="fork"),
+    "parallel, outside": lambda: TransformedEnv(
+        ParallelEnv(2, Gripper, mp_start_method="fork"), transforms()
+    ),
+}
+
+
+@pytest.fixture(params=PLACES)
+def env(request):
+    env = PLACES[request.param]()
+    yield env
+    env.close(raise_if_closed=False)
+
+
+def test_specs(env):
+    check_env_specs(env)
+    chunk = env.full_action_spec["vla_action", "chunk"]
+    assert chunk.shape == (*env.batch_size, H, 10)
+    # Bounds of 2 m and 1, by the normaliser's middle of 1 and half range of 4.
+    limits = torch.tensor([2.0] * 3 + [1.0] * 7)
+    torch.testing.assert_close(chunk.space.low, ((-limits - 1) / 4).expand(chunk.shape))
+
+
+def targets(pose, rng):
+    """A chunk ``[H, 10]`` that is within reach, and where it leads."""
+    chunk = []
+    for _ in range(H):
+        action = absolute(pose, rng.uniform(-0.9, 0.9, 7))
+        rows = action[3:9].reshape(2, 3)
+        matrix = np.stack([*rows, np.cross(*rows)])
+        pose = np.concatenate([matrix, action[:3, None]], 1)
+        chunk.append(action)
+    return np.stack(chunk), pose
+
+
+def test_grippers_go_where_they_are_told(env):
+    """Chunk by chunk, across ends of episodes that leave other rows in the middle of theirs."""
+    rng, td = np.random.default_rng(0), env.reset()
+    for _ in range(7):
+        poses = td["eef_pose"].reshape(-1, 3, 4).double().numpy()
+        chunks, ends = zip(*(targets(pose, rng) for pose in poses), strict=True)
+        chunk = (torch.from_numpy(np.stack(chunks)).float() - 1) / 4
+        td["vla_action", "chunk"] = chunk.view(*env.batch_size, H, 10)
+        stepped, following = env.step_and_maybe_reset(td)
+        steps = stepped["next", "executed_steps"].flatten()
+        reached = stepped["next", "eef_pose"].reshape(-1, 3, 4).numpy()
+        for row in range(len(poses)):
+            if steps[row] == H:
+                np.testing.assert_allclose(reached[row], ends[row], atol=2e-5)
+            else:
+                told = chunks[row][int(steps[row]) - 1]
+                np.testing.assert_allclose(reached[row][:, 3], told[:3], atol=2e-5)
+        td = following
+    assert steps.max() <= H
+
+
+def test_rows_that_rest_stay_where_they_are():
+    env = PLACES["serial, outside"]()
+    td = env.reset()
+    chunk, end = targets(td["eef_pose"][1, 0].double().numpy(), np.random.default_rng(0))
+    td["vla_action", "chunk"] = ((torch.from_numpy(chunk).float() - 1) / 4).expand(2, H, 10)
+    td["_step"] = torch.tensor([False, True])
+    stepped = env.step(td)["next"]
+    torch.testing.assert_close(stepped["eef_pose"][0], td["eef_pose"][0])
+    np.testing.assert_allclose(stepped["eef_pose"][1, 0].numpy(), end, atol=2e-5)
+
+
+def test_transforms_that_wait_make_no_difference():
+    """A counter has to run at every control step, and with it all others."""
+    rollouts = []
+    for more in ([], [StepCounter()]):
+        env = TransformedEnv(Gripper(), transforms(*more))
+        torch.manual_seed(0)
+        rollouts.append(env.rollout(3).exclude("step_count", ("next", "step_count")))
+    torch.testing.assert_close(rollouts[0]["next", "eef_pose"], rollouts[1]["next", "eef_pose"])
+    torch.testing.assert_close(
+        rollouts[0]["next", "observation"], rollouts[1]["next", "observation"], rtol=0, atol=0
+    )
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match=r"output_max \[6\].*got \[3\]"):
+        AbsoluteActions([0.05] * 3)
+    two_arms = AbsoluteActions(SCALE, torch.eye(3).expand(2, 3, 3))
+    with pytest.raises(ValueError, match=r"2 arm\(s\).*width 14.*have 7"):
+        TransformedEnv(Gripper(), two_arms).full_action_spec  # noqa: B018
+    with pytest.raises(KeyError, match="eef_pose=True"):
+        TransformedEnv(Gripper(), AbsoluteActions(SCALE, pose_key="hand")).full_action_spec  # noqa: B018
+    env = TransformedEnv(Gripper(), AbsoluteActions(SCALE))
+    env.reset()
+    with pytest.raises(KeyError, match="what reset or step_mdp returned"):
+        env.step(TensorDict({"action": torch.zeros(10)}))

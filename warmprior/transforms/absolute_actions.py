@@ -1,0 +1,171 @@
+"""Absolute poses as the actions of an environment that takes pose deltas."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Bounded, Composite
+from torchrl.envs.transforms import Transform
+
+from warmprior import keys
+from warmprior.rotation import matrix_to_rotvec, rotation_6d_to_matrix
+from warmprior.transforms.inner_step import KEPT
+
+__all__ = ["AbsoluteActions"]
+
+_DELTA, _ABSOLUTE = 7, 10  # numbers per arm
+_OBTUSE = -0.9  # cosine of an angle from which on the axis loses digits, up to half a turn
+_TINY = 1e-150
+_REACH = 2.0  # metres, in the specification of actions: it only says what is worth sampling
+
+
+class AbsoluteActions(Transform):
+    r"""Turns the pose that an action asks for into the delta from where the gripper is now.
+
+    An action is per arm a position in metres in the world, the first two rows of a rotation matrix and the
+    gripper, as :func:`~warmprior.envs.absolute_actions` computes them from demonstrations. The environment
+    below gets
+
+    .. math:: \mathrm{clip}\bigl((p^* - p) / s_p\bigr), \quad
+              \mathrm{clip}\bigl(\log(R^* R^\top) / s_R\bigr)
+
+    and the gripper, with the gripper's pose :math:`(p, R)` before the step and clipped to the :math:`[-1, 1]`
+    that its controller takes: a pose farther away than one control step reaches is approached at full speed.
+    The six numbers of the rotation may be any that are not parallel; they are orthonormalised.
+
+    It acts on every control step: place it before :class:`ChunkStep` and next to the environment, so that
+    actions are denormalised before they get here (:func:`policy_transforms` does so).
+
+    Args:
+        output_max: ``[6]``, what an input of 1 means, in metres and radians; see
+            :func:`~warmprior.envs.delta_conventions`, also for the next.
+        base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; one arm in the world frame
+            by default.
+
+    Keyword Args:
+        action_key: the action, ``[*B, 10 * arms]`` outside and ``[*B, 7 * arms]`` inside.
+        pose_key: the grippers' poses in the world, ``[*B, arms, 3, 4]``: rotation and, in the last column,
+            position in metres.
+
+    Raises:
+        ValueError: if the shapes do not fit each other, or (in an environment) its actions.
+        KeyError: if there is no pose.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> transform = AbsoluteActions([0.05] * 3 + [0.5] * 3)
+        >>> here = torch.eye(3, 4)[None]  # at the origin, turned by nothing
+        >>> action = torch.tensor([0.02, 0.0, 0.3, 1, 0, 0, 0, 1, 0, -1])
+        >>> transform.inv(TensorDict({"action": action, "eef_pose": here}))["action"]
+        tensor([ 0.4000,  0.0000,  1.0000,  0.0000,  0.0000,  0.0000, -1.0000])
+    """
+
+    def __init__(
+        self,
+        output_max: Tensor | Sequence[float],
+        base_rotation: Tensor | None = None,
+        *,
+        action_key: NestedKey = keys.ACTION,
+        pose_key: NestedKey = keys.EEF_POSE,
+    ) -> None:
+        super().__init__(in_keys_inv=[action_key], out_keys_inv=[action_key])
+        # In double precision, like the simulator's: a delta is a small difference of large numbers.
+        scale = torch.as_tensor(output_max, dtype=torch.float64)
+        rotation = torch.eye(3)[None] if base_rotation is None else base_rotation
+        if scale.shape != (6,) or rotation.ndim != 3 or rotation.shape[1:] != (3, 3):
+            raise ValueError(
+                "AbsoluteActions needs output_max [6] and base_rotation [arms, 3, 3], got "
+                f"{list(scale.shape)} and {list(rotation.shape)}"
+            )
+        self.register_buffer("scale", scale)
+        self.register_buffer("base_rotation", rotation.double())
+        self.action_key = unravel_key(action_key)
+        self.pose_key = unravel_key(pose_key)
+
+    @property
+    def arms(self) -> int:
+        """How many arms act."""
+        return len(self.base_rotation)
+
+    @property
+    def one_step(self) -> Tensor:
+        """How far one control step can move each number of an action, ``[10 * arms]``; 0 for the gripper.
+
+        In these units (see :meth:`Normalizer.fit`) poses and deltas compare.
+        """
+        position, turn = self.scale[:3], self.scale[3:].amin()
+        return torch.cat((position, turn.expand(6), turn.new_zeros(1))).repeat(self.arms)
+
+    def delta(self, action: Tensor, pose: Tensor) -> Tensor:
+        """The delta that leads from a pose to the one that is asked for, as far as one step goes.
+
+        Args:
+            action: ``[*B, 10 * arms]``.
+            pose: ``[*B, arms, 3, 4]``.
+
+        Returns:
+            ``[*B, 7 * arms]`` in ``[-1, 1]``, in the dtype of ``action``.
+        """
+        target, now = action.double().unflatten(-1, (self.arms, _ABSOLUTE)), pose.double()
+        move = target[..., :3] - now[..., 3]
+        turn = rotation_6d_to_matrix(target[..., 3:9]) @ now[..., :3].mT
+        step = torch.stack((move, _rotvec(turn)), -2) @ self.base_rotation
+        delta = torch.cat((step.flatten(-2) / self.scale, target[..., 9:]), -1)
+        return delta.clamp(-1, 1).flatten(-2).to(action.dtype)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        # A partial step of a batched environment has set its observations aside.
+        kept = tensordict.get(KEPT, None)
+        pose = tensordict.get(self.pose_key, None)
+        if pose is None and kept is not None:
+            pose = kept.get(self.pose_key, None)
+        if pose is None:
+            raise KeyError(
+                f"AbsoluteActions needs the gripper's pose at {self.pose_key!r}: step with what reset or "
+                "step_mdp returned"
+            )
+        action = tensordict.get(self.action_key)
+        return tensordict.set(self.action_key, self.delta(action, pose))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Outside environments the transform does nothing: demonstrations are read as absolute poses."""
+        return tensordict
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Replace the deltas by absolute poses."""
+        parent = self.parent
+        if parent is not None and self.pose_key not in parent.observation_spec.keys(True, True):
+            raise KeyError(
+                f"AbsoluteActions found no {self.pose_key!r} among the observations: make the environment "
+                "with eef_pose=True"
+            )
+        actions = input_spec["full_action_spec"]
+        leaf = actions[self.action_key]
+        if leaf.shape[-1] != self.arms * _DELTA:
+            raise ValueError(
+                f"AbsoluteActions of {self.arms} arm(s) is for actions of width {self.arms * _DELTA}, the "
+                f"environment's have {leaf.shape[-1]}"
+            )
+        limit = torch.tensor(([_REACH] * 3 + [1.0] * 7) * self.arms, device=leaf.device)
+        limit = limit.to(leaf.dtype).expand(*leaf.shape[:-1], self.arms * _ABSOLUTE)
+        actions[self.action_key] = Bounded(-limit, limit, device=leaf.device)
+        return input_spec
+
+
+def _rotvec(turn: Tensor) -> Tensor:
+    """As :func:`matrix_to_rotvec`, at a third of its time: this runs at every control step.
+
+    Args:
+        turn: ``[..., 3, 3]``.
+    """
+    cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
+    if bool((cosine < _OBTUSE).any()):
+        return matrix_to_rotvec(turn)
+    axis = 0.5 * (turn - turn.mT)[..., (2, 0, 1), (1, 2, 0)]
+    sine = axis.norm(dim=-1, keepdim=True)
+    return axis * (torch.atan2(sine, cosine) / sine.clamp_min(_TINY)).clamp_min(1.0)
