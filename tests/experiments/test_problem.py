@@ -13,6 +13,7 @@ from warmprior.experiments import NetworkOptions, Recipe, RunOptions, Store, rob
 from warmprior.experiments.recipe import DataOptions
 from warmprior.experiments.record import record, restore
 from warmprior.io.files import file_digest
+from warmprior.training import TrainingConfig
 from warmprior.transforms import AbsoluteActions
 
 
@@ -53,7 +54,8 @@ def test_absolute_actions(path, tmp_path):
     assert absolute.data["action"][:, 9].abs().max() <= 1
     assert absolute.clip == absolute.data["action"].abs().max() and delta.clip == 1.0
     prior = GaussianPrior(8)
-    networks = [store(p, tmp_path).new_actor(prior, 0).network for p in (delta, absolute)]
+    stores = (store(p, tmp_path) for p in (delta, absolute))
+    networks = [s.new_actor(prior, TrainingConfig()).network for s in stores]
     assert networks[0].trend is None and isinstance(networks[1].trend, PoseTrend)
 
 

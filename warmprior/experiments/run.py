@@ -459,10 +459,14 @@ class Comparison:
         ]
 
     def _compute(self, following: Mapping[int, Sequence[_Measure | _Play]]) -> None:
-        """Longest jobs first: trainings, then measures and episodes of what is trained."""
+        """One seed after another; a policy is played before the next is trained.
+
+        Only the last trainings start at once, for they take longest and nothing should wait for them.
+        """
         self.results.save()
         at_once = self.trainings_at_once or len(following)
-        to_train, ready = deque(_Train(n) for n in following), deque[_Measure | _Play]()
+        by_seed = sorted(following, key=lambda n: self.contestants[n].training.seed)
+        to_train, ready = deque(map(_Train, by_seed)), deque[_Measure | _Play]()
         worker = _Worker(self.contestants, self.recipe.evaluation)
         outcomes: dict[tuple[int, int, int], list[Episode]] = {}
         measures: dict[int, _Measures] = {}
@@ -474,7 +478,7 @@ class Comparison:
 
         def next_training() -> _Train | None:
             """The first that needs no policy which is still to be trained."""
-            if training >= at_once:
+            if training >= at_once or (ready and len(to_train) > workers):
                 return None
             done = (job for job in to_train if teachers.get(job.number) in {None, *taught})
             return next(done, None)

@@ -273,25 +273,48 @@ class PreconditionedNetwork(VelocityNetwork):
         """The groups of the network inside."""
         return self.network.parameter_groups(weight_decay)
 
+    def remainder(self, t: Tensor) -> Tensor:
+        """Standard deviation of what the best linear prediction leaves of the velocity: the unit of ``F``.
+
+        Args:
+            t: times, ``[B]``.
+
+        Returns:
+            ``[B, P, d_a]``, larger than 0.
+        """
+        coefficients = self.interpolant.coefficients(t[:, None, None])
+        return self._remainder(*coefficients) * self._scale(*coefficients[:2])
+
+    def _scale(self, alpha: Tensor, beta: Tensor) -> Tensor:
+        """One over the standard deviation of the point."""
+        moments = self.moments
+        s0 = moments.source_variance.sqrt()
+        # Along the source, and across: a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
+        along = _combination(s0, alpha, moments.covariance / s0, beta)
+        across = beta * moments.conditional_deviation
+        return torch.addcmul(along * along, across, across).rsqrt()
+
+    def _remainder(self, alpha: Tensor, beta: Tensor, d_alpha: Tensor, d_beta: Tensor) -> Tensor:
+        """The remainder times the standard deviation of the point."""
+        s0 = self.moments.source_variance.sqrt()
+        return (alpha * d_beta - d_alpha * beta).abs() * (s0 * self.moments.conditional_deviation)
+
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
         """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
         self.check_chunk(a)
         alpha, beta, d_alpha, d_beta = self.interpolant.coefficients(t[:, None, None])
         moments = self.moments
         m0, m1, c = moments.source_mean, moments.target_mean, moments.covariance
-        v0, v1, q = moments.source_variance, moments.target_variance, moments.conditional_deviation
+        v0, v1 = moments.source_variance, moments.target_variance
         if self.trend is not None:
             source, target = self.trend(observation)
             m0, m1 = m0 + source, m1 + target
-        s0 = v0.sqrt()
-        # Along the source, and across: a_t = E[a_t] + along z_0 + across z_1 with z ~ N(0, I).
-        along, across = _combination(s0, alpha, c / s0, beta), beta * q
-        scale = torch.addcmul(along * along, across, across).rsqrt()
+        scale = self._scale(alpha, beta)
         centred = torch.addcmul(torch.addcmul(a, alpha, m0, value=-1), beta, m1, value=-1)
         standardised = centred * scale
         covariance = _combination(v0, alpha * d_alpha, v1, beta * d_beta)
         covariance = torch.addcmul(covariance, alpha * d_beta + d_alpha * beta, c)
-        remainder = (alpha * d_beta - d_alpha * beta).abs() * (s0 * q)
+        remainder = self._remainder(alpha, beta, d_alpha, d_beta)
         learnt = self.network(t, standardised, observation)
         velocity = torch.addcmul(covariance * standardised, remainder, learnt)
         return torch.addcmul(_combination(m0, d_alpha, m1, d_beta), scale, velocity)

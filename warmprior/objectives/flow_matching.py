@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
@@ -20,9 +20,11 @@ from warmprior.modules.ode import integrate
 from warmprior.modules.prior import Prior
 from warmprior.objectives.times import TIMES, Times
 
-__all__ = ["FlowMatchingLoss", "Objective", "check_objective"]
+__all__ = ["FlowMatchingLoss", "Objective", "Weighting", "check_objective"]
 
 Objective = Literal["velocity", "l1"]
+
+Weighting = Literal["velocity", "standardised"]
 
 TEACHER_STEPS = 9
 """Steps from the start to the end of the flow that self-distillation learns to make in one: the paper's."""
@@ -32,20 +34,30 @@ DISTILLED_SHARE = 0.25
 
 
 def check_objective(
-    *, times: str, objective: str, self_distillation: float, prior: Prior | None = None
+    *,
+    times: str,
+    objective: str,
+    weighting: str,
+    self_distillation: float,
+    prior: Prior | None = None,
 ) -> None:
     """Whether there is a loss of these options, and whether a prior's field can be trained by it.
 
     Keyword Args:
         times: name of the distribution of the times.
         objective: see :class:`FlowMatchingLoss`.
+        weighting: see :class:`FlowMatchingLoss`.
         self_distillation: see :class:`FlowMatchingLoss`.
         prior: the source distribution.
 
     Raises:
         ValueError: naming the option.
     """
-    choices = {"times": (times, TIMES), "objective": (objective, get_args(Objective))}
+    choices = {
+        "times": (times, TIMES),
+        "objective": (objective, get_args(Objective)),
+        "weighting": (weighting, get_args(Weighting)),
+    }
     for name, (value, known) in choices.items():
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
@@ -111,6 +123,12 @@ class FlowMatchingLoss(LossModule):
         times: how training times are distributed: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
             ``"logit-normal"`` (:mod:`warmprior.objectives.times`), or a function of their signature.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
+        weighting: ``"velocity"`` (Algorithm 1) takes errors as they are. ``"standardised"`` divides them by
+            what the best linear prediction leaves (:meth:`PreconditionedNetwork.remainder`): every time,
+            position and dimension counts alike, in the manner of EDM (Karras et al., 2022, Table 1). As they
+            are, errors near the source count little: with a standard normal source and data of deviation
+            :math:`s`, those at ``t = 0``, where one-step samplers are, count :math:`s^2` times those at
+            ``t = 1``.
         self_distillation: weight of the self-distillation; 0 is none.
         teacher: the network of averaged weights that self-distillation learns from; by default the trained
             one as it is. It is neither trained nor saved with the loss.
@@ -128,9 +146,10 @@ class FlowMatchingLoss(LossModule):
         moved to the network's, where the generator has to be.
 
     Raises:
-        ValueError: for an unknown ``reduction``, ``times`` or ``objective``, or a negative weight; for a
-            curved path with an option or a prior that needs the straight one; for an option that needs a flow
-            with a prior whose field is none; or for another path than the network is preconditioned for.
+        ValueError: for an unknown ``reduction``, ``times``, ``objective`` or ``weighting``, or a negative
+            weight; for standardised errors of a network that is not preconditioned; for a curved path with an
+            option or a prior that needs the straight one; for an option that needs a flow with a prior whose
+            field is none; or for another path than the network is preconditioned for.
 
     Examples:
         >>> import torch
@@ -171,6 +190,7 @@ class FlowMatchingLoss(LossModule):
         *,
         times: str | Times = "uniform",
         objective: Objective = "velocity",
+        weighting: Weighting = "velocity",
         self_distillation: float = 0.0,
         teacher: nn.Module | None = None,
         interpolant: Interpolant | None = None,
@@ -187,11 +207,17 @@ class FlowMatchingLoss(LossModule):
         check_objective(
             times="uniform" if callable(times) else times,
             objective=objective,
+            weighting=weighting,
             self_distillation=self_distillation,
             prior=self.prior,
         )
+        if weighting == "standardised" and not hasattr(actor_network.network, "remainder"):
+            raise ValueError(
+                "standardised errors are in the units of a PreconditionedNetwork: wrap the network in one, "
+                "or take the weighting 'velocity'"
+            )
         self.times = times if callable(times) else TIMES[times]
-        self.objective = objective
+        self.objective, self.weighting = objective, weighting
         self.self_distillation = float(self_distillation)
         self.__dict__["teacher"] = teacher  # no part of this module: it is another's to save
         built_for = getattr(actor_network.network, "interpolant", None)
@@ -333,9 +359,11 @@ class FlowMatchingLoss(LossModule):
 
     def _distance(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
         """What the objective makes of predicted velocities at times ``t`` ``[*B]``, ``[*B, P, d_a]``."""
-        if self.objective == "l1":
-            return (1 - t)[..., None, None] * (predicted - velocity).abs()
-        return (predicted - velocity).square()
+        error = predicted - velocity
+        if self.weighting == "standardised":
+            unit = cast(Any, self.velocity_network).remainder(t.reshape(-1))
+            error = error / unit.view_as(error)
+        return (1 - t)[..., None, None] * error.abs() if self.objective == "l1" else error.square()
 
     def _reduced(self, error: Tensor, pad: Tensor | None) -> Tensor:
         """Errors ``[*B, P, d_a]`` where they count."""

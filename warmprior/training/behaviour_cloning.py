@@ -168,6 +168,7 @@ class BehaviourCloning:
             actor,
             times=config.times,
             objective=config.objective,
+            weighting=config.weighting,
             self_distillation=config.self_distillation,
             teacher=cast(Any, self.ema.module)["network"],
             generator=self.generator,

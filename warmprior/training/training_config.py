@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from warmprior.io.options import LATER
 from warmprior.modules.prior import Prior
-from warmprior.objectives.flow_matching import Objective, check_objective
+from warmprior.objectives.flow_matching import Objective, Weighting, check_objective
 from warmprior.objectives.times import TimesName
 
 __all__ = ["TrainingConfig"]
@@ -32,6 +32,8 @@ class TrainingConfig:
         seed: of initial weights, sampling, source, times and dropout.
         times: how the times of the loss are distributed.
         objective: the loss: squared error of velocities, or L1 error of predicted samples (L1 Flow).
+        weighting: of the loss: errors as they are, or in units of what preconditioning leaves, so that every
+            time counts alike.
         self_distillation: weight of learning in one step where the flow of averaged weights ends.
 
     Raises:
@@ -52,6 +54,7 @@ class TrainingConfig:
     seed: int = 0
     times: TimesName = field(default="uniform", metadata=LATER)
     objective: Objective = field(default="velocity", metadata=LATER)
+    weighting: Weighting = field(default="velocity", metadata=LATER)
     self_distillation: float = field(default=0.0, metadata=LATER)
 
     def __post_init__(self) -> None:
@@ -85,6 +88,7 @@ class TrainingConfig:
         check_objective(
             times=self.times,
             objective=self.objective,
+            weighting=self.weighting,
             self_distillation=self.self_distillation,
             prior=prior,
         )
