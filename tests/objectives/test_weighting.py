@@ -1,0 +1,155 @@
+"""Standardised errors: their unit against regression by least squares, and what a loss of 1 means."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from warmprior import (
+    FlowMatchingLoss,
+    GaussianPrior,
+    LinearInterpolant,
+    PastPrior,
+    PreconditionedNetwork,
+    SourceMoments,
+    TrigonometricInterpolant,
+    VelocityMLP,
+    WarmPriorActor,
+)
+from warmprior.modules.network import VelocityNetwork
+
+H, D_A, N = 2, 1, 40_000
+
+
+class Nothing(VelocityNetwork):
+    """Has learnt nothing."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.weight = nn.Parameter(torch.zeros(1))
+
+    def forward(self, t, a, observation):
+        return self.weight * a
+
+
+def batch(prior, n=N, seed=0):
+    """Jointly Gaussian past and target, with another correlation and spread at each position."""
+    g = torch.Generator().manual_seed(seed)
+    past = torch.randn(n, H, D_A, generator=g) * torch.tensor([[0.5], [1.5]]) + 0.3
+    a1 = torch.tensor([[0.9], [0.2]]) * past + torch.tensor([[0.1], [0.7]]) * torch.randn(
+        n, H, D_A, generator=g
+    )
+    warm = torch.full((n, H, 1), prior.ever_warm)
+    return TensorDict(
+        {
+            "observation": torch.zeros(n, 1, 1),
+            "vla_action": {"chunk": a1},
+            "action_is_pad": torch.zeros(n, H, dtype=torch.bool),
+            "prior": {"loc": past, "warm": warm},
+        },
+        [n],
+    )
+
+
+def policy(prior, interpolant=None, network=Nothing):
+    windows = batch(prior)
+    moments = SourceMoments.fit(windows, prior, generator=torch.Generator().manual_seed(1))
+    inside = network(D_A, 1, H, 1)
+    return WarmPriorActor(
+        PreconditionedNetwork(inside, moments=moments, interpolant=interpolant), prior
+    )
+
+
+@pytest.mark.parametrize("path", [LinearInterpolant(), TrigonometricInterpolant()])
+@pytest.mark.parametrize("prior", [GaussianPrior(H), PastPrior(H, sigma=0.4)])
+@pytest.mark.parametrize("time", [0.0, 0.3, 0.9, 1.0])
+def test_the_unit_is_what_least_squares_leave(prior, path, time):
+    network = policy(prior, path).network
+    windows, g = batch(prior, seed=5), torch.Generator().manual_seed(6)
+    a0 = prior.sample(windows["prior", "loc"], windows["prior", "warm"], g).double()
+    a1 = windows["vla_action", "chunk"].double()
+    a_t, velocity = path(a0, a1, torch.full((N,), time).double())
+    unit = network.remainder(torch.tensor([time]))[0]
+    for p in range(H):
+        design = torch.stack([torch.ones(N).double(), a_t[:, p, 0]], 1)
+        fit = torch.linalg.lstsq(design, velocity[:, p, :]).solution
+        left = (velocity[:, p, :] - design @ fit).std()
+        assert float(unit[p, 0]) == pytest.approx(float(left), rel=0.03)
+
+
+@pytest.mark.parametrize("prior", [GaussianPrior(H), PastPrior(H, sigma=0.4)])
+def test_a_network_that_has_learnt_nothing_has_a_loss_of_one_at_every_time(prior):
+    windows = batch(prior, seed=7)
+
+    def loss(time, **options):
+        def times(shape, generator, dtype, device):
+            return torch.full(shape, time, dtype=dtype, device=device)
+
+        generator = torch.Generator().manual_seed(8)
+        module = FlowMatchingLoss(policy(prior), times=times, generator=generator, **options)
+        return float(module(windows)["loss_flow_matching"])
+
+    standardised = [loss(t, weighting="standardised") for t in (0.0, 0.5, 1.0)]
+    assert standardised == pytest.approx([1.0] * 3, rel=0.03)
+    assert loss(0.0) < 0.5 * loss(1.0) or not isinstance(prior, GaussianPrior)
+
+
+def test_errors_are_divided_coordinate_by_coordinate():
+    prior = PastPrior(H, sigma=0.4)
+    actor = policy(prior, network=lambda *sizes: VelocityMLP(*sizes, hidden_dim=8))
+    windows = batch(prior, 6)
+    windows["action_is_pad"][0, 1] = True
+    times = torch.rand(6)
+
+    def errors(**options):
+        module = FlowMatchingLoss(
+            actor,
+            times=lambda shape, *_: times,
+            reduction="none",
+            generator=torch.Generator().manual_seed(0),
+            **options,
+        )
+        return module(windows)
+
+    unit = actor.network.remainder(times)
+    plain, weighed = errors(), errors(weighting="standardised")
+    key = "loss_flow_matching"
+    torch.testing.assert_close(weighed[key], plain[key] / unit.square())
+    assert not weighed[key][0, 1].any()
+    plain, weighed = (errors(objective="l1", weighting=w) for w in ("velocity", "standardised"))
+    torch.testing.assert_close(weighed[key], plain[key] / unit)
+    plain, weighed = (
+        errors(self_distillation=2.0, weighting=w) for w in ("velocity", "standardised")
+    )
+    key, start = "loss_self_distillation", actor.network.remainder(torch.zeros(1))
+    torch.testing.assert_close(weighed[key], plain[key] / start.square())
+
+
+def test_the_best_field_is_the_same():
+    """On data that the network can fit exactly, both weightings lead to the same velocities."""
+    prior = GaussianPrior(H)
+    found = []
+    for weighting in ("velocity", "standardised"):
+        torch.manual_seed(0)
+        actor = policy(prior)  # a linear network on jointly Gaussian data: F = 0 is best
+        actor.network.network.weight.data.fill_(0.5)
+        generator = torch.Generator().manual_seed(0)
+        module = FlowMatchingLoss(actor, weighting=weighting, generator=generator)
+        optimizer = torch.optim.Adam(module.parameters(), lr=0.02)
+        for i in range(150):
+            loss = module(batch(prior, 2000, seed=i))["loss_flow_matching"]
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        found.append(float(actor.network.network.weight))
+    assert found == pytest.approx([0.0, 0.0], abs=0.03)
+
+
+def test_networks_without_a_unit_are_refused():
+    actor = WarmPriorActor(VelocityMLP(D_A, 1, H, 1, hidden_dim=8), GaussianPrior(H))
+    with pytest.raises(ValueError, match="PreconditionedNetwork"):
+        FlowMatchingLoss(actor, weighting="standardised")
+    with pytest.raises(ValueError, match="weighting must be one of velocity, standardised"):
+        FlowMatchingLoss(actor, weighting="loud")
