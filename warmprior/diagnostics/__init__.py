@@ -2,6 +2,7 @@
 
 from warmprior.diagnostics.action_error import action_error
 from warmprior.diagnostics.branching import branching_bound, branching_cost
+from warmprior.diagnostics.coverage import source_coverage
 from warmprior.diagnostics.curvature import curvature
 from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revision
@@ -47,6 +48,7 @@ __all__ = [
     "paired_probability_better",
     "probability_better",
     "smoothness",
+    "source_coverage",
     "source_leak",
     "success_posterior",
     "summarize_seeds",

@@ -13,6 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from warmprior.diagnostics.branching import branching_bound
+from warmprior.diagnostics.coverage import source_coverage
 from warmprior.diagnostics.curvature import curvature
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.statistics import bootstrap_ratio
@@ -53,7 +54,8 @@ def flow_measures(
     Returns:
         ``"kappa"`` and ``"relative_curvature"``, see :func:`~warmprior.diagnostics.curvature`; NaN where the
         field does not move or is no flow. ``"bound"``, see
-        :func:`~warmprior.diagnostics.branching_bound`; NaN where it does not apply.
+        :func:`~warmprior.diagnostics.branching_bound`, and ``"coverage"``, see
+        :func:`~warmprior.diagnostics.source_coverage`; NaN where they do not apply.
     """
     measured = dict.fromkeys(("kappa", "relative_curvature"), math.nan)
     if policy.prior.is_flow:
@@ -62,7 +64,8 @@ def flow_measures(
             found = curvature(policy, batch, n_steps, generator=generator)
         for name, key in (("kappa", "kappa_executed"), ("relative_curvature", "relative_executed")):
             measured[name] = float(found[key].nanmean())
-    return measured | {"bound": float(_bounds(policy.prior, batch)[1])}
+    bound, coverage = _bounds(policy.prior, batch)[1], source_coverage(policy, batch)
+    return measured | {"bound": float(bound), "coverage": coverage}
 
 
 def straightness(

@@ -267,6 +267,7 @@ def flow_table(rows: Sequence[Row]) -> str:
             f"curvature / {base}'s": relative("kappa"),
             f"curvature per squared mean velocity / {base}'s": relative("relative_curvature"),
             f"bound of the branching cost / {base}'s": relative("bound"),
+            "actions inside the source's 90% interval": mean_cell("coverage", ".2f"),
             f"training time / {base}'s": relative("training_seconds"),
             "mean to demonstrated action": mean_cell("mean_error", ".3f"),
             "mean to prediction, demonstrated states": mean_cell("mean_revision_data", ".3f"),

@@ -1,0 +1,76 @@
+"""Coverage of sources, where the share of targets inside is known."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from warmprior import (
+    CVAEPrior,
+    GaussianPrior,
+    PastPrior,
+    PreviewPrior,
+    VelocityMLP,
+    WarmPriorActor,
+)
+from warmprior.diagnostics import source_coverage
+
+H, D_A, N = 3, 2, 20_000
+
+
+def actor(prior):
+    return WarmPriorActor(VelocityMLP(D_A, 1, prior.prediction_length, 1, hidden_dim=4), prior)
+
+
+def windows(prior, spread, warm=True):
+    g = torch.Generator().manual_seed(0)
+    p = prior.prediction_length
+    loc = torch.rand(N, p, D_A, generator=g)
+    return TensorDict(
+        {
+            "observation": torch.zeros(N, 1, 1),
+            "vla_action": {"chunk": warm * loc + spread * torch.randn(N, p, D_A, generator=g)},
+            "action_is_pad": torch.zeros(N, p, dtype=torch.bool),
+            "prior": {"loc": loc, "warm": torch.full((N, p, 1), warm)},
+        },
+        [N],
+    )
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9])
+@pytest.mark.parametrize("prior", [PastPrior(H, sigma=0.4), PreviewPrior(H, sigma=0.4)])
+def test_a_source_that_spreads_like_the_data_covers_its_level(prior, level):
+    assert source_coverage(actor(prior), windows(prior, 0.4), level=level) == pytest.approx(
+        level, abs=0.01
+    )
+    # Half as wide: P(|z| < q / 2) for the quantile q.
+    z = torch.distributions.Normal(0.0, 1.0)
+    narrow = float(2 * z.cdf(z.icdf(torch.tensor((1 + level) / 2)) / 2) - 1)
+    found = source_coverage(actor(prior), windows(prior, 0.8), level=level)
+    assert found == pytest.approx(narrow, abs=0.01)
+
+
+def test_only_executed_positions_inside_the_episode_count():
+    prior = PreviewPrior(H, sigma=0.0)
+    data = windows(prior, 0.0)
+    data["vla_action", "chunk"][:, 0] += 1.0
+    data["vla_action", "chunk"][:, H:] += 9.0
+    assert source_coverage(actor(prior), data) == pytest.approx(2 / 3)
+    data["action_is_pad"][:, 0] = True
+    assert source_coverage(actor(prior), data) == 1.0
+
+
+def test_cold_sources_are_standard_normal():
+    prior = GaussianPrior(H)
+    found = source_coverage(actor(prior), windows(prior, 1.0, warm=False))
+    assert found == pytest.approx(0.9, abs=0.01)
+
+
+def test_what_is_no_gaussian_has_none():
+    prior = CVAEPrior(H).sized(D_A, 1, 1)
+    assert math.isnan(source_coverage(actor(prior), windows(prior, 1.0)))
+    with pytest.raises(ValueError, match=r"level must be in \(0, 1\)"):
+        source_coverage(actor(PastPrior(H)), windows(PastPrior(H), 1.0), level=1.0)
