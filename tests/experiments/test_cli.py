@@ -74,7 +74,8 @@ def test_every_leaf_is_an_option_under_its_own_name(tmp_path):
         "envs": [2],
     }
     argv = [str(word) for name, values in given.items() for word in (f"--{name}", *values)]
-    recipe = read(*argv, "--no-precondition", "--out", str(tmp_path / "out"))
+    plain = ["--no-precondition", "--weighting", "velocity"]
+    recipe = read(*argv, *plain, "--out", str(tmp_path / "out"))
     assert recipe.data.task == ("can", "stack") and recipe.data.count("mh") == 9
     assert (recipe.network.hidden_dim, recipe.network.precondition) == (32, False)
     assert (recipe.training.iterations, recipe.training.learning_rate) == (11, 0.5)
@@ -87,6 +88,8 @@ def test_every_leaf_is_an_option_under_its_own_name(tmp_path):
 @pytest.mark.parametrize(
     ("argv", "message"),
     [
+        ("--no-precondition", "--weighting standardised needs --precondition"),
+        ("--prior past,age=3", "PastPrior cannot be built"),
         ("--preset nobodys", "--preset must be one of quick, cpu, paper"),
         ("--seeds 1000000000", "--seeds must be between 1 and 1,000"),
         ("--episodes 0", "--episodes must be between 1"),
@@ -173,7 +176,8 @@ def test_options_without_effect_are_refused(tmp_path):
     for given in ("--episodes 3", "--no-precondition --episodes 3"):
         with pytest.raises(ValueError, match=r"makes no use of it: leave out --episodes$"):
             read(*given.split(), *out, unused=("episodes", "top_k"))
-    assert not read("--no-precondition", *out, unused=("episodes",)).network.precondition
+    plain = ["--no-precondition", "--weighting", "velocity"]
+    assert not read(*plain, *out, unused=("episodes",)).network.precondition
 
 
 def test_a_misspelt_folder_starts_no_new_run(tmp_path):
