@@ -71,7 +71,7 @@ def with_errors(comparison: Comparison, observations: SharedObservations) -> lis
     names = (*comparison.contestants[0].facts(), "nfe")
     return [
         Row(row.facts, {**row.measures, "action_error": errors[tuple(row[n] for n in names)]})
-        for row in comparison.results.rows
+        for row in comparison.rows
     ]
 
 

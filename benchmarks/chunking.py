@@ -59,7 +59,8 @@ def run(argv: Sequence[str] | None) -> None:
     recipe.check_single(problem=True, sigma=True)
     with started(recipe, "chunking") as out:
         comparison = Comparison(recipe, "chunking")
-        rows = sorted(comparison.run().rows, key=lambda row: (row["chunk"], -row["nfe"]))
+        comparison.run()
+        rows = sorted(comparison.rows, key=lambda row: (row["chunk"], -row["nfe"]))
         top_k, nfe = recipe.evaluation.top_k, min(comparison.nfes)
         chunks = sorted(set(recipe.sources.chunk))
         title = f"{comparison.title}, {recipe.evaluation.seeds} seed(s)"

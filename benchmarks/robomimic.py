@@ -106,7 +106,8 @@ def run(argv: Sequence[str] | None) -> None:
     recipe = parse(PRESETS, argv, study="robomimic", description=__doc__)
     with started(recipe, "robomimic") as out:
         comparison = Comparison(recipe, "robomimic")
-        rows = comparison.run().rows
+        comparison.run()
+        rows = comparison.rows
         source = comparison.stores[0].problem.facts["source"]
         table = success_table(
             rows, top_k=recipe.evaluation.top_k, source=source, notes=notes(comparison)

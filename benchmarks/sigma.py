@@ -76,7 +76,7 @@ def run(argv: Sequence[str] | None) -> None:
             return lambda rows: cell(select(rows, mean=mean) or select(rows, mean="training"))
 
         text = table(
-            [*select(results.rows, "success_rate"), *trained, *deployed],
+            [*comparison.rows, *trained, *deployed],
             lambda row: f"{prior_label(row['prior'])}, sigma {row['sigma']:g}",
             None,
             {

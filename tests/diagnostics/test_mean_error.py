@@ -9,7 +9,15 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, WarmPriorActor
+from warmprior import (
+    CVAEPrior,
+    ForecastPrior,
+    GaussianPrior,
+    HistoryPrior,
+    PastPrior,
+    PreviewPrior,
+    WarmPriorActor,
+)
 from warmprior.diagnostics import mean_error, mean_revision
 
 H, D_A = 2, 3
@@ -66,6 +74,26 @@ def test_without_a_mean_there_is_no_error():
     rollout = TensorDict({"vla_action": {"chunk": torch.zeros(3, H, 1)}}, [3])
     rollout["next"] = TensorDict({"executed_steps": torch.full((3, 1), H)}, [3])
     assert math.isnan(mean_revision(rollout, GaussianPrior(H)))
+
+
+def test_the_mean_is_that_of_the_source():
+    """Of a learned one wherever it is, and none where the mean only conditions or enters later."""
+    prior = ForecastPrior(H).sized(D_A, 1, 1)
+    batch = windows(prior, warm=False)
+    mean, _ = prior.distribution(
+        batch["prior", "loc"], batch["prior", "warm"], batch["observation"]
+    )
+    counted = ~batch["action_is_pad"].unsqueeze(-1)
+    squared = ((mean - batch["vla_action", "chunk"]).square() * counted).sum() / counted.sum() / D_A
+    found = mean_error(WarmPriorActor(Still(), prior), batch, nfe=1)
+    assert found.target == pytest.approx(float(squared.sqrt()))
+    for other in (HistoryPrior(H), CVAEPrior(H).sized(D_A, 1, 1)):
+        actor = WarmPriorActor(Still(), other, observation_key="observation")
+        assert math.isnan(mean_error(actor, windows(other), nfe=1).target)
+    chunks = [[1.0, 2.0], [4.0, 8.0]]
+    decided = rollout(chunks, [2, 2], [False, False])
+    for other in (ForecastPrior(H).sized(1, 1, 1), HistoryPrior(H)):
+        assert math.isnan(mean_revision(decided, other))
 
 
 def rollout(chunks, executed, done):

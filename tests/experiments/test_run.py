@@ -53,6 +53,7 @@ from warmprior.experiments import (
     RunOptions,
     Store,
     store,
+    write_report,
 )
 
 H = 4
@@ -385,6 +386,56 @@ def test_a_policy_that_fails_is_named_and_does_not_stop_the_others(undisturbed, 
     assert again.failures == []
 
 
+def test_rows_of_a_policy_that_failed_on_the_way_are_kept_but_not_shown(tmp_path):
+    compared = comparison(tmp_path, 1, priors=PRIORS[:2], seeds=2)
+    compared.run()
+    everything = compared.results.rows
+    failed = compared.contestants.pop()
+    assert [row for row in everything if row["prior"] == "past" and row["seed"] == 1]
+    assert len(compared.rows) == len(everything) - 4 and failed.prior.name == "past"
+    assert {(row["prior"], row["seed"]) for row in compared.timed()} == {
+        ("gaussian", 0),
+        ("gaussian", 1),
+        ("past", 0),
+    }
+    write_report(tmp_path, "| table |\n")
+    with pytest.raises(PartialFailure, match="1 failed"):
+        write_report(tmp_path, "| table |\n", [f"{failed}: it stumbled"])
+    assert (tmp_path / "table.md").read_text() == f"| table |\n\n- Missing: {failed}: it stumbled\n"
+
+
+def test_a_problem_that_cannot_be_built_leaves_the_others_alone(tmp_path):
+    """In one worker, which plays the sound problem before and after."""
+    sound, broken = drift_problem(), replace(drift_problem(), task="broken", make_env=unbuildable)
+    options = {"priors": PRIORS[:2], "seeds": 1}
+    alone = comparison(tmp_path / "alone", 1, **options)
+    alone.run()
+    both = comparison(tmp_path / "both", 1, **options)
+    store = both.stores[0]
+    recipe = both.recipe
+    stores = [
+        Store(p, store.network, store.directory, store.logs, store.run) for p in (sound, broken)
+    ]
+    both = Comparison(recipe, "two", stores=stores, directory=tmp_path / "two", priors=PRIORS[:2])
+    both.run()
+    assert len(both.failures) == 2 and all("cannot be built" in f for f in both.failures)
+    assert both.rows == alone.rows
+
+
+def unbuildable(**options):
+    raise RuntimeError("this simulator cannot be built")
+
+
+def test_rows_from_before_priors_had_options_are_continued(undisturbed, tmp_path):
+    (tmp_path / "out").mkdir()
+    results = stored(undisturbed)
+    for row in results["rows"]:
+        assert row["facts"].pop("options") == ""
+    (tmp_path / "out" / "results.json").write_text(json.dumps(results))
+    again = comparison(tmp_path, 1, resume=True)
+    assert not any(again._evaluations(n) for n in range(len(again.contestants)))
+
+
 class Stumbling(DriftEnv):
     def _step(self, tensordict):
         if self.seed_ == EVALUATION_SEED + 2:
@@ -540,6 +591,36 @@ def test_a_student_waits_for_its_teacher(tmp_path, capsys):
     assert [row["prior"] for row in both] == ["reflow"] * 4 + ["gaussian"] * 4 and both[:4] == one
     reflow, gaussian = (c.policy().network.state_dict() for c in compared.contestants)
     assert any(not torch.equal(reflow[name], gaussian[name]) for name in reflow)
+
+
+def test_students_of_one_teacher_share_it(tmp_path, capsys):
+    """It is trained once, by one worker, though it is not compared itself."""
+    priors = [ReflowPrior(H, teacher_nfe=n) for n in (2, 3)]
+    for envs in (1, 3):
+        compared = comparison(tmp_path / str(envs), envs, priors=priors, seeds=1)
+        compared.run()
+        told = capsys.readouterr().out
+        assert not compared.failures and told.count("trained drift own, gaussian") == 1
+        teacher = compared.contestants[0].teacher()
+        whole = teacher.store.training_seconds(teacher.prior, teacher.training)
+        assert all(row["training_seconds"] > whole for row in compared.timed())
+    assert rows_of(tmp_path / "1") == rows_of(tmp_path / "3")
+
+
+class Unteachable(Store):
+    def train(self, prior, training, progress=None):
+        if prior.name == "gaussian":
+            raise FloatingPointError("the teacher diverged")
+        return super().train(prior, training, progress)
+
+
+def test_without_its_teacher_a_student_fails_at_once(tmp_path):
+    priors = [ReflowPrior(H), PastPrior(H)]
+    compared = comparison(tmp_path, 2, kind=Unteachable, priors=priors, seeds=1)
+    compared.run()
+    assert [c.prior.name for c in compared.contestants] == ["past"]
+    assert len(compared.failures) == 2
+    assert all("the teacher diverged" in failure for failure in compared.failures)
 
 
 def test_a_chunk_longer_than_every_demonstration_is_refused(tmp_path):

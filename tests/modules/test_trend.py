@@ -10,13 +10,18 @@ import torch
 from tensordict import TensorDict
 
 from warmprior import (
+    A2APrior,
+    CVAEPrior,
+    ForecastPrior,
     GaussianPrior,
+    LeapPrior,
     Normalizer,
     PastPrior,
     PoseTrend,
     PreconditionedNetwork,
     RestingAction,
     SourceMoments,
+    StepPrior,
     VelocityMLP,
     VelocityNetwork,
 )
@@ -92,6 +97,16 @@ def windows(n=4000, noise=0.1, warm=False):
 def fit(batch, prior):
     generator = torch.Generator().manual_seed(0)
     return PoseTrend.fit(batch, prior, RestingAction(COLUMNS), generator=generator)
+
+
+@pytest.mark.parametrize("kind", [ForecastPrior, LeapPrior, CVAEPrior, A2APrior, StepPrior])
+def test_sources_that_see_the_observation(kind):
+    """The source's trend is that of its draws, which depend on the observation where it sees it."""
+    prior = kind(P).sized(D_A, D_O, TO)
+    trend = fit(windows(), prior)
+    assert bool(torch.isfinite(trend.source).all())
+    if kind in (ForecastPrior, LeapPrior):  # untrained, they still follow what they see
+        assert float(trend.source.abs().max()) > 0.02
 
 
 def test_against_least_squares():

@@ -19,7 +19,7 @@ __all__ = ["MeanError", "mean_error", "mean_revision"]
 
 @dataclass(frozen=True)
 class MeanError:
-    """Root mean squares over warm positions inside the episode and dimensions; NaN if none is warm.
+    """Root mean squares over warm positions inside the episode and dimensions; NaN if the source has no mean.
 
     Attributes:
         target: distance of the mean from the demonstrated actions.
@@ -77,12 +77,14 @@ def mean_error(
         start = policy.prior.start(flat.loc, flat.warm, generator, flat.observation)
         nfe = policy.ode.nfe if nfe is None else nfe
         chunk = predict(policy, rows, start, nfe=nfe, split=split)
-    warm = (flat.warm & flat.counted).expand_as(flat.loc)
-    return MeanError(_rms((flat.loc - flat.target)[warm]), _rms((flat.loc - chunk)[warm]))
+        mean, _ = policy.prior.distribution(flat.loc, flat.warm, flat.observation)
+    known = flat.warm | policy.prior.always_warm
+    known = (known & flat.counted & policy.prior.moves_source).expand_as(mean)
+    return MeanError(_rms((mean - flat.target)[known]), _rms((mean - chunk)[known]))
 
 
 def mean_revision(rollout: TensorDictBase, prior: Prior) -> float:
-    """Distance of the mean from what is then predicted, along rollouts.
+    """Distance of the carried mean from what is then predicted, along rollouts.
 
     Where it is larger than at demonstrated states (:attr:`MeanError.revision`), forecasts age worse where
     the policy brings itself than where the demonstrations are.
@@ -93,7 +95,8 @@ def mean_revision(rollout: TensorDictBase, prior: Prior) -> float:
 
     Returns:
         Root mean square over warm positions and dimensions, in normalised action units; NaN if no
-        decision's mean is warm.
+        decision's mean is warm, or if the source is centred elsewhere (a learned one, for which rollouts
+        would have to keep the observations).
 
     Raises:
         KeyError: if a key is missing.
@@ -114,6 +117,8 @@ def mean_revision(rollout: TensorDictBase, prior: Prior) -> float:
         raise KeyError(f"the rollout lacks {keys.CHUNK} or ('next', '{keys.EXECUTED}')")
     if rollout.ndim != 1:
         raise ValueError(f"need decisions [D] of one environment, got {tuple(rollout.shape)}")
+    if type(prior).distribution is not Prior.distribution or not prior.moves_source:
+        return math.nan
     done = rollout.get(("next", "done"), torch.zeros_like(steps, dtype=torch.bool))
     nothing = torch.zeros_like(chunk[0]), torch.zeros_like(chunk[0, :, :1], dtype=torch.bool)
     (loc, warm), elapsed = nothing, torch.zeros_like(steps[0])

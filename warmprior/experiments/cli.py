@@ -176,8 +176,9 @@ def write_report(out: Path, table: str, failures: Sequence[str] = ()) -> None:
     Raises:
         PartialFailure: if anything is, after the table is shown.
     """
+    missing = "".join(f"- Missing: {failure}\n" for failure in failures)
+    table += missing and f"\n{missing}"
     write_atomic(out / "table.md", lambda path: path.write_text(table))
     print(f"\n{table}\nResults, table and pictures: {out}", flush=True)
     if failures:
-        told = "".join(f"\n- {failure}" for failure in failures)
-        raise PartialFailure(f"{len(failures)} failed (--resume tries again):{told}")
+        raise PartialFailure(f"{len(failures)} failed (--resume tries again):\n{missing}")

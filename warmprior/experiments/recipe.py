@@ -369,6 +369,10 @@ class Recipe:
         for prior in self.sources.priors():
             prior.allowed_nfes(self.evaluation.nfes)
             self.training.check_prior(prior)
+            if self.training.batch_size < prior.least_batch:
+                raise ValueError(
+                    f"{prior.name} pairs within a batch: --batch-size must be at least {prior.least_batch}"
+                )
         if self.evaluation.grid != "uniform" and max(self.evaluation.nfe) == 1:
             raise ValueError("--grid has no effect at NFE 1, which is one step on every grid")
 

@@ -73,6 +73,10 @@ class Contestant:
         problem = self.store.problem
         return f"{problem.task} {problem.style}, {self.prior.describe()}, seed {self.training.seed}"
 
+    def teacher(self) -> Contestant:
+        """The policy that it learns from, see :attr:`Prior.teacher`."""
+        return replace(self, prior=self.store.teacher(self.prior))
+
     def facts(self) -> dict[str, Any]:
         """What rows tell of it."""
         return {
@@ -168,7 +172,7 @@ class _Worker:
         # worker might hold for ever: each entry has a single writer.
         self.iterations = multiprocessing.RawArray("q", len(contestants))
         self._store: Store | None = None
-        self._simulator: EnvBase
+        self._simulator: EnvBase | None = None
         self._playing: tuple[int, int] | None = None
 
     def train(self, number: int) -> Losses:
@@ -184,6 +188,7 @@ class _Worker:
     def play(self, job: _Play) -> Episode:
         chosen = self.contestants[job.number]
         if (job.number, job.checkpoint) != self._playing:
+            self._playing = None  # whatever fails on the way
             self._actor, self._env = self._prepare(chosen, job.checkpoint)
             self._playing = job.number, job.checkpoint
         seed = chosen.training.seed
@@ -215,8 +220,9 @@ class _Worker:
 
     def _prepare(self, chosen: Contestant, checkpoint: int) -> tuple[WarmPriorActor, EnvBase]:
         if self._store is not chosen.store:
-            if self._store is not None:
+            if self._simulator is not None:
                 self._simulator.close(raise_if_closed=False)
+            self._store, self._simulator = None, None
             self._simulator = chosen.store.problem.make_env(**self.options.environment)
             self._store = chosen.store
         policy = self._load(chosen, checkpoint)
@@ -382,8 +388,17 @@ class Comparison:
             curves.setdefault(label(row), []).append(store.train(c.prior, c.training))
         return curves
 
+    @property
+    def rows(self) -> list[Row]:
+        """The rows of :attr:`contestants`: not those of policies that failed on the way."""
+        names = tuple(self.contestants[0].facts())
+        mine = {tuple(c.facts().values()) for c in self.contestants}
+        return [
+            row for row in self.results.rows if tuple(row.facts.get(name) for name in names) in mine
+        ]
+
     def timed(self) -> list[Row]:
-        """The rows, with the processor time of their policies' trainings as ``"training_seconds"``.
+        """The :attr:`rows`, with the processor time of their policies' trainings as ``"training_seconds"``.
 
         It is no part of the results, which are the same on every machine.
         """
@@ -394,7 +409,7 @@ class Comparison:
         names = tuple(self.contestants[0].facts())
         return [
             replace(row, measures={**row.measures, "training_seconds": seconds.get(mine)})
-            for row in self.results.rows
+            for row in self.rows
             for mine in [tuple(row.facts.get(name) for name in names)]
         ]
 
@@ -426,16 +441,12 @@ class Comparison:
         if self.failures:
             raise PartialFailure("; ".join(self.failures))
 
-    def _teachers(self) -> dict[int, int]:
-        """The contestant whose policy teaches another one, for those that are taught by one."""
-        numbers = {c.folder: n for n, c in enumerate(self.contestants)}
-        found = {}
-        for n, c in enumerate(self.contestants):
-            if c.prior.teacher is not None:
-                folder = c.store.folder(c.store.teacher(c.prior), c.training)
-                if folder in numbers:
-                    found[n] = numbers[folder]
-        return found
+    def _missing_teachers(self) -> list[Contestant]:
+        """Policies that others learn from (:attr:`Prior.teacher`), where they are not compared themselves."""
+        known = {c.folder for c in self.contestants}
+        taught = (c for c in self.contestants if c.prior.teacher is not None)
+        found = {t.folder: t for t in map(Contestant.teacher, taught) if t.folder not in known}
+        return list(found.values())
 
     def _rows(self, number: int) -> list[tuple[dict[str, Any], int, int]]:
         """Facts of a contestant's rows, with their checkpoint and NFE."""
@@ -464,24 +475,32 @@ class Comparison:
         Only the last trainings start at once, for they take longest and nothing should wait for them.
         """
         self.results.save()
+        everyone = [*self.contestants, *self._missing_teachers()]
+        following = {n: following.get(n, []) for n in range(len(everyone))}
+        numbers = {c.folder: n for n, c in enumerate(everyone)}
+        teachers = {
+            n: numbers[c.teacher().folder]
+            for n, c in enumerate(everyone)
+            if c.prior.teacher is not None
+        }
         at_once = self.trainings_at_once or len(following)
-        by_seed = sorted(following, key=lambda n: self.contestants[n].training.seed)
+        by_seed = sorted(following, key=lambda n: everyone[n].training.seed)
         to_train, ready = deque(map(_Train, by_seed)), deque[_Measure | _Play]()
-        worker = _Worker(self.contestants, self.recipe.evaluation)
+        worker = _Worker(everyone, self.recipe.evaluation)
         outcomes: dict[tuple[int, int, int], list[Episode]] = {}
         measures: dict[int, _Measures] = {}
         failed: dict[int, str] = {}
         episodes = sum(isinstance(job, _Play) for jobs in following.values() for job in jobs)
-        iterations = sum(self.contestants[n].training.iterations for n in following)
+        iterations = sum(c.training.iterations for c in everyone)
         workers = min(self.num_workers, sum(1 + len(jobs) for jobs in following.values()))
-        training, teachers, taught = 0, self._teachers(), set[int]()
+        training, taught = 0, set[int]()
 
         def next_training() -> _Train | None:
             """The first that needs no policy which is still to be trained."""
             if training >= at_once or (ready and len(to_train) > workers):
                 return None
-            done = (job for job in to_train if teachers.get(job.number) in {None, *taught})
-            return next(done, None)
+            free = (job for job in to_train if teachers.get(job.number) in {None, *taught})
+            return next(free, None)
 
         with (
             ComparisonProgress(iterations, episodes) as progress,
@@ -497,15 +516,18 @@ class Comparison:
                     break
                 for attempt, result in pool.wait(0.5):
                     job: Job = attempt.job
-                    chosen = self.contestants[job.number]
+                    chosen = everyone[job.number]
                     if isinstance(job, _Train):
                         training -= 1
                         taught.add(job.number)
                     if isinstance(result, _Failure):
-                        if job.number not in failed:
-                            failed[job.number] = f"{chosen}: {result.reason}"
-                            progress.say(f"FAILED {failed[job.number]}")
-                        ready = deque(j for j in ready if j.number != job.number)
+                        pupils = [n for n, teacher in teachers.items() if teacher == job.number]
+                        for n in (job.number, *pupils):
+                            if n not in failed:
+                                failed[n] = f"{everyone[n]}: {result.reason}"
+                                progress.say(f"FAILED {failed[n]}")
+                        to_train = deque(j for j in to_train if j.number not in failed)
+                        ready = deque(j for j in ready if j.number not in failed)
                     elif isinstance(job, _Train):
                         ready.extend(following[job.number])
                         chosen.store.note_trained(chosen.prior, chosen.training, result)
@@ -517,10 +539,11 @@ class Comparison:
                         progress.played()
                         cell = job.number, job.checkpoint, job.nfe
                         outcomes.setdefault(cell, []).append(result)
-                    self._write_down(job.number, outcomes, measures, progress)
+                    if job.number < len(self.contestants):
+                        self._write_down(job.number, outcomes, measures, progress)
                 progress.trained(sum(worker.iterations))
         self.failures = [failed[number] for number in sorted(failed)]
-        if len(failed) == len(self.contestants):
+        if all(n in failed for n in range(len(self.contestants))):
             raise PartialFailure("; ".join(self.failures))
         self.contestants = [c for n, c in enumerate(self.contestants) if n not in failed]
 

@@ -124,13 +124,13 @@ class Store:
         return actor.to(self.run.device)
 
     def _prepared(self, prior: Prior, training: TrainingConfig) -> Prior:
-        if prior.teacher is not None:
-            prior = copy.copy(prior)
-            prior.learn_from(self.policy(self.teacher(prior), training))
         if isinstance(prior, nn.Module):  # it learns: every policy has its own
             prior = Prior.from_config(prior.config())
         if isinstance(prior, LearnedPrior):
             self._learn(prior, training)
+        if prior.teacher is not None:
+            prior = prior if isinstance(prior, nn.Module) else copy.copy(prior)
+            prior.learn_from(self.policy(self.teacher(prior), training))
         return prior
 
     def teacher(self, prior: Prior) -> Prior:
@@ -200,6 +200,8 @@ class Store:
         """
         folder = self.folder(prior, training)
         if folder not in self._losses:
+            if prior.teacher is not None:
+                self.train(self.teacher(prior), training, progress)
             logger = self._logger(folder.name)
             started, known = time.process_time(), policy_path(folder, training.iterations).is_dir()
             on_cpu = torch.device(self.run.device).type == "cpu"
@@ -228,7 +230,7 @@ class Store:
         return self._losses[folder]
 
     def training_seconds(self, prior: Prior, training: TrainingConfig) -> float | None:
-        """Processor time of a policy's training, with all that its prior needed before.
+        """Processor time of a policy's training, with what its prior learnt and its teacher's training.
 
         Args:
             prior: its source distribution.
@@ -238,7 +240,11 @@ class Store:
             ``None`` if it is not trained, or was not in one go.
         """
         path = self.folder(prior, training) / TIME
-        return read_json(path)["seconds"] if path.is_file() else None
+        mine = read_json(path)["seconds"] if path.is_file() else None
+        if mine is None or prior.teacher is None:
+            return mine
+        teachers = self.training_seconds(self.teacher(prior), training)
+        return None if teachers is None else mine + teachers
 
     def note_trained(self, prior: Prior, training: TrainingConfig, losses: Losses) -> None:
         """Take note of a policy that another process trained.

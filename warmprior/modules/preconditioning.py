@@ -148,7 +148,7 @@ class SourceMoments(nn.Module):
             )
         observation = batch.get(keys.OBSERVATION, None)
         a0 = prior.sample(batch[keys.LOC], batch[keys.WARM], generator, observation)
-        sizes = [part.numel() for part in batches]  # paired as training does it, batch by batch
+        sizes = [part.numel() for part in batches]  # couplings pair within a batch
         parts = zip(
             a0.split(sizes),
             batch[keys.CHUNK].split(sizes),

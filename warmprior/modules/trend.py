@@ -153,7 +153,8 @@ class PoseTrend(nn.Module):
         resting = rest(windows[keys.OBSERVATION][:, -1].float()).double()
         centre = resting.mean(0)
         mean = windows[keys.LOC], windows[keys.WARM]
-        draws = [prior.sample(*mean, generator).double() for _ in range(DRAWS)]
+        seen = windows[keys.OBSERVATION]
+        draws = [prior.sample(*mean, generator, seen).double() for _ in range(DRAWS)]
         ends = torch.stack((torch.stack(draws).mean(0), windows[keys.CHUNK].double()))
         # Padded positions do not count: they would pull the trend to the episode's last action.
         weight = (~windows[keys.IS_PAD]).double().unsqueeze(-1)

@@ -30,7 +30,7 @@ TEACHER_STEPS = 9
 """Steps from the start to the end of the flow that self-distillation learns to make in one: the paper's."""
 
 DISTILLED_SHARE = 0.25
-"""Of a batch, that of shortcut models: each of these windows costs ten forward passes more."""
+"""Of a batch, that of shortcut models: each of these windows costs nine forward passes more."""
 
 
 def check_objective(

@@ -48,7 +48,7 @@ def learn_prior(
         seed: of initial weights, batches and draws; PyTorch's own generator stays as it is.
 
     Raises:
-        ValueError: if ``iterations < 1`` or ``held_out`` is not in (0, 1).
+        ValueError: if ``iterations < 1`` or ``held_out`` is not in (0, 0.5].
         FloatingPointError: if the loss becomes NaN or infinite.
 
     Examples:
@@ -58,9 +58,9 @@ def learn_prior(
         >>> prior = ForecastPrior(4).sized(action_dim=1, observation_dim=9, observation_steps=1)
         >>> learn_prior(prior, navigation_demonstrations(), iterations=10, observation_steps=1)
     """
-    if iterations < 1 or not 0.0 < held_out < 1.0:
+    if iterations < 1 or not 0.0 < held_out <= 0.5:
         raise ValueError(
-            f"need iterations >= 1 and 0 < held_out < 1, got {iterations} and {held_out}"
+            f"need iterations >= 1 and 0 < held_out <= 0.5, got {iterations} and {held_out}"
         )
     episodes = data[keys.EPISODE].flatten()
     number = episodes.unique(return_inverse=True)[1]
