@@ -112,6 +112,42 @@ def test_the_calibration_makes_errors_as_large_as_they_are_said_to_be():
     torch.testing.assert_close(narrow.distribution(loc, warm, seen)[1], 0.5 * calibrated)
 
 
+def test_no_calibrated_scale_is_below_the_smallest():
+    """And its typical value is what residuals in its source space are drawn with."""
+    prior = ForecastPrior(H, hidden_dim=8, sigma=0.5).sized(D_A, D_O, 1)
+    loc, warm = torch.rand(50, H, D_A), torch.ones(50, H, 1, dtype=torch.bool)
+    seen, counted = torch.rand(50, 1, D_O), torch.rand(50, H, 1) < 0.7
+    mean, _ = prior.distribution(loc, warm, seen)
+    prior.calibrate(mean, counted, loc, warm, seen)  # without any error
+    torch.testing.assert_close(prior.distribution(loc, warm, seen)[1], torch.full_like(mean, 0.01))
+    assert prior.residual_sigma == pytest.approx(0.01)
+    prior.calibrate(mean + 0.3 * torch.randn(mean.shape), counted, loc, warm, seen)
+    scale = prior.distribution(loc, warm, seen)[1][counted]
+    assert prior.residual_sigma == pytest.approx(float(scale.square().mean().sqrt()))
+    again = ForecastPrior.from_config(prior.config())
+    again.load_state_dict(prior.state_dict())
+    assert again.residual_sigma == prior.residual_sigma
+    with pytest.raises(ValueError, match="no networks yet"):
+        ForecastPrior(H).residual_sigma  # noqa: B018
+
+
+def test_the_loss_of_a_cvae_is_its_equation():
+    prior = CVAEPrior(H, hidden_dim=8, latent_dim=3, beta=0.7).sized(D_A, D_O, 1)
+    g = torch.Generator().manual_seed(0)
+    a1, seen = torch.randn(5, H, D_A, generator=g), torch.randn(5, 1, D_O, generator=g)
+    counted, loc = torch.ones(5, H, 1, dtype=torch.bool), torch.zeros(5, H, D_A)
+    found = prior.learning_loss(a1, counted, loc, counted, seen, torch.Generator().manual_seed(1))
+    code = prior.encoder(torch.cat([seen.flatten(1), a1.flatten(1)], -1))
+    mean, deviation = code[:, :3], (0.5 * code[:, 3:]).exp()
+    z = mean + deviation * torch.randn(5, 3, generator=torch.Generator().manual_seed(1))
+    error = a1.flatten(1) - prior.decoder(torch.cat([seen.flatten(1), z], -1))
+    q, standard = torch.distributions.Normal(mean, deviation), torch.distributions.Normal(0.0, 1.0)
+    divergence = torch.distributions.kl_divergence(q, standard).sum(-1)
+    length = H * D_A
+    expected = error.square().sum(-1) / length + 0.7 * 3 / length * divergence
+    torch.testing.assert_close(found, expected.mean())
+
+
 def test_only_what_a_source_sees_changes_it(data):
     batch = windows(GaussianPrior(H), data, MIDDLES)
     batch["prior", "loc"] = torch.full_like(batch["prior", "loc"], 0.5)
@@ -182,6 +218,9 @@ class TestStep:
         assert float(start.std()) == pytest.approx(0.25, rel=0.03)
         source = prior.sample(loc, warm, torch.Generator().manual_seed(0))
         assert torch.allclose(start, 0.25 * source + 0.3)
+        anchor = prior.anchor(loc, warm, torch.zeros(5000, 1, D_O))
+        torch.testing.assert_close(start, anchor + prior.residual_sigma * source)
+        assert prior.moves_source
         assert float(source.std()) == pytest.approx(1.0, rel=0.03)
 
     def test_a_robot_that_stays_meets_more_noise(self):
@@ -216,7 +255,10 @@ class TestStep:
         with pytest.raises(ValueError, match="start_time"):
             integrate(lambda t, a: a, a, nfe=1, start_time=1.0)
 
-    @pytest.mark.parametrize("options", [{"start_time": 1.0}, {"stall": -1.0}])
+    @pytest.mark.parametrize(
+        "options",
+        [{"start_time": 1.0}, {"start_time": True}, {"stall": -1.0}, {"stall_noise": math.inf}],
+    )
     def test_options_out_of_range(self, options):
         with pytest.raises(ValueError, match=next(iter(options))):
             StepPrior(H, **options)
@@ -224,10 +266,9 @@ class TestStep:
 
 @pytest.mark.parametrize("kind", LEARNED)
 def test_configurations_build_the_same_prior(kind, data):
-    assert Prior.make(kind.name, H).config()["action_dim" if kind is not CVAEPrior else "name"] in (
-        None,
-        kind.name,
-    )
+    made = Prior.make(kind.name, H)
+    assert made.config()["action_dim"] is None and made.config()["hidden_dim"] == 256
+    assert Prior.make(f"{kind.name},hidden_dim=256", H).config() == made.config()
     prior = learned(kind, data, iterations=2)
     again = Prior.from_config(prior.config())
     assert again.config() == prior.config() and not prior.is_gaussian
@@ -275,8 +316,22 @@ def test_bad_input_is_named(data):
         ForecastPrior(H).distribution(torch.zeros(1, H, 1), torch.zeros(1, H, 1).bool())
     with pytest.raises(ValueError, match="was built for"):
         ForecastPrior(H).sized(1, 2, 1).sized(1, 3, 1)
-    with pytest.raises(ValueError, match="latent_dim"):
-        CVAEPrior(H, latent_dim=0)
+    for latent_dim in (0, 2.5):
+        with pytest.raises(ValueError, match="latent_dim"):
+            CVAEPrior(H, latent_dim=latent_dim)
+    for beta in (0.0, math.inf, "abc"):
+        with pytest.raises(ValueError, match="beta"):
+            CVAEPrior(H, beta=beta)
+    for hidden_dim in (0, 1.5, True):
+        with pytest.raises(ValueError, match="hidden_dim"):
+            LeapPrior(H, hidden_dim=hidden_dim)
+    with pytest.raises(ValueError, match="observation_steps"):
+        LeapPrior(H, action_dim=1, observation_dim=1, observation_steps=1.5)
+    nested = TensorDict({"pose": torch.zeros(1, 1, D_O)}, [1])
+    with pytest.raises(ValueError, match=r"forecast takes one tensor.*nested"):
+        ForecastPrior(H).sized(D_A, D_O, 1).distribution(
+            torch.zeros(1, H, D_A), torch.zeros(1, H, 1).bool(), nested
+        )
     with pytest.raises(ValueError, match="no networks yet"):
         learn_prior(ForecastPrior(H), data, iterations=1, observation_steps=1)
     prior = ForecastPrior(H).sized(D_A, D_O, 1)

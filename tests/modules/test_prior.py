@@ -228,6 +228,10 @@ def test_paper_setting_draws_nothing():
         ((4,), {"cold_probability": -0.1}, "cold_probability"),
         ((4,), {"cold_probability": 1.1}, "cold_probability"),
         ((4,), {"cold_probability": float("nan")}, "cold_probability"),
+        ((4,), {"sigma": True}, "sigma"),
+        ((4,), {"correlation": True}, "correlation"),
+        ((4,), {"correlation": "abc"}, "correlation must be a finite number, got 'abc'"),
+        ((4,), {"correlation": None}, "correlation"),
     ],
 )
 @pytest.mark.parametrize("prior_class", PRIORS)

@@ -242,11 +242,48 @@ def test_what_make_cannot_build_is_told():
         ("past,correlation=2", r"correlation must be in \[0, 1\], got 2"),
         ("regression,correlation=0.5", "RegressionPrior cannot be built"),
         ("nope,age=3", "unknown prior 'nope'"),
+        ("cvae,foo=1", r"CVAEPrior cannot be built.*foo=1.*it takes .*latent_dim"),
+        ("cvae,correlation=0.5", "CVAEPrior cannot be built.*correlation=0.5"),
+        ("past,correlation=abc", "PastPrior cannot be built.*correlation='abc'.*it takes"),
+        ("past,correlation=null", "PastPrior cannot be built.*correlation must be"),
+        ("past,correlation=true", "PastPrior cannot be built.*correlation must be"),
+        ("step,start_time=abc", "StepPrior cannot be built.*start_time='abc'.*it takes"),
+        ("ot,observation_weight=abc", "OTPrior cannot be built.*observation_weight='abc'"),
+        ("ot,observation_weight=Infinity", "OTPrior cannot be built.*observation_weight must be"),
+        ("cvae,beta=abc", "CVAEPrior cannot be built.*beta='abc'.*it takes"),
+        ("cvae,latent_dim=2.5", "latent_dim must be a whole number"),
+        ("forecast,hidden_dim=0", "hidden_dim must be a whole number"),
+        ("reflow,teacher_nfe=2.5", "teacher_nfe must be a whole number"),
+        ("past,correlation=0.5,correlation=0.2", "correlation is given twice"),
+        ("past,chunk_length=3", "PastPrior cannot be built.*chunk_length"),
+        (
+            "gaussian,sigma=0.3",
+            r"sigma is unknown to it, or without effect\): it takes chunk_length$",
+        ),
+        ("gaussian,correlation=0.5", r"correlation is unknown to it, or without effect"),
     ],
 )
 def test_options_that_do_not_fit(name, message):
     with pytest.raises(ValueError, match=message):
         Prior.make(name, H)
+
+
+def test_what_is_given_beside_the_name_is_not_given_behind_it():
+    with pytest.raises(ValueError, match=r"sigma is given twice: also as 0\.5"):
+        Prior.make("past,sigma=0.3", H, sigma=0.5)
+    with pytest.raises(ValueError, match="cold_probability is given twice"):
+        Prior.make("past,cold_probability=0.3", H, cold_probability=0.5)
+    prior = Prior.make("past,sigma=0.3,cold_probability=0.2", H)
+    assert (prior.sigma, prior.cold_probability) == (0.3, 0.2)
+
+
+def test_commas_inside_a_value_stay_there():
+    name = f"{Anchor.name},gain=0.5,offsets=[1.0, 2.0],correlation=0.25"
+    prior = Prior.make(name, H)
+    assert prior.config()["offsets"] == [1.0, 2.0] and prior.correlation == 0.25
+    assert Prior.make(f"{prior.name},{prior.options}", H).config() == prior.config()
+    # What has no effect is not taken, and so not told.
+    assert GaussianPrior(H, correlation=0.5).options == ""
 
 
 def test_options_are_told_as_they_are_given():

@@ -24,6 +24,7 @@ from warmprior import (
     PastPrior,
     PreviewPrior,
     PriorAnchor,
+    StepPrior,
 )
 
 H = 3
@@ -110,6 +111,30 @@ def test_a_learned_mean_is_the_anchor_from_the_first_decision_on():
         mean, _ = prior.distribution(loc, warm, part["observation"])
         torch.testing.assert_close(part["prior", "anchor"], mean)
         assert mean.any()
+
+
+def test_the_centre_of_a_start_from_a_forecast_is_its_share_of_the_forecast():
+    width = CountingEnv(LENGTHS[0]).reset()["observation"].shape[-1]
+    prior = StepPrior(H, start_time=0.75, stall=0.0).sized(ACTION_DIM, width, 1)
+    parts = Compose(ObservationStack(1), *history(prior), PriorAnchor(prior))
+    env = TransformedEnv(CountingEnv(LENGTHS[0]), parts)
+    check_env_specs(env)
+    data = env.rollout(3)
+    mean = data["prior", "loc"], data["prior", "warm"]
+    forecast = prior.forecast(*mean, data["observation"])
+    torch.testing.assert_close(data["prior", "anchor"], 0.75 * forecast)
+    start = prior.start(*mean, torch.Generator().manual_seed(0), data["observation"])
+    eps = torch.randn(start.shape, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(data["prior", "anchor"] + prior.residual_sigma * eps, start)
+
+
+def test_a_learned_prior_is_the_anchor_s_own():
+    """What moves the environment leaves the policy's weights where they are."""
+    prior = ForecastPrior(H).sized(ACTION_DIM, 3, 1)
+    anchor = PriorAnchor(prior).to("meta")
+    assert anchor.prior.calibration.is_meta and not prior.calibration.is_meta
+    paper = PastPrior(H)
+    assert PriorAnchor(paper).prior is paper
 
 
 def test_noise_is_standard_normal():

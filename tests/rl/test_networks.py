@@ -11,12 +11,14 @@ from torch import nn
 
 from warmprior import (
     BoxTanhNormal,
+    ForecastPrior,
     GaussianPrior,
     HistoryPrior,
     MeanObservation,
     PastPrior,
     PriorDecoder,
     ResidualSampler,
+    StepPrior,
     VelocityMLP,
     WarmPriorActor,
     make_prior_space_actor,
@@ -173,6 +175,15 @@ def test_clipped_is_the_default_around_a_mean():
     assert float(at_the_edge) == pytest.approx(2 * stats.norm.cdf(-0.5), abs=0.02)
     inside = draws[draws.abs() < 0.5].numpy()
     assert stats.kstest(inside, stats.truncnorm(-0.5, 0.5).cdf).pvalue > 1e-3
+
+
+def test_residuals_are_as_large_as_the_source_deviates_from_the_anchor():
+    learned = ForecastPrior(P, sigma=0.5).sized(D_A, D_O, TO)
+    learned.typical_scale.fill_(0.2)
+    step = StepPrior(P, start_time=0.75).sized(D_A, D_O, TO)
+    for prior, sigma in ((learned, 0.1), (step, 0.25), (PastPrior(P, sigma=0.3), 0.3)):
+        sampler = ResidualSampler(make_decoder(prior, 0.5))
+        assert sampler.sigma == pytest.approx(sigma) and sampler.distribution == "clipped"
 
 
 def test_sampler_options():

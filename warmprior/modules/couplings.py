@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any, ClassVar
 
 import torch
@@ -9,6 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from warmprior.io.extras import require
+from warmprior.modules.prior import check_finite_numbers, check_whole_numbers
 from warmprior.modules.priors import GaussianPrior
 
 __all__ = ["OTPrior", "ReflowPrior"]
@@ -22,18 +24,19 @@ class OTPrior(GaussianPrior):
     .. math::
         \sum_j \|a_0^{\pi(j)} - a_1^j\|^2 + w \|o^{\pi(j)} - o^j\|^2
 
-    (Tong et al., 2024; Pooladian et al., 2023), exactly, in groups of at most 256. At decisions the source
-    is drawn at any observation, so pairs across observations bias the policy; ``w`` makes them dear. At
-    ``w = 0`` the observation is ignored; at a large one everything stays where it is.
+    (Tong et al., 2024; Pooladian et al., 2023), exactly, in nearly equal groups of at most 256. At decisions
+    the source is drawn at any observation, so pairs across observations bias the policy; ``w`` makes them
+    dear. At ``w = 0`` the observation is ignored; at a large one everything stays where it is.
 
     Args:
         chunk_length: ``H``.
 
     Keyword Args:
-        observation_weight: ``w``, for observations in the data's normalised units.
+        observation_weight: ``w``, for observations in the data's normalised units, each one tensor.
 
     Raises:
-        ValueError: if the weight is negative, or a batch has fewer than two windows.
+        ValueError: if the weight is negative or not finite, a batch has fewer than two windows, or its
+            observations are nested.
         ImportError: if scipy is missing.
 
     Examples:
@@ -51,7 +54,8 @@ class OTPrior(GaussianPrior):
     GROUP: ClassVar[int] = 256
 
     def __init__(self, chunk_length: int, *, observation_weight: float = 10.0) -> None:
-        if not observation_weight >= 0:
+        check_finite_numbers(observation_weight=observation_weight)
+        if observation_weight < 0:
             raise ValueError(f"observation_weight must be at least 0, got {observation_weight}")
         require("scipy", "sim")
         self.observation_weight = observation_weight
@@ -72,9 +76,14 @@ class OTPrior(GaussianPrior):
             raise ValueError(f"{self.name} pairs within a batch: it needs at least 2 windows")
         if observation is None and self.observation_weight:
             raise ValueError(f"{self.name} needs the observations, or observation_weight=0")
+        if self.observation_weight and not isinstance(observation, Tensor):
+            raise ValueError(
+                f"{self.name} compares observations that are one tensor each, and no nested ones: "
+                "concatenate their entries, or set observation_weight=0"
+            )
         paired = []
-        for i in range(0, len(source), self.GROUP):
-            group = slice(i, i + self.GROUP)
+        # Groups of nearly one size: a window that is left over could only be paired with itself.
+        for group in torch.arange(len(source)).tensor_split(-(-len(source) // self.GROUP)):
             cost = _squared_distances(target[group], source[group])
             if self.observation_weight:
                 assert observation is not None
@@ -103,7 +112,17 @@ class ReflowPrior(GaussianPrior):
         teacher_nfe: the teacher's Euler steps.
 
     Raises:
-        ValueError: if ``teacher_nfe < 1``, or it is trained without a teacher.
+        ValueError: if ``teacher_nfe`` is no whole number of at least 1, or it is trained without a teacher.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import VelocityMLP, WarmPriorActor
+        >>> prior = ReflowPrior(4, teacher_nfe=2)
+        >>> prior.learn_from(WarmPriorActor(VelocityMLP(2, 3, 4), GaussianPrior(4)))
+        >>> a0, a1, seen = torch.randn(5, 4, 2), torch.zeros(5, 4, 2), torch.zeros(5, 2, 3)
+        >>> source, target = prior.couple(a0, a1, observation=seen)
+        >>> source is a0, target.shape
+        (True, torch.Size([5, 4, 2]))
     """
 
     name = "reflow"
@@ -112,16 +131,24 @@ class ReflowPrior(GaussianPrior):
     teacher = "gaussian"
 
     def __init__(self, chunk_length: int, *, teacher_nfe: int = 9) -> None:
-        if teacher_nfe < 1:
-            raise ValueError(f"teacher_nfe must be at least 1, got {teacher_nfe}")
+        check_whole_numbers(teacher_nfe=teacher_nfe)
         super().__init__(chunk_length)
         self.teacher_nfe = teacher_nfe
         self.policy: Any = None
 
     def learn_from(self, policy: Any) -> None:
-        """Take the teacher."""
+        """Take the teacher, which :meth:`couple` moves to the device of the data.
+
+        Raises:
+            ValueError: if it is the policy of another prior, or of another chunk length.
+        """
         if policy.prior.name != self.teacher:
             raise ValueError(f"{self.name} learns from {self.teacher}, not from {policy.prior}")
+        if policy.prior.chunk_length != self.chunk_length:
+            raise ValueError(
+                f"{self.name} has chunks of {self.chunk_length} actions, but its teacher of "
+                f"{policy.prior.chunk_length}"
+            )
         self.policy = policy.eval().requires_grad_(False)
 
     @torch.no_grad()
@@ -137,6 +164,10 @@ class ReflowPrior(GaussianPrior):
             raise ValueError(
                 f"{self.name} has no teacher: hand a trained policy of {self.teacher} to learn_from"
             )
+        for tensor in chain(self.policy.parameters(), self.policy.buffers()):
+            if tensor.device != a0.device:
+                self.policy.to(a0.device)
+                break
         ode = self.policy.ode
         noise_key, observation_key = ode.in_keys
         data = TensorDict({noise_key: a0, observation_key: observation}, a0.shape[:-2])

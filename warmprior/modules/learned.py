@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
+from warmprior.modules.prior import check_finite_numbers, check_whole_numbers
 from warmprior.modules.priors import PastPrior
 
 __all__ = ["A2APrior", "CVAEPrior", "ForecastPrior", "LeapPrior", "LearnedPrior", "StepPrior"]
 
 SCALE_FLOOR = 0.02
-"""Smallest standard deviation of a learned Gaussian source, in normalised action units."""
+"""Smallest standard deviation of a learned Gaussian source, calibrated, in normalised action units and
+before ``sigma`` multiplies it."""
 
 
 class LearnedPrior(PastPrior, nn.Module):
@@ -23,8 +24,8 @@ class LearnedPrior(PastPrior, nn.Module):
     It learns by a loss of its own, on the windows that the flow will be trained on
     (:func:`~warmprior.training.learn_prior`), and is fixed from then on: the flow, and the moments that it
     is preconditioned with, see one and the same source. The mean that it starts from,
-    :math:`\mu`, is that of :class:`PastPrior`. Subclasses set ``outputs`` and override
-    :meth:`learning_loss` and :meth:`distribution` (or :meth:`sample`).
+    :math:`\mu`, is that of :class:`PastPrior`. Subclasses make their networks in :meth:`build`, and override
+    :meth:`learning_loss` and :meth:`distribution` (or :meth:`sample`). Observations are single tensors.
 
     Args:
         chunk_length: ``H``.
@@ -38,7 +39,22 @@ class LearnedPrior(PastPrior, nn.Module):
         cold_probability: see :class:`Prior`.
 
     Raises:
-        ValueError: if only some of the widths are given, or one is below 1.
+        ValueError: if only some of the widths are given, or one is no whole number of at least 1.
+
+    Examples:
+        >>> import torch
+        >>> from torch import nn
+        >>> class Shifted(LearnedPrior):  # the last chunk, with a learned shift
+        ...     name = "shifted"
+        ...     def build(self):
+        ...         self.shift = nn.Parameter(torch.zeros(self.action_dim))
+        ...     def distribution(self, loc, warm, observation=None):
+        ...         return super().distribution(loc + self.shift, warm, observation)
+        ...     def learning_loss(self, a1, counted, loc, warm, observation, generator=None):
+        ...         return ((a1 - loc - self.shift).square() * (warm & counted)).mean()
+        >>> prior = Shifted(4, sigma=0.1)
+        >>> prior.is_sized, prior.sized(action_dim=2, observation_dim=3, observation_steps=1).shift
+        (False, Parameter containing: tensor([0., 0.]))
     """
 
     sees_history: ClassVar[bool] = True
@@ -65,10 +81,17 @@ class LearnedPrior(PastPrior, nn.Module):
         super().__init__(chunk_length, sigma=sigma, cold_probability=cold_probability)
         given = (action_dim, observation_dim, observation_steps)
         widths = [width for width in given if width is not None]
-        if len(widths) not in (0, 3) or any(width < 1 for width in widths):
+        if len(widths) not in (0, 3):
             raise ValueError(
-                f"{type(self).__name__} needs action_dim, observation_dim and observation_steps, each at "
-                f"least 1, or none of them, got {given}"
+                f"{type(self).__name__} needs action_dim, observation_dim and observation_steps, or none of "
+                f"them, got {given}"
+            )
+        check_whole_numbers(hidden_dim=hidden_dim)
+        if widths:
+            check_whole_numbers(
+                action_dim=action_dim,
+                observation_dim=observation_dim,
+                observation_steps=observation_steps,
             )
         self.hidden_dim, self.is_sized = hidden_dim, bool(widths)
         if self.is_sized:
@@ -124,7 +147,7 @@ class LearnedPrior(PastPrior, nn.Module):
         """What the network is given, ``[*B, seen_dim]``.
 
         Raises:
-            ValueError: if there is no observation, or the networks were not built.
+            ValueError: if there is no observation or a nested one, or the networks were not built.
         """
         self._check_sized()
         parts = []
@@ -132,6 +155,11 @@ class LearnedPrior(PastPrior, nn.Module):
             if observation is None:
                 raise ValueError(
                     f"{self.name} needs the observation: give the sampler its observation_key"
+                )
+            if not isinstance(observation, Tensor):
+                raise ValueError(
+                    f"{self.name} takes one tensor [*B, To, d_o] as the observation, and no nested one: "
+                    "concatenate its entries, or use a prior that sees none"
                 )
             parts.append(observation.flatten(-2))
         if self.sees_history:
@@ -199,7 +227,8 @@ class ForecastPrior(LearnedPrior):
 
     per position and dimension. Afterwards :math:`s_\phi` is multiplied, per position and dimension, by the
     root mean square of :math:`(a_1 - \mu_\phi) / s_\phi` on episodes that were held out: a source that errs
-    more than it thinks is widened until it errs as it says. ``sigma`` multiplies the result.
+    more than it thinks is widened until it errs as it says, and one that errs less is narrowed, down to 0.02.
+    ``sigma`` multiplies the result.
 
     Args:
         chunk_length: ``H``.
@@ -219,12 +248,27 @@ class ForecastPrior(LearnedPrior):
     default_sigma = 1.0
     always_warm = True
     calibration: Tensor
+    typical_scale: Tensor
 
     def build(self) -> None:
-        """One network for mean and scale, and the calibration."""
+        """One network for mean and scale, the calibration, and the typical scale that it finds."""
         self.network = self.mlp(self.seen_dim, 2 * self.chunk_dim)
         shape = (self.prediction_length, self.action_dim)
         self.register_buffer("calibration", torch.ones(shape))
+        self.register_buffer("typical_scale", torch.ones(()))
+
+    @property
+    def residual_sigma(self) -> float:
+        """``sigma`` times the root mean square of the scale on the windows of the calibration, 1 before it.
+
+        Raises:
+            ValueError: if the networks were not built.
+        """
+        self._check_sized()
+        return self.sigma * float(self.typical_scale)
+
+    def _calibrated(self, scale: Tensor) -> Tensor:
+        return (self.calibration * scale).clamp_min(SCALE_FLOOR)
 
     def _gaussian(
         self, loc: Tensor, warm: Tensor, observation: Tensor | None
@@ -240,7 +284,7 @@ class ForecastPrior(LearnedPrior):
     ) -> tuple[Tensor, Tensor]:
         """The learned mean and the calibrated scale."""
         mean, scale = self._gaussian(loc, warm, observation)
-        return mean, self.sigma * self.calibration * scale
+        return mean, self.sigma * self._calibrated(scale)
 
     def learning_loss(
         self,
@@ -258,12 +302,13 @@ class ForecastPrior(LearnedPrior):
     def calibrate(
         self, a1: Tensor, counted: Tensor, loc: Tensor, warm: Tensor, observation: Tensor
     ) -> None:
-        """Scale by the root mean square of the standardised error."""
+        """Scale by the root mean square of the standardised error, and note what scale that gives."""
         mean, scale = self._gaussian(loc, warm, observation)
         squared = ((a1 - mean) / scale).square() * counted
         known = counted.sum(0).clamp_min(1)
         found = torch.where(counted.any(0), squared.sum(0) / known, 1.0)
         self.calibration.copy_(found.sqrt())
+        self.typical_scale.copy_(_mean(self._calibrated(scale).square(), counted).sqrt())
 
 
 class LeapPrior(ForecastPrior):
@@ -271,6 +316,14 @@ class LeapPrior(ForecastPrior):
 
     Args:
         chunk_length: ``H``.
+
+    Examples:
+        >>> import torch
+        >>> prior = LeapPrior(4).sized(action_dim=2, observation_dim=3, observation_steps=1)
+        >>> loc, warm = torch.rand(5, 4, 2), torch.ones(5, 4, 1, dtype=torch.bool)
+        >>> mean, _ = prior.distribution(loc, warm, torch.zeros(5, 1, 3))
+        >>> bool((mean == mean[0]).all())  # the last actions play no role
+        True
     """
 
     name = "leap"
@@ -288,6 +341,13 @@ class A2APrior(LearnedPrior):
 
     Args:
         chunk_length: ``H``.
+
+    Examples:
+        >>> import torch
+        >>> prior = A2APrior(4).sized(action_dim=2, observation_dim=3, observation_steps=1)
+        >>> loc, warm = torch.rand(5, 4, 2), torch.ones(5, 4, 1, dtype=torch.bool)
+        >>> bool((prior.sample(loc, warm) == prior.sample(loc, warm)).all())
+        True
     """
 
     name = "a2a"
@@ -327,18 +387,35 @@ class CVAEPrior(LearnedPrior):
 
     .. math::
         a_0 = g_\phi(o, z) + \sigma \varepsilon, \quad z \sim N(0, I), \qquad
-        \min_\phi E\left[\|a_1 - g_\phi(o, z)\|^2 + \beta \, KL(q_\phi(z | o, a_1) \| N(0, I))\right]
+        \min_\phi E\left[\frac{1}{D} \|a_1 - g_\phi(o, z)\|^2
+        + \beta \frac{d_z}{D} \, KL(q_\phi(z | o, a_1) \| N(0, I))\right]
 
-    (Chen et al., 2024). The flow from it is that of every other prior; BRIDGER's own path adds noise between
-    the ends and is sampled as a stochastic differential equation.
+    with :math:`D = P d_a` coordinates of a chunk and :math:`d_z` of ``z``; the first term is the mean over
+    the coordinates inside the episode (Chen et al., 2024). The flow from it is that of every other prior;
+    BRIDGER's own path adds noise between the ends and is sampled as a stochastic differential equation.
 
     Args:
         chunk_length: ``H``.
 
     Keyword Args:
         latent_dim: width of ``z``.
-        beta: weight of the divergence, per coordinate of the chunk.
+        beta: weight of the divergence.
+        action_dim: see :class:`LearnedPrior`.
+        observation_dim: likewise.
+        observation_steps: likewise.
+        hidden_dim: likewise.
         sigma: noise of the source around the decoder's output.
+        cold_probability: see :class:`Prior`.
+
+    Raises:
+        ValueError: if ``latent_dim`` is no whole number of at least 1, or ``beta`` no finite number > 0.
+
+    Examples:
+        >>> import torch
+        >>> prior = CVAEPrior(4, latent_dim=2).sized(action_dim=2, observation_dim=3, observation_steps=1)
+        >>> loc, warm = torch.zeros(5, 4, 2), torch.zeros(5, 4, 1, dtype=torch.bool)
+        >>> prior.sample(loc, warm, observation=torch.zeros(5, 1, 3)).shape
+        torch.Size([5, 4, 2])
     """
 
     name = "cvae"
@@ -350,12 +427,32 @@ class CVAEPrior(LearnedPrior):
     beta: float
 
     def __init__(
-        self, chunk_length: int, *, latent_dim: int = 8, beta: float = 0.01, **options: Any
+        self,
+        chunk_length: int,
+        *,
+        latent_dim: int = 8,
+        beta: float = 0.01,
+        action_dim: int | None = None,
+        observation_dim: int | None = None,
+        observation_steps: int | None = None,
+        hidden_dim: int = 256,
+        sigma: float | None = None,
+        cold_probability: float = 0.0,
     ) -> None:
-        if latent_dim < 1 or not beta > 0:
-            raise ValueError(f"need latent_dim >= 1 and beta > 0, got {latent_dim} and {beta}")
+        check_whole_numbers(latent_dim=latent_dim)
+        check_finite_numbers(beta=beta)
+        if beta <= 0:
+            raise ValueError(f"beta must be a finite number > 0, got {beta}")
         self.__dict__.update(latent_dim=latent_dim, beta=beta)
-        super().__init__(chunk_length, **options)
+        super().__init__(
+            chunk_length,
+            action_dim=action_dim,
+            observation_dim=observation_dim,
+            observation_steps=observation_steps,
+            hidden_dim=hidden_dim,
+            sigma=sigma,
+            cold_probability=cold_probability,
+        )
 
     def build(self) -> None:
         """Encoder and decoder."""
@@ -394,7 +491,7 @@ class CVAEPrior(LearnedPrior):
         observation: Tensor,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Squared error of the reconstruction and divergence of the code."""
+        """Mean squared error of the reconstruction, and divergence of the code."""
         seen = self.seen(loc, warm, observation)
         found = self.encoder(torch.cat([seen, (a1 * counted).flatten(-2)], -1))
         mean, log_variance = found.chunk(2, -1)
@@ -425,11 +522,26 @@ class StepPrior(LearnedPrior):
         start_time: :math:`t_s`.
         stall: see above, in normalised action units.
         stall_noise: see above.
+
+    Raises:
+        ValueError: if ``start_time`` is not in (0, 1), ``stall`` below 0, or one of the three not finite.
+
+    Examples:
+        >>> import torch
+        >>> prior = StepPrior(4, start_time=0.75).sized(
+        ...     action_dim=2, observation_dim=3, observation_steps=1)
+        >>> loc, warm = torch.zeros(5, 4, 2), torch.zeros(5, 4, 1, dtype=torch.bool)
+        >>> seen, draw = torch.zeros(5, 1, 3), torch.Generator().manual_seed(0)
+        >>> start = prior.start(loc, warm, draw, seen)
+        >>> noise = prior.sample(loc, warm, draw.manual_seed(0))
+        >>> torch.allclose(start, prior.anchor(loc, warm, seen) + prior.residual_sigma * noise)
+        True
     """
 
     name = "step"
     label = "STEP"
     color = "#35978f"
+    always_warm = True
     stall: float
     stall_noise: float
 
@@ -445,10 +557,10 @@ class StepPrior(LearnedPrior):
         observation_steps: int | None = None,
         hidden_dim: int = 256,
     ) -> None:
-        if not 0.0 < start_time < 1.0 or not stall >= 0 or not math.isfinite(stall_noise):
+        check_finite_numbers(start_time=start_time, stall=stall, stall_noise=stall_noise)
+        if not 0.0 < start_time < 1.0 or stall < 0:
             raise ValueError(
-                f"need 0 < start_time < 1, stall >= 0 and a finite stall_noise, got {start_time}, {stall} "
-                f"and {stall_noise}"
+                f"need 0 < start_time < 1 and stall >= 0, got {start_time} and {stall}"
             )
         self.__dict__.update(start_time=start_time, stall=stall, stall_noise=stall_noise)
         super().__init__(
@@ -476,9 +588,13 @@ class StepPrior(LearnedPrior):
         return super().distribution(loc, torch.zeros_like(warm), observation)
 
     @property
-    def moves_source(self) -> bool:
-        """No: the forecast enters at decisions alone, and an agent searches around zero."""
-        return False
+    def residual_sigma(self) -> float:
+        """Share of the noise in :meth:`start`, without what is added where the robot may be stuck."""
+        return 1.0 - self.start_time
+
+    def anchor(self, loc: Tensor, warm: Tensor, observation: Tensor | None = None) -> Tensor:
+        """Share of the forecast in :meth:`start`."""
+        return self.start_time * self.forecast(loc, warm, observation)
 
     def start(
         self,

@@ -9,6 +9,7 @@ import math
 import re
 import zlib
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
@@ -19,6 +20,30 @@ __all__ = ["Prior"]
 
 PALETTE = ("#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", "#984ea3", "#17becf")
 """Colours in figures of priors that choose none."""
+
+NEXT_OPTION = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
+"""What separates options behind a prior's name; other commas belong to a value."""
+
+WARM_ARGUMENTS = frozenset({"sigma", "cold_probability", "correlation"})
+"""Arguments without effect where nothing is ever warm."""
+
+
+def check_finite_numbers(**values: Any) -> None:
+    """Raise ValueError for the first of them that is no finite number."""
+    for name, value in values.items():
+        try:
+            finite = not isinstance(value, bool) and math.isfinite(value)
+        except (TypeError, ValueError, OverflowError):
+            finite = False
+        if not finite:
+            raise ValueError(f"{name} must be a finite number, got {value!r}")
+
+
+def check_whole_numbers(**values: Any) -> None:
+    """Raise ValueError for the first of them that is no whole number of at least 1."""
+    for name, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+            raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
 
 
 class Prior:
@@ -55,8 +80,8 @@ class Prior:
             that averages sees through it.
 
     Raises:
-        ValueError: if ``chunk_length < 1``, ``sigma < 0``, or ``cold_probability`` or ``correlation`` is not
-            in [0, 1].
+        ValueError: if ``chunk_length < 1``, ``sigma`` is not a finite number >= 0, or ``cold_probability`` or
+            ``correlation`` is not in [0, 1].
 
     Examples:
         >>> import torch
@@ -90,7 +115,8 @@ class Prior:
     default_sigma: ClassVar[float] = 1.0
     """``sigma`` where none is given."""
     always_warm: ClassVar[bool] = False
-    """Whether there is a mean where the window or decision has none, as in the first chunk of an episode."""
+    """Whether :meth:`anchor` holds where the window or decision has no mean, as in the first chunk of an
+    episode."""
     ever_warm: ClassVar[bool] = True
     """Whether there is ever a mean. Otherwise ``sigma`` and ``cold_probability`` are without effect."""
     is_flow: ClassVar[bool] = True
@@ -124,17 +150,16 @@ class Prior:
     ) -> None:
         if chunk_length < 1:
             raise ValueError(f"chunk_length must be at least 1, got {chunk_length}")
-        sigma = self.default_sigma if sigma is None else float(sigma)
-        if not sigma >= 0 or sigma == float("inf"):
+        sigma = self.default_sigma if sigma is None else sigma
+        shares = {"cold_probability": cold_probability, "correlation": correlation}
+        check_finite_numbers(sigma=sigma, **shares)
+        if sigma < 0:
             raise ValueError(f"sigma must be a finite number >= 0, got {sigma}")
-        for name, share in {
-            "cold_probability": cold_probability,
-            "correlation": correlation,
-        }.items():
+        for name, share in shares.items():
             if not 0.0 <= share <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {share}")
         self.chunk_length = int(chunk_length)
-        self.sigma = sigma
+        self.sigma = float(sigma)
         self.cold_probability = float(cold_probability)
         self.correlation = float(correlation)
 
@@ -208,7 +233,8 @@ class Prior:
         """One prior of a comparison: what its constructor takes of the options that compare sources.
 
         Args:
-            name: see :meth:`find`; with further arguments as in ``"preview,correlation=0.5"``.
+            name: see :meth:`find`; with further arguments as in ``"preview,correlation=0.5"``, as JSON or
+                plain text. A comma separates them if ``option=`` follows, and belongs to the value otherwise.
             chunk_length: ``H``.
 
         Keyword Args:
@@ -216,7 +242,8 @@ class Prior:
             cold_probability: likewise.
 
         Raises:
-            ValueError: see :meth:`find` and :class:`Prior`.
+            ValueError: if there is no such prior, or an argument is out of range, given twice, unknown or
+                without effect, naming it and what the prior takes.
 
         Examples:
             >>> [Prior.make(name, 8, sigma=0.3) for name in ("past", "regression")]
@@ -225,22 +252,29 @@ class Prior:
             0.5
         """
         found = Prior.find(name)
-        options: dict[str, Any] = {"sigma": sigma, "cold_probability": cold_probability}
-        taken = {key: value for key, value in options.items() if found.takes(key)}
-        taken |= _parsed(name)
-        signature = inspect.signature(found.__init__)
+        behind = _parsed(name)
+        beside: dict[str, Any] = {"sigma": sigma, "cold_probability": cold_probability}
+        unset = {"sigma": None, "cold_probability": 0.0}
+        taken = {key: value for key, value in beside.items() if found.takes(key)} | behind
         try:
-            signature.bind(None, chunk_length, **taken)
-        except TypeError as error:
+            for key in behind:
+                if not found.takes(key):
+                    raise ValueError(f"{key} is unknown to it, or without effect")
+                if key in beside and beside[key] != unset[key]:
+                    raise ValueError(f"{key} is given twice: also as {beside[key]}")
+            return found(chunk_length, **taken)
+        except (TypeError, ValueError, ArithmeticError) as error:
+            told = [f"{k}={v!r}" for k, v in taken.items() if k in behind or v != unset[k]]
             raise ValueError(
-                f"{found.__name__} cannot be built from chunk_length, {', '.join(taken)} ({error}): it takes "
-                f"{', '.join(list(signature.parameters)[1:])}. Give arguments of your own defaults"
+                f"{found.__name__} cannot be built from {', '.join(['chunk_length', *told])} ({error}): it "
+                f"takes {', '.join(found._takes())}"
             ) from error
-        return found(chunk_length, **taken)
 
     @classmethod
     def takes(cls, argument: str) -> bool:
-        """Whether ``sigma`` or ``cold_probability`` is an argument of the constructor, and has an effect.
+        """Whether the constructor has such an argument, and it has an effect.
+
+        Where nothing is ever warm, ``sigma``, ``cold_probability`` and ``correlation`` have none.
 
         Args:
             argument: its name.
@@ -248,19 +282,38 @@ class Prior:
         Examples:
             >>> [Prior.find(name).takes("sigma") for name in ("past", "gaussian", "regression")]
             [True, False, False]
+            >>> [Prior.find(name).takes("correlation") for name in ("past", "gaussian", "history")]
+            [True, False, False]
         """
         parameters = inspect.signature(cls.__init__).parameters
         kinds = [parameter.kind for parameter in parameters.values()]
         named = argument in parameters or inspect.Parameter.VAR_KEYWORD in kinds
-        return cls.ever_warm and named
+        return named and (cls.ever_warm or argument not in WARM_ARGUMENTS)
+
+    @classmethod
+    def _takes(cls) -> list[str]:
+        """All such arguments, for messages."""
+        parameters = list(inspect.signature(cls.__init__).parameters.values())[1:]  # without self
+        return [
+            f"**{parameter.name}" if parameter.kind is parameter.VAR_KEYWORD else parameter.name
+            for parameter in parameters
+            if cls.takes(parameter.name)
+        ]
 
     @property
     def moves_source(self) -> bool:
-        """Whether the mean is the centre of the source, so that an agent can search around it.
+        """Whether :meth:`anchor` is the centre of the source, so that an agent can search around it.
 
         It is not if nothing is ever warm, or if the mean conditions the network instead.
         """
         return self.ever_warm and not self.conditions_network
+
+    @property
+    def residual_sigma(self) -> float:
+        """Typical deviation of :meth:`start` from :meth:`anchor`: what residuals without an agent are drawn
+        with. ``sigma`` by default.
+        """
+        return self.sigma
 
     @property
     def is_gaussian(self) -> bool:
@@ -378,6 +431,21 @@ class Prior:
             A point at :attr:`start_time`, ``[*B, P, d_a]``.
         """
         return self.sample(loc, warm, generator, observation)
+
+    def anchor(self, loc: Tensor, warm: Tensor, observation: Tensor | None = None) -> Tensor:
+        """Mean of :meth:`start`, around which an agent searches: that of :meth:`distribution` by default.
+
+        It counts on warm positions, or on all (:attr:`always_warm`), if the prior :attr:`moves_source`.
+
+        Args:
+            loc: see :meth:`distribution`.
+            warm: see :meth:`distribution`.
+            observation: see :meth:`distribution`.
+
+        Returns:
+            A point at :attr:`start_time`, broadcastable to ``[*B, P, d_a]``.
+        """
+        return self.distribution(loc, warm, observation)[0]
 
     def couple(
         self,
@@ -510,6 +578,7 @@ class Prior:
             f"{name}={json.dumps(value)}"
             for name, value in self._resolved().items()
             if name not in self.untold
+            and self.takes(name)
             and not (name in parameters and parameters[name].default == value)
         )
 
@@ -549,17 +618,21 @@ class Prior:
 
 def _parsed(name: str) -> dict[str, Any]:
     """Options behind the name of a prior, such as ``"preview,correlation=0.5"``."""
-    options = {}
-    for part in name.split(",")[1:]:
+    options: dict[str, Any] = {}
+    _, comma, rest = name.partition(",")
+    for part in NEXT_OPTION.split(rest) if comma else ():
         key, equals, text = part.partition("=")
-        if not equals or not key.strip().isidentifier():
+        key = key.strip()
+        if not equals or not key.isidentifier():
             raise ValueError(
                 f"options of a prior are written as name,option=value, got {part!r} in {name!r}"
             )
+        if key in options:
+            raise ValueError(f"the option {key} is given twice in {name!r}")
         try:
-            options[key.strip()] = json.loads(text)
+            options[key] = json.loads(text)
         except json.JSONDecodeError:
-            options[key.strip()] = text
+            options[key] = text
     return options
 
 

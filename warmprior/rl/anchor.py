@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
 import random
 from typing import Any, Literal, Self
@@ -9,6 +10,7 @@ from typing import Any, Literal, Self
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
+from torch import nn
 from torchrl.data import TensorSpec
 from torchrl.envs.transforms import Transform
 
@@ -31,7 +33,9 @@ class PriorAnchor(Transform):
     draw of that source it does not. The draw is made *here*, before the agent acts, and written next to
     the observation: the agent sees which noise will be used, the decision process stays Markov (for WP-Past
     if whole chunks are executed, see :func:`~warmprior.make_prior_space_actor`) and the decoder
-    deterministic. ``("prior", "loc")`` is left alone, :class:`ActionHistory` carries it on.
+    deterministic. ``("prior", "loc")`` is left alone, :class:`ActionHistory` carries it on. The mean is that
+    of what the flow starts from at decisions, :meth:`Prior.anchor`: of :class:`~warmprior.StepPrior` a share
+    of its forecast.
 
     Append it after :class:`ActionHistory`, inside or outside of batched environments.
 
@@ -41,7 +45,8 @@ class PriorAnchor(Transform):
         transform draws for all of them.
 
     Args:
-        prior: the policy's source distribution.
+        prior: the policy's source distribution. One that learns is copied, as it is now: the copy goes where
+            the environment goes, and the policy's own where the policy goes.
 
     Keyword Args:
         cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default
@@ -89,6 +94,9 @@ class PriorAnchor(Transform):
         super().__init__(in_keys=[loc_key, warm_key], out_keys=[anchor_key])
         if cold not in (None, "noise", "zero"):
             raise ValueError(f"cold must be 'noise' or 'zero', got {cold!r}")
+        if isinstance(prior, nn.Module):
+            # It becomes a part of this one: whatever moved the environment would move the policy's weights.
+            prior = copy.deepcopy(prior).cpu().requires_grad_(False)
         self.prior = prior
         self.follows_mean = prior.moves_source
         self.cold = cold or ("noise" if self.follows_mean else "zero")
@@ -171,7 +179,7 @@ class PriorAnchor(Transform):
         if self.follows_mean:
             observation = next_tensordict.get(self.observation_key, None)
             with torch.no_grad():
-                mean, _ = self.prior.distribution(loc, warm, observation)
+                mean = self.prior.anchor(loc, warm, observation)
             anchor = torch.where(warm | self.prior.always_warm, mean, cold)
         return next_tensordict.set(self.anchor_key, anchor)
 

@@ -19,7 +19,8 @@ ResidualDistribution = Literal["normal", "clipped", "uniform"]
 class ResidualSampler(TensorDictModuleBase):
     r"""Draws residuals without an agent: to fill the buffer at first, and to distil the noise critic.
 
-    With :math:`\sigma` the prior's (1 if nothing is ever warm) and :math:`\delta` the decoder's:
+    With :math:`\sigma` the typical deviation from the anchor (:attr:`~warmprior.Prior.residual_sigma`: the
+    prior's ``sigma``, or what it tells instead; 1 around zero) and :math:`\delta` the decoder's:
 
     ===============  =============================================================================
     distribution     residual
@@ -38,7 +39,7 @@ class ResidualSampler(TensorDictModuleBase):
     Keyword Args:
         distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
             noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
-        sigma: the prior's own by default.
+        sigma: the prior's own by default, as it is now.
         generator: source of randomness on the data's device; PyTorch's global one by default.
 
     Raises:
@@ -65,7 +66,7 @@ class ResidualSampler(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if sigma is None:
-            sigma = decoder.prior.sigma if decoder.prior.moves_source else 1.0
+            sigma = decoder.prior.residual_sigma if decoder.prior.moves_source else 1.0
         if distribution is None and decoder.prior.moves_source:
             distribution = "clipped" if sigma > 0 else "uniform"
         elif distribution is None:
