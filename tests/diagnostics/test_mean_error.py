@@ -16,6 +16,7 @@ from warmprior import (
     HistoryPrior,
     PastPrior,
     PreviewPrior,
+    StepPrior,
     WarmPriorActor,
 )
 from warmprior.diagnostics import mean_error, mean_revision
@@ -87,7 +88,7 @@ def test_the_mean_is_that_of_the_source():
     squared = ((mean - batch["vla_action", "chunk"]).square() * counted).sum() / counted.sum() / D_A
     found = mean_error(WarmPriorActor(Still(), prior), batch, nfe=1)
     assert found.target == pytest.approx(float(squared.sqrt()))
-    for other in (HistoryPrior(H), CVAEPrior(H).sized(D_A, 1, 1)):
+    for other in (HistoryPrior(H), *(k(H).sized(D_A, 1, 1) for k in (CVAEPrior, StepPrior))):
         actor = WarmPriorActor(Still(), other, observation_key="observation")
         assert math.isnan(mean_error(actor, windows(other), nfe=1).target)
     chunks = [[1.0, 2.0], [4.0, 8.0]]

@@ -78,8 +78,10 @@ def mean_error(
         nfe = policy.ode.nfe if nfe is None else nfe
         chunk = predict(policy, rows, start, nfe=nfe, split=split)
         mean, _ = policy.prior.distribution(flat.loc, flat.warm, flat.observation)
-    known = flat.warm | policy.prior.always_warm
-    known = (known & flat.counted & policy.prior.moves_source).expand_as(mean)
+    # STEP's source has no mean: its forecast enters the flow later.
+    has_mean = policy.prior.moves_source and policy.prior.start_time == 0.0
+    known = (flat.warm | policy.prior.always_warm) & flat.counted & has_mean
+    known = known.expand_as(mean)
     return MeanError(_rms((mean - flat.target)[known]), _rms((mean - chunk)[known]))
 
 
