@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from warmprior.diagnostics import SharedObservations, action_error
 from warmprior.experiments import (
@@ -24,13 +25,13 @@ from warmprior.experiments import (
     mean_known,
     parse,
     plot_budget,
-    prior_label,
     started,
     success_cell,
     table,
     write_report,
 )
 from warmprior.experiments.recipe import check_counts
+from warmprior.experiments.tables import source_at_nfe
 from warmprior.io.script import run_script
 from warmprior.training import TrainingConfig
 
@@ -62,15 +63,21 @@ class BudgetRecipe(MeasuredRecipe):
 
 def with_errors(comparison: Comparison, observations: SharedObservations) -> list[Row]:
     """The rows, with the error of their policies on demonstrations that none was trained on."""
-    errors = {}
+    errors: dict[tuple[Any, ...], float] = {}
     for contestant in comparison.contestants:
         windows = observations.windows(contestant.prior)
         found = action_error(comparison.player(contestant), windows, nfes=comparison.nfes)
         for nfe, error in found.items():
             errors[(*contestant.facts().values(), nfe)] = error
     names = (*comparison.contestants[0].facts(), "nfe")
+
+    def key(row: Row) -> tuple[Any, ...]:
+        # Rows of earlier versions have no options.
+        facts = {"options": "", **row.facts}
+        return tuple(facts[name] for name in names)
+
     return [
-        Row(row.facts, {**row.measures, "action_error": errors[tuple(row[n] for n in names)]})
+        Row(row.facts, {**row.measures, "action_error": errors[key(row)]})
         for row in comparison.results.rows
     ]
 
@@ -80,7 +87,7 @@ def make_table(rows: Sequence[Row], top_k: int) -> str:
     return table(
         sorted(rows, key=lambda row: (row["iterations"], -row["nfe"])),
         lambda row: str(row["iterations"]),
-        lambda row: f"NFE {row['nfe']}: {prior_label(row['prior'])}",
+        source_at_nfe(rows),
         {"": lambda cell: f"{success(cell)} ({mean_known(cell, 'action_error'):.4f})"},
         head="iterations",
         notes=[
