@@ -24,13 +24,13 @@ from warmprior.experiments import (
     mean_known,
     parse,
     plot_budget,
-    prior_label,
     started,
     success_cell,
     table,
     write_report,
 )
 from warmprior.experiments.recipe import check_counts
+from warmprior.experiments.tables import source_at_nfe
 from warmprior.io.script import run_script
 from warmprior.training import TrainingConfig
 
@@ -62,7 +62,7 @@ class BudgetRecipe(MeasuredRecipe):
 
 def with_errors(comparison: Comparison, observations: SharedObservations) -> list[Row]:
     """The rows, with the error of their policies on demonstrations that none was trained on."""
-    errors = {}
+    errors: dict[tuple[Any, ...], float] = {}
     for contestant in comparison.contestants:
         windows = observations.windows(contestant.prior)
         found = action_error(comparison.player(contestant), windows, nfes=comparison.nfes)
@@ -70,7 +70,9 @@ def with_errors(comparison: Comparison, observations: SharedObservations) -> lis
             errors[(*contestant.facts().values(), nfe)] = error
     names = (*comparison.contestants[0].facts(), "nfe")
     return [
-        Row(row.facts, {**row.measures, "action_error": errors[tuple(row[n] for n in names)]})
+        replace(
+            row, measures={**row.measures, "action_error": errors[tuple(row[n] for n in names)]}
+        )
         for row in comparison.rows
     ]
 
@@ -80,7 +82,7 @@ def make_table(rows: Sequence[Row], top_k: int) -> str:
     return table(
         sorted(rows, key=lambda row: (row["iterations"], -row["nfe"])),
         lambda row: str(row["iterations"]),
-        lambda row: f"NFE {row['nfe']}: {prior_label(row['prior'])}",
+        source_at_nfe(rows),
         {"": lambda cell: f"{success(cell)} ({mean_known(cell, 'action_error'):.4f})"},
         head="iterations",
         notes=[

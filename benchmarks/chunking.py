@@ -22,8 +22,8 @@ from warmprior.experiments import (
     plot_chunk_lengths,
     plot_success,
     plot_success_bars,
-    prior_label,
     select,
+    source_labels,
     started,
     success_cell,
     table,
@@ -34,11 +34,11 @@ from warmprior.io.script import run_script
 
 
 def make_table(rows: Sequence[Row], top_k: int) -> str:
-    jump = mean_cell("boundary_jump", ".3f")
+    jump, label = mean_cell("boundary_jump", ".3f"), source_labels(rows, chunks=False)
     return table(
         rows,
         lambda row: f"H = {row['chunk']}",
-        lambda row: f"NFE {row['nfe']}: {prior_label(row['prior'])}",
+        lambda row: f"NFE {row['nfe']}: {label(row)}",
         {
             "success (%)": success_cell(top_k),
             "jump at boundaries": lambda rows: jump(last_checkpoints(rows)),

@@ -142,8 +142,9 @@ def run(argv: Sequence[str] | None) -> None:
         observations = SharedObservations(problem.data, recipe.sources.chunk[0])
         rows = [*judge(comparison), *curvatures(comparison, observations)]
         comparison.results.add(*rows)
-        draw(comparison, rows, observations)
+        # Before the pictures, which are the lesser loss: the trainings took the time.
         write_report(out, make_table(rows, variation_notes(recipe)))
+        draw(comparison, rows, observations)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -5,19 +5,21 @@ python benchmarks/prior_space_rl.py                          # lift from a weak 
 python benchmarks/prior_space_rl.py --preset paper --task square --run runs/square-ph-paper
 python benchmarks/prior_space_rl.py --resume                 # after an interruption
 
-A frozen policy per prior and seed comes from --run (a finished run of robomimic.py) or is trained first.
+A frozen policy per source and seed comes from --run (a finished run of robomimic.py) or is trained first.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
-from warmprior import WarmPriorActor
+from warmprior import Prior, WarmPriorActor
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.experiments import (
     Comparison,
@@ -37,7 +39,7 @@ from warmprior.experiments import (
     write_report,
 )
 from warmprior.experiments.figures import agent_label
-from warmprior.experiments.labels import with_actions
+from warmprior.experiments.labels import source_of, with_actions
 from warmprior.experiments.prior_space import (
     PRIOR_SPACE_PRESETS,
     PriorSpaceRecipe,
@@ -45,37 +47,84 @@ from warmprior.experiments.prior_space import (
     prior_space_preset,
 )
 from warmprior.experiments.results import facts_of_machine, grouped
-from warmprior.io.files import read_json, write_atomic
+from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.io.script import run_script
 from warmprior.rl import PriorSpaceTraining
 from warmprior.training.threads import torch_threads
 
-Frozen = dict[str, dict[int, WarmPriorActor]]
-"""Policies by prior name and training seed."""
+Source = tuple[str, str]
+"""Name and options of a prior: agents of several options of one prior are compared like those of several."""
+
+Frozen = dict[Source, dict[int, WarmPriorActor]]
+"""Policies by source and training seed."""
+
+
+def source_of_prior(prior: Prior) -> Source:
+    return prior.name, prior.options
+
+
+def told(source: Source) -> str:
+    """A source in words, as ``--prior`` takes it."""
+    return ",".join(filter(None, source))
+
+
+def slug(source: Source) -> str:
+    """A source in the names of folders: two sources never share one, nor a name that is too long."""
+    name, options = source
+    if not options:
+        return name
+    # Numbers and the like stay readable; texts and lists could become the same as others.
+    plain = re.fullmatch(r"[\w.=+,-]{1,60}", options, re.ASCII) is not None
+    short = re.sub(r"[^\w.=+-]+", "-", options, flags=re.ASCII)[:60]
+    return f"{name}-{short}" if plain else f"{name}-{short}-{digest_of(options)[:8]}"
+
+
+def is_asked(text: str, actor: WarmPriorActor) -> bool:
+    """Whether a policy is what a ``--prior`` names; what is not said there is as the policy has it."""
+    own, network = actor.prior, actor.network
+    if Prior.find(text) is not type(own):
+        return False
+    asked = Prior.make(
+        text, own.chunk_length, sigma=own.sigma, cold_probability=own.cold_probability
+    )
+    sizes = (network.action_dim, network.observation_dim, network.observation_steps)
+    return asked.sized(*sizes).config() == own.config()
 
 
 def frozen_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], Frozen]:
     """The facts of the problem, and the policies: of --run, or trained now where they are not yet."""
-    run, device = recipe.policies.run, recipe.run.device
+    run, device, priors = recipe.policies.run, recipe.run.device, recipe.sources.priors()
     if run is not None:
         facts, actors = finished_policies(run, device)
         if recipe.data.task not in ((), (facts["task"],)):
             raise ValueError(f"--run {run} is of {facts['task']}, not of {recipe.data.task[0]}")
-        missing = [p.name for p in recipe.sources.priors() if p.name not in actors]
+        taken: Frozen = {}
+        missing = []
+        for text, source in zip(
+            dict.fromkeys(recipe.sources.prior), map(source_of_prior, priors), strict=True
+        ):
+            found = [g for g in actors.values() if is_asked(text, next(iter(g.values())))]
+            if found:
+                taken[source] = found[0]
+            else:
+                missing.append(text)
         if missing:
-            raise ValueError(
-                f"--run {run} has policies of {', '.join(actors)}, but none of {', '.join(missing)}"
-            )
-        return facts, actors
+            have, lack = "; ".join(map(told, actors)), "; ".join(missing)
+            raise ValueError(f"--run {run} has policies of {have}, but none of {lack}")
+        return facts, taken
     stores = None
     if recipe.is_toy:
         policies, logs = out.parent / "policies", out / "logs"
         stores = [Store(navigation_problem(), recipe.network, policies, logs, recipe.run)]
     comparison = Comparison(recipe, "frozen policies", stores=stores, directory=out / "frozen")
     comparison.train()
-    frozen: Frozen = {}
-    for c in comparison.contestants:
-        frozen.setdefault(c.prior.name, {})[c.training.seed] = c.policy()
+    (store,) = comparison.stores
+    frozen = {
+        source_of_prior(prior): {
+            seed: store.policy(prior, replace(recipe.training, seed=seed)) for seed in recipe.seeds
+        }
+        for prior in priors
+    }
     return comparison.results.meta["problems"][0], frozen
 
 
@@ -85,22 +134,28 @@ def kept_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], 
     To continue, they must find the very policies they began with, whatever has become of those, or would
     be trained by now.
     """
-    names = dict.fromkeys(prior.name for prior in recipe.sources.priors())
-    folders = {(n, s): out / "policies" / f"{n}-seed{s}" for n in names for s in recipe.seeds}
+    sources = dict.fromkeys(map(source_of_prior, recipe.sources.priors()))
+    folders = {
+        (source, seed): out / "policies" / f"{slug(source)}-seed{seed}"
+        for source, seed in product(sources, recipe.seeds)
+    }
     facts = out / "policies" / "problem.json"
     if not (recipe.run.resume and facts.exists()):
         problem, frozen = frozen_policies(recipe, out)
-        for (name, seed), folder in folders.items():
-            group = frozen[name]
+        for (source, seed), folder in folders.items():
+            group = frozen[source]
             if seed not in group:
-                print(f"--run has {len(group)} seeds of {name}: agent {seed} shares a policy")
+                print(
+                    f"--run has {len(group)} seeds of {told(source)}: agent {seed} shares a policy"
+                )
             of_seeds = list(group.values())
             group.get(seed, of_seeds[seed % len(of_seeds)]).save_pretrained(folder)
         text = json.dumps(problem) + "\n"
         write_atomic(facts, lambda path: path.write_text(text))
-    loaded: Frozen = {name: {} for name in names}
-    for (name, seed), folder in folders.items():
-        loaded[name][seed] = WarmPriorActor.from_pretrained(folder, device=recipe.run.device)
+    loaded: Frozen = {}
+    for (source, seed), folder in folders.items():
+        actor = WarmPriorActor.from_pretrained(folder, device=recipe.run.device)
+        loaded.setdefault(source, {})[seed] = actor
     return read_json(facts), loaded
 
 
@@ -133,8 +188,8 @@ def make_table(rows: Sequence[Row]) -> str:
     )
 
 
-def agent_of(row: Row) -> tuple[str, str]:
-    return row["algorithm"], row["prior"]
+def agent_of(row: Row) -> tuple[str, Source]:
+    return row["algorithm"], source_of(row)
 
 
 def draw(rows: Sequence[Row], out: Path, title: str, warmup: int) -> None:
@@ -163,17 +218,18 @@ def run(argv: Sequence[str] | None) -> None:
         meta = facts_of_machine(torch_threads=recipe.agents.threads) | {"problems": [problem]}
         identity = {"study": "rl", "recipe": record(recipe)}
         results = Results(out / "results.json", meta, identity, resume=recipe.run.resume)
+        # Rows of earlier versions have no options, and are to be replaced by those that have.
+        results.rows = [replace(row, facts={"options": "", **row.facts}) for row in results.rows]
         results.save()  # from now on there is something to continue
-        diverged: dict[tuple[str, str, int], str] = {}
-        names = dict.fromkeys(prior.name for prior in recipe.sources.priors())
-        for seed, algorithm, name in product(recipe.seeds, recipe.agents.algorithm, names):
-            agent, actor = f"{algorithm} {name}, seed {seed}", frozen[name][seed]
+        diverged: dict[tuple[str, Source, int], str] = {}
+        for seed, algorithm, source in product(recipe.seeds, recipe.agents.algorithm, frozen):
+            agent, actor = f"{algorithm} {told(source)}, seed {seed}", frozen[source][seed]
             config = recipe.agent(actor.prior, algorithm, seed)
             training = PriorSpaceTraining(
                 actor,
                 agent_environment(recipe, actor),
                 config,
-                out / f"{algorithm}-{name}-seed{seed}",
+                out / f"{algorithm}-{slug(source)}-seed{seed}",
                 evaluation_seed=EVALUATION_SEED,
                 description=agent,
             )
@@ -181,13 +237,14 @@ def run(argv: Sequence[str] | None) -> None:
                 with torch_threads(recipe.agents.threads):
                     training.run()
             except FloatingPointError as error:  # no reason to keep the other agents from learning
-                diverged[algorithm, name, seed] = f"{agent}: {error}"
+                diverged[algorithm, source, seed] = f"{agent}: {error}"
             facts = {
                 "task": problem["task"],
                 "data": problem["style"],
                 **{name: problem[name] for name in ("actions",) if name in problem},
                 "algorithm": algorithm,
-                "prior": name,
+                "prior": source[0],
+                "options": source[1],
                 "sigma": actor.prior.sigma,
                 "chunk": actor.prior.chunk_length,
                 "nfe": config.nfe,
@@ -197,8 +254,8 @@ def run(argv: Sequence[str] | None) -> None:
             results.add(*(evaluated(facts, point) for point in training.curve))
         complete = [row for row in results.rows if (*agent_of(row), row["seed"]) not in diverged]
         if complete:
-            told = with_actions(f"{problem['task']} {problem['style']}", problem.get("actions"))
-            title = f"{told}, NFE {recipe.evaluation.nfe[0]}"
+            name = with_actions(f"{problem['task']} {problem['style']}", problem.get("actions"))
+            title = f"{name}, NFE {recipe.evaluation.nfe[0]}"
             draw(complete, out, title, recipe.rl.warmup_steps)
             write_report(out, make_table(complete))
         if diverged:

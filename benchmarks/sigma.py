@@ -29,6 +29,7 @@ from warmprior.experiments import (
     table,
     write_report,
 )
+from warmprior.experiments.labels import source_of
 from warmprior.experiments.straightness import pooled
 from warmprior.experiments.tables import Cell
 from warmprior.io.script import run_script
@@ -77,7 +78,7 @@ def run(argv: Sequence[str] | None) -> None:
 
         text = table(
             [*comparison.rows, *trained, *deployed],
-            lambda row: f"{prior_label(row['prior'])}, sigma {row['sigma']:g}",
+            lambda row: f"{prior_label(*source_of(row))}, sigma {row['sigma']:g}",
             None,
             {
                 "success (%)": lambda rows: success(select(rows, "success_rate")),

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+from types import SimpleNamespace
 
 import pytest
 
 from tests.benchmarks.script_parts import is_png, options, refused, stored, written
-from warmprior import WarmPriorActor
+from tests.experiments.row_parts import row as evaluation
+from warmprior import PastPrior, WarmPriorActor
 from warmprior.data import RobomimicExperienceReplay
 from warmprior.diagnostics import SharedObservations, action_error
 
@@ -96,3 +98,32 @@ def test_bad_options_stop_before_any_work(
 ):
     argv = arguments(dataset, tmp_path / "out", validation, **extra)
     assert message in refused(budget.main, argv, capsys)
+
+
+def test_options_of_a_prior_have_cells_of_their_own(budget, monkeypatch):
+    """Also where an earlier version wrote rows without options."""
+    first = evaluation(2, prior="past")
+    second = evaluation(8, prior="past", options="correlation=0.5")
+    names = ("prior", "options", "sigma", "chunk", "seed", "iterations")
+    contestants = [
+        SimpleNamespace(
+            prior=PastPrior(8, sigma=1.0, correlation=each),
+            facts=lambda r=r: {n: {"options": "", **r.facts}[n] for n in names},
+        )
+        for r, each in ((first, 0.0), (second, 0.5))
+    ]
+    comparison = SimpleNamespace(
+        contestants=contestants,
+        nfes=[1],
+        player=lambda contestant: contestant,
+        results=SimpleNamespace(rows=[first, second]),
+    )
+    monkeypatch.setattr(
+        budget, "action_error", lambda actor, windows, nfes: {1: actor.prior.correlation}
+    )
+    observations = SimpleNamespace(windows=lambda prior: None)
+    rows = budget.with_errors(comparison, observations)
+    assert [each["action_error"] for each in rows] == [0.0, 0.5]
+    head, _, line, *_ = budget.make_table(rows, 1).splitlines()
+    assert head == "| iterations | NFE 1: WP-Past | NFE 1: WP-Past, correlation=0.5 |"
+    assert line == "| 100 | 20.0 (0.0000) | 80.0 (0.5000) |"

@@ -91,6 +91,27 @@ def test_a_training_that_diverges_ends_without_a_traceback(benchmark, tmp_path, 
     assert stored(out)["rows"] == [] and not (out / "table.md").exists()
 
 
+def test_a_picture_that_cannot_be_drawn_costs_no_table(benchmark, tmp_path, capsys, monkeypatch):
+    def broken(*args):
+        raise ValueError("no picture")
+
+    monkeypatch.setattr(benchmark, "draw", broken)
+    out = tmp_path / "out"
+    argv = command_line(
+        iterations=2,
+        episodes=2,
+        chunk=32,
+        nfe=1,
+        prior="gaussian",
+        sigma=None,
+        envs=1,
+        logger="none",
+        out=out,
+    )
+    assert "no picture" in refused(benchmark.main, argv, capsys)
+    assert "| Base, NFE 1 |" in (out / "table.md").read_text()
+
+
 def test_table_tells_what_is_missing(benchmark):
     def rows(prior, seed, nfe=1, **measures):
         facts = {"prior": prior, "sigma": 1.0, "chunk": 4, "seed": seed}

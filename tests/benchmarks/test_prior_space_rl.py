@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,13 +19,14 @@ import torch
 from torchrl.envs import UnaryTransform
 
 from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
-from warmprior import WarmPriorActor
+from warmprior import ForecastPrior, PastPrior, VelocityMLP, WarmPriorActor
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("tyro")
 
 from warmprior.experiments import grouped, parse, started
 from warmprior.experiments.prior_space import PRIOR_SPACE_PRESETS, prior_space_preset
+from warmprior.training.behaviour_cloning import policy_path
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "prior_space_rl.py"
 TINY = {
@@ -116,6 +119,44 @@ def test_the_toy_with_both_algorithms(benchmark, tmp_path, capsys):
     assert stored(out)["rows"] == result["rows"]
 
 
+def test_options_of_a_prior_are_agents_of_their_own(benchmark, tmp_path, capsys):
+    out = tmp_path / "runs" / "out"
+    prior = ["past", "past,correlation=0.5"]
+    few = {"rl__environment_steps": 300, "rl__warmup_steps": 200, "seeds": 1, "prior": prior}
+    assert benchmark.main(unit(out, **few)) == 0
+    rows = stored(out)["rows"]
+    found = grouped(rows, lambda row: (row["prior"], row["options"]))
+    assert list(found) == [("past", ""), ("past", "correlation=0.5")]
+    assert len({len(points) for points in found.values()}) == 1
+    # Each acts in the source of its own policy; folders without options are called as ever.
+    for name, correlation in (("past", 0.0), ("past-correlation=0.5", 0.5)):
+        kept = WarmPriorActor.from_pretrained(out / "policies" / f"{name}-seed0")
+        assert kept.prior.correlation == correlation
+        assert (out / f"dsrl-na-{name}-seed0").is_dir()
+    table = (out / "table.md").read_text()
+    assert "| DSRL-NA, WP-Past (1 seed) |" in table
+    assert "| DSRL-NA, WP-Past, correlation=0.5 (1 seed) |" in table
+
+    # Rows that an earlier version wrote are continued, not doubled.
+    path = out / "results.json"
+    written_before = json.loads(path.read_text())
+    for each in written_before["rows"]:
+        if not each["facts"]["options"]:
+            del each["facts"]["options"]
+    path.write_text(json.dumps(written_before))
+    assert benchmark.main(["--resume", "--out", str(out)]) == 0
+    again = grouped(stored(out)["rows"], lambda row: (row["prior"], row["options"]))
+    assert again == found
+
+
+def test_a_folder_per_source(benchmark):
+    options = ["", "a=1", "a=-1", "a=1,b=2", 'a="1,b=2"', 'a="1-b=2"', 'a="/"', "a=" + "1" * 300]
+    names = [benchmark.slug(("mine", each)) for each in options]
+    assert names[:4] == ["mine", "mine-a=1", "mine-a=-1", "mine-a=1-b=2"]
+    assert len(set(names)) == len(names)
+    assert all(re.fullmatch(r"[\w.=+-]{1,90}", name) for name in names)
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -186,6 +227,8 @@ def test_resume_goes_on_where_it_stopped(benchmark, tmp_path, monkeypatch):
         ("--preset unit --play-on", "leave out --play-on"),
         ("--preset unit --prior regression", "--prior regression is no flow"),
         ("--preset unit --prior nobodys", "unknown prior 'nobodys'"),
+        ("--preset unit --prior past past,sigma=0.3", "Compare these in runs of their own"),
+        ("--preset unit --prior past past,cold_probability=0.3", "would not tell PastPrior"),
         ("--horizon 0", "--horizon must be between 1 and"),
         (
             "--preset unit --data mh",
@@ -305,6 +348,55 @@ def finished(dataset, tmp_path_factory):
     return out
 
 
+@pytest.fixture(scope="module")
+def with_options(tmp_path_factory):
+    """What a finished run leaves of policies: three options of one prior, and a learned one."""
+    out = tmp_path_factory.mktemp("of-options") / "main"
+    priors = [
+        *(PastPrior(8, sigma=0.3, correlation=share) for share in (0.0, 0.5, 0.25)),
+        ForecastPrior(8).sized(2, 3, 1),
+    ]
+    entries = []
+    for i, prior in enumerate(priors):
+        folder = policy_path(out.parent / "policies" / str(i), 1)
+        WarmPriorActor(VelocityMLP(2, 3, 8, 1), prior).save_pretrained(folder)
+        entry = {"prior": prior.config(), "iterations": 1, "seed": 0, "folder": str(i)}
+        entries.append(entry)
+    out.mkdir()
+    meta = {"policies": entries, "problems": [{"task": "lift", "style": "ph"}]}
+    (out / "results.json").write_text(json.dumps({"meta": meta, "rows": []}))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("priors", "correlations"),
+    [
+        (["past"], [0.0]),
+        (["past,correlation=0.5"], [0.5]),
+        (["past,correlation=0.50,sigma=0.3", "past"], [0.5, 0.0]),
+        (["forecast", "past,correlation=0.25"], [0.0, 0.25]),
+    ],
+)
+def test_the_options_of_a_finished_run_are_those_asked_for(
+    benchmark, with_options, tmp_path, priors, correlations
+):
+    words = " ".join(command_line(run=with_options, out=tmp_path / "out", prior=priors))
+    facts, kept = benchmark.kept_policies(read(words + " --seeds 1"), tmp_path / "out")
+    assert facts["task"] == "lift"
+    assert [actors[0].prior.correlation for actors in kept.values()] == correlations
+    names = [text.partition(",")[0] for text in priors]
+    assert [actors[0].prior.name for actors in kept.values()] == names
+
+
+@pytest.mark.parametrize("prior", ["past,correlation=0.75", "past,sigma=0.5", "preview"])
+def test_options_that_a_finished_run_does_not_have(
+    benchmark, with_options, tmp_path, capsys, prior
+):
+    argv = command_line(run=with_options, out=tmp_path / "out", prior=prior)
+    told = refused(benchmark.main, argv, capsys)
+    assert f"past,correlation=0.5; past,correlation=0.25; forecast, but none of {prior}" in told
+
+
 SHORT = {
     "rl__environment_steps": 60,
     "rl__warmup_steps": 30,
@@ -319,7 +411,7 @@ SHORT = {
     [
         ("--task can", "is of lift, not of can"),
         ("--preset unit", "is of lift, not of navigation"),
-        ("--prior preview", "has policies of gaussian, past, but none of preview"),
+        ("--prior preview", "has policies of gaussian; past, but none of preview"),
         ("--chunk 4", "--run brings its policies and their data: leave out --chunk"),
         ("--sigma 0.2", "--run brings its policies and their data: leave out --sigma"),
         ("--data mh", "leave out --data"),

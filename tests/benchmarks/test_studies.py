@@ -17,6 +17,7 @@ from tests.benchmarks.script_parts import (
     written,
 )
 from tests.data.synthetic import write_robomimic_file
+from tests.experiments.row_parts import row as evaluation
 from warmprior import PastPrior
 
 pytest.importorskip("robosuite")
@@ -322,3 +323,29 @@ def test_jumps_are_those_of_the_last_checkpoint_as_in_the_figure(scripts):
     table = scripts["chunking"].make_table(rows, 2)
     assert "| H = 1, success (%) | 50.0 | 50.0 | 50.0 |" in table
     assert "| H = 1, jump at boundaries | 0.250 | 0.250 | 0.250 |" in table
+
+
+def test_options_of_a_prior_have_columns_of_their_own(scripts):
+    shown = [
+        evaluation(k, prior="past", chunk=chunk, **told)
+        for chunk in (1, 8)
+        for k, told in ((2, {}), (8, {"options": "correlation=0.5"}))
+    ]
+    head, _, first, *_ = scripts["chunking"].make_table(shown, 1).splitlines()
+    assert head == "|  | NFE 1: WP-Past | NFE 1: WP-Past, correlation=0.5 |"
+    assert first == "| H = 1, success (%) | 20.0 | 80.0 |"
+
+
+def test_sigma_of_several_options_of_a_prior(scripts, dataset, validation, tmp_path):
+    argv = options(
+        dataset,
+        tmp_path / "runs" / "sigma",
+        prior=["past", "past,correlation=0.5"],
+        sigma=[0.5],
+        iterations=2,
+        **{k: v for k, v in measured(None, validation, "sigma").items() if k != "out"},
+    )
+    assert scripts["sigma"].main(argv) == 0
+    table = (tmp_path / "runs" / "sigma" / "table.md").read_text()
+    lines = [line.split("|")[1].strip() for line in table.splitlines()[2:4]]
+    assert lines == ["WP-Past, sigma 0.5", "WP-Past, correlation=0.5, sigma 0.5"]

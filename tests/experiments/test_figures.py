@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("tyro")
@@ -11,12 +12,18 @@ pytest.importorskip("tyro")
 from tests.experiments.row_parts import compared, row
 from warmprior.experiments import (
     Row,
+    navigation_figures,
+    plot_budget,
+    plot_chunk_lengths,
     plot_filmstrip,
     plot_learning_curves,
+    plot_navigation,
     plot_reinforcement,
+    plot_sigma,
     plot_success,
     plot_success_bars,
     select,
+    study_figures,
 )
 from warmprior.experiments import (
     figures as module,
@@ -53,7 +60,8 @@ def figures(monkeypatch):
         return figure, axes
 
     make = module.new_figure
-    monkeypatch.setattr(module, "new_figure", spy)
+    for each in (module, study_figures, navigation_figures):
+        monkeypatch.setattr(each, "new_figure", spy)
     return drawn
 
 
@@ -150,3 +158,99 @@ def test_a_filmstrip_is_written(tmp_path):
     frames = [np.zeros((8, 8, 3), dtype=np.uint8)] * 2
     plot_filmstrip(frames, ["0", "8"], tmp_path / "c.png", title="t")
     assert is_png(tmp_path / "c.png")
+
+
+def variants(**more):
+    """WP-Past as an earlier version wrote it, without options, and with options: solved more often."""
+    for k, told in ((2, {}), (8, {"options": "correlation=0.5"})):
+        for seed in (0, 1):
+            yield row(k, prior="past", seed=seed, **told, **more)
+
+
+TOLD = ["WP-Past", "WP-Past, correlation=0.5"]
+
+
+def told_apart(lines):
+    """Names and heights of the lines, each of a look of its own."""
+    assert len({(str(line.get_color()), line.get_linestyle()) for line in lines}) == len(lines)
+    return [(line.get_label(), list(line.get_ydata())) for line in lines]
+
+
+def test_options_of_a_prior_have_bars_and_violins_of_their_own(tmp_path, figures):
+    shown = list(variants())
+    plot_success_bars(shown, tmp_path / "a.png", top_k=1, title="t")
+    plot_success(shown, tmp_path / "b.png", title="t")
+    (bars,), (violins,) = figures
+    assert [text.get_text() for text in bars.texts] == ["20", "80"]
+    assert [text.get_text() for text in violins.texts] == ["4/20", "16/20"]
+    for axis in (bars, violins):
+        assert axis.get_legend_handles_labels()[1] == TOLD
+    assert len({bar.get_facecolor() for bar in bars.patches}) == 2
+    assert len({tuple(each.get_facecolor()[0]) for each in violins.collections}) == 2
+
+
+def test_options_of_a_prior_have_learning_curves_of_their_own(tmp_path, figures):
+    losses = {name: [[(10, 1.0), (20, 0.5)]] for name in TOLD}
+    plot_learning_curves(losses, variants(), tmp_path / "a.png", title="t")
+    ((left, right),) = figures
+    assert [name for name, _ in told_apart(left.get_lines())] == TOLD
+    assert [k.lines[0].get_ydata()[0] for k in right.containers] == pytest.approx([0.2, 0.8])
+
+
+def test_options_of_a_prior_have_lines_of_their_own_against_the_chunk_length(tmp_path, figures):
+    jumps = {"boundary_jump": 1.0, "inner_jump": 0.5}
+    shown = [one for chunk in (1, 8) for one in variants(chunk=chunk, measures=jumps)]
+    plot_chunk_lengths(shown, tmp_path / "a.png", top_k=1, title="t")
+    ((above, below),) = figures
+    assert told_apart(above.get_lines()) == [(TOLD[0], [0.2, 0.2]), (TOLD[1], [0.8, 0.8])]
+    assert len(told_apart(below.get_lines())) == 4
+
+
+def test_options_of_a_prior_have_lines_of_their_own_against_the_budget(tmp_path, figures):
+    measured = {"action_error": 0.1}
+    shown = [one for n in (50, 100) for one in variants(iterations=n, measures=measured)]
+    plot_budget(shown, tmp_path / "a.png", top_k=1, title="t")
+    ((above, below),) = figures
+    assert told_apart(above.get_lines()) == [(TOLD[0], [0.2, 0.2]), (TOLD[1], [0.8, 0.8])]
+    assert len(told_apart(below.get_lines())) == 2
+
+
+def test_options_of_a_prior_have_panels_of_their_own_against_sigma(tmp_path, figures):
+    shown = [row(5, seed=0)]
+    for sigma in (0.1, 0.5):
+        shown += variants(sigma=sigma)
+        for told, ratio in (("", 0.25), ("correlation=0.5", 0.75)):
+            facts = {"prior": "past", "options": told, "sigma": sigma, "seed": 0}
+            measures = {"ratio_executed": ratio, "bound_executed": 1.0}
+            shown.append(Row(facts | {"mean": "training"}, measures))
+    plot_sigma(shown, tmp_path / "a.png", top_k=1, title="t")
+    (panels,) = figures
+    assert [axis.get_title() for axis in panels] == TOLD
+    for axis, success, ratio in zip(panels, (0.2, 0.8), (0.25, 0.75), strict=True):
+        assert list(axis.get_lines()[0].get_ydata()) == [success] * 2
+        (right,) = (
+            each
+            for each in axis.figure.axes
+            if each.bbox.bounds == axis.bbox.bounds and each is not axis
+        )
+        assert list(right.get_lines()[0].get_ydata()) == [ratio] * 2
+
+
+def test_options_of_a_prior_are_agents_of_their_own(tmp_path, figures):
+    points = [(0, {"base": 0.0}), (90, {"greedy": 1.0, "stochastic": 1.0})]
+    other = [
+        Row({**each.facts, "options": "correlation=0.5"}, each.measures) for each in rows(0, points)
+    ]
+    plot_reinforcement([*TWO_SEEDS, *other], tmp_path / "a.png", title="t", warmup_steps=50)
+    for axis in figures[0]:
+        (_, first), (name, second) = told_apart(axis.get_lines())
+        assert first[0] == pytest.approx(0.3) and second == [0.0, 1.0]
+        assert name == "DSRL-NA, WP-Past, correlation=0.5 (1 seed)"
+
+
+def test_panels_beyond_the_alphabet_have_no_letters(tmp_path, figures):
+    panels = {f"policy {i}": (torch.zeros(1, 64), ["told"]) for i in range(26)}
+    plot_navigation(panels, tmp_path / "a.png", chunk_length=8, title="t")
+    ((*axes,),) = figures
+    titles = [axis.get_title() for axis in axes[:27]]
+    assert titles[12] == "(m) policy 11" and titles[25:] == ["(z) policy 24", "policy 25"]

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from warmprior.diagnostics.statistics import SeedSummary, success_posterior, summarize_seeds
-from warmprior.experiments.labels import prior_color, prior_label, source_labels
-from warmprior.experiments.results import Row, grouped, select, success_summary
+from warmprior.experiments.labels import prior_label, source_colors, source_labels, source_of
+from warmprior.experiments.results import Row, grouped, success_summary
 from warmprior.io.extras import require
 
 __all__ = [
@@ -72,7 +72,7 @@ def plot_success(
     """
     rows = list(rows)
     label, groups = source_labels(rows), grouped(rows, group)
-    sources = list(grouped(rows, label))
+    sources, colors = list(grouped(rows, label)), source_colors(rows, label)
     figure, (axis,) = new_figure(2.2 + 0.55 * (len(sources) + 1) * len(groups), 4.2)
     grid = np.linspace(0.0, 1.0, 801)
     ticks: list[float] = []
@@ -91,7 +91,7 @@ def plot_success(
                 grid,
                 x - half,
                 x + half,
-                color=prior_color(cell[0]["prior"]),
+                color=colors(cell[0]),
                 alpha=0.75,
                 lw=0,
                 label=None if source in shown else source,
@@ -121,32 +121,35 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
         top_k: checkpoints averaged per seed.
         title: of the figure.
     """
-    priors, groups = grouped(rows, lambda row: row["prior"]), grouped(rows, lambda r: r["chunk"])
+    label, groups = source_labels(rows, chunks=False), grouped(rows, lambda row: row["chunk"])
+    sources, colors = list(grouped(rows, label)), source_colors(rows, label)
+    shown: set[str] = set()
     figure, (axis,) = new_figure(1.8 + 1.5 * len(groups), 3.6)
     for g, members in enumerate(groups.values()):
-        for j, prior in enumerate(priors):
-            cell = select(members, prior=prior)
+        for j, source in enumerate(sources):
+            cell = [row for row in members if label(row) == source]
             if not cell:
                 continue
             summary = success_summary(cell, top_k)
-            x = g * (len(priors) + 0.8) + j
+            x = g * (len(sources) + 0.8) + j
             axis.bar(
                 x,
                 summary.mean,
                 0.85,
                 yerr=None if math.isnan(summary.std) else summary.std,
                 capsize=3,
-                color=prior_color(prior),
-                label=prior_label(prior) if g == 0 else None,
+                color=colors(cell[0]),
+                label=None if source in shown else source,
             )
+            shown.add(source)
             axis.text(x, summary.mean + 0.015, f"{100 * summary.mean:.0f}", ha="center", fontsize=8)
-    centre = (len(priors) - 1) / 2
-    at = [g * (len(priors) + 0.8) + centre for g in range(len(groups))]
+    centre = (len(sources) - 1) / 2
+    at = [g * (len(sources) + 0.8) + centre for g in range(len(groups))]
     axis.set_xticks(at, [f"H = {chunk}" for chunk in groups])
     axis.set_ylim(0, 1.08)
     axis.set_ylabel(f"success rate (NFE {rows[0]['nfe']})")
     axis.grid(axis="y", alpha=0.25)
-    figure.legend(loc="outside lower center", ncols=len(priors), frameon=False, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=min(4, len(sources)), frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=150)
 
@@ -170,12 +173,13 @@ def plot_learning_curves(
     """
     rows = list(rows)
     figure, (left, right) = new_figure(9.0, 3.6, columns=2)
-    by_source = grouped(rows, source_labels(rows))
-    colors = {source: prior_color(group[0]["prior"]) for source, group in by_source.items()}
+    label = source_labels(rows)
+    by_source, color = grouped(rows, label), source_colors(rows, label)
+    colors = {source: color(group[0]) for source, group in by_source.items()}
     for source, seeds in losses.items():
         for i, curve in enumerate(seeds):
-            label = source if i == 0 else None
-            left.plot(*zip(*curve, strict=True), color=colors.get(source), lw=1.0, label=label)
+            name = source if i == 0 else None
+            left.plot(*zip(*curve, strict=True), color=colors.get(source), lw=1.0, label=name)
     left.set_yscale("log")
     left.set_ylabel("flow-matching loss (own source)")
     for source, group in by_source.items():
@@ -225,9 +229,9 @@ def plot_filmstrip(
 
 
 def agent_label(row: Row, seeds: int) -> str:
-    """What figures and tables call the agents of one algorithm and prior."""
+    """What figures and tables call the agents of one algorithm and source."""
     many = "" if seeds == 1 else "s"
-    return f"{row['algorithm'].upper()}, {prior_label(row['prior'])} ({seeds} seed{many})"
+    return f"{row['algorithm'].upper()}, {prior_label(*source_of(row))} ({seeds} seed{many})"
 
 
 def plot_reinforcement(
@@ -239,7 +243,7 @@ def plot_reinforcement(
     evaluation: they are due at the same number of control steps, and made at the next decision.
 
     Args:
-        rows: evaluations with ``algorithm``, ``prior``, ``seed``, ``environment_steps`` and
+        rows: evaluations with ``algorithm``, ``prior``, ``options``, ``seed``, ``environment_steps`` and
             ``evaluation`` (``"base"``, ``"greedy"`` or ``"stochastic"``).
         path: of the PNG.
 
@@ -249,9 +253,10 @@ def plot_reinforcement(
     """
     rows = list(rows)
     figure, axes = new_figure(10.0, 3.8, 1, 2, share=True)
-    agents = grouped(rows, lambda row: (row["algorithm"], row["prior"]))
+    agents = grouped(rows, lambda row: (row["algorithm"], *source_of(row)))
+    colors = source_colors(rows)
     for axis, kind in zip(axes, ("greedy", "stochastic"), strict=True):
-        for (algorithm, prior), members in agents.items():
+        for (algorithm, *_), members in agents.items():
             shown = [row for row in members if row["evaluation"] in ("base", kind)]
             seeds = list(grouped(shown, lambda row: row["seed"]).values())
             shared = range(min(map(len, seeds)))
@@ -262,7 +267,7 @@ def plot_reinforcement(
                     for k in shared
                 ],
                 [summarize_seeds([points[k]["success_rate"] for points in seeds]) for k in shared],
-                color=prior_color(prior),
+                color=colors(members[0]),
                 ls="--" if algorithm == "dsrl-sac" else "-",
                 ms=3,
                 label=agent_label(members[0], len(seeds)),

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Hashable, Iterable
+from typing import Any
 
 from warmprior.experiments.results import Row
 from warmprior.modules.prior import Prior
 
-__all__ = ["prior_color", "prior_label", "source_labels", "with_actions"]
+__all__ = [
+    "prior_color",
+    "prior_label",
+    "source_colors",
+    "source_labels",
+    "source_of",
+    "with_actions",
+]
+
+PALEST = 0.6
+"""Share of white (or black, where the prior's own colour is bright) in the last shade of a prior."""
 
 
 def with_actions(told: str, actions: str | None) -> str:
@@ -24,15 +35,29 @@ def with_actions(told: str, actions: str | None) -> str:
     return told if actions is None else f"{told}, {actions} actions"
 
 
-def prior_label(name: str) -> str:
-    """What tables and figures call a prior: its own label, or the name where it is not imported.
+def source_of(row: Row) -> tuple[str, str]:
+    """Name and options of the prior of a row; earlier versions wrote rows without options.
 
     Examples:
-        >>> prior_label("past"), prior_label("not imported")
-        ('WP-Past', 'not imported')
+        >>> [source_of(Row({"prior": "past", **told}, {})) for told in ({"options": "leap=2"}, {})]
+        [('past', 'leap=2'), ('past', '')]
+    """
+    return row["prior"], row.get("options") or ""
+
+
+def prior_label(name: str, options: str = "") -> str:
+    """What tables and figures call a prior: its own label, or the name where it is not imported.
+
+    Args:
+        name: of the prior.
+        options: that are not at their defaults, as :attr:`Prior.options` tells them.
+
+    Examples:
+        >>> prior_label("past"), prior_label("past", "correlation=0.5"), prior_label("not imported")
+        ('WP-Past', 'WP-Past, correlation=0.5', 'not imported')
     """
     prior = Prior.registered().get(name)
-    return name if prior is None else prior.label
+    return ", ".join(filter(None, (name if prior is None else prior.label, options)))
 
 
 def prior_color(name: str) -> str | None:
@@ -41,11 +66,49 @@ def prior_color(name: str) -> str | None:
     return None if prior is None else prior.color
 
 
-def source_labels(rows: Iterable[Row]) -> Callable[[Row], str]:
+def source_colors(
+    rows: Iterable[Row], source: Callable[[Row], Hashable] = source_of
+) -> Callable[[Row], Any]:
+    """A function that gives the colour of a row: its prior's, in shades where several sources share it.
+
+    Args:
+        rows: all that are shown together; of a prior the first source keeps the colour as it is.
+        source: tells apart what has a colour of its own; prior and options by default.
+
+    Examples:
+        >>> rows = [Row({"prior": "past", "options": told}, {}) for told in ("", "correlation=0.5")]
+        >>> colors = source_colors(rows)
+        >>> colors(rows[0]) == prior_color("past"), colors(rows[1]) == prior_color("past")
+        (True, False)
+    """
+    variants: dict[str, list[Hashable]] = {}
+    for row in rows:
+        of_prior = variants.setdefault(row["prior"], [])
+        if source(row) not in of_prior:
+            of_prior.append(source(row))
+
+    def color(row: Row) -> Any:
+        own, of_prior = prior_color(row["prior"]), variants[row["prior"]]
+        place = of_prior.index(source(row))
+        if own is None or place == 0:
+            return own
+        from matplotlib.colors import to_rgb
+
+        rgb = to_rgb(own)
+        end, share = float(sum(rgb) < 2), PALEST * place / (len(of_prior) - 1)
+        return tuple((1 - share) * part + share * end for part in rgb)
+
+    return color
+
+
+def source_labels(rows: Iterable[Row], *, chunks: bool = True) -> Callable[[Row], str]:
     """A function that names the source of a row: its options, and sigma and H where these tell rows apart.
 
     Args:
         rows: all that are shown together.
+
+    Keyword Args:
+        chunks: whether H belongs to the name; not where it is told beside it.
 
     Examples:
         >>> rows = [Row({"prior": "past", "sigma": s, "chunk": 8}, {}) for s in (0.5, 1.0)]
@@ -56,10 +119,10 @@ def source_labels(rows: Iterable[Row]) -> Callable[[Row], str]:
     sigmas: dict[str, set[float]] = {}
     for row in rows:
         sigmas.setdefault(row["prior"], set()).add(row["sigma"])
-    several_chunks = len({row["chunk"] for row in rows}) > 1
+    several_chunks = chunks and len({row["chunk"] for row in rows}) > 1
 
     def label(row: Row) -> str:
-        text = ", ".join(filter(None, (prior_label(row["prior"]), row.get("options"))))
+        text = prior_label(*source_of(row))
         if len(sigmas[row["prior"]]) > 1:
             text += f", sigma {row['sigma']:g}"
         return f"{text}, H {row['chunk']}" if several_chunks else text

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,8 @@ def plot_navigation(
             axis.plot(x, drawn[0], color=_INK, lw=1.3)
             starts = slice(None, None, chunk_length)
             axis.plot(x[starts], drawn[0, starts], "o", color=_INK, ms=2.8)
-        axis.set_title(f"({'abcdefghijkl'[i]}) {name}", fontsize=10)
+        letter = f"({ascii_lowercase[i]}) " if i < len(ascii_lowercase) else ""
+        axis.set_title(f"{letter}{name}", fontsize=10)
         axis.text(
             0.5,
             0.02,

@@ -121,7 +121,15 @@ class PriorSpaceRecipe(Recipe):
                     raise ValueError(f"{told}: leave out --{name}")
         else:
             self.data.check()
+        configs: dict[tuple[str, str], dict[str, Any]] = {}
         for prior in self.sources.priors():
+            same = configs.setdefault((prior.name, prior.options), prior.config())
+            if same != prior.config():
+                raise ValueError(
+                    "agents are told apart by the name and options of their prior, but for sigma and "
+                    f"cold_probability: they would not tell {prior} from another {prior.name}. Compare "
+                    "these in runs of their own"
+                )
             if not prior.is_flow:
                 raise ValueError(
                     f"--prior {prior.name} is no flow: there is no source space to act in"

@@ -325,7 +325,7 @@ def finished_problem(run: Path) -> dict[str, Any]:
 
 def finished_policies(
     run: Path, device: str = "cpu"
-) -> tuple[dict[str, Any], dict[str, dict[int, WarmPriorActor]]]:
+) -> tuple[dict[str, Any], dict[tuple[str, str], dict[int, WarmPriorActor]]]:
     """The last policies of a finished comparison of sources.
 
     Args:
@@ -333,8 +333,8 @@ def finished_policies(
         device: where to put them.
 
     Returns:
-        Facts of the problem (``task``, ``style`` and those of the data), and the policies by prior name and
-        training seed.
+        Facts of the problem (``task``, ``style`` and those of the data), and the policies by name and
+        :attr:`~warmprior.Prior.options` of their prior and training seed.
 
     Raises:
         FileNotFoundError: if there are no results, or a policy is missing.
@@ -342,13 +342,16 @@ def finished_policies(
     """
     meta = _facts_of(run)
     entries = [(Prior.from_config(entry["prior"]), entry) for entry in meta["policies"]]
-    told = {(prior.describe(), entry["iterations"]): prior.name for prior, entry in entries}
+    told = {
+        (prior.describe(), entry["iterations"]): (prior.name, prior.options)
+        for prior, entry in entries
+    }
     if len(set(told.values())) < len(told) or len(meta["problems"]) > 1:
         raise ValueError(
             f"--run {run} compares {'; '.join(name for name, _ in told)} on {len(meta['problems'])} "
             "problem(s): name a run of one task and style, with one sigma and one chunk length"
         )
-    actors: dict[str, dict[int, WarmPriorActor]] = {}
+    actors: dict[tuple[str, str], dict[int, WarmPriorActor]] = {}
     for prior, entry in entries:
         folder = policy_path(
             run.resolve().parent / "policies" / entry["folder"], entry["iterations"]
@@ -358,5 +361,5 @@ def finished_policies(
                 f"{folder} is missing: finish the run with --resume --out {run}"
             )
         actor = WarmPriorActor.from_pretrained(folder, prior=prior, device=device)
-        actors.setdefault(prior.name, {})[entry["seed"]] = actor
+        actors.setdefault((prior.name, prior.options), {})[entry["seed"]] = actor
     return meta["problems"][0], actors

@@ -7,7 +7,13 @@ from pathlib import Path
 
 from warmprior.diagnostics.statistics import summarize_seeds
 from warmprior.experiments.figures import band, new_figure
-from warmprior.experiments.labels import prior_color, prior_label
+from warmprior.experiments.labels import (
+    prior_color,
+    prior_label,
+    source_colors,
+    source_labels,
+    source_of,
+)
 from warmprior.experiments.paper import PAPER_SIGMA
 from warmprior.experiments.results import Row, grouped, mean_known, select, success_summary
 from warmprior.experiments.straightness import pooled
@@ -21,7 +27,7 @@ def plot_sigma(
 ) -> None:
     """Success against sigma, with the curvature and the branching bound on the same axis (appendix).
 
-    A panel per warm prior; shaded is one seed standard deviation. Curvature (executed positions, mean
+    A panel per warm source; shaded is one seed standard deviation. Curvature (executed positions, mean
     of the training) and bound are those of the prior over those of the baseline.
 
     Args:
@@ -36,21 +42,22 @@ def plot_sigma(
     """
     played = select(rows, "success_rate")
     measured = pooled(select(rows, "ratio_executed", mean="training"))
-    by_prior = grouped(played, lambda row: row["prior"])
-    warm = [name for name in by_prior if Prior.find(name).takes("sigma")]
-    base = next((name for name in by_prior if name not in warm), None)
-    base_bound = mean_known(select(measured, prior=base), "bound_executed")
+    by_source, curved = grouped(played, source_of), grouped(measured, source_of)
+    warm = [source for source in by_source if Prior.find(source[0]).takes("sigma")]
+    base = next((source for source in by_source if source not in warm), None)
+    base_bound = None if base is None else mean_known(curved.get(base, ()), "bound_executed")
     figure, axes = new_figure(5.2 * len(warm), 4.2, 1, len(warm))
-    for axis, prior in zip(axes, warm, strict=True):
-        cells = grouped(by_prior[prior], lambda row: row["sigma"])
+    for axis, source in zip(axes, warm, strict=True):
+        prior, options = source
+        cells = grouped(by_source[source], lambda row: row["sigma"])
         sigmas = sorted(cells, reverse=True)
         points = [success_summary(cells[sigma], top_k) for sigma in sigmas]
         band(axis, range(len(sigmas)), points, color=prior_color(prior), label="success rate")
         if base is not None:
-            level = success_summary(by_prior[base], top_k).mean
-            label = f"{prior_label(base)}"
-            axis.axhline(level, color=prior_color(base), ls="--", lw=1.2, label=label)
-        if paper:
+            level = success_summary(by_source[base], top_k).mean
+            label = prior_label(*base)
+            axis.axhline(level, color=prior_color(base[0]), ls="--", lw=1.2, label=label)
+        if paper and not options:
             told = PAPER_SIGMA.get(prior, {})
             x = [i for i, s in enumerate(sigmas) if s in told]
             axis.plot(x, [told[sigmas[i]] for i in x], "*", color="black", ms=10, label="paper")
@@ -59,7 +66,8 @@ def plot_sigma(
             ("ratio_executed", 1.0, "s", "curvature (executed H)"),
             ("bound_executed", base_bound, "^", "branching bound"),
         ):
-            found = {s: mean_known(select(measured, prior=prior, sigma=s), measure) for s in sigmas}
+            at = grouped(curved.get(source, ()), lambda row: row["sigma"])
+            found = {s: mean_known(at.get(s, ()), measure) for s in sigmas}
             known = {s: value for s, value in found.items() if value is not None and scale}
             right.plot(
                 [sigmas.index(s) for s in known],
@@ -77,7 +85,7 @@ def plot_sigma(
         axis.set_xlabel(r"$\sigma$")
         axis.set_ylim(-0.02, 1.02)
         axis.set_ylabel("success rate")
-        axis.set_title(prior_label(prior), fontsize=10)
+        axis.set_title(prior_label(*source), fontsize=10)
         axis.grid(axis="y", alpha=0.25)
         handles, labels = (
             [part for a in (axis, right) for part in a.get_legend_handles_labels()[i]]
@@ -105,15 +113,17 @@ def plot_chunk_lengths(rows: Sequence[Row], path: str | Path, *, top_k: int, tit
     """
     by_nfe = grouped(rows, lambda row: row["nfe"])
     chunks = sorted({row["chunk"] for row in rows})
+    label = source_labels(rows, chunks=False)
+    colors = source_colors(rows, label)
     figure, axes = new_figure(3.4 * len(by_nfe), 6.0, 2, len(by_nfe))
     for column, (nfe, members) in enumerate(by_nfe.items()):
         above, below = axes[column], axes[len(by_nfe) + column]
-        for prior, cells in grouped(members, lambda row: row["prior"]).items():
-            found = grouped(cells, lambda row: row["chunk"])
+        for source, cells in grouped(members, label).items():
+            color, found = colors(cells[0]), grouped(cells, lambda row: row["chunk"])
             known = sorted(found)
             at = [chunks.index(chunk) for chunk in known]
             points = [success_summary(found[chunk], top_k) for chunk in known]
-            band(above, at, points, color=prior_color(prior), label=prior_label(prior))
+            band(above, at, points, color=color, label=source)
             for measure, style in (("boundary_jump", "-"), ("inner_jump", ":")):
                 jumps = {
                     chunks.index(chunk): mean_known(
@@ -122,7 +132,7 @@ def plot_chunk_lengths(rows: Sequence[Row], path: str | Path, *, top_k: int, tit
                     for chunk in known
                 }
                 shown = {x: jump for x, jump in jumps.items() if jump is not None}
-                line = {"color": prior_color(prior), "ls": style, "marker": "o", "ms": 3, "lw": 1.2}
+                line = {"color": color, "ls": style, "marker": "o", "ms": 3, "lw": 1.2}
                 below.plot(list(shown), list(shown.values()), **line)
         above.set_title(f"NFE {nfe}", fontsize=10)
         above.set_ylim(-0.02, 1.02)
@@ -154,19 +164,21 @@ def plot_budget(rows: Sequence[Row], path: str | Path, *, top_k: int, title: str
     """
     by_nfe = grouped(sorted(rows, key=lambda row: row["nfe"]), lambda row: row["nfe"])
     budgets = sorted({row["iterations"] for row in rows})
+    label = source_labels(rows)
+    colors = source_colors(rows, label)
     figure, axes = new_figure(3.6 * len(by_nfe), 6.0, 2, len(by_nfe))
     for column, (nfe, members) in enumerate(by_nfe.items()):
         above, below = axes[column], axes[len(by_nfe) + column]
-        for prior, cells in grouped(members, lambda row: row["prior"]).items():
-            found = grouped(cells, lambda row: row["iterations"])
+        for source, cells in grouped(members, label).items():
+            color, found = colors(cells[0]), grouped(cells, lambda row: row["iterations"])
             known = sorted(found)
             success = [success_summary(select(found[n], "success_rate"), top_k) for n in known]
             errors = [
                 summarize_seeds([row["action_error"] for row in select(found[n], "action_error")])
                 for n in known
             ]
-            band(above, known, success, color=prior_color(prior), label=prior_label(prior))
-            band(below, known, errors, color=prior_color(prior))
+            band(above, known, success, color=color, label=source)
+            band(below, known, errors, color=color)
         above.set_title(f"NFE {nfe}", fontsize=10)
         above.set_ylim(-0.02, 1.02)
         below.set_ylim(bottom=0)

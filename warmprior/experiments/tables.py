@@ -188,7 +188,7 @@ def success_table(
         value, baseline = (
             paper_success(*place, p, row["nfe"], row["chunk"]) for p in (row["prior"], "gaussian")
         )
-        if value is None or baseline is None:
+        if value is None or baseline is None or row.get("options"):
             return None
         gain = "" if row["prior"] == "gaussian" else f" ({value - baseline:+.1f})"
         return f"{value:.1f}{gain}"
