@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 from warmprior.diagnostics import SharedObservations, action_error
 from warmprior.experiments import (
