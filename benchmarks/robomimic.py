@@ -23,7 +23,6 @@ from warmprior.experiments import (
     plot_filmstrip,
     plot_learning_curves,
     plot_success,
-    prior_label,
     select,
     source_labels,
     started,
@@ -35,23 +34,13 @@ from warmprior.experiments.store import Store
 from warmprior.io.script import run_script
 from warmprior.training import record_filmstrip
 
-TRAINED_AFTER = {"preview": 40_000}
-"""Iterations up to which success was measured to rise at the small network and batch (docs/evidence.md)."""
-
 
 def notes(comparison: Comparison) -> list[str]:
     recipe, paper = comparison.recipe, PRESETS["paper"]
-    iterations = recipe.training.iterations
     variations = variation_notes(recipe)
-    if recipe.network == paper.network and iterations >= paper.training.iterations:
+    if recipe.network == paper.network and recipe.training.iterations >= paper.training.iterations:
         return variations
-    names = dict.fromkeys(prior.name for prior in comparison.priors)
-    short = [prior_label(n) for n in names if iterations < TRAINED_AFTER.get(n, 0)]
-    told = (
-        "Success still rises with more iterations than these (docs/evidence.md, 'Training budget')."
-    )
-    lines = [f"- {', '.join(short)}: short of training. {told}"] if short else []
-    return [*variations, *lines, "- Network and training budget are smaller than the paper's."]
+    return [*variations, "- Network and training budget are smaller than the paper's."]
 
 
 def draw(comparison: Comparison, rows: Sequence[Row]) -> None:
