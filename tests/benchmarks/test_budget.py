@@ -108,7 +108,7 @@ def test_options_of_a_prior_have_cells_of_their_own(budget, monkeypatch):
     contestants = [
         SimpleNamespace(
             prior=PastPrior(8, sigma=1.0, correlation=each),
-            facts=lambda r=r: {n: {"options": "", **r.facts}[n] for n in names},
+            facts=lambda r=r: {n: r.facts[n] for n in names},
         )
         for r, each in ((first, 0.0), (second, 0.5))
     ]
@@ -116,7 +116,7 @@ def test_options_of_a_prior_have_cells_of_their_own(budget, monkeypatch):
         contestants=contestants,
         nfes=[1],
         player=lambda contestant: contestant,
-        results=SimpleNamespace(rows=[first, second]),
+        rows=[first, second],
     )
     monkeypatch.setattr(
         budget, "action_error", lambda actor, windows, nfes: {1: actor.prior.correlation}
@@ -124,6 +124,7 @@ def test_options_of_a_prior_have_cells_of_their_own(budget, monkeypatch):
     observations = SimpleNamespace(windows=lambda prior: None)
     rows = budget.with_errors(comparison, observations)
     assert [each["action_error"] for each in rows] == [0.0, 0.5]
+    assert [each.outcomes for each in rows] == [first.outcomes, second.outcomes]
     head, _, line, *_ = budget.make_table(rows, 1).splitlines()
     assert head == "| iterations | NFE 1: WP-Past | NFE 1: WP-Past, correlation=0.5 |"
     assert line == "| 100 | 20.0 (0.0000) | 80.0 (0.5000) |"

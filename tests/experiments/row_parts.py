@@ -9,6 +9,7 @@ FACTS = {
     "task": "square",
     "data": "ph",
     "prior": "gaussian",
+    "options": "",
     "sigma": 1.0,
     "chunk": 8,
     "seed": 0,
