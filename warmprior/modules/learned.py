@@ -332,7 +332,34 @@ class LeapPrior(ForecastPrior):
     sees_history = False
 
 
-class A2APrior(LearnedPrior):
+class PointForecastPrior(LearnedPrior):
+    r"""Base class of learned priors whose network forecasts the chunk, by mean squared error."""
+
+    always_warm = True
+
+    def build(self) -> None:
+        """The forecaster."""
+        self.network = self.mlp(self.seen_dim, self.chunk_dim)
+
+    def forecast(self, loc: Tensor, warm: Tensor, observation: Tensor | None) -> Tensor:
+        """The forecast chunk, ``[*B, P, d_a]``."""
+        seen = self.seen(loc, warm, observation)
+        return self.network(seen).unflatten(-1, (self.prediction_length, self.action_dim))
+
+    def learning_loss(
+        self,
+        a1: Tensor,
+        counted: Tensor,
+        loc: Tensor,
+        warm: Tensor,
+        observation: Tensor,
+        generator: torch.Generator | None = None,
+    ) -> Tensor:
+        """Mean squared error."""
+        return _mean((a1 - self.forecast(loc, warm, observation)).square(), counted)
+
+
+class A2APrior(PointForecastPrior):
     r"""A2A in action space: a deterministic source :math:`a_0 = f_\phi(h)` made of the last actions alone.
 
     A2A (Jia et al., 2026) encodes a history into the source of a flow between latent codes of chunks, without
@@ -354,32 +381,14 @@ class A2APrior(LearnedPrior):
     label = "A2A (action space)"
     color = "#bf812d"
     default_sigma = 0.0
-    always_warm = True
     sees_observation = False
-
-    def build(self) -> None:
-        """The encoder."""
-        self.network = self.mlp(self.seen_dim, self.chunk_dim)
 
     def distribution(
         self, loc: Tensor, warm: Tensor, observation: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """The encoded history, and ``sigma`` around it, 0 by default."""
-        seen = self.seen(loc, warm, observation)
-        mean = self.network(seen).unflatten(-1, (self.prediction_length, self.action_dim))
+        mean = self.forecast(loc, warm, observation)
         return mean, torch.full_like(mean[..., :1], self.sigma)
-
-    def learning_loss(
-        self,
-        a1: Tensor,
-        counted: Tensor,
-        loc: Tensor,
-        warm: Tensor,
-        observation: Tensor,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Mean squared error."""
-        return _mean((a1 - self.distribution(loc, warm)[0]).square(), counted)
 
 
 class CVAEPrior(LearnedPrior):
@@ -502,7 +511,7 @@ class CVAEPrior(LearnedPrior):
         return error + self.beta * divergence / self.chunk_dim * self.latent_dim
 
 
-class StepPrior(LearnedPrior):
+class StepPrior(PointForecastPrior):
     r"""STEP: a forecast enters the flow of a standard normal source at an intermediate time.
 
     The flow is trained as ever, from N(0, I). At decisions a forecaster :math:`f_\phi(o, h)`, trained by mean
@@ -541,7 +550,6 @@ class StepPrior(LearnedPrior):
     name = "step"
     label = "STEP"
     color = "#35978f"
-    always_warm = True
     stall: float
     stall_noise: float
 
@@ -572,15 +580,6 @@ class StepPrior(LearnedPrior):
             sigma=1.0,
         )
 
-    def build(self) -> None:
-        """The forecaster."""
-        self.network = self.mlp(self.seen_dim, self.chunk_dim)
-
-    def forecast(self, loc: Tensor, warm: Tensor, observation: Tensor | None) -> Tensor:
-        """The forecast chunk, ``[*B, P, d_a]``."""
-        seen = self.seen(loc, warm, observation)
-        return self.network(seen).unflatten(-1, (self.prediction_length, self.action_dim))
-
     def distribution(
         self, loc: Tensor, warm: Tensor, observation: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
@@ -610,15 +609,3 @@ class StepPrior(LearnedPrior):
         stuck = warm[..., :1, :] & (moved < self.stall)
         eps = torch.where(stuck, (1 + self.stall_noise) * eps, eps)
         return (1 - self.start_time) * eps + self.start_time * forecast
-
-    def learning_loss(
-        self,
-        a1: Tensor,
-        counted: Tensor,
-        loc: Tensor,
-        warm: Tensor,
-        observation: Tensor,
-        generator: torch.Generator | None = None,
-    ) -> Tensor:
-        """Mean squared error."""
-        return _mean((a1 - self.forecast(loc, warm, observation)).square(), counted)
