@@ -49,6 +49,7 @@ from warmprior.experiments.prior_space import (
 from warmprior.experiments.results import facts_of_machine, grouped
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.io.script import run_script
+from warmprior.modules.prior import options_of
 from warmprior.rl import PriorSpaceTraining
 from warmprior.training.threads import torch_threads
 
@@ -84,9 +85,8 @@ def is_asked(text: str, actor: WarmPriorActor) -> bool:
     own, network = actor.prior, actor.network
     if Prior.find(text) is not type(own):
         return False
-    asked = Prior.make(
-        text, own.chunk_length, sigma=own.sigma, cold_probability=own.cold_probability
-    )
+    unsaid = {"sigma", "cold_probability"} - set(options_of(text))
+    asked = Prior.make(text, own.chunk_length, **{key: getattr(own, key) for key in unsaid})
     sizes = (network.action_dim, network.observation_dim, network.observation_steps)
     return asked.sized(*sizes).config() == own.config()
 

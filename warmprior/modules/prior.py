@@ -252,7 +252,7 @@ class Prior:
             0.5
         """
         found = Prior.find(name)
-        behind = _parsed(name)
+        behind = options_of(name)
         beside: dict[str, Any] = {"sigma": sigma, "cold_probability": cold_probability}
         unset = {"sigma": None, "cold_probability": 0.0}
         taken = {key: value for key, value in beside.items() if found.takes(key)} | behind
@@ -616,8 +616,16 @@ class Prior:
         return f"{type(self).__name__}({', '.join(told)})"
 
 
-def _parsed(name: str) -> dict[str, Any]:
-    """Options behind the name of a prior, such as ``"preview,correlation=0.5"``."""
+def options_of(name: str) -> dict[str, Any]:
+    """Options behind the name of a prior.
+
+    Raises:
+        ValueError: if they are not written as ``name,option=value``, or one is given twice.
+
+    Examples:
+        >>> options_of("preview,correlation=0.5")
+        {'correlation': 0.5}
+    """
     options: dict[str, Any] = {}
     _, comma, rest = name.partition(",")
     for part in NEXT_OPTION.split(rest) if comma else ():
