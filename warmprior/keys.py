@@ -10,6 +10,7 @@ of the denormalising transform.
 constant                key                                    shape and dtype
 ======================  =====================================  ==================================
 :data:`OBSERVATION`     ``"observation"``                      ``[*B, To, d_o]`` float
+:data:`STATE`           ``"state"``, nested under observation  ``[*B, To, d_s]`` float
 :data:`CONDITIONED`     ``("prior", "observation")``           ``[*B, To, d_o + P * d_a + 1]`` float
 :data:`ACTION`          ``"action"``                           ``[*B, d_a]`` float
 :data:`EEF_POSE`        ``"eef_pose"``                         ``[*B, arms, 3, 4]`` float, raw
@@ -29,6 +30,10 @@ constant                key                                    shape and dtype
 :data:`FRAME`           ``"frame"``                            ``[N]`` int64, data only
 ======================  =====================================  ==================================
 
+An observation with images has several entries, nested under :data:`OBSERVATION`: the vector
+:data:`STATE`, and images uint8 ``[*B, To, 3, h, w]`` under robomimic's names, such as
+``"agentview_image"``.
+
 In prior-space reinforcement learning :data:`ANCHOR` is the centre of the agent's box and :data:`DELTA` its
 action, so that the source is always ``noise = anchor + delta``. An environment that decodes by itself tells
 what it made of a step's action under ``("next", "decoded", "noise")`` and ``("next", "decoded", "chunk")``;
@@ -43,6 +48,7 @@ from __future__ import annotations
 from torchrl.data.vla import ACTION_CHUNK_KEY, ACTION_IS_PAD_KEY, ACTION_KEY, OBSERVATION_KEY
 
 OBSERVATION = OBSERVATION_KEY
+STATE = "state"
 ACTION = ACTION_KEY
 EEF_POSE = "eef_pose"
 CONDITIONED = ("prior", "observation")

@@ -4,6 +4,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.baselines import HistoryPrior, RegressionPrior
 from warmprior.modules.chi_transformer import ChiTransformer
 from warmprior.modules.couplings import OTPrior, ReflowPrior
+from warmprior.modules.encoder import ImageEncoder, load_imagenet
 from warmprior.modules.interpolant import (
     Interpolant,
     LinearInterpolant,
@@ -27,6 +28,7 @@ from warmprior.modules.prior import Prior
 from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.modules.sampler import PriorSampler
 from warmprior.modules.trend import PoseTrend, RestingAction
+from warmprior.modules.vision import VisionNetwork
 
 __all__ = [
     "A2APrior",
@@ -35,6 +37,7 @@ __all__ = [
     "ForecastPrior",
     "GaussianPrior",
     "HistoryPrior",
+    "ImageEncoder",
     "Interpolant",
     "LeapPrior",
     "LearnedPrior",
@@ -58,6 +61,8 @@ __all__ = [
     "TrigonometricInterpolant",
     "VelocityMLP",
     "VelocityNetwork",
+    "VisionNetwork",
     "WarmPriorActor",
     "integrate",
+    "load_imagenet",
 ]

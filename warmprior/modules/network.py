@@ -101,6 +101,16 @@ class VelocityNetwork(nn.Module):
         if tuple(observation.shape[1:]) != expected:
             raise ValueError(f"{built}, got {tuple(observation.shape)}")
 
+    def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
+        """What can be computed of an observation once, before the field is evaluated at it many times.
+
+        The network takes the result in place of the observation. By default nothing can.
+
+        Args:
+            observation: ``[B, To, d_o]``, or a tensordict ``[B]``.
+        """
+        return observation
+
     def config(self) -> dict[str, Any]:
         """JSON-serialisable class name and constructor arguments."""
         return {"name": type(self).__name__, **self._config}
@@ -144,6 +154,8 @@ def velocity_field(
 ) -> Callable[[Tensor, Tensor], Tensor]:
     """A network's velocity ``(t, a) -> v`` at observations, in the precision of ``a``.
 
+    The observations are encoded once (:meth:`VelocityNetwork.encode`), however often the field is evaluated.
+
     The network computes in its own precision (that of its first parameter): float64 demonstrations and
     environments, and bfloat16 networks, need no casts elsewhere, and the path is integrated, and its error
     measured, in the precision of the actions.
@@ -153,19 +165,37 @@ def velocity_field(
         observation: ``[B, To, *]``, or a tensordict of such entries; whole numbers, such as pixels, are
             left as they are.
     """
-    tensors = chain(network.parameters(), network.buffers())  # a frozen network has buffers alone
-    dtype = next((value.dtype for value in tensors if value.is_floating_point()), None)
+    seen = encoded(network, observation)
+    dtype = _precision(network)
     if dtype is None:
-        return lambda t, a: network(t, a, observation)
+        return lambda t, a: network(t, a, seen)
+    return lambda t, a: network(t.to(dtype), a.to(dtype), seen).to(a.dtype)
+
+
+def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
+    """What a network makes of observations once (:meth:`VelocityNetwork.encode`), in its own precision.
+
+    Args:
+        network: see :func:`velocity_field`.
+        observation: see :func:`velocity_field`.
+    """
+    dtype = _precision(network)
 
     def cast(value: Tensor) -> Tensor:
         return value.to(dtype) if value.is_floating_point() else value
 
-    if isinstance(observation, TensorDictBase):
-        several = observation.apply(cast)
-        return lambda t, a: network(t.to(dtype), a.to(dtype), several).to(a.dtype)
-    observation = cast(observation)
-    return lambda t, a: network(t.to(dtype), a.to(dtype), observation).to(a.dtype)
+    if dtype is not None:
+        if isinstance(observation, TensorDictBase):
+            observation = observation.apply(cast)
+        else:
+            observation = cast(observation)
+    encode = getattr(network, "encode", None)
+    return observation if encode is None else encode(observation)
+
+
+def _precision(network: nn.Module) -> torch.dtype | None:
+    tensors = chain(network.parameters(), network.buffers())  # a frozen network has buffers alone
+    return next((value.dtype for value in tensors if value.is_floating_point()), None)
 
 
 def network_observation(

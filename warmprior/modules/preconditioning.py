@@ -269,6 +269,10 @@ class PreconditionedNetwork(VelocityNetwork):
         }
         return config if self.trend is None else config | {"trend": self.trend.config()}
 
+    def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
+        """As the network inside does."""
+        return self.network.encode(observation)
+
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
         """The groups of the network inside."""
         return self.network.parameter_groups(weight_decay)

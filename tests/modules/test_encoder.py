@@ -1,0 +1,302 @@
+"""Observations with images: encoders, and networks and policies behind them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from warmprior import (
+    FlowMatchingLoss,
+    ImageEncoder,
+    PastPrior,
+    PreconditionedNetwork,
+    VelocityMLP,
+    VisionNetwork,
+    WarmPriorActor,
+    window_replay_buffer,
+)
+from warmprior.modules import load_imagenet
+
+CAMERAS = ("agentview_image", "robot0_eye_in_hand_image")
+SIZE, CROP, STATE = 12, 8, 3
+
+
+def encoder_of(**options) -> ImageEncoder:
+    given = {"image_size": SIZE, "crop_size": CROP, "backbone": "small"} | options
+    return ImageEncoder(CAMERAS, STATE, **given)
+
+
+def observation_of(*batch: int, size: int = SIZE, seed: int = 0) -> TensorDict:
+    draw = torch.Generator().manual_seed(seed)
+    images = {
+        name: torch.randint(256, (*batch, 2, 3, size, size), dtype=torch.uint8, generator=draw)
+        for name in CAMERAS
+    }
+    return TensorDict({"state": torch.randn(*batch, 2, STATE, generator=draw), **images}, batch)
+
+
+def network_of(**options) -> VisionNetwork:
+    encoder = encoder_of(**options)
+    return VisionNetwork(encoder, VelocityMLP(2, encoder.observation_dim, 4, hidden_dim=16))
+
+
+class Seen(nn.Module):
+    """In place of a backbone: keeps what it is given."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(()))
+        self.windows: list[torch.Tensor] = []
+
+    def forward(self, pixels):
+        self.windows.append(pixels)
+        return self.weight * pixels.flatten(1).mean(1, keepdim=True)
+
+
+def seeing(room: int = SIZE - CROP) -> tuple[ImageEncoder, Seen]:
+    encoder = ImageEncoder(["cam"], 0, image_size=CROP + room, crop_size=CROP, backbone="small")
+    seen = Seen()
+    encoder.networks[0] = seen
+    return encoder, seen
+
+
+def pixels_of(images: torch.Tensor) -> torch.Tensor:
+    """What a backbone is given, written out channel by channel."""
+    scaled = images.double() / 255
+    for channel, (mean, deviation) in enumerate([(0.485, 0.229), (0.456, 0.224), (0.406, 0.225)]):
+        scaled[..., channel, :, :] = (scaled[..., channel, :, :] - mean) / deviation
+    return scaled.float()
+
+
+@pytest.mark.parametrize(("backbone", "features"), [("small", 64), ("resnet18", 512)])
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_vector_and_features_side_by_side(backbone, features, batch):
+    encoder = encoder_of(backbone=backbone).eval()
+    observation = observation_of(*batch)
+    out = encoder(observation)
+    assert out.shape == (*batch, 2, STATE + 2 * features)
+    assert encoder.observation_dim == out.shape[-1]
+    assert torch.equal(out[..., :STATE], observation["state"])
+    for number, camera in enumerate(CAMERAS):  # each camera by its own network, one step at a time
+        centre = observation[camera][..., 2 : 2 + CROP, 2 : 2 + CROP].flatten(0, -4)
+        with torch.no_grad():
+            alone = encoder.networks[number](pixels_of(centre))
+        first = STATE + number * features
+        part = out[..., first : first + features].flatten(0, -2)
+        torch.testing.assert_close(part, alone, rtol=1e-4, atol=1e-4)
+
+
+def test_the_resnet_normalises_groups_and_has_no_head():
+    network = encoder_of(backbone="resnet18").networks[0]
+    kinds = {type(module) for module in network.modules()}
+    assert nn.GroupNorm in kinds and nn.BatchNorm2d not in kinds and nn.Linear not in kinds
+    assert {
+        m.num_channels // m.num_groups for m in network.modules() if isinstance(m, nn.GroupNorm)
+    } == {16}
+
+
+def test_one_network_for_all_cameras():
+    shared, separate = encoder_of(share=True), encoder_of()
+    assert len(shared.networks) == 1 and len(separate.networks) == 2
+    assert shared.observation_dim == separate.observation_dim
+    same = observation_of(3)
+    same[CAMERAS[1]] = same[CAMERAS[0]]
+    first, second = shared.eval()(same)[..., STATE:].chunk(2, -1)
+    assert torch.equal(first, second)
+    first, second = separate.eval()(same)[..., STATE:].chunk(2, -1)
+    assert not torch.equal(first, second)
+
+
+def test_random_windows_are_crops_of_all_steps_alike_and_reach_everywhere():
+    encoder, seen = seeing()
+    images = torch.arange(2 * 3 * SIZE * SIZE).remainder(251).to(torch.uint8)
+    images = images.view(2, 3, SIZE, SIZE).expand(400, 2, 3, SIZE, SIZE)
+    torch.manual_seed(0)
+    encoder(TensorDict({"cam": images}, [400]))
+    (windows,) = seen.windows
+    room = SIZE - CROP + 1
+    crops = torch.stack(
+        [
+            pixels_of(images[0, :, :, top : top + CROP, left : left + CROP])
+            for top in range(room)
+            for left in range(room)
+        ]
+    )
+    found = set()
+    for window in windows.detach().unflatten(0, (400, 2)):
+        distance = (crops - window).abs().amax((1, 2, 3, 4))
+        assert distance.min() < 1e-5
+        found.add(int(distance.argmin()))
+    assert len(found) == room * room  # of 25 in 400 draws: missed with probability 2e-6
+
+
+def test_windows_follow_the_seed_and_evaluation_draws_none():
+    encoder, observation = encoder_of(), observation_of(4)
+    one, two, other = ((torch.manual_seed(seed), encoder(observation))[1] for seed in (3, 3, 4))
+    assert torch.equal(one, two) and not torch.equal(one, other)
+    state = torch.get_rng_state()
+    centre = encoder.eval()(observation)
+    assert torch.equal(torch.get_rng_state(), state)
+    border = observation.clone()
+    for camera in CAMERAS:
+        border[camera][..., :2, :] = 0
+        border[camera][..., -2:] = 0
+    assert torch.equal(encoder(border), centre)
+
+
+def test_a_window_of_the_whole_image_is_the_image():
+    encoder, seen = seeing(room=0)
+    images = observation_of(3, size=CROP)[CAMERAS[0]]
+    encoder(TensorDict({"cam": images}, [3]))
+    torch.testing.assert_close(seen.windows[0].unflatten(0, (3, 2)), pixels_of(images))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"crop_size": 13}, "crop_size <= image_size"),
+        ({"crop_size": 4}, "8 <= crop_size"),
+        ({"backbone": "vgg"}, "'resnet18' or 'small', got 'vgg'"),
+    ],
+)
+def test_options_out_of_range(options, message):
+    with pytest.raises(ValueError, match=message):
+        encoder_of(**options)
+    for cameras in ((), ("a", "a")):
+        with pytest.raises(ValueError, match="different cameras"):
+            ImageEncoder(cameras, 0)
+
+
+def test_observations_that_do_not_fit():
+    encoder = encoder_of()
+    with pytest.raises(KeyError, match=r"missing: \['robot0_eye_in_hand_image'\]"):
+        encoder(observation_of(3).exclude(CAMERAS[1]))
+    with pytest.raises(ValueError, match=r"3 numbers in 'state', got \(3, 2, 4\)"):
+        encoder(observation_of(3).set("state", torch.zeros(3, 2, 4)))
+    with pytest.raises(
+        ValueError, match=r"\(3, 12, 12\), but 'agentview_image' is torch.uint8 \(3, 2, 3, 9, 9\)"
+    ):
+        encoder(observation_of(3, size=9))
+    floats = observation_of(3)
+    floats[CAMERAS[0]] = floats[CAMERAS[0]].float()
+    with pytest.raises(ValueError, match=r"torch\.float32"):
+        encoder(floats)
+    upright = observation_of(3)
+    upright[CAMERAS[0]] = upright[CAMERAS[0]].movedim(-3, -1)
+    with pytest.raises(ValueError, match=r"\(3, 2, 12, 12, 3\)"):
+        encoder(upright)
+
+
+def test_a_network_for_other_observations():
+    with pytest.raises(ValueError, match="observation_dim=5, but the encoder gives 131"):
+        VisionNetwork(encoder_of(), VelocityMLP(2, 5, 4))
+
+
+def policy_of(network: nn.Module) -> WarmPriorActor:
+    return WarmPriorActor(network, PastPrior(4), generator=torch.Generator().manual_seed(0))
+
+
+def decision_of(*batch: int) -> TensorDict:
+    mean = {"loc": torch.zeros(*batch, 4, 2), "warm": torch.ones(*batch, 4, 1, dtype=torch.bool)}
+    return TensorDict({"observation": observation_of(*batch), "prior": mean}, batch)
+
+
+class Counted(ImageEncoder):
+    calls = 0
+
+    def forward(self, observation):
+        self.calls += 1
+        return super().forward(observation)
+
+
+def counted() -> Counted:
+    return Counted(CAMERAS, STATE, image_size=SIZE, crop_size=CROP, backbone="small")
+
+
+@pytest.mark.parametrize("precondition", [False, True])
+@pytest.mark.parametrize("nfe", [1, 3, 9])
+def test_the_encoder_runs_once_per_decision(precondition, nfe):
+    encoder = counted()
+    network = VisionNetwork(encoder, VelocityMLP(2, encoder.observation_dim, 4, hidden_dim=16))
+    policy = policy_of(PreconditionedNetwork(network) if precondition else network)
+    policy(decision_of(3), nfe=nfe)
+    assert encoder.calls == 1
+
+
+def demonstrations() -> TensorDict:
+    observation = observation_of(40)
+    first = TensorDict({key: value[:, 0] for key, value in observation.items()}, [40])
+    episode = torch.arange(40) // 20
+    return TensorDict(
+        {"observation": first, "action": torch.randn(40, 2), "episode": episode}, [40]
+    )
+
+
+def test_the_encoder_runs_once_per_loss_and_learns():
+    encoder = counted()
+    network = VisionNetwork(encoder, VelocityMLP(2, encoder.observation_dim, 4, hidden_dim=16))
+    policy = policy_of(PreconditionedNetwork(network))
+    loss = FlowMatchingLoss(policy)
+    batch = window_replay_buffer(demonstrations(), policy.prior, batch_size=8).sample()
+    assert batch["observation", CAMERAS[0]].shape == (8, 2, 3, SIZE, SIZE)
+    loss(batch)["loss_flow_matching"].backward()
+    assert encoder.calls == 1
+    assert all(p.grad is not None and bool(p.grad.abs().sum() > 0) for p in encoder.parameters())
+
+
+def test_features_take_the_place_of_the_observation():
+    policy = policy_of(PreconditionedNetwork(network_of())).eval()
+    data = decision_of(3)
+    features = policy.network.encode(data["observation"])
+    assert features.shape == (3, 2, 131)
+    t, a = torch.rand(3), torch.randn(3, 4, 2)
+    assert torch.equal(policy.network(t, a, features), policy.network(t, a, data["observation"]))
+
+
+@pytest.mark.parametrize("options", [{}, {"share": True}, {"backbone": "resnet18"}])
+def test_a_saved_policy_returns_the_same_chunks(tmp_path, options):
+    policy = policy_of(PreconditionedNetwork(network_of(**options))).eval()
+    policy.save_pretrained(tmp_path)
+    again = WarmPriorActor.from_pretrained(tmp_path, generator=torch.Generator().manual_seed(0))
+    one, two = policy(decision_of(3)), again.eval()(decision_of(3))
+    assert torch.equal(one["vla_action", "chunk"], two["vla_action", "chunk"])
+    assert again.network.config() == policy.network.config()
+
+
+def test_imagenets_weights_go_to_the_convolutions_of_every_camera(monkeypatch):
+    from torchvision.models import ResNet18_Weights, resnet18
+
+    torch.manual_seed(1)
+    official = resnet18().state_dict()
+    monkeypatch.setattr(ResNet18_Weights, "get_state_dict", lambda self, **options: official)
+    encoder = encoder_of(backbone="resnet18")
+    load_imagenet(encoder)
+    for network in encoder.networks:
+        for name, value in network.state_dict().items():
+            if value.ndim == 4:
+                assert torch.equal(value, official[name])
+            else:  # group norm without effect
+                assert value.unique().item() == (1.0 if name.endswith("weight") else 0.0)
+
+
+def test_imagenets_weights_that_cannot_be_had(monkeypatch):
+    from torchvision.models import ResNet18_Weights
+
+    def offline(self, **options):
+        raise OSError("no route to host")
+
+    monkeypatch.setattr(ResNet18_Weights, "get_state_dict", offline)
+    with pytest.raises(
+        OSError, match=r"cannot be had \(no route to host\): connect once, or put resnet18"
+    ):
+        load_imagenet(encoder_of(backbone="resnet18"))
+    with pytest.raises(ValueError, match="not for 'small'"):
+        load_imagenet(encoder_of())
+
+
+def test_half_precision_networks_take_images_as_they_are():
+    policy = policy_of(network_of().to(torch.bfloat16)).eval()
+    chunk = policy(decision_of(3))["vla_action", "chunk"]
+    assert chunk.dtype == torch.float32 and bool(torch.isfinite(chunk).all())

@@ -1,0 +1,233 @@
+"""Encoders of observations that hold images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.modules import ConvNet
+
+from warmprior import keys
+from warmprior.io.extras import require
+
+__all__ = ["ImageEncoder", "load_imagenet"]
+
+Backbone = Literal["resnet18", "small"]
+
+_CHANNEL_MEAN = (0.485, 0.456, 0.406)
+_CHANNEL_DEVIATION = (0.229, 0.224, 0.225)
+"""Of ImageNet's pixels in [0, 1], which its weights expect."""
+
+_SMALL_FEATURES = 64
+
+
+def _resnet18() -> tuple[nn.Module, int]:
+    torchvision: Any = require("torchvision.models", "vision")
+    # As in Diffusion Policy: averaged weights and the running statistics of batch norm do not go together.
+    network = torchvision.resnet18(norm_layer=lambda width: nn.GroupNorm(width // 16, width))
+    width = network.fc.in_features
+    network.fc = nn.Identity()
+    return network, width
+
+
+def _small(crop_size: int) -> tuple[nn.Module, int]:
+    side = crop_size
+    for _ in range(3):
+        side = (side + 1) // 2
+    convolutions = ConvNet(
+        in_features=3, num_cells=[32, 64, 64], strides=2, paddings=1, activation_class=nn.ReLU
+    )
+    # The positions of features are kept, which a pooling network of this size would lose.
+    return nn.Sequential(
+        convolutions, nn.Linear(64 * side * side, _SMALL_FEATURES)
+    ), _SMALL_FEATURES
+
+
+class ImageEncoder(nn.Module):
+    r"""Encodes an observation of images and a vector: one vector per observation step.
+
+    Every camera has a network of its own, ResNet-18 with group norm as in the paper (Table 4), whose
+    features stand behind the vector. In training mode a random window of the image is cut out, the same
+    one for all ``To`` images of a camera; otherwise the central one. Pixels are scaled by ImageNet's
+    statistics.
+
+    Args:
+        cameras: names of the images in the observation.
+        state_dim: width of the vector ``"state"`` in it; 0 if there is none.
+
+    Keyword Args:
+        image_size: side of the images in pixels.
+        crop_size: side of the window.
+        backbone: ``"resnet18"``, or ``"small"``: three convolutions and a linear layer, for small budgets.
+        share: one network for all cameras.
+
+    Raises:
+        ValueError: if there are no cameras or one is named twice, a size is out of range, or there is no
+            such backbone.
+        ImportError: if ResNet-18 is asked for and torchvision is missing.
+
+    .. note::
+        The windows of a training are drawn by PyTorch's global generator, like dropout.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> encoder = ImageEncoder(["agentview_image"], 9, image_size=32, crop_size=28, backbone="small")
+        >>> observation = TensorDict({
+        ...     "state": torch.zeros(4, 2, 9),
+        ...     "agentview_image": torch.zeros(4, 2, 3, 32, 32, dtype=torch.uint8),
+        ... }, [4])
+        >>> encoder(observation).shape, encoder.observation_dim
+        (torch.Size([4, 2, 73]), 73)
+    """
+
+    _mean: Tensor
+    _deviation: Tensor
+
+    def __init__(
+        self,
+        cameras: Sequence[str],
+        state_dim: int,
+        *,
+        image_size: int = 84,
+        crop_size: int = 76,
+        backbone: Backbone = "resnet18",
+        share: bool = False,
+    ) -> None:
+        super().__init__()
+        cameras = tuple(cameras)
+        if not cameras or len(set(cameras)) < len(cameras):
+            raise ValueError(f"an image encoder needs different cameras, got {list(cameras)}")
+        if state_dim < 0 or not 8 <= crop_size <= image_size:
+            raise ValueError(
+                f"need state_dim >= 0 and 8 <= crop_size <= image_size, got {state_dim}, {crop_size} and "
+                f"{image_size}"
+            )
+        if backbone not in ("resnet18", "small"):
+            raise ValueError(f"backbone is 'resnet18' or 'small', got {backbone!r}")
+        self.cameras, self.state_dim = cameras, state_dim
+        self.image_size, self.crop_size = image_size, crop_size
+        self.backbone, self.share = backbone, share
+        made = [
+            _resnet18() if backbone == "resnet18" else _small(crop_size)
+            for _ in (cameras[:1] if share else cameras)
+        ]
+        self.networks = nn.ModuleList(network for network, _ in made)
+        #: Width of what :meth:`forward` returns.
+        self.observation_dim = state_dim + len(cameras) * made[0][1]
+        for name, values in {"_mean": _CHANNEL_MEAN, "_deviation": _CHANNEL_DEVIATION}.items():
+            self.register_buffer(name, torch.tensor(values).view(3, 1, 1), persistent=False)
+
+    def config(self) -> dict[str, Any]:
+        """Constructor arguments as JSON holds them."""
+        return {
+            "cameras": list(self.cameras),
+            "state_dim": self.state_dim,
+            "image_size": self.image_size,
+            "crop_size": self.crop_size,
+            "backbone": self.backbone,
+            "share": self.share,
+        }
+
+    def forward(self, observation: TensorDictBase) -> Tensor:
+        """Encode an observation.
+
+        Args:
+            observation: ``[*B]``, with ``"state"`` ``[*B, To, state_dim]`` and images uint8
+                ``[*B, To, 3, image_size, image_size]`` under the names of the cameras.
+
+        Returns:
+            ``[*B, To, observation_dim]``: the vector, and the features of the cameras in their order.
+
+        Raises:
+            KeyError: if an entry is missing.
+            ValueError: if one has another shape, or images are not uint8.
+        """
+        self._check(observation)
+        parts = [observation[keys.STATE]] if self.state_dim else []
+        dtype = next(self.networks.parameters()).dtype
+        for number, camera in enumerate(self.cameras):
+            images = observation[camera]
+            *batch, _, _, _ = images.shape
+            pixels = self._cropped(images.flatten(0, -5) if len(batch) > 1 else images[None])
+            pixels = pixels.flatten(0, 1).to(dtype) / 255
+            network = self.networks[0 if self.share else number]
+            parts.append(network((pixels - self._mean) / self._deviation).unflatten(0, batch))
+        return torch.cat(parts, -1)
+
+    def _cropped(self, images: Tensor) -> Tensor:
+        """Windows of images ``[B, To, 3, h, w]``."""
+        size, room = self.crop_size, self.image_size - self.crop_size
+        if not self.training:
+            return images[..., room // 2 : room // 2 + size, room // 2 : room // 2 + size]
+        if room == 0:
+            return images
+        batch, device = len(images), images.device
+        top, left = torch.randint(room + 1, (2, batch, 1), device=device)
+        span = torch.arange(size, device=device)
+        rows, columns = top + span, left + span
+        flat = images.flatten(1, 2)
+        number, channel = (torch.arange(n, device=device) for n in flat.shape[:2])
+        window = flat[
+            number[:, None, None, None],
+            channel[:, None, None],
+            rows[:, None, :, None],
+            columns[:, None, None, :],
+        ]
+        return window.unflatten(1, images.shape[1:3])
+
+    def _check(self, observation: TensorDictBase) -> None:
+        wanted = [*([keys.STATE] if self.state_dim else []), *self.cameras]
+        missing = [key for key in wanted if key not in observation]
+        if missing:
+            raise KeyError(
+                f"the encoder needs the entries {wanted} of the observation; missing: {missing}, it has "
+                f"{sorted(map(str, observation.keys()))}"
+            )
+        if self.state_dim and observation[keys.STATE].shape[-1] != self.state_dim:
+            raise ValueError(
+                f"the encoder was built for {self.state_dim} numbers in {keys.STATE!r}, got "
+                f"{tuple(observation[keys.STATE].shape)}"
+            )
+        expected = (3, self.image_size, self.image_size)
+        for camera in self.cameras:
+            images = observation[camera]
+            if tuple(images.shape[-3:]) != expected or images.dtype != torch.uint8:
+                raise ValueError(
+                    f"the encoder was built for uint8 images [*B, To, 3, h, w] with (3, h, w) = {expected}, "
+                    f"but {camera!r} is {images.dtype} {tuple(images.shape)}"
+                )
+
+
+def load_imagenet(encoder: ImageEncoder) -> None:
+    """Give the ResNets of an encoder the weights of ImageNet, in place.
+
+    They come from torchvision, which downloads them once. Group norm, which takes the place of batch norm,
+    starts from no effect.
+
+    Args:
+        encoder: with the backbone ``"resnet18"``.
+
+    Raises:
+        ValueError: if it has another backbone.
+        OSError: if they are neither stored here nor can be downloaded.
+    """
+    if encoder.backbone != "resnet18":
+        raise ValueError(f"ImageNet's weights are for resnet18, not for {encoder.backbone!r}")
+    torchvision: Any = require("torchvision.models", "vision")
+    weights = torchvision.ResNet18_Weights.IMAGENET1K_V1
+    try:
+        state = weights.get_state_dict(progress=False, check_hash=True)
+    except OSError as error:
+        raise OSError(
+            f"ImageNet's weights of ResNet-18 cannot be had ({error}): connect once, or put "
+            f"{weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints"
+        ) from error
+    for network in encoder.networks:
+        mine = network.state_dict()
+        # Those of the convolutions: batch norm's have the names of group norm's.
+        taken = {name: state[name] for name in mine if mine[name].ndim == 4}
+        network.load_state_dict(mine | taken)
