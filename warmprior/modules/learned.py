@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torchrl.modules import MLP
 
-from warmprior.modules.prior import check_finite_numbers, check_whole_numbers
+from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.priors import PastPrior
 
 __all__ = ["A2APrior", "CVAEPrior", "ForecastPrior", "LeapPrior", "LearnedPrior", "StepPrior"]
