@@ -84,7 +84,8 @@ class Prior(NamedPrior):
     """Whether :meth:`anchor` holds where the window or decision has no mean, as in the first chunk of an
     episode."""
     ever_warm: ClassVar[bool] = True
-    """Whether there is ever a mean. Otherwise ``sigma`` and ``cold_probability`` are without effect."""
+    """Whether there is ever a mean. Otherwise ``sigma``, ``cold_probability`` and ``correlation`` are without
+    effect."""
     is_flow: ClassVar[bool] = True
     """Whether the field is trained at all times. Otherwise it is at ``t = 0`` alone, and one network
     evaluation is all that it is good for."""
@@ -146,10 +147,13 @@ class Prior(NamedPrior):
 
     @property
     def residual_sigma(self) -> float:
-        """Typical deviation of :meth:`start` from :meth:`anchor`: what residuals without an agent are drawn
-        with. ``sigma`` by default.
+        """What residuals without an agent are drawn with: the typical deviation of :meth:`start` from the
+        centre of the agent's search.
+
+        By default ``sigma`` around :meth:`anchor`. Around zero, where the source is not centred
+        (:attr:`moves_source`), 1: that of a standard normal one, and as wide as normalised actions are.
         """
-        return self.sigma
+        return self.sigma if self.moves_source else 1.0
 
     @property
     def is_gaussian(self) -> bool:
