@@ -284,6 +284,28 @@ def test_configurations_build_the_same_prior(kind, data):
     assert not any(p.requires_grad for p in again.parameters())
 
 
+@pytest.mark.parametrize("kind", LEARNED)
+def test_cold_probability_is_taken_where_withholding_the_mean_changes_the_source(kind):
+    prior = kind(H, hidden_dim=8).sized(D_A, D_O, 1)
+    loc, warm = torch.rand(3, H, D_A), torch.ones(3, H, 1, dtype=torch.bool)
+    seen = torch.rand(3, 1, D_O)
+    drawn = [
+        prior.sample(loc, w, torch.Generator().manual_seed(1), seen)
+        for w in (warm, torch.zeros_like(warm))
+    ]
+    assert kind.takes("cold_probability") != torch.equal(*drawn)
+
+
+@pytest.mark.parametrize("kind", [LeapPrior, CVAEPrior])
+def test_a_share_without_effect_beside_the_name_is_left_out_but_files_may_hold_one(kind):
+    """As of the Gaussian source; what was saved is still what it was."""
+    plain = kind(H).config()
+    assert Prior.make(kind.name, H, cold_probability=0.3).config() == plain
+    for share in (0.0, 0.3):
+        saved = plain | {"cold_probability": share}
+        assert Prior.from_config(saved).config() == saved
+
+
 def test_the_same_seed_learns_the_same_and_leaves_other_draws_alone(data):
     torch.manual_seed(3)
     first = learned(ForecastPrior, data, iterations=5)

@@ -37,7 +37,7 @@ class CVAEPrior(LearnedPrior):
         observation_steps: likewise.
         hidden_dim: likewise.
         sigma: noise of the source around the decoder's output.
-        cold_probability: see :class:`Prior`.
+        cold_probability: without effect, since the networks are given no last actions.
 
     Raises:
         ValueError: if ``latent_dim`` is no whole number of at least 1, or ``beta`` no finite number > 0.

@@ -33,7 +33,7 @@ class LearnedPrior(PastPrior, nn.Module):
         observation_steps: ``To``.
         hidden_dim: width of the network's two hidden layers.
         sigma: see the subclass.
-        cold_probability: see :class:`Prior`.
+        cold_probability: see :class:`Prior`; without effect if the network is given no last actions.
 
     Raises:
         ValueError: if only some of the widths are given, or one is no whole number of at least 1.
@@ -96,6 +96,23 @@ class LearnedPrior(PastPrior, nn.Module):
             self.action_dim, self.observation_dim, self.observation_steps = widths
             self.build()
             self.requires_grad_(False)
+
+    @classmethod
+    def takes(cls, argument: str) -> bool:
+        """Whether the constructor has such an argument, and it has an effect.
+
+        A network without the last actions does not notice that they are withheld: where it is given none
+        (:attr:`sees_history`), ``cold_probability`` has no effect.
+
+        Args:
+            argument: its name.
+
+        Examples:
+            >>> from warmprior import Prior
+            >>> [Prior.find(name).takes("cold_probability") for name in ("forecast", "leap")]
+            [True, False]
+        """
+        return super().takes(argument) and (cls.sees_history or argument != "cold_probability")
 
     @property
     def chunk_dim(self) -> int:
