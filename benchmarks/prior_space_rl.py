@@ -49,7 +49,7 @@ from warmprior.experiments.prior_space import (
 from warmprior.experiments.results import facts_of_machine, grouped
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.io.script import run_script
-from warmprior.modules.prior import options_of
+from warmprior.modules.named_prior import options_of
 from warmprior.rl import PriorSpaceTraining
 from warmprior.training.threads import torch_threads
 

@@ -15,6 +15,7 @@ from warmprior import (
     GaussianPrior,
     LeapPrior,
     LearnedPrior,
+    LearningWindows,
     PriorSampler,
     StepPrior,
     VelocityMLP,
@@ -101,7 +102,7 @@ def test_the_calibration_makes_errors_as_large_as_they_are_said_to_be():
     a1 = mean + factor * scale * torch.randn(500, H, 3, generator=g)
     counted = torch.rand(500, H, 1, generator=g) < 0.7
     a1 = a1.masked_fill(~counted, 100.0)
-    prior.calibrate(a1, counted, loc, warm, seen)
+    prior.calibrate(LearningWindows(a1, counted, loc, warm, seen))
     same, calibrated = prior.distribution(loc, warm, seen)
     assert torch.equal(same, mean)
     torch.testing.assert_close(calibrated / scale, factor.expand_as(scale), rtol=0.1, atol=0)
@@ -118,10 +119,11 @@ def test_no_calibrated_scale_is_below_the_smallest():
     loc, warm = torch.rand(50, H, D_A), torch.ones(50, H, 1, dtype=torch.bool)
     seen, counted = torch.rand(50, 1, D_O), torch.rand(50, H, 1) < 0.7
     mean, _ = prior.distribution(loc, warm, seen)
-    prior.calibrate(mean, counted, loc, warm, seen)  # without any error
+    prior.calibrate(LearningWindows(mean, counted, loc, warm, seen))  # without any error
     torch.testing.assert_close(prior.distribution(loc, warm, seen)[1], torch.full_like(mean, 0.01))
     assert prior.residual_sigma == pytest.approx(0.01)
-    prior.calibrate(mean + 0.3 * torch.randn(mean.shape), counted, loc, warm, seen)
+    a1 = mean + 0.3 * torch.randn(mean.shape)
+    prior.calibrate(LearningWindows(a1, counted, loc, warm, seen))
     scale = prior.distribution(loc, warm, seen)[1][counted]
     assert prior.residual_sigma == pytest.approx(float(scale.square().mean().sqrt()))
     again = ForecastPrior.from_config(prior.config())
@@ -136,7 +138,8 @@ def test_the_loss_of_a_cvae_is_its_equation():
     g = torch.Generator().manual_seed(0)
     a1, seen = torch.randn(5, H, D_A, generator=g), torch.randn(5, 1, D_O, generator=g)
     counted, loc = torch.ones(5, H, 1, dtype=torch.bool), torch.zeros(5, H, D_A)
-    found = prior.learning_loss(a1, counted, loc, counted, seen, torch.Generator().manual_seed(1))
+    windows = LearningWindows(a1, counted, loc, counted, seen)
+    found = prior.learning_loss(windows, torch.Generator().manual_seed(1))
     code = prior.encoder(torch.cat([seen.flatten(1), a1.flatten(1)], -1))
     mean, deviation = code[:, :3], (0.5 * code[:, 3:]).exp()
     z = mean + deviation * torch.randn(5, 3, generator=torch.Generator().manual_seed(1))
@@ -279,6 +282,28 @@ def test_configurations_build_the_same_prior(kind, data):
     assert torch.equal(*starts)
     assert prior.sized(D_A, D_O, 1) is prior
     assert not any(p.requires_grad for p in again.parameters())
+
+
+@pytest.mark.parametrize("kind", LEARNED)
+def test_cold_probability_is_taken_where_withholding_the_mean_changes_the_source(kind):
+    prior = kind(H, hidden_dim=8).sized(D_A, D_O, 1)
+    loc, warm = torch.rand(3, H, D_A), torch.ones(3, H, 1, dtype=torch.bool)
+    seen = torch.rand(3, 1, D_O)
+    drawn = [
+        prior.sample(loc, w, torch.Generator().manual_seed(1), seen)
+        for w in (warm, torch.zeros_like(warm))
+    ]
+    assert kind.takes("cold_probability") != torch.equal(*drawn)
+
+
+@pytest.mark.parametrize("kind", [LeapPrior, CVAEPrior])
+def test_a_share_without_effect_beside_the_name_is_left_out_but_files_may_hold_one(kind):
+    """As of the Gaussian source; what was saved is still what it was."""
+    plain = kind(H).config()
+    assert Prior.make(kind.name, H, cold_probability=0.3).config() == plain
+    for share in (0.0, 0.3):
+        saved = plain | {"cold_probability": share}
+        assert Prior.from_config(saved).config() == saved
 
 
 def test_the_same_seed_learns_the_same_and_leaves_other_draws_alone(data):

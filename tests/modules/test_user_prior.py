@@ -261,6 +261,10 @@ def test_what_make_cannot_build_is_told():
             r"sigma is unknown to it, or without effect\): it takes chunk_length$",
         ),
         ("gaussian,correlation=0.5", r"correlation is unknown to it, or without effect"),
+        ("leap,cold_probability=0.3", "cold_probability is unknown to it, or without effect"),
+        ("cvae,cold_probability=0.3", "cold_probability is unknown to it, or without effect"),
+        ("step,sigma=0.3", "sigma is unknown to it, or without effect"),
+        ("step,cold_probability=0.3", "cold_probability is unknown to it, or without effect"),
     ],
 )
 def test_options_that_do_not_fit(name, message):

@@ -11,6 +11,7 @@ from torch import nn
 
 from warmprior import (
     BoxTanhNormal,
+    CVAEPrior,
     ForecastPrior,
     GaussianPrior,
     HistoryPrior,
@@ -184,6 +185,14 @@ def test_residuals_are_as_large_as_the_source_deviates_from_the_anchor():
     for prior, sigma in ((learned, 0.1), (step, 0.25), (PastPrior(P, sigma=0.3), 0.3)):
         sampler = ResidualSampler(make_decoder(prior, 0.5))
         assert sampler.sigma == pytest.approx(sigma) and sampler.distribution == "clipped"
+
+
+@pytest.mark.parametrize("kind", [GaussianPrior, CVAEPrior])
+def test_around_zero_residuals_are_standard_normal_whatever_the_noise_of_the_source(kind):
+    """Of Gaussian sources without a mean, and of draws of a decoder, ``sigma`` is not the width."""
+    prior = kind(P, sigma=0.1).sized(D_A, D_O, TO)
+    sampler = ResidualSampler(make_decoder(prior, 1.5))
+    assert prior.residual_sigma == sampler.sigma == 1.0 and sampler.distribution == "normal"
 
 
 def test_sampler_options():

@@ -1,24 +1,21 @@
 """Priors, velocity networks and the actor."""
 
+from warmprior.modules.a2a import A2APrior
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.baselines import HistoryPrior, RegressionPrior
 from warmprior.modules.chi_transformer import ChiTransformer
 from warmprior.modules.couplings import OTPrior, ReflowPrior
+from warmprior.modules.cvae import CVAEPrior
 from warmprior.modules.encoder import ImageEncoder, load_imagenet
+from warmprior.modules.gaussian_forecast import ForecastPrior, LeapPrior
 from warmprior.modules.interpolant import (
     Interpolant,
     LinearInterpolant,
     PolynomialInterpolant,
     TrigonometricInterpolant,
 )
-from warmprior.modules.learned import (
-    A2APrior,
-    CVAEPrior,
-    ForecastPrior,
-    LeapPrior,
-    LearnedPrior,
-    StepPrior,
-)
+from warmprior.modules.learned import LearnedPrior
+from warmprior.modules.learning_windows import LearningWindows
 from warmprior.modules.mlp import VelocityMLP
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 from warmprior.modules.normalize import Normalizer
@@ -27,6 +24,7 @@ from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMomen
 from warmprior.modules.prior import Prior
 from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.modules.sampler import PriorSampler
+from warmprior.modules.step import StepPrior
 from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.modules.vision import VisionNetwork
 
@@ -41,6 +39,7 @@ __all__ = [
     "Interpolant",
     "LeapPrior",
     "LearnedPrior",
+    "LearningWindows",
     "LinearInterpolant",
     "Normalizer",
     "ODEActor",

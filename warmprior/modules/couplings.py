@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from warmprior.io.extras import require
-from warmprior.modules.prior import check_finite_numbers, check_whole_numbers
+from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.priors import GaussianPrior
 
 __all__ = ["OTPrior", "ReflowPrior"]

@@ -19,8 +19,9 @@ ResidualDistribution = Literal["normal", "clipped", "uniform"]
 class ResidualSampler(TensorDictModuleBase):
     r"""Draws residuals without an agent: to fill the buffer at first, and to distil the noise critic.
 
-    With :math:`\sigma` the typical deviation from the anchor (:attr:`~warmprior.Prior.residual_sigma`: the
-    prior's ``sigma``, or what it tells instead; 1 around zero) and :math:`\delta` the decoder's:
+    With :math:`\sigma` the typical deviation of the source from where the agent searches
+    (:attr:`~warmprior.Prior.residual_sigma`: by default the prior's ``sigma`` around its mean, and 1 around
+    zero) and :math:`\delta` the decoder's:
 
     ===============  =============================================================================
     distribution     residual
@@ -66,7 +67,7 @@ class ResidualSampler(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if sigma is None:
-            sigma = decoder.prior.residual_sigma if decoder.prior.moves_source else 1.0
+            sigma = decoder.prior.residual_sigma
         if distribution is None and decoder.prior.moves_source:
             distribution = "clipped" if sigma > 0 else "uniform"
         elif distribution is None:

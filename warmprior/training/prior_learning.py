@@ -6,11 +6,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 from torch.optim import AdamW
 
 from warmprior import keys
 from warmprior.modules.learned import LearnedPrior
+from warmprior.modules.learning_windows import LearningWindows
 from warmprior.training.optim import warmup_cosine
 from warmprior.transforms.window import window_replay_buffer
 
@@ -83,7 +83,7 @@ def learn_prior(
     optimizer = AdamW(prior.parameters(), lr=learning_rate, weight_decay=weight_decay, fused=True)
     schedule = warmup_cosine(optimizer, iterations, 0.1)
     for _ in range(iterations):
-        loss = prior.learning_loss(*_parts(buffer.sample()), generator)
+        loss = prior.learning_loss(_learning_windows(buffer.sample()), generator)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -95,11 +95,15 @@ def learn_prior(
         )
     unseen = data[apart] if bool(apart.any()) else data
     with torch.no_grad():
-        prior.calibrate(*_parts(windows(unseen, CALIBRATION_WINDOWS).sample()))
+        prior.calibrate(_learning_windows(windows(unseen, CALIBRATION_WINDOWS).sample()))
 
 
-def _parts(batch: TensorDictBase) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """What :meth:`LearnedPrior.learning_loss` takes of a batch of windows."""
-    counted = ~batch[keys.IS_PAD].unsqueeze(-1)
-    loc, warm, seen = (batch[key] for key in (keys.LOC, keys.WARM, keys.OBSERVATION))
-    return batch[keys.CHUNK], counted, loc, warm, seen
+def _learning_windows(batch: TensorDictBase) -> LearningWindows:
+    """What a prior takes of a batch of the buffer."""
+    return LearningWindows(
+        a1=batch[keys.CHUNK],
+        counted=~batch[keys.IS_PAD].unsqueeze(-1),
+        loc=batch[keys.LOC],
+        warm=batch[keys.WARM],
+        observation=batch[keys.OBSERVATION],
+    )
