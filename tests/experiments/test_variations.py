@@ -12,7 +12,7 @@ import torch
 
 pytest.importorskip("tyro")
 
-from tests.experiments.test_run import PRIORS, TRAINING, comparison, drift_problem, rows_of
+from tests.experiments.comparison_parts import PRIORS, TRAINING, comparison, drift_problem, rows_of
 from warmprior import PastPrior
 from warmprior.experiments import (
     NAVIGATION_PRESETS,
