@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import pytest
+import torch
+from tensordict import TensorDict
 
 pytest.importorskip("robosuite")
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
-from warmprior import GaussianPrior, PoseTrend
+from warmprior import GaussianPrior, ODEActor, PoseTrend
 from warmprior.data import DatasetError
 from warmprior.experiments import NetworkOptions, Recipe, RunOptions, Store, robosuite_problem
 from warmprior.experiments.recipe import DataOptions
@@ -52,11 +54,34 @@ def test_absolute_actions(path, tmp_path):
     units = [0.05] * 3 + [0.5] * 6
     assert absolute.normalizer.scale("action")[:9].tolist() == pytest.approx(units)
     assert absolute.data["action"][:, 9].abs().max() <= 1
-    assert absolute.clip == absolute.data["action"].abs().max() and delta.clip == 1.0
     prior = GaussianPrior(8)
     stores = (store(p, tmp_path) for p in (delta, absolute))
     networks = [s.new_actor(prior, TrainingConfig()).network for s in stores]
     assert networks[0].trend is None and isinstance(networks[1].trend, PoseTrend)
+
+
+def test_what_leaves_the_span_of_the_demonstrations_is_remembered_at_its_bound(path, tmp_path):
+    """Of every dimension: poses range over many control steps, the gripper over one unit."""
+    delta, problem = (robosuite_problem(path, actions=name) for name in ("delta", "absolute"))
+    span = problem.data["action"].abs().amax(0)
+    assert delta.clip == 1.0 and span[9] < span.max() / 2
+    actor = store(problem, tmp_path).new_actor(GaussianPrior(8), TrainingConfig())
+    demonstrated, beyond = problem.data["action"][:8], 1e3 * problem.data["action"][8:16].sign()
+    for wanted, expected in ((demonstrated, demonstrated), (beyond, beyond.clamp(-span, span))):
+        mean = {("prior", "noise"): torch.zeros(1, 8, 10), "observation": torch.zeros(1, 2, 19)}
+        ode = ODEActor(Towards(wanted), nfe=1, clip=actor.ode.clip)
+        assert torch.equal(ode(TensorDict(mean, [1]))["vla_action", "chunk"][0], expected)
+
+
+class Towards(torch.nn.Module):
+    """The flow from 0 to a chunk."""
+
+    def __init__(self, chunk):
+        super().__init__()
+        self.chunk = chunk
+
+    def forward(self, t, a, observation):
+        return self.chunk.expand_as(a)
 
 
 def test_files_without_poses_are_named(tmp_path):

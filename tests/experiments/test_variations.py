@@ -12,8 +12,8 @@ import torch
 
 pytest.importorskip("tyro")
 
-from tests.experiments.test_run import PRIORS, TRAINING, comparison, drift_problem, rows_of
-from warmprior import PastPrior
+from tests.experiments.comparison_parts import PRIORS, TRAINING, comparison, drift_problem, rows_of
+from warmprior import PastPrior, RegressionPrior
 from warmprior.experiments import (
     NAVIGATION_PRESETS,
     PRESETS,
@@ -115,6 +115,11 @@ def test_a_continued_run_has_its_options(tmp_path):
         ("--grid sparse", "unknown grid 'sparse'; choose one of uniform, dense-jump"),
         ("--grid dense-jump:2", r"the jump of a grid must start in \(0, 1\), got 'dense-jump:2'"),
         ("--grid dense-jump --nfe 1", "--grid has no effect at NFE 1"),
+        ("--grid dense-jump --prior regression", "--grid has no effect at NFE 1"),
+        (
+            "--times u-shaped --prior regression",
+            "--times has no effect on regression, trained at t = 0",
+        ),
         ("--objective l1 --prior past regression --nfe 1", "leave out regression"),
         ("--self-distillation 1 --prior regression --nfe 1", "leave out regression"),
     ],
@@ -141,6 +146,24 @@ def test_options_without_effect_are_refused(tmp_path):
     presets = {"quick": replace(PRESETS["quick"], evaluation=EvaluationOptions(grid="dense-jump"))}
     with pytest.raises(ValueError, match="makes no use of it: leave out --grid"):
         read("--grid", "uniform", "--out", tmp_path / "out", presets=presets, unused=("grid",))
+
+
+def test_one_flow_makes_use_of_them(tmp_path):
+    argv = ["--prior", "regression", "past", "--times", "u-shaped", "--grid", "dense-jump"]
+    recipe = read(*argv, "--out", tmp_path / "out")
+    assert (recipe.training.times, recipe.evaluation.grid) == ("u-shaped", "dense-jump")
+
+
+class Copying(RegressionPrior):
+    """No flow itself, but it learns from one, which the times are of."""
+
+    name = "copying"
+    teacher = "gaussian"
+
+
+def test_times_are_those_of_teachers_as_well(tmp_path):
+    given = ["--prior", "copying", "--times", "u-shaped", "--out", tmp_path / "out"]
+    assert read(*given).training.times == "u-shaped"
 
 
 def test_policies_are_played_and_measured_on_the_grid(tmp_path):

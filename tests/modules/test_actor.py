@@ -176,6 +176,14 @@ def test_round_trip_is_bit_identical(tmp_path, prior_class, kind):
         assert torch.equal(again.normalizer.scale(key), actor.normalizer.scale(key))
 
 
+def test_a_bound_per_dimension_is_saved(tmp_path):
+    prior, bounds = GaussianPrior(H), tuple(0.1 * (i + 1) for i in range(D_A))
+    actor = WarmPriorActor(network_for(prior), prior, clip=bounds)
+    actor.save_pretrained(tmp_path)
+    again = WarmPriorActor.from_pretrained(tmp_path)
+    assert again.ode.clip == actor.replace(nfe=1).ode.clip == list(bounds)
+
+
 def test_no_normalizer_and_nested_key(tmp_path):
     prior = GaussianPrior(H)
     WarmPriorActor(network_for(prior), prior, observation_key=("state", "low")).save_pretrained(

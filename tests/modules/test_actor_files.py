@@ -235,7 +235,7 @@ def test_evaluations_that_nobody_can_wait_for(tmp_path, nfe):
         WarmPriorActor(VelocityMLP(2, 5, 3, 2, hidden_dim=16), PastPrior(3), nfe=10**9)
 
 
-@pytest.mark.parametrize("clip", [float("nan"), 0.0])
+@pytest.mark.parametrize("clip", [float("nan"), 0.0, [1.0, float("nan")], []])
 def test_a_bound_that_is_none(tmp_path, clip):
     saved(tmp_path)
     change_config(tmp_path, "actor", clip=clip)

@@ -131,6 +131,14 @@ def test_clip_applies_to_the_chunk_and_not_to_the_path():
     assert torch.equal(out["vla_action", "chunk"], last.clamp(-0.5, 0.5))
 
 
+def test_every_dimension_may_have_a_bound_of_its_own():
+    data = batch(50)
+    free = ODEActor(Counting(), nfe=2)(data.clone())["vla_action", "chunk"]
+    bound = torch.tensor([0.5, 0.0])
+    chunk = ODEActor(Counting(), nfe=2, clip=(0.5, 0.0))(data.clone())["vla_action", "chunk"]
+    assert torch.equal(chunk, free.clamp(-bound, bound)) and chunk.abs().max() == 0.5
+
+
 def test_renamed_keys():
     data = TensorDict({"n": torch.randn(3, 4, 2), "o": {"s": torch.randn(3, 2, 3)}}, [3])
     actor = ODEActor(
@@ -157,6 +165,8 @@ def test_gradients_flow_through_the_whole_flow():
         ({"nfe": 6, "solver": "rk4"}, "multiple of 4 for the rk4 solver, got 6"),
         ({"clip": 0.0}, "clip"),
         ({"clip": -1.0}, "clip"),
+        ({"clip": (1.0, -1.0)}, "clip"),
+        ({"clip": (0.0, 0.0)}, "clip"),
     ],
 )
 def test_bad_options(options, message):

@@ -1,6 +1,8 @@
 """Experiments: from options to trained policies, rows, tables and figures. Needs ``warmprior[sim]``."""
 
 from warmprior.experiments.cli import parse, started, write_report
+from warmprior.experiments.comparison import Comparison
+from warmprior.experiments.contestant import Contestant
 from warmprior.experiments.figures import (
     plot_filmstrip,
     plot_learning_curves,
@@ -38,7 +40,6 @@ from warmprior.experiments.recipe import (
 )
 from warmprior.experiments.record import record, restore
 from warmprior.experiments.results import Results, Row, grouped, mean_known, select, success_summary
-from warmprior.experiments.run import Comparison, Contestant
 from warmprior.experiments.store import Store, finished_policies
 from warmprior.experiments.straightness import straightness
 from warmprior.experiments.study_figures import plot_budget, plot_chunk_lengths, plot_sigma

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -57,7 +57,7 @@ class Problem:
             same. See :func:`~warmprior.policy_transforms`.
         rest: for absolute actions, to let networks learn only what does not follow from where the grippers
             are, see :class:`~warmprior.PoseTrend`.
-        clip: bound of the normalised actions that are executed; ``None`` for none.
+        clip: bound of the normalised actions that are executed, or one per dimension; ``None`` for none.
         environment: what a saved policy keeps of the environment, see
             :func:`~warmprior.envs.environment_of`.
 
@@ -74,7 +74,7 @@ class Problem:
     normalizer: Normalizer | None = None
     actions: Transform | None = None
     rest: RestingAction | None = None
-    clip: float | None = None
+    clip: float | Sequence[float] | None = None
     environment: Mapping[str, Any] | None = None
 
     def __post_init__(self) -> None:
@@ -135,7 +135,8 @@ def robosuite_problem(
         style=style,
         data=data,
         make_env=make_env,
-        identity=" ".join([digest, *space.values()]),
+        # Policies of absolute poses once had a single bound, and remembered grippers wider than any.
+        identity=" ".join([digest, *(f"{name}, a bound per dimension" for name in space.values())]),
         facts={
             "source": source,
             "file": path.name,
@@ -148,7 +149,7 @@ def robosuite_problem(
         actions=transform,
         rest=None if transform is None else RestingAction(dataset.pose_columns, normalizer),
         # What leaves the span of the normalised demonstrations is executed, and remembered, at the bound.
-        clip=1.0 if transform is None else float(data[ACTION].abs().max()),
+        clip=1.0 if transform is None else data[ACTION].abs().amax(0).tolist(),
         environment=description,
     )
 

@@ -366,15 +366,25 @@ class Recipe:
                 "--weighting standardised needs --precondition: add --weighting velocity to "
                 "--no-precondition"
             )
-        for prior in self.sources.priors():
-            prior.allowed_nfes(self.evaluation.nfes)
+        priors, played = self.sources.priors(), set[int]()
+        for prior in priors:
+            played.update(prior.allowed_nfes(self.evaluation.nfes))
             self.training.check_prior(prior)
             if self.training.batch_size < prior.least_batch:
                 raise ValueError(
                     f"{prior.name} pairs within a batch: --batch-size must be at least {prior.least_batch}"
                 )
-        if self.evaluation.grid != "uniform" and max(self.evaluation.nfe) == 1:
-            raise ValueError("--grid has no effect at NFE 1, which is one step on every grid")
+        # Those of teachers count: a policy that is no flow may learn from one that is.
+        if self.training.times != "uniform" and not any(p.is_flow or p.teacher for p in priors):
+            raise ValueError(
+                f"--times has no effect on {', '.join(dict.fromkeys(p.name for p in priors))}, trained at "
+                "t = 0 alone: leave it out, or add a prior that is a flow"
+            )
+        if self.evaluation.grid != "uniform" and played == {1}:
+            raise ValueError(
+                "--grid has no effect at NFE 1, which is one step on every grid, and these priors are "
+                "evaluated at no other: leave it out"
+            )
 
     def check_single(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
@@ -102,7 +102,7 @@ class WarmPriorActor(TensorDictModuleBase):
         nfe: int | None = None,
         solver: Solver = "euler",
         grid: str = "uniform",
-        clip: float | None = None,
+        clip: float | Sequence[float] | None = None,
         normalizer: Normalizer | None = None,
         environment: Mapping[str, Any] | None = None,
         generator: torch.Generator | None = None,

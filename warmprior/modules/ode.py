@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from numbers import Integral
 from typing import Literal
@@ -142,9 +142,9 @@ class ODEActor(TensorDictModuleBase):
         start_time: see :func:`integrate`.
         solver: see :func:`integrate`.
         grid: see :func:`integrate`.
-        clip: the chunk is clamped to ``[-clip, clip]``; ``None`` (default) leaves it as integrated.
-            Set it where the normalised data span ``[-1, 1]``, so that what the environment executes
-            is what the prior remembers.
+        clip: the chunk is clamped to ``[-clip, clip]``, one bound for all action dimensions or ``d_a`` of
+            them; ``None`` (default) leaves it as integrated. Set it to what the normalised data span, such as
+            1, so that what the environment executes is what the prior remembers.
         noise_key: key of the source, ``[*B, P, d_a]``.
         observation_key: key of the observation, ``[*B, To, d_o]``.
         chunk_key: key written, ``[*B, P, d_a]``.
@@ -176,7 +176,7 @@ class ODEActor(TensorDictModuleBase):
         start_time: float = 0.0,
         solver: Solver = "euler",
         grid: str = "uniform",
-        clip: float | None = None,
+        clip: float | Sequence[float] | None = None,
         noise_key: NestedKey = keys.NOISE,
         observation_key: NestedKey = keys.OBSERVATION,
         chunk_key: NestedKey = keys.CHUNK,
@@ -193,8 +193,14 @@ class ODEActor(TensorDictModuleBase):
         self.solver = solver
         self.check_nfe(nfe)
         check_grid(grid)
-        if clip is not None and not clip > 0:
-            raise ValueError(f"clip must be > 0 or None, got {clip}")
+        # A list, as the configuration of a saved policy has it.
+        clip = clip if clip is None or isinstance(clip, int | float) else list(clip)
+        bounds = clip if isinstance(clip, list) else [1.0 if clip is None else clip]
+        # A dimension that never varies is bounded by 0, but not all of them.
+        if not (all(bound >= 0 for bound in bounds) and any(bound > 0 for bound in bounds)):
+            raise ValueError(
+                f"clip must be > 0, one such number per dimension, or None, got {clip}"
+            )
         self.network = network
         self.nfe = nfe
         self.grid = grid
@@ -240,6 +246,9 @@ class ODEActor(TensorDictModuleBase):
             tensordict.set(self.path_key, path_or_chunk.reshape(*batch, *path_or_chunk.shape[1:]))
             chunk = path_or_chunk[:, -1]
         chunk = chunk.reshape(a0.shape)
-        if self.clip is not None:
+        if isinstance(self.clip, list):
+            bound = torch.tensor(self.clip, dtype=chunk.dtype, device=chunk.device)
+            chunk = chunk.clamp(-bound, bound)
+        elif self.clip is not None:
             chunk = chunk.clamp(-self.clip, self.clip)
         return tensordict.set(self.out_keys[0], chunk)

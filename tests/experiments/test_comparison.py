@@ -1,0 +1,173 @@
+"""Comparisons as users see them: what is trained, continued, told and refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+
+from warmprior import ForecastPrior, PastPrior, StepPrior
+from warmprior.io.script import PartialFailure
+
+pytest.importorskip("tyro")
+
+from tests.experiments.comparison_parts import (
+    ACTION_DIM,
+    OBSERVATION_DIM,
+    PRIORS,
+    H,
+    comparison,
+    rows_of,
+    stored,
+)
+from warmprior.experiments import Store, store, write_report
+
+
+def test_losses_are_those_of_the_workers_and_nothing_is_trained_again(
+    undisturbed, tmp_path, monkeypatch
+):
+    finished = comparison(tmp_path, 2, logger="csv")
+    finished.run()
+    iterations = [5, 10, 15, 20]
+    monkeypatch.setattr(Store, "new_actor", lambda *args: pytest.fail("something was trained"))
+    losses = finished.losses(finished.stores[0])
+    assert {name: len(curves) for name, curves in losses.items()} == {p.label: 2 for p in PRIORS}
+    assert all([i for i, _ in curve] == iterations for c in losses.values() for curve in c)
+    monkeypatch.undo()
+    again = comparison(undisturbed, 1, resume=True)
+    assert again.losses(again.stores[0]) == losses
+    logs = tmp_path / "out" / "logs"
+    logged = {path.relative_to(logs).parts[0] for path in logs.rglob("*loss*.csv")}
+    assert logged == {path.name for path in (tmp_path / "policies").iterdir()}
+
+
+def test_meta_tells_what_computed(undisturbed):
+    meta = stored(undisturbed)["meta"]
+    assert meta["hardware"]["torch_threads"] == 1 and meta["hardware"]["workers"] == 1
+    assert "envs" not in meta["identity"]["recipe"]["run"] and meta["wall_time_s"] > 0
+    assert [p["seed"] for p in meta["policies"]] == [0, 1] * 3
+
+
+def test_another_number_of_workers_continues(undisturbed, tmp_path):
+    """Stored rows are kept, missing ones played."""
+    whole = stored(undisturbed)["rows"]
+    comparison(tmp_path, 1).run()
+    path = tmp_path / "out" / "results.json"
+    results = json.loads(path.read_text())
+    results["rows"] = [
+        row | {"measures": row["measures"] | {"mean_steps": 12_345.0}} for row in whole[3:9]
+    ]
+    path.write_text(json.dumps(results))
+    comparison(tmp_path, 2, resume=True).run()
+    assert stored(tmp_path)["rows"] == whole[:3] + results["rows"] + whole[9:]
+
+
+def test_rows_of_a_policy_that_failed_on_the_way_are_kept_but_not_shown(tmp_path):
+    compared = comparison(tmp_path, 1, priors=PRIORS[:2], seeds=2)
+    compared.run()
+    everything = compared.results.rows
+    failed = compared.contestants.pop()
+    assert [row for row in everything if row["prior"] == "past" and row["seed"] == 1]
+    assert len(compared.rows) == len(everything) - 4 and failed.prior.name == "past"
+    assert {(row["prior"], row["seed"]) for row in compared.timed()} == {
+        ("gaussian", 0),
+        ("gaussian", 1),
+        ("past", 0),
+    }
+    write_report(tmp_path, "| table |\n")
+    with pytest.raises(PartialFailure, match="1 failed"):
+        write_report(tmp_path, "| table |\n", [f"{failed}: it stumbled"])
+    assert (tmp_path / "table.md").read_text() == f"| table |\n\n- Missing: {failed}: it stumbled\n"
+
+
+def test_the_same_policy_is_trained_once(tmp_path, capsys):
+    twice = [PastPrior(H), PastPrior(H)]
+    compared = comparison(tmp_path, 2, priors=twice, seeds=1)
+    assert len(compared.run().rows) == 4  # two checkpoints, two NFEs
+    assert capsys.readouterr().out.count("trained ") == 1
+
+
+class Unhashable(PastPrior):
+    """As a dataclass is that compares its fields."""
+
+    name = "unhashable"
+    __hash__ = None
+
+    def __eq__(self, other):
+        return self is other
+
+
+class Widening(PastPrior, torch.nn.Module):
+    """Its noise is learnt."""
+
+    name = "widening"
+
+    def __init__(self, chunk_length, *, sigma=0.5, cold_probability=0.0):
+        torch.nn.Module.__init__(self)
+        super().__init__(chunk_length, sigma=sigma, cold_probability=cold_probability)
+        self.scale = torch.nn.Parameter(torch.ones(()))
+
+    def sample(self, loc, warm, generator=None, observation=None):
+        return loc + self.scale * (super().sample(loc, warm, generator) - loc)
+
+
+def test_priors_that_learn_or_cannot_be_hashed(tmp_path):
+    compared = comparison(tmp_path, 2, priors=[Unhashable(H), Widening(H)], seeds=1)
+    rows = compared.run().rows
+    assert [row["prior"] for row in rows] == ["unhashable"] * 4 + ["widening"] * 4
+    assert float(compared.contestants[1].policy().prior.scale) != 1.0
+
+
+def test_priors_that_learn_before_the_flow_learn_once(tmp_path, monkeypatch):
+    priors = [ForecastPrior(H), StepPrior(H)]
+    compared = comparison(tmp_path, 2, priors=priors, seeds=1)
+    compared.run()
+    forecast = compared.contestants[0]
+    assert forecast.prior.is_sized and (forecast.folder / "prior.safetensors").exists()
+    learnt = forecast.policy().prior
+    loaded = forecast.store.load(priors[0], forecast.training).prior
+    assert all(
+        torch.equal(a, b) for a, b in zip(*(p.buffers() for p in (learnt, loaded)), strict=True)
+    )
+    fresh = ForecastPrior(H).sized(ACTION_DIM, OBSERVATION_DIM, 2).state_dict()
+    assert any(not torch.equal(learnt.state_dict()[name], fresh[name]) for name in fresh)
+    rows = rows_of(tmp_path)
+    monkeypatch.setattr(store, "learn_prior", lambda *args, **kwargs: pytest.fail("learnt again"))
+    again = comparison(tmp_path, 1, priors=priors, seeds=1, resume=True)
+    again.run()
+    assert rows_of(tmp_path) == rows
+
+
+def test_times_of_trainings_are_told_beside_the_rows(tmp_path):
+    compared = comparison(tmp_path, 2, priors=PRIORS[:2], seeds=1)
+    assert compared.timed() == []
+    compared.run()
+    first = compared.timed()
+    assert [replace(row, measures={}) for row in first] == [
+        replace(row, measures={}) for row in compared.results.rows
+    ]
+    assert all(row["training_seconds"] > 0 for row in first)
+    assert len({row["training_seconds"] for row in first}) == 2
+    again = comparison(tmp_path, 1, priors=PRIORS[:2], seeds=1, resume=True)
+    again.run()
+    assert again.timed() == first  # nothing was trained
+    (compared.contestants[0].folder / "training_time.json").unlink()
+    assert compared.timed()[0]["training_seconds"] is None
+
+
+def test_a_chunk_longer_than_every_demonstration_is_refused(tmp_path):
+    with pytest.raises(ValueError, match="longest demonstration of drift own has, 40"):
+        comparison(tmp_path, 1, priors=[PastPrior(41)])
+
+
+def test_results_of_another_recipe_are_not_continued(undisturbed):
+    with pytest.raises(ValueError, match=r"results\.json belongs to another"):
+        comparison(undisturbed, 1, resume=True, episodes=6)
+
+
+def test_what_rows_could_not_tell_is_refused(tmp_path):
+    twins = [PastPrior(3), PastPrior(3, cold_probability=0.5)]
+    with pytest.raises(ValueError, match="rows tell policies apart by their task"):
+        comparison(tmp_path, 1, priors=twins)

@@ -1,0 +1,104 @@
+"""Rows of a comparison: what they tell, and in which order."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+import warnings
+from dataclasses import replace
+
+import pytest
+import torch
+from torchrl.envs import TransformedEnv
+
+from warmprior.diagnostics import SharedObservations, branching_bound, curvature, source_leak
+from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.training import play_episode
+
+pytest.importorskip("tyro")
+
+from tests.experiments.comparison_parts import (
+    PRIORS,
+    TRAINING,
+    DriftEnv,
+    comparison,
+    rows_of,
+    stored,
+)
+from warmprior.experiments import Store
+from warmprior.experiments.outcomes import Outcomes
+
+
+class LastIsFirst(Store):
+    """The trainings end in the opposite order, some of them later than others."""
+
+    def train(self, prior, training, progress=None):
+        losses = super().train(prior, training, progress)
+        time.sleep(1.5 - 0.5 * [p.name for p in PRIORS].index(prior.name) - 0.2 * training.seed)
+        return losses
+
+
+def test_rows_have_their_order_whatever_ends_first(undisturbed, tmp_path, capsys):
+    comparison(tmp_path, 6, kind=LastIsFirst).run()
+    rows = rows_of(tmp_path)
+    cells = [(row["prior"], row["seed"], row["checkpoint"], row["nfe"]) for row in rows]
+    names = ("gaussian", "past", "preview")
+    assert cells == [(p, s, c, n) for p in names for s in (0, 1) for c in (10, 20) for n in (3, 1)]
+    assert rows == rows_of(undisturbed)
+    told = capsys.readouterr().out
+    assert told.count("trained ") == 6 and told.count("played ") == 24
+    assert told.index("trained drift own, preview") < told.index("trained drift own, gaussian")
+
+
+def test_rows_tell_what_was_measured_of_their_policy(undisturbed):
+    """The same as measured here, on the policy that the row is about, if it is a last checkpoint."""
+    (store,) = comparison(undisturbed, 1, resume=True).stores
+    for row in rows_of(undisturbed):
+        if row["checkpoint"] != TRAINING.iterations:
+            assert row.get("source_leak") is None and row.get("kappa") is None
+            continue
+        prior = next(prior for prior in PRIORS if prior.name == row["prior"])
+        shared = SharedObservations(store.problem.data, prior.chunk_length, observation_steps=2)
+        order = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
+        shared = shared.subset(order.sort()[0])
+        windows = shared.windows(prior)
+        policy = store.load(prior, replace(TRAINING, seed=row["seed"]), row["checkpoint"])
+        leak = source_leak(policy, windows, nfes=(1, 3), episodes=shared.episodes)[row["nfe"]]
+        assert row["source_leak"] == pytest.approx(leak.leak)
+        assert row["inner_step_ratio"] == pytest.approx(leak.inner_step_ratio)
+        generator = torch.Generator().manual_seed(0)
+        if prior.ever_warm:
+            windows = shared.deployed(policy, generator=generator)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            flow = curvature(policy, windows, generator=generator)
+        for name, key in (("kappa", "kappa_executed"), ("relative_curvature", "relative_executed")):
+            value = float(flow[key].nanmean())
+            told = math.nan if row[name] is None else row[name]  # it does not move
+            assert told == pytest.approx(value, nan_ok=True)
+        bound = branching_bound(windows, prior)["total_executed"].mean()
+        assert row["bound"] == pytest.approx(float(bound))
+
+
+def test_rows_tell_every_episode_in_the_order_of_the_seeds(undisturbed):
+    (store,) = comparison(undisturbed, 1, resume=True).stores
+    row = rows_of(undisturbed)[-1]
+    policy = store.load(PRIORS[2], replace(TRAINING, seed=row["seed"]), row["checkpoint"])
+    env = TransformedEnv(DriftEnv(), store.transforms(PRIORS[2])())
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + row["episodes"])
+    options = {"nfe": row["nfe"], "policy_seed": row["seed"]}
+    solved = [play_episode(policy, env, seed, **options).success for seed in seeds]
+    assert row["outcomes"] == "".join(str(int(s)) for s in solved)
+    assert 0 < sum(solved) < len(solved)
+
+
+def test_rows_from_before_priors_had_options_are_continued(undisturbed, tmp_path):
+    (tmp_path / "out").mkdir()
+    results = stored(undisturbed)
+    for row in results["rows"]:
+        assert row["facts"].pop("options") == ""
+    (tmp_path / "out" / "results.json").write_text(json.dumps(results))
+    again = comparison(tmp_path, 1, resume=True)
+    outcomes = Outcomes(again.contestants, again.recipe.evaluation)
+    assert not any(outcomes.missing(n, again.results) for n in range(len(again.contestants)))

@@ -1,0 +1,331 @@
+"""Compares sources: trains what is missing, measures and plays it, and writes it down."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from warmprior.diagnostics.shared_observations import SharedObservations
+from warmprior.experiments.contestant import Contestant
+from warmprior.experiments.labels import source_labels
+from warmprior.experiments.outcomes import Outcomes
+from warmprior.experiments.problem import find_problems, observe
+from warmprior.experiments.progress import ComparisonProgress
+from warmprior.experiments.recipe import HeldOutOptions, Recipe
+from warmprior.experiments.record import record
+from warmprior.experiments.results import Results, Row, facts_of_machine
+from warmprior.experiments.schedule import Schedule
+from warmprior.experiments.store import Losses, Store
+from warmprior.experiments.worker import Attempt, Failure, Measure, Play, Train, Worker
+from warmprior.io.files import check_writable
+from warmprior.io.script import PartialFailure
+from warmprior.io.workers import WorkerPool, available_cores
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.prior import Prior
+
+__all__ = ["Comparison"]
+
+
+class Comparison:
+    """Evaluates the policies of several sources alike.
+
+    Args:
+        recipe: everything that determines it.
+        study: its name; a folder holds one.
+        stores: the problems; those of the recipe by default.
+        directory: where the results go; the run's output folder by default.
+        priors: the sources, the baseline first; those of the recipe by default.
+
+    Attributes:
+        contestants: the policies, in order; after a run without those that failed.
+        results: the rows so far.
+        failures: what failed in the last run, and why.
+
+    Raises:
+        ValueError: if a prior allows none of the NFEs, is longer than every demonstration, rows could not
+            tell two policies apart, or the folder's results belong to other options.
+        OSError: if the folder cannot be written to.
+    """
+
+    def __init__(
+        self,
+        recipe: Recipe,
+        study: str = "comparison",
+        *,
+        stores: Sequence[Store] | None = None,
+        directory: Path | None = None,
+        priors: Sequence[Prior] | None = None,
+    ) -> None:
+        self.recipe, self.directory = recipe, directory or recipe.run.directory
+        self.priors = recipe.sources.priors() if priors is None else list(priors)
+        self.nfes = recipe.evaluation.nfes
+        for prior in self.priors:
+            prior.allowed_nfes(self.nfes)
+        check_writable(self.directory)
+        if stores is None:
+            out = recipe.run.directory
+            policies, logs = out.parent / "policies", out / "logs"
+            problems = find_problems(recipe.data, recipe.network.observation_steps)
+            stores = [Store(p, recipe.network, policies, logs, recipe.run) for p in problems]
+        self.stores = list(stores)
+        self.contestants = self._contestants()
+        self._order = {tuple(c.facts().values()): i for i, c in enumerate(self.contestants)}
+        problems = [store.problem for store in self.stores]
+        identity = {
+            "study": study,
+            "recipe": record(recipe),
+            "priors": [prior.config() for prior in self.priors],
+            "data": [problem.identity for problem in problems],
+        }
+        meta = {
+            **facts_of_machine(workers=self.num_workers, device=recipe.run.device, torch_threads=1),
+            "problems": [{"task": p.task, "style": p.style, **p.facts} for p in problems],
+            "policies": [
+                c.facts() | {"prior": c.prior.config(), "folder": c.folder.name}
+                for c in self.contestants
+            ],
+        }
+        self.results = Results(
+            self.directory / "results.json", meta, identity, resume=recipe.run.resume
+        )
+        self.failures: list[str] = []
+
+    def _contestants(self) -> list[Contestant]:
+        found: dict[Path, Contestant] = {}  # two workers must not train the same policy
+        told: dict[tuple[Any, ...], Path] = {}
+        for store in self.stores:
+            longest = int(store.problem.data["episode"].flatten().bincount().max())
+            for training in self.recipe.trainings():
+                for prior in self.priors:
+                    if prior.chunk_length > longest:
+                        raise ValueError(
+                            f"{prior} predicts more steps than the longest demonstration of "
+                            f"{store.problem.name} has, {longest}: choose a shorter chunk"
+                        )
+                    for seed in self.recipe.seeds:
+                        chosen = replace(training, seed=seed)
+                        contestant = Contestant(store, store.sized(prior), chosen)
+                        key = tuple(contestant.facts().values())
+                        if told.setdefault(key, contestant.folder) != contestant.folder:
+                            raise ValueError(
+                                "rows tell policies apart by their task, prior, options, sigma, chunk "
+                                f"length, iterations and seed: they would not tell {prior} from another "
+                                f"{prior.name}. Compare these in runs of their own"
+                            )
+                        found.setdefault(contestant.folder, contestant)
+        return list(found.values())
+
+    @property
+    def num_workers(self) -> int:
+        """Worker processes: as asked for, or one per core that this process may use."""
+        return self.recipe.run.envs or available_cores()
+
+    @property
+    def trainings_at_once(self) -> int | None:
+        """How many trainings may share the device; no limit on a CPU, where each has a thread."""
+        return None if torch.device(self.recipe.run.device).type == "cpu" else 1
+
+    @property
+    def title(self) -> str:
+        """What is compared, for figures."""
+        return ", ".join(store.problem.name for store in self.stores)
+
+    def player(self, contestant: Contestant) -> WarmPriorActor:
+        """The last policy of averaged weights, as it is played here.
+
+        Args:
+            contestant: one of :attr:`contestants`.
+        """
+        return contestant.policy().replace(grid=self.recipe.evaluation.grid)
+
+    def policies(self) -> dict[str, dict[int, WarmPriorActor]]:
+        """The last policies, by the description of their prior and their training seed.
+
+        A prior of which a seed failed is left out: it would not compare with the others.
+        """
+        found: dict[str, dict[int, WarmPriorActor]] = {}
+        for c in self.contestants:
+            found.setdefault(c.prior.describe(), {})[c.training.seed] = c.policy()
+        return {
+            name: seeds for name, seeds in found.items() if len(seeds) == len(self.recipe.seeds)
+        }
+
+    def observe(self, options: HeldOutOptions) -> tuple[SharedObservations, str]:
+        """Held-out observations of the first problem, and what they are in words.
+
+        Args:
+            options: which.
+
+        Raises:
+            ValueError: see :func:`observe`.
+        """
+        problem = self.stores[0].problem
+        assert problem.normalizer is not None, "demonstrations of simulators have one"
+        return observe(
+            options,
+            self.results.meta["problems"][0],
+            problem.normalizer,
+            chunk_length=self.priors[0].chunk_length,
+            observation_steps=self.recipe.network.observation_steps,
+            device=self.recipe.run.device,
+        )
+
+    def losses(self, store: Store) -> dict[str, list[Losses]]:
+        """Training curves on one problem, by source one ``[(iteration, loss), ...]`` per policy.
+
+        Args:
+            store: of the problem.
+        """
+        mine = [c for c in self.contestants if c.store is store]
+        rows = [Row(c.facts(), {}) for c in mine]
+        label, curves = source_labels(rows), dict[str, list[Losses]]()
+        for c, row in zip(mine, rows, strict=True):
+            curves.setdefault(label(row), []).append(store.train(c.prior, c.training))
+        return curves
+
+    @property
+    def rows(self) -> list[Row]:
+        """The rows of :attr:`contestants`: not those of policies that failed on the way."""
+        mine = {tuple(c.facts().values()) for c in self.contestants}
+        return [row for row in self.results.rows if self._policy(row) in mine]
+
+    def timed(self) -> list[Row]:
+        """The :attr:`rows`, with the processor time of their policies' trainings as ``"training_seconds"``.
+
+        It is no part of the results, which are the same on every machine.
+        """
+        seconds = {
+            tuple(c.facts().values()): c.store.training_seconds(c.prior, c.training)
+            for c in self.contestants
+        }
+        return [
+            replace(
+                row, measures={**row.measures, "training_seconds": seconds.get(self._policy(row))}
+            )
+            for row in self.rows
+        ]
+
+    def _policy(self, row: Row) -> tuple[Any, ...]:
+        """The facts of a row that tell which policy it is of."""
+        return tuple(row.facts.get(name) for name in self.contestants[0].facts())
+
+    def run(self) -> Results:
+        """Train what is missing and play what is missing, in worker processes.
+
+        A policy is played as soon as it is trained and a worker is free. The rows and their order are the
+        same for any number of workers. A policy whose training, measures or episodes fail does not stop the
+        others; it is told in :attr:`failures`, and tried again when the run is resumed.
+
+        Returns:
+            The results, also in ``results.json``.
+
+        Raises:
+            PartialFailure: if no policy is left.
+            WorkerError: if a worker process dies, a ``RuntimeError``.
+        """
+        self._compute(play=True)
+        return self.results
+
+    def train(self) -> None:
+        """Train what is missing, in worker processes, and play nothing.
+
+        Raises:
+            PartialFailure: if a training failed, once all others are done.
+            WorkerError: if a worker process dies, a ``RuntimeError``.
+        """
+        self._compute(play=False)
+        if self.failures:
+            raise PartialFailure("; ".join(self.failures))
+
+    def _missing_teachers(self) -> list[Contestant]:
+        """Policies that others learn from (:attr:`Prior.teacher`), where they are not compared themselves."""
+        known = {c.folder for c in self.contestants}
+        taught = (c for c in self.contestants if c.prior.teacher is not None)
+        found = {t.folder: t for t in map(Contestant.teacher, taught) if t.folder not in known}
+        return list(found.values())
+
+    def _compute(self, *, play: bool) -> None:
+        """Train, and measure and play what the missing rows need."""
+        self.results.save()
+        outcomes = Outcomes(self.contestants, self.recipe.evaluation)
+        following = {}
+        if play:
+            following = {n: outcomes.missing(n, self.results) for n in range(len(self.contestants))}
+        jobs = [job for those in following.values() for job in those]
+        everyone = [*self.contestants, *self._missing_teachers()]
+        workers = min(self.num_workers, len(everyone) + len(jobs))
+        schedule = self._schedule(everyone, following, workers)
+        worker = Worker(everyone, self.recipe.evaluation)
+        failed: dict[int, str] = {}
+        iterations = sum(c.training.iterations for c in everyone)
+        episodes = sum(isinstance(job, Play) for job in jobs)
+        with (
+            ComparisonProgress(iterations, episodes) as progress,
+            WorkerPool(workers, worker) as pool,
+        ):
+            while True:
+                while pool.idle and (job := schedule.next()) is not None:
+                    pool.submit(Attempt(job))
+                if not pool.running:
+                    break
+                for attempt, result in pool.wait(0.5):
+                    job, chosen = attempt.job, everyone[attempt.job.number]
+                    if isinstance(result, Failure):
+                        for n in schedule.failed(job):
+                            failed[n] = f"{everyone[n]}: {result.reason}"
+                            progress.say(f"FAILED {failed[n]}")
+                    elif isinstance(job, Train):
+                        schedule.trained(job.number)
+                        chosen.store.note_trained(chosen.prior, chosen.training, result)
+                        self.results.save()
+                        progress.say(f"trained {chosen}, {chosen.training.iterations} iterations")
+                    else:
+                        if isinstance(job, Play):
+                            progress.played()
+                        for row in outcomes.add(job, result):
+                            self.results.add(row, order=self._place)
+                            progress.say(_told(chosen, row))
+                progress.trained(sum(worker.iterations))
+        self.failures = [failed[number] for number in sorted(failed)]
+        if all(n in failed for n in range(len(self.contestants))):
+            raise PartialFailure("; ".join(self.failures))
+        self.contestants = [c for n, c in enumerate(self.contestants) if n not in failed]
+
+    def _schedule(
+        self,
+        everyone: Sequence[Contestant],
+        following: Mapping[int, Sequence[Measure | Play]],
+        workers: int,
+    ) -> Schedule:
+        """One training seed after another, teachers before their pupils."""
+        numbers = {c.folder: n for n, c in enumerate(everyone)}
+        return Schedule(
+            sorted(numbers.values(), key=lambda n: everyone[n].training.seed),
+            following,
+            teachers={
+                n: numbers[c.teacher().folder]
+                for n, c in enumerate(everyone)
+                if c.prior.teacher is not None
+            },
+            workers=workers,
+            trainings_at_once=self.trainings_at_once,
+        )
+
+    def _place(self, row: Row) -> tuple[int, int, int]:
+        """Where a row stands among all."""
+        number = self._order.get(self._policy(row), len(self._order))
+        return number, row.get("checkpoint") or 0, -(row.get("nfe") or 0)
+
+
+def _told(chosen: Contestant, row: Row) -> str:
+    told = (
+        f"played {chosen}, iteration {row['checkpoint']}, NFE {row['nfe']}: {row['successes']} of "
+        f"{row['episodes']} solved"
+    )
+    if row.get("source_leak") is not None:
+        told += f", source leak {row['source_leak']:.2f}"
+    return told

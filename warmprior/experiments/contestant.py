@@ -1,0 +1,79 @@
+"""A policy of a comparison: where it lies, and what tells it from the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from warmprior.experiments.store import Store
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.prior import Prior
+from warmprior.training.behaviour_cloning import policy_path
+from warmprior.training.training_config import TrainingConfig
+
+__all__ = ["Contestant"]
+
+
+@dataclass(frozen=True, eq=False)
+class Contestant:
+    """A policy of a comparison, trained or not.
+
+    Attributes:
+        store: where it lies, with its problem.
+        prior: its source distribution.
+        training: its recipe, with its seed.
+    """
+
+    store: Store
+    prior: Prior
+    training: TrainingConfig
+
+    @property
+    def folder(self) -> Path:
+        """Where it lies, or will lie."""
+        return self.store.folder(self.prior, self.training)
+
+    @property
+    def path(self) -> Path:
+        """Where its last policy of averaged weights lies, or will lie."""
+        return policy_path(self.folder, self.training.iterations)
+
+    def policy(self) -> WarmPriorActor:
+        """The last policy of averaged weights, trained if it is not yet."""
+        return self.store.policy(self.prior, self.training)
+
+    def __str__(self) -> str:
+        problem = self.store.problem
+        return f"{problem.task} {problem.style}, {self.prior.describe()}, seed {self.training.seed}"
+
+    def teacher(self) -> Contestant:
+        """The policy that it learns from, see :attr:`Prior.teacher`."""
+        return replace(self, prior=self.store.teacher(self.prior))
+
+    def facts(self) -> dict[str, Any]:
+        """What rows tell of it."""
+        return {
+            "task": self.store.problem.task,
+            "data": self.store.problem.style,
+            **self.store.problem.space,
+            "prior": self.prior.name,
+            "options": self.prior.options,
+            "sigma": float(self.prior.sigma),
+            "chunk": self.prior.chunk_length,
+            "seed": self.training.seed,
+            "iterations": self.training.iterations,
+        }
+
+    def cells(self, nfes: Sequence[int]) -> list[dict[str, Any]]:
+        """Facts of the rows that tell how it was played: one per checkpoint and NFE.
+
+        Args:
+            nfes: numbers of network evaluations to play it with, where its field allows them.
+        """
+        return [
+            self.facts() | {"checkpoint": checkpoint, "nfe": nfe}
+            for checkpoint in self.training.checkpoint_iterations
+            for nfe in self.prior.allowed_nfes(nfes)
+        ]

@@ -1,0 +1,83 @@
+"""What is measured of a policy on the data that it was trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+
+from warmprior.diagnostics.mean_error import MeanError, mean_error
+from warmprior.diagnostics.shared_observations import SharedObservations
+from warmprior.diagnostics.source_leak import SourceLeak, source_leak
+from warmprior.experiments.straightness import flow_measures
+from warmprior.modules.actor import WarmPriorActor
+
+__all__ = ["Measures", "measure"]
+
+MEASURED_WINDOWS = 512
+"""Observations of the training data on which source leak and flow of every policy are measured."""
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What is measured of a policy on its training data.
+
+    Attributes:
+        leaks: its source leak by NFE; empty where no two episodes have steps to compare.
+        means: the error of its mean by NFE.
+        flow: of its flow and source; these hold at any NFE.
+    """
+
+    leaks: dict[int, SourceLeak]
+    means: dict[int, MeanError]
+    flow: dict[str, float]
+
+    def at(self, nfe: int) -> dict[str, float | None]:
+        """By name, as a row of this NFE tells it.
+
+        Args:
+            nfe: one that was measured.
+        """
+        leak, mean = self.leaks.get(nfe), self.means[nfe]
+        return {
+            "mean_error": mean.target,
+            "mean_revision_data": mean.revision,
+            "source_leak": None if leak is None else leak.leak,
+            "inner_step_ratio": None if leak is None else leak.inner_step_ratio,
+            **self.flow,
+        }
+
+
+def measure(
+    policy: WarmPriorActor,
+    data: TensorDictBase,
+    nfes: Sequence[int],
+    *,
+    chunk_length: int,
+    observation_steps: int,
+) -> Measures:
+    """Measure a policy on the same observations, and by the same draws, as all others.
+
+    Args:
+        policy: on the CPU.
+        data: contiguous steps in normalised units, see :class:`~warmprior.ActionWindow`.
+        nfes: numbers of network evaluations, where the policy's field allows them.
+
+    Keyword Args:
+        chunk_length: ``H``.
+        observation_steps: ``To``.
+    """
+    shared = SharedObservations(data.to("cpu"), chunk_length, observation_steps=observation_steps)
+    drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
+    shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
+    leaks = {}
+    if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
+        windows = shared.windows(policy.prior)
+        leaks = source_leak(policy, windows, nfes=nfes, episodes=shared.episodes)
+    generator = torch.Generator().manual_seed(0)
+    met = shared.met(policy, generator=generator)
+    allowed = policy.prior.allowed_nfes(nfes)
+    means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
+    return Measures(leaks, means, flow_measures(policy, met, generator=generator))

@@ -1,0 +1,171 @@
+"""What a worker process of a comparison does: it trains policies, measures them and plays them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torchrl.envs import EnvBase, TransformedEnv
+
+from warmprior.experiments.contestant import Contestant
+from warmprior.experiments.measures import Measures, measure
+from warmprior.experiments.recipe import EvaluationOptions
+from warmprior.experiments.store import Losses, Store
+from warmprior.io.script import ERRORS
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.training.evaluation import Episode, play_episode
+
+__all__ = ["Attempt", "Failure", "Job", "Measure", "Play", "Train", "Worker"]
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a policy.
+
+    Attributes:
+        number: of the policy.
+    """
+
+    number: int
+
+    def __call__(self, worker: Worker) -> Losses:
+        """Its training curve."""
+        return worker.train(self.number)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Measure the last checkpoint of a policy on its training data.
+
+    Attributes:
+        number: of the policy.
+    """
+
+    number: int
+
+    def __call__(self, worker: Worker) -> Measures:
+        """What was measured."""
+        return worker.measure(self.number)
+
+
+@dataclass(frozen=True)
+class Play:
+    """Play an episode.
+
+    Attributes:
+        number: of the policy.
+        checkpoint: of its training, an iteration.
+        nfe: network evaluations per chunk.
+        episode_seed: of the episode.
+    """
+
+    number: int
+    checkpoint: int
+    nfe: int
+    episode_seed: int
+
+    def __call__(self, worker: Worker) -> Episode:
+        """The episode."""
+        return worker.play(self)
+
+
+Job = Train | Measure | Play
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a job came to nothing."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """A job whose failure is a result: it must not stop the others."""
+
+    job: Job
+
+    def __call__(self, worker: Worker) -> Any:
+        """What the job gives, or a :class:`Failure`."""
+        try:
+            return self.job(worker)
+        except Exception as error:
+            if not isinstance(error, ERRORS):
+                traceback.print_exc()  # nothing that a user can mend
+            return Failure(str(error) or repr(error))
+
+
+class Worker:
+    """The state of a worker process.
+
+    It keeps its simulator, and the policy that it played last: an episode after one of the same policy
+    needs no preparation.
+
+    Args:
+        contestants: the policies that jobs name by number.
+        options: how they are played.
+
+    Attributes:
+        iterations: of each training so far, shared with the process that shows them.
+    """
+
+    def __init__(self, contestants: Sequence[Contestant], options: EvaluationOptions) -> None:
+        self.contestants, self.options = contestants, options
+        # Without a lock, which a killed worker might hold for ever: each entry has a single writer.
+        self.iterations = multiprocessing.RawArray("q", len(contestants))
+        self._store: Store | None = None
+        self._simulator: EnvBase | None = None
+        self._playing: tuple[int, int] | None = None
+
+    def train(self, number: int) -> Losses:
+        """Train a policy, see :meth:`Store.train`."""
+
+        def report(iteration: int) -> None:
+            self.iterations[number] = iteration
+
+        chosen = self.contestants[number]
+        losses = chosen.store.train(chosen.prior, chosen.training, report)
+        if torch.cuda.is_initialized():
+            torch.cuda.empty_cache()  # for the next training, which may be another worker's
+        return losses
+
+    def measure(self, number: int) -> Measures:
+        """Measure the last checkpoint of a policy on its training data."""
+        chosen = self.contestants[number]
+        return measure(
+            self._load(chosen),
+            chosen.store.problem.data,
+            self.options.nfes,
+            chunk_length=chosen.prior.chunk_length,
+            observation_steps=chosen.store.network.observation_steps,
+        )
+
+    def play(self, job: Play) -> Episode:
+        """Play an episode; its noise is that of the policy's seed."""
+        chosen = self.contestants[job.number]
+        if (job.number, job.checkpoint) != self._playing:
+            self._playing = None  # whatever fails on the way
+            self._actor, self._env = self._prepare(chosen, job.checkpoint)
+            self._playing = job.number, job.checkpoint
+        seed = chosen.training.seed
+        return play_episode(self._actor, self._env, job.episode_seed, nfe=job.nfe, policy_seed=seed)
+
+    def _load(self, chosen: Contestant, checkpoint: int | None = None) -> WarmPriorActor:
+        policy = chosen.store.load(chosen.prior, chosen.training, checkpoint)
+        return policy.replace(grid=self.options.grid)
+
+    def _prepare(self, chosen: Contestant, checkpoint: int) -> tuple[WarmPriorActor, EnvBase]:
+        if self._store is not chosen.store:
+            if self._simulator is not None:
+                self._simulator.close(raise_if_closed=False)
+            self._store, self._simulator = None, None
+            self._simulator = chosen.store.problem.make_env(**self.options.environment)
+            self._store = chosen.store
+        policy = self._load(chosen, checkpoint)
+        # The policy's own prior, which may have learnt.
+        transforms = chosen.store.transforms(policy.prior)()
+        return policy, TransformedEnv(self._simulator, transforms)
