@@ -105,6 +105,14 @@ def demonstrations(args: argparse.Namespace) -> None:
     print(generate_demonstrations(args.task, args.data, args.n, path=args.out))
 
 
+def render(args: argparse.Namespace) -> None:
+    """Render the states of demonstrations to images; continues where it was interrupted."""
+    from warmprior.data import render_demonstrations
+
+    options = {"fast": args.fast, "out": args.out, "workers": args.workers}
+    print(render_demonstrations(args.file, args.cameras, args.size, **options))
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The commands and their options."""
     parser = argparse.ArgumentParser(prog="python -m warmprior", description=__doc__)
@@ -145,6 +153,14 @@ def make_parser() -> argparse.ArgumentParser:
     add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (%(default)s)")
     add("--n", type=int, default=200, help="how many (%(default)s)")
     add("--out", type=Path, help="HDF5 file (default: in the cache)")
+
+    add = command(render)
+    add("file", type=Path, help="robomimic HDF5 file with states")
+    add("--cameras", nargs="+", help="of the simulator (default: those of the task)")
+    add("--size", type=int, default=84, help="side of the images in pixels (%(default)s)")
+    add("--fast", action="store_true", help="no reflections, shadows and smooth edges")
+    add("--out", type=Path, help="HDF5 file, also FILE itself (default: in the cache)")
+    add("--workers", type=int, help="processes (default: one per core)")
     return parser
 
 

@@ -14,6 +14,7 @@ constant                key                                    shape and dtype
 :data:`CONDITIONED`     ``("prior", "observation")``           ``[*B, To, d_o + P * d_a + 1]`` float
 :data:`ACTION`          ``"action"``                           ``[*B, d_a]`` float
 :data:`EEF_POSE`        ``"eef_pose"``                         ``[*B, arms, 3, 4]`` float, raw
+:data:`SIM_STATE`       ``"sim_state"``                        ``[*B, 1 + nq + nv]`` float64, raw
 :data:`LOC`             ``("prior", "loc")``                   ``[*B, P, d_a]`` float
 :data:`WARM`            ``("prior", "warm")``                  ``[*B, P, 1]`` bool
 :data:`ANCHOR`          ``("prior", "anchor")``                ``[*B, P, d_a]`` float
@@ -40,7 +41,8 @@ what it made of a step's action under ``("next", "decoded", "noise")`` and ``("n
 without ``"next"`` they are those of the step before.
 
 :data:`EEF_POSE` holds the grippers' rotations and, in the last column, positions in metres, both in the
-world. Environments tell it where the actions of policies are absolute poses.
+world. Environments tell it where the actions of policies are absolute poses, and :data:`SIM_STATE`, time,
+positions and velocities of the simulator, where policies see images, which are rendered from it.
 """
 
 from __future__ import annotations
@@ -51,6 +53,7 @@ OBSERVATION = OBSERVATION_KEY
 STATE = "state"
 ACTION = ACTION_KEY
 EEF_POSE = "eef_pose"
+SIM_STATE = "sim_state"
 CONDITIONED = ("prior", "observation")
 LOC = ("prior", "loc")
 WARM = ("prior", "warm")

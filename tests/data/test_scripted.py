@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from unittest.mock import MagicMock
 
@@ -21,13 +20,11 @@ pytest.importorskip("h5py")
 import h5py
 
 from tests.processes import ended
-from warmprior.data.scripted import episode as episode_module
 from warmprior.data.scripted import generate as generate_module
 from warmprior.data.scripted import generate_demonstrations
 from warmprior.data.scripted.episode import Episode, expert_loop, operator_of, run_episode
 from warmprior.data.scripted.geometry import nearest_yaw, rotation_matrix, rotation_vector
 from warmprior.data.scripted.writer import write_robomimic
-from warmprior.envs import rendering_backend
 from warmprior.envs.simulator import make_simulator
 from warmprior.envs.tasks import EVALUATION_SEED, TASKS
 
@@ -195,7 +192,7 @@ def generated(monkeypatch, path, run_episode, **options):
 
 @pytest.mark.parametrize("workers", [1, 2, 7])
 def test_operators_contribute_equally(workers, tmp_path, monkeypatch):
-    def run_episode(loop, task, style, seed, image_size):
+    def run_episode(loop, task, style, seed):
         time.sleep(0.01 * (seed % 3))  # they end in another order than they began
         # The last operator succeeds every fourth time only.
         return fake_episode(seed, success=seed % 6 != 5 or seed % 24 == 5)
@@ -209,7 +206,7 @@ def test_operators_contribute_equally(workers, tmp_path, monkeypatch):
 
 
 def test_gives_up_when_the_expert_never_succeeds(tmp_path, monkeypatch):
-    def run_episode(loop, task, style, seed, image_size):
+    def run_episode(loop, task, style, seed):
         return fake_episode(seed, "ph", success=False)
 
     with pytest.raises(RuntimeError, match="only 0 of 2 demonstrations succeeded in 140"):
@@ -229,20 +226,6 @@ def test_filter_keys_of_several_operators(tmp_path):
     for name in ("better", "okay", "worse", "50_percent"):
         for split in ("train", "valid"):
             assert masks.get(f"{name}_{split}", set()) == masks[name] & masks[split]
-
-
-def test_images(monkeypatch):
-    if rendering_backend() is None:
-        pytest.skip("no OpenGL backend")
-    short = replace(TASKS["lift"], horizon_ph=5)
-    monkeypatch.setattr(episode_module, "get_task", lambda name: short)
-    loop = expert_loop("lift")
-    episode = run_episode(loop, "lift", "ph", 0, image_size=16)
-    images = episode.observations["agentview_image"]
-    assert images.shape == (6, 16, 16, 3)
-    assert images.dtype == np.uint8
-    plain = run_episode(loop, "lift", "ph", 0)
-    np.testing.assert_array_equal(plain.actions, episode.actions)
 
 
 def test_rotations_agree_with_scipy():

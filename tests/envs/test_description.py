@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("robosuite")
 
 from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -82,10 +83,10 @@ def solved(path, actions):
     import h5py
 
     data = RobomimicExperienceReplay(path, absolute_actions=actions == "absolute")
-    make_env, transform = robosuite_parts(
+    make_env, adapters = robosuite_parts(
         environment_description(data.recorded_env_args, "ph", 2, actions)
     )
-    env = make_env() if transform is None else TransformedEnv(make_env(), transform)
+    env = TransformedEnv(make_env(), Compose(*adapters.values()))
     outcomes = []
     with h5py.File(path) as file:
         seeds = [file[f"data/demo_{i}"].attrs["seed"] for i in range(data.num_episodes)]

@@ -45,11 +45,13 @@ def test_recorded_actions_are_identified_as_ever(path):
 
 
 def test_absolute_actions(path, tmp_path):
-    delta, absolute = (robosuite_problem(path, actions=name) for name in ("delta", "absolute"))
+    delta, absolute = (
+        robosuite_problem(path, options=DataOptions(actions=name)) for name in ("delta", "absolute")
+    )
     assert absolute.identity != delta.identity
     assert absolute.name == "lift ph (file data), absolute actions"
     assert absolute.data["action"].shape == (50, 10)
-    assert isinstance(absolute.actions, AbsoluteActions) and delta.actions is None
+    assert isinstance(absolute.adapters["actions"], AbsoluteActions) and not delta.adapters
     # In the units of deltas, and what is executed spans what was recorded.
     units = [0.05] * 3 + [0.5] * 6
     assert absolute.normalizer.scale("action")[:9].tolist() == pytest.approx(units)
@@ -62,7 +64,9 @@ def test_absolute_actions(path, tmp_path):
 
 def test_what_leaves_the_span_of_the_demonstrations_is_remembered_at_its_bound(path, tmp_path):
     """Of every dimension: poses range over many control steps, the gripper over one unit."""
-    delta, problem = (robosuite_problem(path, actions=name) for name in ("delta", "absolute"))
+    delta, problem = (
+        robosuite_problem(path, options=DataOptions(actions=name)) for name in ("delta", "absolute")
+    )
     span = problem.data["action"].abs().amax(0)
     assert delta.clip == 1.0 and span[9] < span.max() / 2
     actor = store(problem, tmp_path).new_actor(GaussianPrior(8), TrainingConfig())
@@ -92,4 +96,4 @@ def test_files_without_poses_are_named(tmp_path):
     with h5py.File(path, "a") as file:
         del file["data/demo_0/obs/robot0_eef_quat"]
     with pytest.raises(DatasetError, match=r"lift\.hdf5.*no 'obs/robot0_eef_quat'"):
-        robosuite_problem(path, actions="absolute")
+        robosuite_problem(path, options=DataOptions(actions="absolute"))

@@ -216,11 +216,25 @@ def test_a_preconditioned_network_may_take_several():
     assert rollout["vla_action", "chunk"].isfinite().all()
 
 
-def test_a_mean_cannot_be_appended_to_several():
+@pytest.mark.parametrize("place", ["single", "serial-inside", "parallel-outside"])
+def test_a_mean_is_appended_to_the_vector_among_several(place):
     prior = HistoryPrior(H)
-    actor = WarmPriorActor(Encoder(ACTION_DIM, 4, H, TO), prior, nfe=1)
-    with pytest.raises(ValueError, match=r"appends its mean to an observation vector"):
-        build("single", "nested", prior).rollout(1, actor)
+    env = build(place, "nested", prior)
+    check_env_specs(env, break_when_any_done="both")
+    rollout = env.rollout(3, break_when_any_done=False)
+    seen, own = rollout["prior", "observation"], rollout["observation"]
+    assert torch.equal(seen["pixels"], own["pixels"])
+    mean = (rollout["prior", "loc"] * rollout["prior", "warm"]).flatten(-2)
+    added = torch.cat([mean, rollout["prior", "warm"].any(-2).float()], -1).unsqueeze(-2)
+    expected = torch.cat([own["state"], added.expand(*own["state"].shape[:-1], -1)], -1)
+    assert torch.equal(seen["state"], expected) and bool(added.any())
+    env.close()
+
+
+def test_a_mean_cannot_be_appended_where_there_is_no_vector():
+    transforms = policy_transforms(HistoryPrior(H), observation_key="sensors")
+    with pytest.raises(ValueError, match=r"appends its mean to an observation vector.*'state'"):
+        TransformedEnv(CameraEnv(layout="named"), transforms).rollout(1)
 
 
 def test_an_observation_of_another_name():

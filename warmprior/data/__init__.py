@@ -9,6 +9,7 @@ from warmprior.data.hdf5 import DatasetError
 from warmprior.data.robomimic import RobomimicExperienceReplay
 
 if TYPE_CHECKING:
+    from warmprior.data.render import render_demonstrations
     from warmprior.data.scripted import generate_demonstrations
 
 __all__ = [
@@ -16,15 +17,20 @@ __all__ = [
     "RobomimicExperienceReplay",
     "download_robomimic",
     "generate_demonstrations",
+    "render_demonstrations",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    # The experts sit on top of the simulator, which reading files does not need.
+    # They sit on top of the simulator, which reading files does not need.
     if name == "generate_demonstrations":
         from warmprior.data.scripted import generate_demonstrations
 
         return generate_demonstrations
+    if name == "render_demonstrations":
+        from warmprior.data.render import render_demonstrations
+
+        return render_demonstrations
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warmprior.data.hdf5_images import image_size
 from warmprior.data.hdf5_members import DatasetError, member, names, reading
 from warmprior.envs.tasks import TASKS, TaskSpec
 from warmprior.io.extras import require
@@ -41,6 +42,8 @@ class RobomimicIndex:
         lengths: the number of steps of each.
         observation_keys: the observations to read, in the order of concatenation.
         observation_dims: the width of each.
+        image_keys: the images to read.
+        image_size: their side in pixels; 0 if there are none.
         available_keys: every observation of the first demo.
         action_dim: the width of ``actions``.
         env_args: the parsed ``env_args`` as the file has them.
@@ -52,6 +55,8 @@ class RobomimicIndex:
     lengths: tuple[int, ...]
     observation_keys: tuple[str, ...]
     observation_dims: tuple[int, ...]
+    image_keys: tuple[str, ...]
+    image_size: int
     available_keys: tuple[str, ...]
     action_dim: int
     env_args: dict[str, Any]
@@ -238,6 +243,7 @@ def read_index(
     *,
     filter_key: str | None = None,
     observation_keys: Sequence[str] | None = None,
+    image_keys: Sequence[str] = (),
     poses: bool = False,
 ) -> RobomimicIndex:
     """Check a robomimic file and say what it holds. No values are read.
@@ -248,6 +254,7 @@ def read_index(
         observation_keys: the observations to read. By default those of the task, or, for an
             unknown environment, ``object`` and each robot's pose and gripper as far as the file
             has them.
+        image_keys: images to read as well.
         poses: also require the hand pose of every arm, from which absolute actions are built.
 
     Returns:
@@ -289,6 +296,7 @@ def read_index(
             if observation_keys is None:
                 required["obs/object"] = task.object_dim
         lengths: list[int] = []
+        sides: dict[int, str] = {}
         reference: dict[str, int] = {}
         for name in demos:
             demo = _demo(file, name)
@@ -297,12 +305,19 @@ def read_index(
             reference = reference or widths
             _check_widths(path, demo, widths, reference, f"data/{demos[0]}")
             lengths.append(steps)
+            if image_keys:
+                sides.setdefault(image_size(path, demo, image_keys, steps), name)
+    if len(sides) > 1:
+        told = ", ".join(f"{size} in data/{name}" for size, name in sides.items())
+        raise DatasetError(f"{path}: images have several sizes: {told}. Render them anew")
     return RobomimicIndex(
         path=path,
         demos=demos,
         lengths=tuple(lengths),
         observation_keys=keys,
         observation_dims=tuple(reference[f"obs/{key}"] for key in keys),
+        image_keys=tuple(image_keys),
+        image_size=next(iter(sides), 0),
         available_keys=available,
         action_dim=reference["actions"],
         env_args=env_args,

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 
@@ -24,11 +25,12 @@ from warmprior.data.hdf5 import (
     read_index,
     read_rows,
 )
+from warmprior.data.hdf5_images import read_images
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TASKS, TaskSpec
 from warmprior.io.memory import available_memory
-from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION
+from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 
 __all__ = ["RobomimicExperienceReplay"]
 
@@ -50,8 +52,11 @@ def _allocate(
     index: RobomimicIndex, action_dim: int, storage: str, scratch_dir: str | Path | None
 ) -> TensorDict:
     steps = sum(index.lengths)
+    vector = (torch.float32, (sum(index.observation_dims),))
+    image = (torch.uint8, (3, index.image_size, index.image_size))
     widths = {
-        OBSERVATION: (torch.float32, (sum(index.observation_dims),)),
+        _vector_key(index): vector,
+        **{(OBSERVATION, key): image for key in index.image_keys},
         ACTION: (torch.float32, (action_dim,)),
         ("next", "reward"): (torch.float32, (1,)),
         ("next", "done"): (torch.bool, (1,)),
@@ -84,6 +89,10 @@ def _allocate(
             f"{index.path} ({error}). Free some space or choose another scratch_dir."
         ) from error
     return data
+
+
+def _vector_key(index: RobomimicIndex) -> NestedKey:
+    return (OBSERVATION, STATE) if index.image_keys else OBSERVATION
 
 
 def _reserve(mapped: Any) -> None:
@@ -129,7 +138,7 @@ def _read_absolute(
 
 
 def _fill(index: RobomimicIndex, data: TensorDictBase, absolute: bool) -> None:
-    observation, action = data[OBSERVATION].numpy(), data[ACTION].numpy()
+    observation, action = data[_vector_key(index)].numpy(), data[ACTION].numpy()
     reward = data["next", "reward"].numpy()
     columns = np.cumsum([0, *index.observation_dims])
     rows = np.cumsum([0, *index.lengths])
@@ -146,6 +155,8 @@ def _fill(index: RobomimicIndex, data: TensorDictBase, absolute: bool) -> None:
             else:
                 read_rows(file, demo, "actions", action[start:stop])
             read_rows(file, demo, "rewards", reward[start:stop])
+            for key in index.image_keys:
+                read_images(file, demo, key, data[OBSERVATION, key][start:stop])
             data[EPISODE][start:stop] = episode
     torch.arange(len(data), out=data[FRAME])
     last = torch.from_numpy(rows[1:] - 1)
@@ -175,7 +186,8 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
     The whole selection becomes a flat, contiguous :class:`~tensordict.TensorDict` of ``N`` steps, in
     the order of the demos' numbers:
 
-    - ``"observation"`` ``[N, d_o]`` float32, the observation keys side by side;
+    - ``"observation"`` ``[N, d_o]`` float32, the observation keys side by side; with images nested,
+      ``("observation", "state")`` ``[N, d_s]`` and each as uint8 ``[N, 3, size, size]``;
     - ``"action"`` ``[N, d_a]`` float32, as recorded (not normalised);
     - ``("next", "reward")`` ``[N, 1]`` float32;
     - ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` ``[N, 1]`` bool: done
@@ -194,6 +206,8 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
         filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
         observation_keys: observations to concatenate; by default those of the task, or for an
             unknown environment the object and every robot's pose and gripper.
+        image_keys: images to read as well, such as ``"agentview_image"``. They stay bytes; take
+            ``storage="memmap"`` where they are many.
         absolute_actions: turn the recorded pose deltas into absolute poses
             (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm.
         storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``.
@@ -232,6 +246,7 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
         root: str | Path | None = None,
         filter_key: str | None = None,
         observation_keys: Sequence[str] | None = None,
+        image_keys: Sequence[str] = (),
         absolute_actions: bool = False,
         storage: Literal["memory", "memmap"] = "memory",
         scratch_dir: str | Path | None = None,
@@ -251,6 +266,7 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
             path,
             filter_key=filter_key,
             observation_keys=observation_keys,
+            image_keys=image_keys,
             poses=absolute_actions,
         )
         action_dim = index.action_dim
@@ -309,8 +325,18 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
 
     @property
     def observation_keys(self) -> tuple[str, ...]:
-        """The keys whose values stand side by side in ``"observation"``."""
+        """The keys whose values stand side by side in the observation's vector."""
         return self._index.observation_keys
+
+    @property
+    def image_keys(self) -> tuple[str, ...]:
+        """The images next to ``("observation", "state")``."""
+        return self._index.image_keys
+
+    @property
+    def image_size(self) -> int:
+        """Side of the images in pixels, 0 if there are none."""
+        return self._index.image_size
 
     @property
     def pose_columns(self) -> Tensor:

@@ -4,6 +4,7 @@ from warmprior.diagnostics.action_error import action_error
 from warmprior.diagnostics.branching import branching_bound, branching_cost
 from warmprior.diagnostics.coverage import source_coverage
 from warmprior.diagnostics.curvature import curvature
+from warmprior.diagnostics.flow import encoded_windows
 from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revision
 from warmprior.diagnostics.paths import flow_paths, forecast_mean
@@ -39,6 +40,7 @@ __all__ = [
     "branching_cost",
     "compare_smoothness",
     "curvature",
+    "encoded_windows",
     "exceeds_one_sigma",
     "executed_actions",
     "flow_paths",

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import encoded
 
 Field = Callable[[Tensor, Tensor], Tensor]
 
@@ -64,6 +65,11 @@ def flat_windows(
         )
     if batch.batch_size.numel() == 0:
         raise ValueError("the batch holds no observation")
+    if isinstance(batch.get(observation_key), TensorDictBase):
+        raise ValueError(
+            f"{observation_key!r} has several entries, and diagnostics take vectors: pass "
+            "encoded_windows(policy, windows)"
+        )
     device = next(policy.parameters()).device
     prior, ndim = policy.prior, batch.ndim
 
@@ -95,10 +101,40 @@ def flat_windows(
     )
 
 
+def encoded_windows(
+    policy: WarmPriorActor, windows: TensorDictBase, *, split: int = 256
+) -> TensorDictBase:
+    """Windows with what the policy's network makes of observations that hold images.
+
+    Diagnostics evaluate the network many times at the same observations, and look for near ones among them:
+    they take vectors. Windows of such observations are returned as they are.
+
+    Args:
+        policy: the policy.
+        windows: ``[n]``, see :class:`~warmprior.ActionWindow`.
+
+    Keyword Args:
+        split: network batch size, for bounded memory.
+
+    Returns:
+        Windows ``[n]`` with features ``[n, To, d_o]`` as the observation.
+    """
+    key = policy.in_keys[0]
+    observation = windows.get(key, None)
+    if not isinstance(observation, TensorDictBase):
+        return windows
+    device = next(policy.parameters()).device
+    with evaluation_mode(policy):
+        parts = [encoded(policy.network, part.to(device)) for part in observation.split(split)]
+    return windows.copy().to(device).set(key, torch.cat(parts))  # type: ignore[arg-type]
+
+
 def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
     """The observations of a batch without the mean that a conditioned network sees beside them."""
-    conditioned = policy.prior.conditions_network
-    return batch.get(keys.OBSERVATION if conditioned else policy.in_keys[0])
+    key = policy.in_keys[0]
+    if policy.prior.conditions_network and isinstance(batch.get(keys.OBSERVATION), Tensor):
+        key = keys.OBSERVATION
+    return batch.get(key)
 
 
 def check_flow(policy: WarmPriorActor, steps: int) -> None:

@@ -9,6 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.diagnostics.flow import encoded_windows
 from warmprior.diagnostics.paths import forecast_mean
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
@@ -108,16 +109,20 @@ class SharedObservations:
     ) -> TensorDictBase:
         """Windows with the mean that deployment meets: from the policy's own earlier prediction.
 
+        Observations with images are encoded, see :func:`encoded_windows`.
+
         Args:
             policy: the policy.
 
         Keyword Args:
             generator: see :func:`forecast_mean`.
         """
-        earlier = self.windows(policy.prior, offset=self.chunk_length)
+        earlier = encoded_windows(policy, self.windows(policy.prior, offset=self.chunk_length))
         met = forecast_mean(policy, earlier, generator=generator)
         windows = self.windows(policy.prior).to(met.device).update(met)
-        return MeanObservation()(windows) if policy.prior.conditions_network else windows
+        if policy.prior.conditions_network:
+            windows = MeanObservation()(windows)
+        return encoded_windows(policy, windows)
 
     def met(
         self, policy: WarmPriorActor, *, generator: torch.Generator | None = None
@@ -133,7 +138,7 @@ class SharedObservations:
         windows = self.windows(policy.prior)
         if windows[keys.WARM].any():
             return self.deployed(policy, generator=generator)
-        return windows
+        return encoded_windows(policy, windows)
 
     def subset(self, index: Tensor) -> SharedObservations:
         """Some of the observations.

@@ -8,12 +8,13 @@ from functools import partial
 from typing import Any, Literal
 
 from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import Compose
+from torchrl.envs.transforms import Compose, Transform
 
 from warmprior.envs.env_args import delta_conventions
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms.absolute_actions import AbsoluteActions
+from warmprior.transforms.camera_images import CameraImages
 from warmprior.transforms.policy import policy_transforms
 
 __all__ = [
@@ -24,12 +25,15 @@ __all__ = [
     "robosuite_parts",
 ]
 
+_IMAGES = ("cameras", "size", "fast_rendering", "low_dim_keys")
+
 
 def environment_description(
     env_args: Mapping[str, Any],
     style: str,
     observation_steps: int,
     actions: Literal["delta", "absolute"] = "delta",
+    images: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """What :func:`environment_of` needs, for :class:`~warmprior.WarmPriorActor` to keep.
 
@@ -39,34 +43,47 @@ def environment_description(
         observation_steps: ``To``.
         actions: those of the policy: the environment's own pose deltas, or absolute poses (see
             :class:`~warmprior.transforms.AbsoluteActions`).
+        images: of a policy that sees some: ``"cameras"`` and ``"size"``, see
+            :class:`~warmprior.transforms.CameraImages`, ``"fast_rendering"``, and ``"low_dim_keys"``, what
+            it sees besides, see :class:`RobosuiteEnv`.
     """
     description: dict[str, Any] = {
         "robosuite": {"env_args": dict(env_args), "style": style},
         "observation_steps": observation_steps,
     }
-    return description if actions == "delta" else description | {"actions": actions}
+    if actions != "delta":
+        description["actions"] = actions
+    if images is not None:
+        description["images"] = {name: images[name] for name in _IMAGES}
+    return description
 
 
 def robosuite_parts(
     description: Mapping[str, Any],
-) -> tuple[Callable[..., RobosuiteEnv], AbsoluteActions | None]:
-    """What builds the environment, and what turns a policy's actions into its own.
+) -> tuple[Callable[..., RobosuiteEnv], dict[str, Transform]]:
+    """What builds the environment, and what turns it into one for a policy's actions and observations.
 
     Args:
         description: see :func:`environment_description`.
 
     Returns:
-        A function of further options of :class:`RobosuiteEnv`, and a transform that goes next to the
-        environment; ``None`` where the actions are its own.
+        A function of further options of :class:`RobosuiteEnv`, and the transforms that go next to the
+        environment, as arguments of :func:`~warmprior.policy_transforms`.
 
     Raises:
         ValueError: if the environment takes no pose deltas, from which absolute actions are made.
     """
-    make_env = partial(RobosuiteEnv, **description["robosuite"])
-    if description.get("actions", "delta") == "delta":
-        return make_env, None
-    conventions = delta_conventions(description["robosuite"]["env_args"])
-    return partial(make_env, eef_pose=True), AbsoluteActions(*conventions)
+    options: dict[str, Any] = dict(description["robosuite"])
+    transforms: dict[str, Transform] = {}
+    if description.get("actions", "delta") == "absolute":
+        options["eef_pose"] = True
+        transforms["actions"] = AbsoluteActions(*delta_conventions(options["env_args"]))
+    images = description.get("images")
+    if images is not None:
+        options["sim_state"] = True
+        options |= {name: images[name] for name in ("low_dim_keys", "fast_rendering")}
+        transforms["images"] = CameraImages(images["cameras"], images["size"])
+    return partial(RobosuiteEnv, **options), transforms
 
 
 def environment_parts(
@@ -89,14 +106,14 @@ def environment_parts(
             f"the policy keeps no description of a robosuite environment, but {description}: build the "
             "environment yourself, with policy_transforms(actor.prior, normalizer=actor.normalizer)"
         )
-    make_env, actions = robosuite_parts(description)
+    make_env, adapters = robosuite_parts(description)
     normalizer = copy.deepcopy(actor.normalizer)
     transforms = partial(
         policy_transforms,
         actor.prior,
         # The environments' stays on the CPU, wherever the policy goes.
         normalizer=None if normalizer is None else normalizer.to("cpu"),
-        actions=actions,
+        **adapters,
         observation_steps=description["observation_steps"],
     )
     return make_env, transforms
@@ -133,9 +150,16 @@ def _describes_robosuite(description: Any) -> bool:
     """Whether it is what :func:`environment_description` gives."""
     return (
         isinstance(description, Mapping)
-        and set(description) - {"actions"} == {"robosuite", "observation_steps"}
+        and set(description) - {"actions", "images"} == {"robosuite", "observation_steps"}
         and description.get("actions", "delta") in ("delta", "absolute")
         and isinstance(description["robosuite"], Mapping)
         and set(description["robosuite"]) == {"env_args", "style"}
         and isinstance(description["robosuite"]["env_args"], Mapping)
+        and (
+            "images" not in description
+            or (
+                isinstance(description["images"], Mapping)
+                and set(description["images"]) == set(_IMAGES)
+            )
+        )
     )

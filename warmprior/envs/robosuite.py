@@ -14,7 +14,7 @@ from torchrl.envs.utils import _classproperty
 
 from warmprior import keys
 from warmprior.envs.control_loop import ControlLoop, StepLoop
-from warmprior.envs.rendering import render_camera, rendering_backend
+from warmprior.envs.rendering import EnvRenderers, require_rendering
 from warmprior.envs.simulator import (
     action_limits,
     import_robosuite,
@@ -36,7 +36,9 @@ class RobosuiteWrapper(_EnvWrapper):
     key                 shape, dtype
     ==================  =============================================================
     ``"observation"``   ``[d_o]`` float32: ``low_dim_keys``, concatenated
-    ``"pixels"``        ``[h, w, 3]`` uint8, the right way up; only ``from_pixels``
+    ``"pixels"``        ``[h, w, 3]`` uint8, the right way up; only ``from_pixels``. Of several
+                        cameras nested under their names, as ``("pixels", "agentview")``
+    ``"sim_state"``     ``[1 + nq + nv]`` float64, time, positions and velocities; only ``sim_state``
     ``"eef_pose"``      ``[arms, 3, 4]`` float32; only ``eef_pose``
     ``"success"``       ``[1]`` bool
     ``"action"``        ``[d_a]`` float32 in ``[-1, 1]``, the simulator's own units
@@ -58,9 +60,12 @@ class RobosuiteWrapper(_EnvWrapper):
         horizon: time limit in control steps; ``None`` for the environment's own.
         control_loop: ``"lean"`` for :class:`~warmprior.envs.control_loop.ControlLoop`,
             ``"robosuite"`` for ``env.step``.
-        from_pixels: render ``camera`` at every step.
-        camera: the camera rendered.
+        from_pixels: render ``camera`` at every step. Policies that see images need them at decisions alone,
+            where :class:`~warmprior.transforms.CameraImages` renders them.
+        camera: the camera rendered, or several.
         camera_size: side of the image in pixels, or its height and width.
+        fast_rendering: see :class:`~warmprior.envs.rendering.CameraRenderer`.
+        sim_state: tell the simulator's state.
         eef_pose: tell the grippers' poses in the world: rotation and, in the last column, position in
             metres (see :class:`~warmprior.transforms.AbsoluteActions`).
         seed: of the first episodes.
@@ -93,8 +98,10 @@ class RobosuiteWrapper(_EnvWrapper):
         horizon: int | None = None,
         control_loop: Literal["lean", "robosuite"] = "lean",
         from_pixels: bool = False,
-        camera: str = "agentview",
+        camera: str | Sequence[str] = "agentview",
         camera_size: int | tuple[int, int] = 84,
+        fast_rendering: bool = False,
+        sim_state: bool = False,
         eef_pose: bool = False,
         seed: int = 0,
         seed_offset: int = 0,
@@ -112,13 +119,18 @@ class RobosuiteWrapper(_EnvWrapper):
         size = (camera_size, camera_size) if isinstance(camera_size, int) else tuple(camera_size)
         if len(size) != 2 or min(size) < 1:
             raise ValueError(f"camera_size is a side or (height, width), got {camera_size!r}")
+        cameras = (camera,) if isinstance(camera, str) else tuple(camera)
+        if not cameras or len(set(cameras)) < len(cameras):
+            raise ValueError(f"camera is a name, or different ones, got {camera!r}")
         if env is not None:
             kwargs["env"] = env
         self.low_dim_keys = None if low_dim_keys is None else tuple(low_dim_keys)
         self.horizon = horizon
         self.control_loop = control_loop
-        self.from_pixels, self.camera, self.camera_size = from_pixels, camera, size
-        self.eef_pose = eef_pose
+        self.from_pixels, self.cameras, self.camera_size = from_pixels, cameras, size
+        self.nested_pixels = not isinstance(camera, str)
+        self.fast_rendering = fast_rendering
+        self.sim_state, self.eef_pose = sim_state, eef_pose
         self.terminate_on_success = terminate_on_success
         self._seed, self._offset, self._stride = seed, seed_offset, seed_stride
         self._episode, self._elapsed = 0, 0
@@ -145,13 +157,18 @@ class RobosuiteWrapper(_EnvWrapper):
         return self._loop
 
     def render_frame(
-        self, camera: str | None = None, size: int | tuple[int, int] | None = None
+        self,
+        camera: str | None = None,
+        size: int | tuple[int, int] | None = None,
+        state: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Render the current state; works whether or not ``from_pixels`` was asked for.
+        """Render a state; works whether or not ``from_pixels`` was asked for.
 
         Args:
-            camera: defaults to the environment's.
+            camera: defaults to the environment's first.
             size: side in pixels or ``(height, width)``; defaults to ``camera_size``.
+            state: of the simulator, as ``"sim_state"`` and ``loop.state()`` tell it; the current one by
+                default.
 
         Returns:
             uint8 ``[h, w, 3]``, the right way up. The episode goes on as if nothing was rendered.
@@ -166,7 +183,8 @@ class RobosuiteWrapper(_EnvWrapper):
         """
         size = self.camera_size if size is None else size
         height, width = (size, size) if isinstance(size, int) else size
-        return render_camera(self._env, camera or self.camera, height, width)
+        qpos = None if state is None else state[1 : 1 + self._env.sim.model.nq]
+        return self._renderers.render(camera or self.cameras[0], height, width, qpos)
 
     def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
         if "env" not in kwargs:
@@ -191,8 +209,9 @@ class RobosuiteWrapper(_EnvWrapper):
         if self.low_dim_keys is None:
             self.low_dim_keys = default_keys(len(env.robots))
         self._loop = _LOOPS[self.control_loop](env, self.low_dim_keys)
-        if self.from_pixels and rendering_backend() is None:
-            self.render_frame()  # raises, saying what to install
+        self._renderers = EnvRenderers(env, fast=self.fast_rendering)
+        if self.from_pixels:
+            require_rendering()
         width = sum(value.size for value in self._loop.observations().values())
 
         def flag() -> Categorical:
@@ -202,9 +221,14 @@ class RobosuiteWrapper(_EnvWrapper):
             {keys.OBSERVATION: Unbounded((width,), device=self.device), "success": flag()}
         )
         if self.from_pixels:
-            self.observation_spec["pixels"] = Bounded(
-                0, 255, shape=(*self.camera_size, 3), dtype=torch.uint8, device=self.device
-            )
+            shape = (*self.camera_size, 3)
+            pixels = Bounded(0, 255, shape=shape, dtype=torch.uint8, device=self.device)
+            nested = {camera: pixels.clone() for camera in self.cameras}
+            self.observation_spec["pixels"] = Composite(nested) if self.nested_pixels else pixels
+        if self.sim_state:
+            numbers = len(self._loop.state())
+            state = Unbounded((numbers,), dtype=torch.float64, device=self.device)
+            self.observation_spec[keys.SIM_STATE] = state
         if self.eef_pose:
             shape = (len(env.robots), 3, 4)
             self.observation_spec[keys.EEF_POSE] = Unbounded(shape, device=self.device)
@@ -239,7 +263,12 @@ class RobosuiteWrapper(_EnvWrapper):
             **dict(zip(("success", "terminated", "truncated", "done"), bools, strict=True)),
         }
         if self.from_pixels:
-            out["pixels"] = torch.from_numpy(self.render_frame())
+            frames = {
+                camera: torch.from_numpy(self.render_frame(camera)) for camera in self.cameras
+            }
+            out["pixels"] = TensorDict(frames) if self.nested_pixels else frames[self.cameras[0]]
+        if self.sim_state:
+            out[keys.SIM_STATE] = torch.from_numpy(self._loop.state())
         if self.eef_pose:
             arms = range(len(self._env.robots))
             poses = [np.column_stack(self._loop.eef(arm)[::-1]) for arm in arms]
@@ -275,9 +304,12 @@ class RobosuiteEnv(RobosuiteWrapper):
         horizon: time limit in control steps; ``None`` for the task's, or for an environment that is
             not in the table that of ``env_args["env_kwargs"]``, or else robosuite's own.
         control_loop: as for the wrapper.
+        low_dim_keys: as for the wrapper.
         from_pixels: as for the wrapper.
         camera: ``None`` for the task's first.
         camera_size: as for the wrapper.
+        fast_rendering: as for the wrapper.
+        sim_state: as for the wrapper.
         eef_pose: as for the wrapper.
         seed: ``None`` for 0.
         seed_offset: as for the wrapper.
@@ -307,9 +339,12 @@ class RobosuiteEnv(RobosuiteWrapper):
         style: str = "ph",
         horizon: int | None = None,
         control_loop: Literal["lean", "robosuite"] = "lean",
+        low_dim_keys: Sequence[str] | None = None,
         from_pixels: bool = False,
-        camera: str | None = None,
+        camera: str | Sequence[str] | None = None,
         camera_size: int | tuple[int, int] = 84,
+        fast_rendering: bool = False,
+        sim_state: bool = False,
         eef_pose: bool = False,
         seed: int | None = None,
         seed_offset: int = 0,
@@ -339,9 +374,12 @@ class RobosuiteEnv(RobosuiteWrapper):
             env_args=env_args,
             horizon=horizon,
             control_loop=control_loop,
+            low_dim_keys=low_dim_keys,
             from_pixels=from_pixels,
-            camera=camera or "agentview",
+            camera="agentview" if camera is None else camera,
             camera_size=camera_size,
+            fast_rendering=fast_rendering,
+            sim_state=sim_state,
             eef_pose=eef_pose,
             seed=seed or 0,
             seed_offset=seed_offset,

@@ -104,7 +104,7 @@ def isolated_numpy_seed(seed: int) -> Iterator[None]:
         random.setstate(python_state)
 
 
-def task_env_args(task: str, image_size: int = 0) -> dict[str, Any]:
+def task_env_args(task: str) -> dict[str, Any]:
     """Describe a task's environment as the ``env_args`` of a robomimic file.
 
     Every option that changes what an action means is written out: pose deltas of at most 5 cm and
@@ -112,7 +112,6 @@ def task_env_args(task: str, image_size: int = 0) -> dict[str, Any]:
 
     Args:
         task: a name of :data:`warmprior.envs.tasks.TASKS`.
-        image_size: side of the camera images in pixels; 0 for none.
 
     Returns:
         A dict that JSON can hold: ``env_name``, ``env_version``, ``type`` and ``env_kwargs``.
@@ -127,15 +126,15 @@ def task_env_args(task: str, image_size: int = 0) -> dict[str, Any]:
     spec = get_task(task)
     kwargs: dict[str, Any] = {
         "has_renderer": False,
-        "has_offscreen_renderer": bool(image_size),
+        "has_offscreen_renderer": False,
         "ignore_done": True,
         "use_object_obs": True,
-        "use_camera_obs": bool(image_size),
+        "use_camera_obs": False,
         "control_freq": 20,
         "robots": ["Panda"] * spec.arms,
         "camera_depths": False,
-        "camera_heights": image_size or 84,
-        "camera_widths": image_size or 84,
+        "camera_heights": 84,
+        "camera_widths": 84,
         "lite_physics": True,
         "reward_shaping": False,
         "controller_configs": {
@@ -145,8 +144,6 @@ def task_env_args(task: str, image_size: int = 0) -> dict[str, Any]:
     }
     if spec.arms == 2:
         kwargs["env_configuration"] = "opposed"
-    if image_size:
-        kwargs["camera_names"] = list(spec.cameras)
     return {"env_name": spec.env_name, "env_version": "1.5.1", "type": 1, "env_kwargs": kwargs}
 
 

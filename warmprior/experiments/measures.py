@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from tensordict import TensorDictBase
 
+from warmprior.diagnostics.flow import encoded_windows
 from warmprior.diagnostics.mean_error import MeanError, mean_error
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.source_leak import SourceLeak, source_leak
@@ -74,7 +75,7 @@ def measure(
     shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
     leaks = {}
     if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
-        windows = shared.windows(policy.prior)
+        windows = encoded_windows(policy, shared.windows(policy.prior))
         leaks = source_leak(policy, windows, nfes=nfes, episodes=shared.episodes)
     generator = torch.Generator().manual_seed(0)
     met = shared.met(policy, generator=generator)

@@ -6,10 +6,11 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
@@ -17,16 +18,20 @@ from warmprior.data import (
     RobomimicExperienceReplay,
     download_robomimic,
     generate_demonstrations,
+    render_demonstrations,
 )
+from warmprior.data.hdf5 import read_index
+from warmprior.data.render import check_upright
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
 from warmprior.experiments.labels import with_actions
 from warmprior.experiments.recipe import DataOptions, HeldOutOptions
-from warmprior.io.files import file_digest
-from warmprior.keys import ACTION
+from warmprior.io.files import digest_of, file_digest
+from warmprior.keys import ACTION, OBSERVATION, STATE
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.trend import RestingAction
+from warmprior.transforms.absolute_actions import AbsoluteActions
 
 __all__ = [
     "Problem",
@@ -53,8 +58,8 @@ class Problem:
         identity: of the data, which is part of the identity of every policy trained on them.
         facts: what results tell about the data, as JSON.
         normalizer: between raw and normalised units; ``None`` if they are the same.
-        actions: between the policies' actions, in raw units, and the environment's; ``None`` if they are the
-            same. See :func:`~warmprior.policy_transforms`.
+        adapters: transforms next to the environment, as arguments of
+            :func:`~warmprior.policy_transforms`.
         rest: for absolute actions, to let networks learn only what does not follow from where the grippers
             are, see :class:`~warmprior.PoseTrend`.
         clip: bound of the normalised actions that are executed, or one per dimension; ``None`` for none.
@@ -72,7 +77,7 @@ class Problem:
     identity: str
     facts: dict[str, Any] = field(default_factory=dict)
     normalizer: Normalizer | None = None
-    actions: Transform | None = None
+    adapters: Mapping[str, Transform] = field(default_factory=dict)
     rest: RestingAction | None = None
     clip: float | Sequence[float] | None = None
     environment: Mapping[str, Any] | None = None
@@ -90,6 +95,20 @@ class Problem:
         return with_actions(told, self.facts.get("actions"))
 
     @property
+    def vector(self) -> Tensor:
+        """The observation, or its vector if it has images, ``[N, d]``."""
+        observation = self.data[OBSERVATION]
+        return observation[STATE] if isinstance(observation, TensorDictBase) else observation
+
+    @property
+    def images(self) -> dict[str, int]:
+        """Names of the observation's images, and their sides in pixels."""
+        observation = self.data[OBSERVATION]
+        if not isinstance(observation, TensorDictBase):
+            return {}
+        return {name: int(value.shape[-1]) for name, value in observation.items() if name != STATE}
+
+    @property
     def space(self) -> dict[str, str]:
         """The space of the actions, as rows and results tell it: nothing of the recorded one."""
         return {name: self.facts[name] for name in ("actions",) if name in self.facts}
@@ -101,7 +120,7 @@ def robosuite_problem(
     *,
     source: str = "file",
     observation_steps: int = 2,
-    actions: Literal["delta", "absolute"] = "delta",
+    options: DataOptions | None = None,
 ) -> Problem:
     """The problem of a robomimic HDF5 file, in its own simulator.
 
@@ -112,31 +131,42 @@ def robosuite_problem(
     Keyword Args:
         source: where the file comes from: ``"scripted"``, ``"official"`` or ``"file"``.
         observation_steps: ``To`` of the policies.
-        actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
+        options: the policies' actions and observations; those of the file by default.
 
     Raises:
-        DatasetError: if the file cannot be read.
-        ValueError: if it has no pose deltas to make absolute poses of.
+        DatasetError: if the file cannot be read, or images are to be rendered and it has no states.
+        ValueError: if it has no pose deltas to make absolute poses of, or there is no such camera.
     """
-    dataset = RobomimicExperienceReplay(path, absolute_actions=actions == "absolute")
+    options = DataOptions() if options is None else options
+    actions = options.actions
+    dataset, images = _read(path, options)
     description = environment_description(
-        dataset.recorded_env_args, style, observation_steps, actions
+        dataset.recorded_env_args, style, observation_steps, actions, images
     )
-    make_env, transform = robosuite_parts(description)
+    make_env, adapters = robosuite_parts(description)
     # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and
     # positions, which range far, do not weigh little beside the gripper in the loss.
-    units = None if transform is None else {ACTION: transform.one_step}
-    normalizer, digest = Normalizer.fit(dataset.data, units=units), file_digest(path)
-    data = normalizer.normalize(dataset.data.exclude("next"))
-    # Of the recorded actions nothing is said: policies and rows from before there was a choice have these.
+    absolute = adapters.get("actions")
+    units = {ACTION: absolute.one_step} if isinstance(absolute, AbsoluteActions) else None
+    vector = OBSERVATION if images is None else (OBSERVATION, STATE)
+    normalizer = Normalizer.fit(dataset.data, (vector, ACTION), units=units)
+    data, digest = normalizer.normalize(dataset.data.exclude("next")), file_digest(path)
+    # Of what is usual nothing is said: policies and rows from before there was a choice have these.
     space = {} if actions == "delta" else {"actions": actions}
+    seen = {} if images is None else {"obs": "image", "images": images}
     return Problem(
         task=task_of(dataset),
         style=style,
         data=data,
         make_env=make_env,
-        # Policies of absolute poses once had a single bound, and remembered grippers wider than any.
-        identity=" ".join([digest, *(f"{name}, a bound per dimension" for name in space.values())]),
+        identity=" ".join(
+            [
+                digest,
+                # Policies of absolute poses once had a single bound, and remembered grippers wider than any.
+                *(f"{name}, a bound per dimension" for name in space.values()),
+                *([] if images is None else [digest_of(images)]),
+            ]
+        ),
         facts={
             "source": source,
             "file": path.name,
@@ -144,14 +174,50 @@ def robosuite_problem(
             "demonstrations": dataset.num_episodes,
             "steps": len(dataset.data),
             **space,
+            **seen,
         },
         normalizer=normalizer,
-        actions=transform,
-        rest=None if transform is None else RestingAction(dataset.pose_columns, normalizer),
+        adapters=adapters,
+        rest=None if absolute is None else RestingAction(dataset.pose_columns, normalizer),
         # What leaves the span of the normalised demonstrations is executed, and remembered, at the bound.
-        clip=1.0 if transform is None else data[ACTION].abs().amax(0).tolist(),
+        clip=1.0 if absolute is None else data[ACTION].abs().amax(0).tolist(),
         environment=description,
     )
+
+
+def _read(
+    path: Path, options: DataOptions
+) -> tuple[RobomimicExperienceReplay, dict[str, Any] | None]:
+    """The demonstrations as policies are to see them, and what images are among it, if any."""
+    if options.obs == "state":
+        absolute = options.actions == "absolute"
+        return RobomimicExperienceReplay(path, absolute_actions=absolute), None
+    index = read_index(path)
+    known = [key.removesuffix("_image") for key in index.available_keys if key.endswith("_image")]
+    cameras = options.cameras or (index.task.cameras if index.task else tuple(known))
+    if not cameras:
+        raise ValueError(f"{path} has no images, and its task is unknown: name --cameras")
+    names, fast = [f"{camera}_image" for camera in cameras], options.fast_rendering
+    if set(cameras) <= set(known):
+        check_upright(path, names, fast)
+    else:
+        path = render_demonstrations(path, cameras, options.image_size, fast=fast)
+    # What robomimic's image policies see besides: the robot, and not where the objects are.
+    vector = [key for key in index.observation_keys if key != "object"]
+    dataset = RobomimicExperienceReplay(
+        path, observation_keys=vector, image_keys=names, storage="memmap"
+    )
+    if dataset.image_size != options.image_size:
+        raise ValueError(
+            f"{path} has images of {dataset.image_size} pixels: add --image-size {dataset.image_size} "
+            f"(and a --crop-size below), or render it anew"
+        )
+    return dataset, {
+        "cameras": list(cameras),
+        "size": dataset.image_size,
+        "fast_rendering": fast,
+        "low_dim_keys": vector,
+    }
 
 
 def navigation_problem() -> Problem:
@@ -183,7 +249,7 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
             options.dataset,
             options.data[0],
             observation_steps=observation_steps,
-            actions=options.actions,
+            options=options,
         )
         if options.task not in ((), (found.task,)):
             raise ValueError(
@@ -213,7 +279,7 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
                     style,
                     source=source,
                     observation_steps=observation_steps,
-                    actions=options.actions,
+                    options=options,
                 )
             )
     return problems
@@ -260,7 +326,16 @@ def observe(
         n = max(20, int(-(-options.observations // usable)))
         path = generate_demonstrations(task, style, n, HELD_OUT_SEED)
         told = f"{n} newly generated demonstrations"
-    dataset = RobomimicExperienceReplay(path, absolute_actions=facts.get("actions") == "absolute")
+    images = facts.get("images")
+    seen: dict[str, Any] = {}
+    if images is not None:
+        seen = {
+            "obs": "image",
+            "cameras": tuple(images["cameras"]),
+            "image_size": images["size"],
+            "fast_rendering": images["fast_rendering"],
+        }
+    dataset, _ = _read(path, DataOptions(actions=facts.get("actions", "delta"), **seen))
     if task_of(dataset) != task:
         raise ValueError(
             f"--validation {path} holds demonstrations of {task_of(dataset)}, but these policies are for "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -9,9 +10,17 @@ from typing import Annotated, Any, Literal, Self
 import torch
 import tyro
 
+from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
 from warmprior.io.options import LATER
-from warmprior.modules import ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior.modules import (
+    ChiTransformer,
+    ImageEncoder,
+    VelocityMLP,
+    VelocityNetwork,
+    VisionNetwork,
+    load_imagenet,
+)
 from warmprior.modules.grid import check_grid
 from warmprior.modules.prior import Prior
 from warmprior.training.training_config import TrainingConfig
@@ -66,6 +75,10 @@ class DataOptions:
         force_download: fetch them again, in place of a broken local copy.
         demonstrations: scripted demonstrations to generate; two numbers for ph and mh.
         actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
+        obs: what policies see: the state of robot and objects, or that of the robot and images.
+        cameras: of the images; by default the task's two, or four with two arms.
+        image_size: side of the images in pixels.
+        fast_rendering: render without reflections, shadows and smooth edges, three to five times faster.
     """
 
     task: tuple[str, ...] = ()
@@ -75,9 +88,13 @@ class DataOptions:
     force_download: bool = False
     demonstrations: tuple[int, ...] = (150,)
     actions: Literal["delta", "absolute"] = field(default="delta", metadata=LATER)
+    obs: Literal["state", "image"] = field(default="state", metadata=LATER)
+    cameras: tuple[str, ...] = field(default=(), metadata=LATER)
+    image_size: int = field(default=84, metadata=LATER)
+    fast_rendering: bool = field(default=False, metadata=LATER)
 
     def __post_init__(self) -> None:
-        check_counts(self, "demonstrations")
+        check_counts(self, "demonstrations", "image_size")
         if not 1 <= len(self.demonstrations) <= 2:
             raise ValueError(
                 f"--demonstrations takes one number, or one for ph and one for mh, got "
@@ -93,6 +110,12 @@ class DataOptions:
         """
         if self.force_download and not self.download:
             raise ValueError("--force-download belongs to --download")
+        if self.obs == "image":
+            require_rendering()
+            if self.actions == "absolute":
+                raise ValueError("--obs image goes with --actions delta, as in the paper")
+        elif self.cameras or self.fast_rendering:
+            raise ValueError("--cameras and --fast-rendering belong to --obs image")
         for task in self.task:
             if self.dataset is None and not (get_task(task).scripted or self.download):
                 raise ValueError(
@@ -130,31 +153,60 @@ class NetworkOptions:
         hidden_dim: its width; the class's own by default.
         precondition: by the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
+        encoder: of images, a network per camera.
+        crop_size: side of the random window of an image that is seen in training, the central one else.
+        share_encoder: one encoder for all cameras.
+        imagenet: start from ImageNet's weights, which torchvision downloads once (resnet18 only).
     """
 
     network: Literal["mlp", "chi_transformer"] = "mlp"
     hidden_dim: int | None = None
     precondition: bool = True
     observation_steps: int = 2
+    encoder: Literal["resnet18", "small"] = field(default="resnet18", metadata=LATER)
+    crop_size: int = field(default=76, metadata=LATER)
+    share_encoder: bool = field(default=False, metadata=LATER)
+    imagenet: bool = field(default=False, metadata=LATER)
 
     def __post_init__(self) -> None:
-        check_counts(self, "hidden_dim", "observation_steps")
+        check_counts(self, "hidden_dim", "observation_steps", "crop_size")
+        if self.imagenet and self.encoder != "resnet18":
+            raise ValueError(f"--imagenet has weights for resnet18, not for {self.encoder}")
 
     def make(
-        self, action_dim: int, observation_dim: int, prediction_length: int
+        self,
+        action_dim: int,
+        observation_dim: int,
+        prediction_length: int,
+        images: Mapping[str, int] | None = None,
     ) -> VelocityNetwork:
         """A network with fresh weights.
 
         Args:
             action_dim: ``d_a``.
-            observation_dim: ``d_o``.
+            observation_dim: ``d_o``, that of the vector beside the images if there are some.
             prediction_length: ``P``.
+            images: their names and sides in pixels.
         """
         kind, width = _NETWORKS[self.network]
         options = {} if self.hidden_dim is None else {width: self.hidden_dim}
-        return kind(
+        encoder = None
+        if images:
+            encoder = ImageEncoder(
+                list(images),
+                observation_dim,
+                image_size=next(iter(images.values())),
+                crop_size=self.crop_size,
+                backbone=self.encoder,
+                share=self.share_encoder,
+            )
+            if self.imagenet:
+                load_imagenet(encoder)
+            observation_dim = encoder.observation_dim
+        network = kind(
             action_dim, observation_dim, prediction_length, self.observation_steps, **options
         )
+        return network if encoder is None else VisionNetwork(encoder, network)
 
 
 @dataclass(frozen=True)
@@ -347,7 +399,8 @@ class Recipe:
         file = self.data.dataset
         tasks = self.data.task or ("square" if file is None else file.stem,)
         space = [] if self.data.actions == "delta" else [self.data.actions]
-        return "-".join([*tasks, *self.data.data, *space])
+        seen = [] if self.data.obs == "state" else [self.data.obs]
+        return "-".join([*tasks, *self.data.data, *space, *seen])
 
     @property
     def seeds(self) -> range:
@@ -365,6 +418,11 @@ class Recipe:
             raise ValueError(
                 "--weighting standardised needs --precondition: add --weighting velocity to "
                 "--no-precondition"
+            )
+        if self.data.obs == "image" and self.network.crop_size > self.data.image_size:
+            raise ValueError(
+                f"--crop-size {self.network.crop_size} does not fit into --image-size "
+                f"{self.data.image_size}"
             )
         priors, played = self.sources.priors(), set[int]()
         for prior in priors:

@@ -83,13 +83,21 @@ class Store:
         check_writable(self.directory)
 
     def sized(self, prior: Prior) -> Prior:
-        """A prior for the widths of this problem, see :meth:`Prior.sized`."""
+        """A prior for the widths of this problem, see :meth:`Prior.sized`.
+
+        Raises:
+            ValueError: if it learns from observation vectors, and the problem's have images.
+        """
+        if self.problem.images and isinstance(prior, LearnedPrior) and prior.sees_observation:
+            raise ValueError(
+                f"{prior.name} learns from observations that are one vector: leave it out with --obs image"
+            )
         return prior.sized(*self._widths(prior), self.network.observation_steps)
 
     def _widths(self, prior: Prior) -> tuple[int, int]:
-        """``d_a``, and ``d_o`` of what the network sees."""
+        """``d_a``, and ``d_o`` of what the network sees; without the images."""
         action_dim = self.problem.data["action"].shape[-1]
-        width = self.problem.data["observation"].shape[-1]
+        width = self.problem.vector.shape[-1]
         return action_dim, width + MeanObservation.width(prior, action_dim)
 
     def new_actor(self, prior: Prior, training: TrainingConfig) -> WarmPriorActor:
@@ -103,7 +111,7 @@ class Store:
         """
         prior, problem = self._prepared(self.sized(prior), training), self.problem
         torch.manual_seed(training.seed)
-        network = self.network.make(*self._widths(prior), prior.prediction_length)
+        network = self.network.make(*self._widths(prior), prior.prediction_length, problem.images)
         if self.network.precondition:
             steps = self.network.observation_steps
             network = precondition(
@@ -288,7 +296,7 @@ class Store:
             policy_transforms,
             prior,
             normalizer=self.problem.normalizer,
-            actions=self.problem.actions,
+            **self.problem.adapters,
             observation_steps=self.network.observation_steps,
         )
 

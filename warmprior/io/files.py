@@ -20,6 +20,7 @@ from torch import Tensor
 
 __all__ = [
     "as_json",
+    "cache_folder",
     "check_regular",
     "check_writable",
     "digest_of",
@@ -231,3 +232,13 @@ def exclusive(directory: Path) -> Iterator[None]:
         yield
     finally:
         os.close(folder)
+
+
+def cache_folder(cache_dir: str | Path | None = None) -> Path:
+    """Where generated and rendered files are kept.
+
+    Args:
+        cache_dir: if not ``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior``.
+    """
+    folder = cache_dir or os.environ.get("WARMPRIOR_CACHE") or Path.home() / ".cache" / "warmprior"
+    return Path(folder).expanduser()

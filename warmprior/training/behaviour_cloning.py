@@ -49,6 +49,9 @@ __all__ = ["BehaviourCloning", "precondition"]
 TREND_BATCHES = 16
 """Of 1,024 windows, to which a :class:`PoseTrend` is fitted."""
 
+HASHED_AT_ONCE = 2**26
+"""Bytes of the data."""
+
 STATE_FORMAT = 4
 """Part of every state's identity; raised whenever the same options give other weights."""
 
@@ -429,6 +432,9 @@ def _data_digest(data: TensorDictBase) -> str:
     digest = hashlib.sha256()
     for key, value in sorted(data.items(True, True), key=lambda item: str(item[0])):
         digest.update(str(key).encode())
-        for part in value.split(2**16):  # memory-mapped data may be larger than the memory
+        rows = max(
+            1, HASHED_AT_ONCE // max(1, value[:1].nbytes)
+        )  # it may be larger than the memory
+        for part in value.split(rows):
             digest.update(part.cpu().contiguous().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]

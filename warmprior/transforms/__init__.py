@@ -1,6 +1,7 @@
 """Transforms of replay buffers and environments."""
 
 from warmprior.transforms.absolute_actions import AbsoluteActions
+from warmprior.transforms.camera_images import CameraImages
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.mean_observation import MeanObservation
@@ -12,6 +13,7 @@ __all__ = [
     "AbsoluteActions",
     "ActionHistory",
     "ActionWindow",
+    "CameraImages",
     "ChunkStep",
     "MeanObservation",
     "ObservationStack",

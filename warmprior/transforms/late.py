@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform, TransformedEnv
 
 from warmprior.transforms.absolute_actions import AbsoluteActions
+from warmprior.transforms.camera_images import CameraImages
 from warmprior.transforms.inner_step import InnerStep
 from warmprior.transforms.stack import ObservationStack
 
@@ -19,6 +20,7 @@ __all__ = ["LateTransforms", "advance"]
 _REACH: dict[type[Transform], Callable[[Any], int]] = {
     AbsoluteActions: lambda transform: 1,
     ActionScaling: lambda transform: 1,
+    CameraImages: lambda transform: 1,
     ObservationNorm: lambda transform: 1,
     ObservationStack: lambda transform: transform.steps,
 }

@@ -27,14 +27,15 @@ class MeanObservation(Transform):
     In an environment it comes after :class:`~warmprior.ActionHistory`.
 
     Keyword Args:
-        observation_key: the observation, ``[*B, To, d_o]``.
+        observation_key: the observation, ``[*B, To, d_o]``, or one with images nested under the key, whose
+            vector ``"state"`` is extended.
         loc_key: the mean, ``[*B, P, d_a]``, normalised action space.
         warm_key: the warm mask, bool ``[*B, P, 1]``.
         out_key: key written, ``[*B, To, d_o + P * d_a + 1]``.
 
     Raises:
         KeyError: if an input key is missing.
-        ValueError: if the observation is no vector.
+        ValueError: if the observation has several entries, but no vector ``"state"``.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -71,8 +72,13 @@ class MeanObservation(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the extended observation."""
-        found = self._read(tensordict)
-        return tensordict.set(self.out_keys[0], _extended(*found))
+        observation, loc, warm = self._read(tensordict)
+        if isinstance(observation, TensorDictBase):
+            vector = _extended(observation.get(keys.STATE), loc, warm)
+            extended: Any = observation.copy().set(keys.STATE, vector)
+        else:
+            extended = _extended(observation, loc, warm)
+        return tensordict.set(self.out_keys[0], extended)
 
     def _read(self, place: TensorDictBase | Composite) -> list[Any]:
         """What lies under the input keys, values or their specs."""
@@ -88,11 +94,13 @@ class MeanObservation(Transform):
         return found
 
     def _check_vector(self, observation: object) -> None:
-        if isinstance(observation, (TensorDictBase, Composite)):
+        if not isinstance(observation, (TensorDictBase, Composite)):
+            return
+        if keys.STATE not in observation.keys():  # noqa: SIM118
             raise ValueError(
                 f"MeanObservation appends its mean to an observation vector [*B, To, d_o], but "
                 f"{self.in_keys[0]!r} has the entries {sorted(map(str, observation.keys(True, True)))}: "
-                "concatenate them before"
+                f"concatenate them before, or call one {keys.STATE!r}"
             )
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -106,10 +114,15 @@ class MeanObservation(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the extended observation."""
         observation, loc, _ = self._read(observation_spec)
-        shape = (*observation.shape[:-1], observation.shape[-1] + loc.shape[-2:].numel() + 1)
-        observation_spec[self.out_keys[0]] = Unbounded(
-            shape, dtype=observation.dtype, device=observation.device
-        )
+        several = isinstance(observation, Composite)
+        vector = observation[keys.STATE] if several else observation
+        shape = (*vector.shape[:-1], vector.shape[-1] + loc.shape[-2:].numel() + 1)
+        extended = Unbounded(shape, dtype=vector.dtype, device=vector.device)
+        if several:
+            whole = observation.clone()
+            whole[keys.STATE] = extended
+            extended = whole
+        observation_spec[self.out_keys[0]] = extended
         return observation_spec
 
 

@@ -21,6 +21,7 @@ def policy_transforms(
     *,
     normalizer: Normalizer | None = None,
     actions: Transform | None = None,
+    images: Transform | None = None,
     observation_steps: int = 2,
     execute: int | None = None,
     gamma: float = 1.0,
@@ -32,10 +33,11 @@ def policy_transforms(
 ) -> Compose:
     """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
 
-    In this order: what makes actions the environment's own, normalisation of observations and
-    denormalisation of actions, a stack of the last ``To`` observations (the first one repeated at the
-    start), :class:`ChunkStep`, :class:`ActionHistory`, and :class:`MeanObservation` where the prior
-    conditions the network. It works around a single environment, and inside or outside of batched ones.
+    In this order: what makes actions the environment's own, images of its cameras, normalisation of
+    observations and denormalisation of actions, a stack of the last ``To`` observations (the first one
+    repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`, and :class:`MeanObservation` where the
+    prior conditions the network. It works around a single environment, and inside or outside of batched ones
+    (with images, inside).
 
     Args:
         prior: the policy's source distribution.
@@ -44,6 +46,7 @@ def policy_transforms(
         normalizer: the normaliser of the training data; none if the environment is normalised already.
         actions: between the policy's actions, in raw units, and the environment's, such as
             :class:`AbsoluteActions`; a copy of it is used. None if they are the same.
+        images: makes observations with images, such as :class:`CameraImages`; a copy of it is used.
         observation_steps: ``To``.
         execute: actions executed per decision; all ``H`` by default.
         gamma: discount per control step inside a chunk.
@@ -60,7 +63,7 @@ def policy_transforms(
         >>> env.reset()["observation"].shape
         torch.Size([2, 3])
     """
-    per_step = [] if actions is None else [actions.clone()]
+    per_step = [transform.clone() for transform in (actions, images) if transform is not None]
     per_step += [] if normalizer is None else normalizer.env_transforms()
     return Compose(
         *per_step,

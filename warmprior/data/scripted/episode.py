@@ -12,7 +12,6 @@ from warmprior.data.scripted.operators import OPERATORS, SKILLED, Demonstrator
 from warmprior.data.scripted.tasks_single import can, lift, square, stack
 from warmprior.data.scripted.transport import transport
 from warmprior.envs.control_loop import ControlLoop, StepLoop
-from warmprior.envs.rendering import render_camera
 from warmprior.envs.simulator import make_simulator, task_env_args
 from warmprior.envs.tasks import get_task
 
@@ -79,7 +78,7 @@ def operator_of(style: str, seed: int) -> int:
     return seed % len(OPERATORS) if style == "mh" else 0
 
 
-def run_episode(loop: StepLoop, task: str, style: str, seed: int, image_size: int = 0) -> Episode:
+def run_episode(loop: StepLoop, task: str, style: str, seed: int) -> Episode:
     """Play one scripted episode.
 
     Args:
@@ -87,7 +86,6 @@ def run_episode(loop: StepLoop, task: str, style: str, seed: int, image_size: in
         task: one of :data:`PLANS`.
         style: ``"ph"`` or ``"mh"``.
         seed: of the initial state and of the demonstrator; the same one gives the same episode.
-        image_size: side of the task's camera images in pixels; 0 for none.
 
     Returns:
         The episode, successful or not. It ends six steps after the task is solved, when the plan
@@ -98,13 +96,9 @@ def run_episode(loop: StepLoop, task: str, style: str, seed: int, image_size: in
         True
     """
     spec = get_task(task)
-    cameras = spec.cameras if image_size else ()
 
     def observe(low_dim: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        found = {key: value.astype(np.float64) for key, value in low_dim.items()}
-        for camera in cameras:
-            found[f"{camera}_image"] = render_camera(loop.env, camera, image_size, image_size)
-        return found
+        return {key: value.astype(np.float64) for key, value in low_dim.items()}
 
     index = operator_of(style, seed)
     operator = OPERATORS[index] if style == "mh" else SKILLED

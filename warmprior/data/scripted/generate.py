@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -25,6 +24,7 @@ from warmprior.envs.control_loop import ControlLoop
 from warmprior.envs.simulator import import_robosuite, task_env_args
 from warmprior.envs.tasks import EVALUATION_SEED, get_task
 from warmprior.io.extras import require
+from warmprior.io.files import cache_folder
 from warmprior.io.workers import WorkerPool, available_cores
 
 __all__ = ["GENERATOR_VERSION", "SEEDS_PER_FILE", "generate_demonstrations"]
@@ -46,9 +46,10 @@ def generate_demonstrations(
     cache_dir: str | Path | None = None,
     workers: int | None = None,
     progress: bool = True,
-    image_size: int = 0,
 ) -> Path:
     """Generate successful scripted demonstrations in robomimic's HDF5 layout.
+
+    Of states; :func:`~warmprior.data.render_demonstrations` makes images of them.
 
     Episode ``k`` plays simulator seed ``seed * 100_000 + k``, and the first ``n`` that succeed are
     kept in that order. In ``mh`` data six operators take turns and contribute equally, as in the
@@ -65,7 +66,6 @@ def generate_demonstrations(
         cache_dir: ``None`` for ``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set.
         workers: number of processes; ``None`` for one per available core.
         progress: show a bar with the remaining time.
-        image_size: side of the images of the task's cameras, in pixels; 0 for state only.
 
     Returns:
         The path of the complete file.
@@ -91,13 +91,12 @@ def generate_demonstrations(
     last_seed = EVALUATION_SEED // SEEDS_PER_FILE - 1
     if not 0 <= seed <= last_seed:
         raise ValueError(f"seed must be between 0 and {last_seed}, got {seed}")
-    for name, value, least in (("n", n, 1), ("workers", workers, 1), ("image_size", image_size, 0)):
-        if value is not None and value < least:
-            raise ValueError(f"{name} must be at least {least}, got {value}")
+    for name, value in {"n": n, "workers": workers}.items():
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
     if path is None:
-        suffix = f"_image{image_size}" if image_size else ""
-        name = f"{task}_{style}_n{n}_seed{seed}{suffix}_v{GENERATOR_VERSION}.hdf5"
-        path = _cache_folder(cache_dir) / "scripted" / name
+        name = f"{task}_{style}_n{n}_seed{seed}_v{GENERATOR_VERSION}.hdf5"
+        path = cache_folder(cache_dir) / "scripted" / name
         if path.exists():
             return path
     path = Path(path)
@@ -106,7 +105,7 @@ def generate_demonstrations(
     import_robosuite()
     workers = min(n, workers or available_cores())
     with (
-        WorkerPool(workers, _Player(task, style, image_size)) as pool,
+        WorkerPool(workers, _Player(task, style)) as pool,
         require("tqdm", "sim").tqdm(
             total=n, desc=f"{task}/{style}", unit="demo", disable=not progress
         ) as bar,
@@ -116,17 +115,12 @@ def generate_demonstrations(
         write_robomimic(
             path,
             _successes(pool, style, n, seed * SEEDS_PER_FILE, bar.update),
-            env_args=task_env_args(task, image_size),
+            env_args=task_env_args(task),
             model_file=model_file,
             seed=seed,
             attributes={"source": "scripted", "generator_version": GENERATOR_VERSION},
         )
     return path
-
-
-def _cache_folder(cache_dir: str | Path | None) -> Path:
-    folder = cache_dir or os.environ.get("WARMPRIOR_CACHE") or Path.home() / ".cache" / "warmprior"
-    return Path(folder).expanduser()
 
 
 def _successes(
@@ -166,8 +160,8 @@ def _successes(
 class _Player:
     """One simulation and the episodes played in it; it is made in the worker that plays."""
 
-    def __init__(self, task: str, style: str, image_size: int) -> None:
-        self.task, self.style, self.image_size = task, style, image_size
+    def __init__(self, task: str, style: str) -> None:
+        self.task, self.style = task, style
 
     @cached_property
     def loop(self) -> ControlLoop:
@@ -183,4 +177,4 @@ class _Play:
     seed: int
 
     def __call__(self, player: _Player) -> Episode:
-        return run_episode(player.loop, player.task, player.style, self.seed, player.image_size)
+        return run_episode(player.loop, player.task, player.style, self.seed)

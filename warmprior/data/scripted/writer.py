@@ -93,9 +93,8 @@ def _write_demo(demo: Any, episode: Episode) -> None:
     demo.create_dataset("rewards", data=episode.rewards)
     demo.create_dataset("dones", data=dones)
     for key, values in episode.observations.items():
-        compression = "gzip" if values.dtype == np.uint8 else None
         for group, part in (("obs", values[:-1]), ("next_obs", values[1:])):
-            demo.create_dataset(f"{group}/{key}", data=part, compression=compression)
+            demo.create_dataset(f"{group}/{key}", data=part)
     demo.attrs["num_samples"] = steps
     demo.attrs["ep_meta"] = "{}"
     demo.attrs["seed"] = episode.seed

@@ -1,0 +1,81 @@
+"""Images of robomimic's HDF5 layout: uint8, upright, ``[N, h, w, 3]`` per demo and camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from warmprior.data.hdf5_members import DatasetError, member, names, reading
+
+if TYPE_CHECKING:
+    import h5py
+
+__all__ = ["image_size", "read_images"]
+
+_BLOCK_BYTES = 2**24
+
+
+def image_size(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) -> int:
+    """Side of the images of a demo, after checking that they are what they should be.
+
+    Args:
+        path: of the file.
+        demo: the demo.
+        keys: names of its images, such as ``"agentview_image"``.
+        steps: of the demo.
+
+    Returns:
+        The side in pixels, the same for all.
+
+    Raises:
+        DatasetError: if one is missing, is no image, or has another size or number of rows.
+    """
+    name, sizes = demo.name[1:], {}
+    for key in keys:
+        images = member(demo, f"obs/{key}", "dataset")
+        if images is None:
+            known = ", ".join(k for k in names(demo["obs"]) if k.endswith("_image")) or "none"
+            raise DatasetError(
+                f"{path}: {name} has no images {key!r}; it has {known}. Choose other cameras, or render "
+                f"them: python -m warmprior render {path} --cameras {key.removesuffix('_image')}"
+            )
+        shape: tuple[int, ...] = images.shape or ()
+        what = f"{path}: {name}/obs/{key} has shape {shape} and type {images.dtype}"
+        if images.dtype != "uint8" or len(shape) != 4 or shape[-1] != 3:
+            raise DatasetError(
+                f"{what}; images are uint8 [steps, height, width, 3]. Render them anew: python -m warmprior "
+                "render"
+            )
+        if shape[0] != steps:
+            raise DatasetError(f"{what}, but actions has {steps} rows. Render the file anew")
+        if shape[1] != shape[2]:
+            raise DatasetError(f"{what}; only square images can be used. Render them anew")
+        sizes[key] = shape[1]
+    if len(set(sizes.values())) > 1:
+        told = ", ".join(f"{key} {size}" for key, size in sizes.items())
+        raise DatasetError(f"{path}: {name} has images of several sizes: {told}. Render them anew")
+    return next(iter(sizes.values()))
+
+
+def read_images(file: h5py.File, demo: str, key: str, out: Tensor) -> None:
+    """Read the images of a demo, channels first, block by block.
+
+    Args:
+        file: the open file.
+        demo: the name of the demo.
+        key: of the images.
+        out: uint8 ``[steps, 3, size, size]``, to fill.
+
+    Raises:
+        DatasetError: if they cannot be read.
+    """
+    name = f"data/{demo}/obs/{key}"
+    images: Any = member(file, name, "dataset")
+    rows = max(1, _BLOCK_BYTES // max(1, out[0].numel()))
+    target = out.numpy()
+    for start in range(0, len(out), rows):
+        with reading(file, name):
+            target[start : start + rows] = images[start : start + rows].transpose(0, 3, 1, 2)

@@ -1,0 +1,256 @@
+"""Turns the simulator states of demonstrations into images."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from warmprior.data.hdf5 import RobomimicIndex, open_robomimic, read_index
+from warmprior.data.hdf5_members import DatasetError, member, reading
+from warmprior.envs.env_args import modernize_env_args
+from warmprior.envs.rendering import CameraRenderer, require_rendering
+from warmprior.envs.simulator import make_simulator
+from warmprior.io.extras import require
+from warmprior.io.files import (
+    cache_folder,
+    check_writable,
+    digest_of,
+    exclusive,
+    file_digest,
+    write_atomic,
+)
+from warmprior.io.workers import WorkerPool, available_cores
+
+__all__ = ["check_upright", "render_demonstrations"]
+
+CLEARLY = 8.0
+"""Mean difference of two images, of 255, from which on they show something else."""
+
+
+def render_demonstrations(
+    path: str | Path,
+    cameras: Sequence[str] | None = None,
+    size: int = 84,
+    *,
+    fast: bool = False,
+    out: str | Path | None = None,
+    cache_dir: str | Path | None = None,
+    workers: int | None = None,
+    progress: bool = True,
+) -> Path:
+    """Add images to a robomimic file, rendered from the states that it holds.
+
+    The result is a copy of the file in robomimic's layout, with ``obs/<camera>_image`` uint8
+    ``[N, size, size, 3]``, upright and compressed, in every demo, without ``next_obs``. It appears under its
+    name when it is complete. Finished demos lie in a folder next to it until then: an interrupted call
+    continues from them. The images do not depend on the number of workers.
+
+    Args:
+        path: a robomimic HDF5 file with states.
+        cameras: names of the simulator's cameras; by default those of the task.
+        size: side of the images in pixels.
+
+    Keyword Args:
+        fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
+        out: where to write, replacing what is there; may be ``path`` itself. ``None`` for the cache, from
+            which a file rendered earlier from the same file is returned at once.
+        cache_dir: ``None`` for ``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set.
+        workers: number of processes; ``None`` for one per available core.
+        progress: show a bar with the remaining time.
+
+    Returns:
+        The path of the complete file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        DatasetError: if it holds no states, or those of another simulator.
+        ValueError: if there is no such camera, or an option is out of range.
+        RuntimeError: if nothing here can render.
+        OSError: if the disk is full; what is finished stays.
+
+    Examples:
+        >>> path = render_demonstrations("square.hdf5", ["agentview"])  # doctest: +SKIP
+        >>> path.name  # doctest: +SKIP
+        'square_agentview84_1f2e3d4c.hdf5'
+    """
+    path, index = Path(path), read_index(path)
+    if cameras is None:
+        cameras = index.task.cameras if index.task else ("agentview", "robot0_eye_in_hand")
+    cameras = tuple(cameras)
+    if not cameras or len(set(cameras)) < len(cameras):
+        raise ValueError(f"name different cameras to render, got {list(cameras)}")
+    for name, value in {"size": size, "workers": workers}.items():
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}")
+    identity = digest_of(file_digest(path), cameras, size, fast)[:8]
+    if out is None:
+        told = "-".join(cameras) if len(cameras) < 3 else f"{len(cameras)}cameras"
+        name = f"{path.stem}_{told}{size}{'fast' if fast else ''}_{identity}.hdf5"
+        out = cache_folder(cache_dir) / "rendered" / name
+        if out.exists():
+            return out
+    out = Path(out)
+    parts = out.with_name(f"{out.name}.{identity}.parts")
+    require_rendering()
+    check_writable(out.parent)
+    illustrator = _Illustrator(index, cameras, size, fast, parts)
+    with exclusive(parts):
+        missing = [demo for demo in index.demos if not illustrator.part(demo).exists()]
+        workers = max(1, min(len(missing), workers or available_cores()))
+        with (
+            WorkerPool(workers, illustrator) as pool,
+            tqdm(
+                total=len(index.demos),
+                initial=len(index.demos) - len(missing),
+                desc=f"render {path.stem}",
+                unit="demo",
+                disable=not progress,
+            ) as bar,
+        ):
+            # Before hours are spent. In a worker, for no process that has rendered can fork others that do.
+            pool.submit(_Illustrator.check)
+            pool.wait()
+            for demo in missing:
+                pool.submit(_Render(demo))
+            while pool.running:
+                bar.update(len(pool.wait()))
+        write_atomic(out, lambda temporary: _write(temporary, illustrator))
+        for demo in index.demos:
+            illustrator.part(demo).unlink()
+    parts.rmdir()
+    return out
+
+
+class _Illustrator:
+    """Renders the demos of a file; its simulator is made in the worker that renders."""
+
+    def __init__(
+        self, index: RobomimicIndex, cameras: tuple[str, ...], size: int, fast: bool, parts: Path
+    ) -> None:
+        self.index, self.cameras, self.parts = index, cameras, parts
+        self.size, self.fast = size, fast
+
+    @cached_property
+    def renderer(self) -> CameraRenderer:
+        env = make_simulator(modernize_env_args(self.index.env_args))
+        return CameraRenderer(env.sim.model._model, self.size, self.size, fast=self.fast)
+
+    def part(self, demo: str) -> Path:
+        """Where the images of a finished demo wait for the others."""
+        return self.parts / f"{demo}.npz"
+
+    def positions(self, demo: str) -> np.ndarray:
+        """Positions of all joints before every action, ``[N, nq]``."""
+        path, model = self.index.path, self.renderer.model
+        with open_robomimic(path) as file:
+            states = member(file, f"data/{demo}/states", "dataset")
+            if states is None:
+                raise DatasetError(f"{path}: data/{demo} has no states to render: record them")
+            steps = self.index.lengths[self.index.demos.index(demo)]
+            expected = (steps, 1 + model.nq + model.nv)
+            if states.shape != expected:
+                raise DatasetError(
+                    f"{path}: data/{demo}/states has shape {states.shape}, but the simulator of "
+                    f"{self.index.env_args['env_name']} has {expected}: its robots or objects are others here"
+                )
+            with reading(file, f"data/{demo}/states"):
+                return states[:, 1 : 1 + model.nq]
+
+    def check(self) -> None:
+        """Render one image of every camera."""
+        for camera in self.cameras:
+            self.renderer.render(camera, self.positions(self.index.demos[0])[0])
+
+    def check_upright(self) -> None:
+        """Compare the first images of the file with the simulator's."""
+        path, demo = self.index.path, self.index.demos[0]
+        position = self.positions(demo)[0]
+        with open_robomimic(path) as file:
+            for camera in self.cameras:
+                shown = self.renderer.render(camera, position).astype(np.float32)
+                stored = file[f"data/{demo}/obs/{camera}_image"][0].astype(np.float32)
+                upright, flipped = (np.abs(shown - i).mean() for i in (stored, stored[::-1]))
+                if upright > CLEARLY and 2 * flipped < upright:
+                    raise DatasetError(
+                        f"{path}: the images of {camera} are upside down. robosuite returns them so: write "
+                        f"them with images[:, ::-1], or render them anew (python -m warmprior render {path})"
+                    )
+
+
+@dataclass(frozen=True)
+class _Render:
+    demo: str
+
+    def __call__(self, illustrator: _Illustrator) -> None:
+        positions = illustrator.positions(self.demo)
+        images = {
+            f"{camera}_image": np.stack([illustrator.renderer.render(camera, q) for q in positions])
+            for camera in illustrator.cameras
+        }
+
+        def write(path: Path) -> None:
+            with open(path, "wb") as file:
+                np.savez_compressed(file, **images)  # type: ignore[arg-type]
+
+        write_atomic(illustrator.part(self.demo), write)
+
+
+def _write(path: Path, illustrator: _Illustrator) -> None:
+    """The file with the images of all demos."""
+    h5py, size, index = require("h5py", "sim"), illustrator.size, illustrator.index
+    with open_robomimic(index.path) as source, h5py.File(path, "w") as file:
+        data = file.create_group("data")
+        data.attrs.update(source["data"].attrs)
+        data.attrs["env_args"] = json.dumps(_with_cameras(index.env_args, illustrator), indent=4)
+        data.attrs["rendering"] = json.dumps(
+            {"size": size, "cameras": illustrator.cameras, "fast": illustrator.fast}
+        )
+        for demo in index.demos:
+            data.create_group(demo).attrs.update(source["data"][demo].attrs)
+            for name in source["data"][demo]:
+                if name != "next_obs":
+                    source["data"][demo].copy(name, data[demo])
+            with np.load(illustrator.part(demo), allow_pickle=False) as images:
+                for name in images:
+                    data[demo].require_group("obs").pop(name, None)
+                    data[demo]["obs"].create_dataset(
+                        name, data=images[name], chunks=(1, size, size, 3), compression="gzip"
+                    )
+        if "mask" in source:
+            source.copy("mask", file)
+
+
+def _with_cameras(env_args: Mapping[str, Any], illustrator: _Illustrator) -> dict[str, Any]:
+    kwargs = env_args["env_kwargs"] | {
+        "camera_names": list(illustrator.cameras),
+        "camera_heights": illustrator.size,
+        "camera_widths": illustrator.size,
+    }
+    return {**env_args, "env_kwargs": kwargs}
+
+
+def check_upright(path: Path, image_keys: Sequence[str], fast: bool = False) -> None:
+    """Compare the first images of a file with what the simulator shows there.
+
+    Args:
+        path: a robomimic file with images.
+        image_keys: their names.
+        fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
+
+    Raises:
+        DatasetError: if they are upside down.
+        ValueError: if the simulator has no such camera.
+        RuntimeError: if nothing here can render.
+    """
+    index = read_index(path, image_keys=image_keys)
+    cameras = tuple(key.removesuffix("_image") for key in image_keys)
+    with WorkerPool(1, _Illustrator(index, cameras, index.image_size, fast, path)) as pool:
+        pool.submit(_Illustrator.check_upright)
+        pool.wait()
