@@ -44,6 +44,7 @@ from warmprior.experiments.prior_space import (
     PRIOR_SPACE_PRESETS,
     PriorSpaceRecipe,
     agent_environment,
+    agent_policy,
     prior_space_preset,
 )
 from warmprior.experiments.results import facts_of_machine, grouped
@@ -226,7 +227,7 @@ def run(argv: Sequence[str] | None) -> None:
             agent, actor = f"{algorithm} {told(source)}, seed {seed}", frozen[source][seed]
             config = recipe.agent(actor.prior, algorithm, seed)
             training = PriorSpaceTraining(
-                actor,
+                agent_policy(actor),
                 agent_environment(recipe, actor),
                 config,
                 out / f"{algorithm}-{slug(source)}-seed{seed}",

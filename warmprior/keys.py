@@ -11,6 +11,7 @@ constant                key                                    shape and dtype
 ======================  =====================================  ==================================
 :data:`OBSERVATION`     ``"observation"``                      ``[*B, To, d_o]`` float
 :data:`STATE`           ``"state"``, nested under observation  ``[*B, To, d_s]`` float
+:data:`FEATURES`        ``"features"``, of an encoder           ``[*B, To, d_o]`` float
 :data:`CONDITIONED`     ``("prior", "observation")``           ``[*B, To, d_o + P * d_a + 1]`` float
 :data:`ACTION`          ``"action"``                           ``[*B, d_a]`` float
 :data:`EEF_POSE`        ``"eef_pose"``                         ``[*B, arms, 3, 4]`` float, raw
@@ -54,6 +55,7 @@ STATE = "state"
 ACTION = ACTION_KEY
 EEF_POSE = "eef_pose"
 SIM_STATE = "sim_state"
+FEATURES = "features"
 CONDITIONED = ("prior", "observation")
 LOC = ("prior", "loc")
 WARM = ("prior", "warm")

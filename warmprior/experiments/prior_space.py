@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
 from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose
 
 from warmprior.envs import GoalNavigationEnv
 from warmprior.envs.description import environment_parts
@@ -28,9 +29,15 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.rl import PriorAnchor, PriorSpaceConfig
 from warmprior.training.evaluation import parallel_env
-from warmprior.transforms import policy_transforms
+from warmprior.transforms import EncodeObservation, policy_transforms
 
-__all__ = ["PRIOR_SPACE_PRESETS", "PriorSpaceRecipe", "agent_environment", "prior_space_preset"]
+__all__ = [
+    "PRIOR_SPACE_PRESETS",
+    "PriorSpaceRecipe",
+    "agent_environment",
+    "agent_policy",
+    "prior_space_preset",
+]
 
 TOY = "navigation"
 
@@ -175,6 +182,20 @@ def agent_environment(recipe: PriorSpaceRecipe, actor: WarmPriorActor) -> Callab
     return partial(_simulators, actor, make_env, make_transforms, recipe.agents.num_envs)
 
 
+def agent_policy(actor: WarmPriorActor) -> WarmPriorActor:
+    """The frozen policy of an agent: one that sees images reads their features, as the agent does.
+
+    Args:
+        actor: the policy.
+    """
+    encoding = _encoding(actor)
+    return actor.replace(observation_key=encoding[0].out_keys[0]) if encoding else actor
+
+
+def _encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
+    return [EncodeObservation(actor)] if getattr(actor.network, "encodes", False) else []
+
+
 def _toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
     transforms = policy_transforms(actor.prior, observation_steps=1)
     transforms.append(PriorAnchor(actor.prior, seed=seed))
@@ -184,9 +205,9 @@ def _toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
 def _simulators(
     actor: WarmPriorActor, make_env: Any, make_transforms: Any, num_envs: int, seed: int
 ) -> EnvBase:
-    # The anchor outside of the workers: one transform draws for all of them.
+    # Outside of the workers: one anchor draws for all of them, and one encoder serves them.
     workers = parallel_env(make_env, make_transforms, num_envs)
-    env = TransformedEnv(workers, PriorAnchor(actor.prior, seed=seed))
+    env = TransformedEnv(workers, Compose(*_encoding(actor), PriorAnchor(actor.prior, seed=seed)))
     env.set_seed(seed, static_seed=True)
     return env
 

@@ -31,6 +31,8 @@ class VelocityNetwork(nn.Module):
         ValueError: if a width or length is not positive.
     """
 
+    encodes: bool = False
+    """Whether :meth:`encode` does anything."""
     _registry: ClassVar[dict[str, type[VelocityNetwork]]] = {}
 
     def __init__(

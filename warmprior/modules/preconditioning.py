@@ -239,6 +239,7 @@ class PreconditionedNetwork(VelocityNetwork):
             network.observation_steps,
         )
         self.network = network
+        self.encodes = network.encodes
         self.interpolant = LinearInterpolant() if interpolant is None else interpolant
         ends = self.interpolant.coefficients(torch.tensor([0.0, 1.0]))
         if not all(bool(torch.isfinite(value).all()) for value in ends):

@@ -40,6 +40,8 @@ class VisionNetwork(VelocityNetwork):
         torch.Size([4, 8, 7])
     """
 
+    encodes = True
+
     def __init__(
         self, encoder: ImageEncoder | dict[str, Any], network: VelocityNetwork | dict[str, Any]
     ) -> None:

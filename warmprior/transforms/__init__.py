@@ -3,6 +3,7 @@
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.camera_images import CameraImages
 from warmprior.transforms.chunk import ChunkStep
+from warmprior.transforms.encode import EncodeObservation
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.mean_observation import MeanObservation
 from warmprior.transforms.policy import policy_transforms
@@ -15,6 +16,7 @@ __all__ = [
     "ActionWindow",
     "CameraImages",
     "ChunkStep",
+    "EncodeObservation",
     "MeanObservation",
     "ObservationStack",
     "policy_transforms",

@@ -1,0 +1,142 @@
+"""Agents around a policy that sees images: they read what its frozen encoder makes of them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import SerialEnv, TransformedEnv
+from torchrl.envs.transforms import Compose
+from torchrl.envs.utils import check_env_specs
+
+from tests.rl.training_parts import (
+    EVALUATION_SEED,
+    LENGTHS,
+    H,
+    SolvableEnv,
+    make_actor,
+    make_config,
+)
+from tests.toy_env import ACTION_DIM
+from warmprior import (
+    EncodeObservation,
+    ImageEncoder,
+    PastPrior,
+    PreconditionedNetwork,
+    PriorAnchor,
+    VelocityMLP,
+    VisionNetwork,
+    WarmPriorActor,
+    policy_transforms,
+)
+from warmprior.rl import PriorSpaceTraining
+
+SIZE, STATE = 10, 2 + ACTION_DIM
+IMAGE = (3, SIZE, SIZE)
+
+
+class CameraEnv(SolvableEnv):
+    """The toy with an image whose brightness is its step."""
+
+    def __init__(self, length):
+        super().__init__(length, truncate=True)
+        image = Bounded(0, 255, IMAGE, dtype=torch.uint8)
+        self.observation_spec["observation"] = Composite(state=Unbounded((STATE,)), cam=image)
+
+    def _arrange(self, out):
+        image = torch.full(IMAGE, 20 * self.t, dtype=torch.uint8)
+        return out.set("observation", TensorDict({"state": out["observation"], "cam": image}, []))
+
+    def _reset(self, tensordict=None, **kwargs):
+        return self._arrange(super()._reset(tensordict))
+
+    def _step(self, tensordict):
+        return self._arrange(super()._step(tensordict))
+
+
+class Counted(ImageEncoder):
+    calls: list[int] = []  # noqa: RUF012, shared by the copies
+
+    def forward(self, observation):
+        self.calls.append(len(observation))
+        return super().forward(observation)
+
+
+@pytest.fixture
+def policy() -> WarmPriorActor:
+    torch.manual_seed(0)
+    Counted.calls.clear()
+    encoder = Counted(["cam"], STATE, image_size=SIZE, crop_size=8, backbone="small")
+    network = VisionNetwork(
+        encoder, VelocityMLP(ACTION_DIM, encoder.observation_dim, H, 1, hidden_dim=8)
+    )
+    return WarmPriorActor(PreconditionedNetwork(network), PastPrior(H), nfe=2, clip=1.0)
+
+
+def environment(policy: WarmPriorActor, seed: int = 0) -> TransformedEnv:
+    bases = [CameraEnv(length) for length in LENGTHS]
+    inner = SerialEnv(2, [lambda base=base: base for base in bases])
+    transforms = policy_transforms(policy.prior, observation_steps=1)
+    encode = EncodeObservation(policy)
+    return TransformedEnv(inner, Compose(transforms, encode, PriorAnchor(policy.prior, seed=seed)))
+
+
+def test_features_are_those_of_the_policy_in_evaluation_mode(policy):
+    policy.train()
+    env = environment(policy)
+    check_env_specs(env, break_when_any_done="both")
+    reading = policy.replace(observation_key="features")
+    rollout = env.rollout(3, reading, break_when_any_done=False)
+    network = policy.eval().network.network
+    for place in (rollout, rollout["next"]):
+        observation = place["observation"].reshape(-1)
+        expected = network.encode(observation).detach()
+        torch.testing.assert_close(place["features"].flatten(0, 1), expected)
+
+
+def test_the_policy_returns_the_same_chunks_from_features(policy):
+    env, policy = environment(policy), policy.eval()
+    state = env.reset()
+    one, two = (
+        actor(state.clone(), generator=torch.Generator().manual_seed(3))["vla_action", "chunk"]
+        for actor in (policy, policy.replace(observation_key="features"))
+    )
+    assert torch.equal(one, two)
+
+
+@pytest.mark.parametrize("algorithm", ["dsrl-na", "dsrl-sac"])
+def test_agents_learn_from_features_alone(policy, tmp_path, algorithm):
+    decisions = []
+
+    class Decided(PriorSpaceTraining):
+        def _collect(self, env, data):
+            before = len(Counted.calls)
+            result = super()._collect(env, data)
+            decisions.append(len(Counted.calls) - before)
+            return result
+
+    training = Decided(
+        policy.replace(observation_key="features"),
+        lambda seed: environment(policy, seed),
+        make_config(algorithm=algorithm),
+        tmp_path,
+        evaluation_seed=EVALUATION_SEED,
+        description=None,
+    )
+    training.run()
+    assert set(decisions) <= {1, 2}  # the next state's, and that of environments which start again
+    stored = training.buffer[:]
+    assert {"features"} <= set(stored.keys()) and "observation" not in stored.keys()  # noqa: SIM118
+    assert all(value.dtype != torch.uint8 for value in stored.values(True, True))
+    assert training.agent.state_keys[0] == "features"
+
+
+def test_a_policy_of_vectors_has_nothing_to_encode():
+    with pytest.raises(ValueError, match="VelocityMLP takes observations as they are"):
+        EncodeObservation(make_actor())
+
+
+def test_without_the_observation(policy):
+    with pytest.raises(KeyError, match="found no 'observation'"):
+        EncodeObservation(policy)(TensorDict({}, []))
