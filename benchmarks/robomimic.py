@@ -1,7 +1,8 @@
-"""The paper's Table 1: Gaussian source, WP-Past and WP-Preview on Robomimic tasks from state.
+"""The paper's Table 1: Gaussian source, WP-Past and WP-Preview on Robomimic tasks.
 
 python benchmarks/robomimic.py                                   # a first table within 15 minutes
 python benchmarks/robomimic.py --task can stack --data ph mh --preset cpu
+python benchmarks/robomimic.py --obs image                       # lift from two cameras
 python benchmarks/robomimic.py --download --preset paper --device cuda --out runs/paper
 python benchmarks/robomimic.py --resume --out runs/paper         # after an interruption
 """
@@ -18,6 +19,7 @@ from warmprior.experiments import (
     PRESETS,
     Comparison,
     Row,
+    comparison_preset,
     flow_table,
     parse,
     plot_filmstrip,
@@ -92,7 +94,7 @@ def film(comparison: Comparison, store: Store, end: str) -> None:
 
 
 def run(argv: Sequence[str] | None) -> None:
-    recipe = parse(PRESETS, argv, study="robomimic", description=__doc__)
+    recipe = parse(PRESETS, argv, study="robomimic", description=__doc__, preset=comparison_preset)
     with started(recipe, "robomimic") as out:
         comparison = Comparison(recipe, "robomimic")
         comparison.run()

@@ -88,9 +88,16 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def train(args: argparse.Namespace) -> None:
     """Train policies, and play nothing: the options of benchmarks/robomimic.py."""
-    from warmprior.experiments import PRESETS, Comparison, parse, started
+    from warmprior.experiments import PRESETS, Comparison, comparison_preset, parse, started
 
-    recipe = parse(PRESETS, args.options, study="train", description=train.__doc__, unused=UNPLAYED)
+    recipe = parse(
+        PRESETS,
+        args.options,
+        study="train",
+        description=train.__doc__,
+        preset=comparison_preset,
+        unused=UNPLAYED,
+    )
     with started(recipe, "train"):
         comparison = Comparison(recipe, "train")
         comparison.train()

@@ -37,6 +37,7 @@ from warmprior.experiments.recipe import (
     Recipe,
     RunOptions,
     SourceOptions,
+    comparison_preset,
 )
 from warmprior.experiments.record import record, restore
 from warmprior.experiments.results import Results, Row, grouped, mean_known, select, success_summary
@@ -71,6 +72,7 @@ __all__ = [
     "RunOptions",
     "SourceOptions",
     "Store",
+    "comparison_preset",
     "curvature_table",
     "find_problems",
     "finished_policies",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -36,6 +36,7 @@ __all__ = [
     "Recipe",
     "RunOptions",
     "SourceOptions",
+    "comparison_preset",
 ]
 
 Flat = tyro.conf.OmitArgPrefixes
@@ -534,3 +535,45 @@ PRESETS: dict[str, Recipe] = {
     ),
 }
 """Budgets of comparisons of sources."""
+
+_IMAGES: dict[str, dict[str, dict[str, Any]]] = {
+    # Small images and networks, on a task that is solved from them: half an hour on two cores.
+    "quick": {
+        "data": {
+            "task": ("lift",),
+            "demonstrations": (100,),
+            "image_size": 48,
+            "fast_rendering": True,
+        },
+        "network": {"hidden_dim": 256, "encoder": "small", "crop_size": 42},
+        "training": {"iterations": 3_000, "batch_size": 64},
+        "evaluation": {"nfe": (3, 1)},
+    },
+    "cpu": {
+        "data": {"image_size": 48, "fast_rendering": True},
+        "network": {"hidden_dim": 256, "encoder": "small", "crop_size": 42},
+        "training": {"iterations": 3_000, "batch_size": 64},
+    },
+    "paper": {"network": {"imagenet": True}, "training": {"batch_size": 256}},
+}
+"""What a preset does differently where policies see images."""
+
+
+def comparison_preset(asked: Recipe) -> Recipe:
+    """The preset that is asked for, for what policies are to see.
+
+    Args:
+        asked: names both.
+
+    Examples:
+        >>> comparison_preset(Recipe(data=DataOptions(obs="image"))).network.encoder
+        'small'
+    """
+    preset = PRESETS[asked.run.preset]
+    if asked.data.obs == "state":
+        return preset
+    changed: dict[str, dict[str, Any]] = {"data": {"obs": "image"}}
+    for part, values in _IMAGES[asked.run.preset].items():
+        changed[part] = changed.get(part, {}) | values
+    made = {part: replace(getattr(preset, part), **values) for part, values in changed.items()}
+    return replace(preset, **made)
