@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 
 from warmprior.envs import rendering_backend
 from warmprior.envs.tasks import EVALUATION_SEED
@@ -70,20 +71,25 @@ def draw(comparison: Comparison, rows: Sequence[Row]) -> None:
 
 
 def film(comparison: Comparison, store: Store, end: str) -> None:
-    """An episode of every source's first policy."""
+    """An episode of every source's first policy, in pictures and, where PyAV is there, as a film."""
+    films = find_spec("av") is not None
+    if not films:
+        print("No videos: they need PyAV, as in: pip install 'warmprior[lerobot]'")
     mine = [c for c in comparison.contestants if c.store is store]
     label = source_labels([Row(c.facts(), {}) for c in mine])
     first = {label(Row(c.facts(), {})): c for c in reversed(mine)}
     for name, contestant in reversed(first.items()):
         nfe = min(contestant.prior.allowed_nfes(comparison.nfes))
+        slug = re.sub(r"[^\w.]+", "-", name if "," in name else contestant.prior.name)
+        video = comparison.directory / f"film_{slug}{end.removesuffix('.png')}.mp4"
         strip = record_filmstrip(
             comparison.player(contestant),
             seed=EVALUATION_SEED,
             nfe=nfe,
             policy_seed=contestant.training.seed,
+            video=video if films else None,
             **comparison.recipe.evaluation.environment,
         )
-        slug = re.sub(r"[^\w.]+", "-", name if "," in name else contestant.prior.name)
         outcome = "solved" if strip.success else "not solved"
         plot_filmstrip(
             strip.frames,

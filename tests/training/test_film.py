@@ -24,8 +24,8 @@ def test_frames_are_of_the_evaluated_episode(monkeypatch):
     actor = WarmPriorActor(network, PastPrior(4), clip=1.0, environment=environment)
     states = []
 
-    def render(self, size):
-        states.append(self.loop.state())
+    def render(self, size, state):
+        states.append(state)
         return np.zeros((size, size, 3), dtype=np.uint8)
 
     monkeypatch.setattr(RobosuiteEnv, "render_frame", render)

@@ -13,7 +13,7 @@ from tensordict import TensorDictBase
 from torchrl.envs.transforms import Transform
 
 from warmprior.envs.description import environment_of
-from warmprior.envs.rendering import require_rendering
+from warmprior.envs.rendering import EnvRenderers, require_rendering
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, write_atomic
@@ -51,8 +51,27 @@ class _Played:
 
     def frame(self, step: int, size: int) -> np.ndarray:
         """The picture after a control step, uint8 ``[h, w, 3]``."""
-        self.env.loop.set_state(self.states[step])
-        return self.env.render_frame(size=size)
+        return self.env.render_frame(size=size, state=self.states[step])
+
+    def write(self, path: Path, size: int, rate: int) -> None:
+        """A film of it, with as many control steps per second."""
+        av = require("av", "lerobot")
+        simulator = self.env.loop.env
+        # A frame per control step: in full quality they would take ten times as long as the episode.
+        renderer, nq = EnvRenderers(simulator, fast=True), simulator.sim.model.nq
+
+        def write(temporary: Path) -> None:
+            with av.open(str(temporary), "w", format="mp4") as container:
+                stream = container.add_stream("h264", rate=rate)
+                stream.width = stream.height = size
+                stream.pix_fmt = "yuv420p"
+                for state in self.states:
+                    image = renderer.render(self.env.cameras[0], size, size, state[1 : 1 + nq])
+                    picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+                    container.mux(stream.encode(picture))
+                container.mux(stream.encode())
+
+        write_atomic(path, write)
 
 
 @contextmanager
@@ -94,6 +113,7 @@ def record_filmstrip(
     policy_seed: int = 0,
     frames: int = 9,
     size: int = 160,
+    video: Path | None = None,
     **options: Any,
 ) -> Filmstrip:
     """Play the episode of one seed and render it at evenly spaced control steps.
@@ -108,7 +128,8 @@ def record_filmstrip(
         nfe: network evaluations per chunk; the policy's own by default.
         policy_seed: of the source samples.
         frames: how many pictures.
-        size: side of a picture in pixels.
+        size: side of a picture in pixels, even for a video.
+        video: where to write an MP4 of the same episode as well; needs PyAV.
         options: further ones of :class:`~warmprior.envs.RobosuiteEnv`.
 
     Raises:
@@ -118,6 +139,8 @@ def record_filmstrip(
     with _played(actor, seed, nfe, policy_seed, options) as played:
         steps = np.unique(np.linspace(0, len(played.states) - 1, frames).round().astype(int))
         pictures = [played.frame(step, size) for step in steps]
+        if video is not None:
+            played.write(video, size, _rate(actor))
     return Filmstrip(pictures, steps.tolist(), played.success)
 
 
@@ -167,20 +190,12 @@ def record_video(
         RuntimeError: if nothing on this machine can render; the message names the packages to install.
         ValueError: if the policy keeps no description of its environment.
     """
-    av = require("av", "lerobot")
     with _played(actor, seed, nfe, policy_seed, options) as played:
-        environment: Any = actor.environment
-        kwargs = environment["robosuite"]["env_args"]["env_kwargs"]
-
-        def write(temporary: Path) -> None:
-            with av.open(str(temporary), "w", format="mp4") as container:
-                stream = container.add_stream("h264", rate=round(kwargs.get("control_freq", 20)))
-                stream.width = stream.height = size
-                stream.pix_fmt = "yuv420p"
-                for step in range(len(played.states)):
-                    picture = av.VideoFrame.from_ndarray(played.frame(step, size), format="rgb24")
-                    container.mux(stream.encode(picture))
-                container.mux(stream.encode())
-
-        write_atomic(path, write)
+        played.write(path, size, _rate(actor))
     return played.success
+
+
+def _rate(actor: WarmPriorActor) -> int:
+    """Control steps per second."""
+    environment: Any = actor.environment
+    return round(environment["robosuite"]["env_args"]["env_kwargs"].get("control_freq", 20))
