@@ -289,7 +289,7 @@ def test_imagenets_weights_that_cannot_be_had(monkeypatch):
 
     monkeypatch.setattr(ResNet18_Weights, "get_state_dict", offline)
     with pytest.raises(
-        OSError, match=r"cannot be had \(no route to host\): connect once, or put resnet18"
+        OSError, match=r"cannot be had \(no route to host\): connect once, put resnet18"
     ):
         load_imagenet(encoder_of(backbone="resnet18"))
     with pytest.raises(ValueError, match="not for 'small'"):

@@ -19,6 +19,7 @@ from warmprior.modules import (
     VelocityMLP,
     VelocityNetwork,
     VisionNetwork,
+    imagenet_weights,
     load_imagenet,
 )
 from warmprior.modules.grid import check_grid
@@ -139,6 +140,8 @@ class DataOptions:
         return self.demonstrations[-1 if style == "mh" else 0]
 
 
+_PRETRAINED = "resnet18-imagenet"
+
 _NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
     "mlp": (VelocityMLP, "hidden_dim"),
     "chi_transformer": (ChiTransformer, "embedding_dim"),
@@ -154,25 +157,24 @@ class NetworkOptions:
         hidden_dim: its width; the class's own by default.
         precondition: by the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
-        encoder: of images, a network per camera.
+        encoder: of images, a network per camera: ResNet-18 from ImageNet's weights, which torchvision
+            downloads once, from random ones, or a small network.
         crop_size: side of the random window of an image that is seen in training, the central one else.
         share_encoder: one encoder for all cameras.
-        imagenet: start from ImageNet's weights, which torchvision downloads once (resnet18 only).
     """
 
     network: Literal["mlp", "chi_transformer"] = "mlp"
     hidden_dim: int | None = None
     precondition: bool = True
     observation_steps: int = 2
-    encoder: Literal["resnet18", "small"] = field(default="resnet18", metadata=LATER)
+    encoder: Literal["resnet18-imagenet", "resnet18", "small"] = field(
+        default="resnet18-imagenet", metadata=LATER
+    )
     crop_size: int = field(default=76, metadata=LATER)
     share_encoder: bool = field(default=False, metadata=LATER)
-    imagenet: bool = field(default=False, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_counts(self, "hidden_dim", "observation_steps", "crop_size")
-        if self.imagenet and self.encoder != "resnet18":
-            raise ValueError(f"--imagenet has weights for resnet18, not for {self.encoder}")
 
     def make(
         self,
@@ -198,10 +200,10 @@ class NetworkOptions:
                 observation_dim,
                 image_size=next(iter(images.values())),
                 crop_size=self.crop_size,
-                backbone=self.encoder,
+                backbone="small" if self.encoder == "small" else "resnet18",
                 share=self.share_encoder,
             )
-            if self.imagenet:
+            if self.encoder == _PRETRAINED:
                 load_imagenet(encoder)
             observation_dim = encoder.observation_dim
         network = kind(
@@ -425,6 +427,8 @@ class Recipe:
                 f"--crop-size {self.network.crop_size} does not fit into --image-size "
                 f"{self.data.image_size}"
             )
+        if self.data.obs == "image" and self.network.encoder == _PRETRAINED:
+            imagenet_weights()
         priors, played = self.sources.priors(), set[int]()
         for prior in priors:
             played.update(prior.allowed_nfes(self.evaluation.nfes))
@@ -554,13 +558,15 @@ _IMAGES: dict[str, dict[str, dict[str, Any]]] = {
         "network": {"hidden_dim": 256, "encoder": "small", "crop_size": 42},
         "training": {"iterations": 3_000, "batch_size": 64},
     },
-    "paper": {"network": {"imagenet": True}, "training": {"batch_size": 256}},
+    "paper": {"training": {"batch_size": 256}},
 }
 """What a preset does differently where policies see images."""
 
 
 def comparison_preset(asked: Recipe) -> Recipe:
     """The preset that is asked for, for what policies are to see.
+
+    Where ImageNet's weights cannot be had, an encoder that would start from them starts from random ones.
 
     Args:
         asked: names both.
@@ -576,4 +582,11 @@ def comparison_preset(asked: Recipe) -> Recipe:
     for part, values in _IMAGES[asked.run.preset].items():
         changed[part] = changed.get(part, {}) | values
     made = {part: replace(getattr(preset, part), **values) for part, values in changed.items()}
-    return replace(preset, **made)
+    preset = replace(preset, **made)
+    if preset.network.encoder == asked.network.encoder == _PRETRAINED:
+        try:
+            imagenet_weights()
+        except (OSError, ImportError) as error:
+            print(f"{error}. The encoder starts from random weights.", flush=True)
+            return replace(preset, network=replace(preset.network, encoder="resnet18"))
+    return preset

@@ -6,7 +6,7 @@ from warmprior.modules.baselines import HistoryPrior, RegressionPrior
 from warmprior.modules.chi_transformer import ChiTransformer
 from warmprior.modules.couplings import OTPrior, ReflowPrior
 from warmprior.modules.cvae import CVAEPrior
-from warmprior.modules.encoder import ImageEncoder, load_imagenet
+from warmprior.modules.encoder import ImageEncoder, imagenet_weights, load_imagenet
 from warmprior.modules.gaussian_forecast import ForecastPrior, LeapPrior
 from warmprior.modules.interpolant import (
     Interpolant,
@@ -62,6 +62,7 @@ __all__ = [
     "VelocityNetwork",
     "VisionNetwork",
     "WarmPriorActor",
+    "imagenet_weights",
     "integrate",
     "load_imagenet",
 ]

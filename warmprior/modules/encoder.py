@@ -13,7 +13,7 @@ from torchrl.modules import ConvNet
 from warmprior import keys
 from warmprior.io.extras import require
 
-__all__ = ["ImageEncoder", "load_imagenet"]
+__all__ = ["ImageEncoder", "imagenet_weights", "load_imagenet"]
 
 Backbone = Literal["resnet18", "small"]
 
@@ -202,32 +202,42 @@ class ImageEncoder(nn.Module):
                 )
 
 
+def imagenet_weights() -> dict[str, Tensor]:
+    """ImageNet's weights of ResNet-18, which torchvision downloads once.
+
+    Raises:
+        OSError: if they are neither stored here nor can be downloaded.
+        ImportError: if torchvision is missing.
+    """
+    torchvision: Any = require("torchvision.models", "vision")
+    weights = torchvision.ResNet18_Weights.IMAGENET1K_V1
+    try:
+        return weights.get_state_dict(progress=False, check_hash=True)
+    except OSError as error:
+        raise OSError(
+            f"ImageNet's weights of ResNet-18 cannot be had ({error}): connect once, put "
+            f"{weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints, or start from random "
+            "weights (--encoder resnet18)"
+        ) from error
+
+
 def load_imagenet(encoder: ImageEncoder) -> None:
     """Give the ResNets of an encoder the weights of ImageNet, in place.
 
-    They come from torchvision, which downloads them once. Group norm, which takes the place of batch norm,
-    starts from no effect.
+    Group norm, which takes the place of batch norm, starts from no effect.
 
     Args:
         encoder: with the backbone ``"resnet18"``.
 
     Raises:
         ValueError: if it has another backbone.
-        OSError: if they are neither stored here nor can be downloaded.
+        OSError: see :func:`imagenet_weights`.
     """
     if encoder.backbone != "resnet18":
         raise ValueError(f"ImageNet's weights are for resnet18, not for {encoder.backbone!r}")
-    torchvision: Any = require("torchvision.models", "vision")
-    weights = torchvision.ResNet18_Weights.IMAGENET1K_V1
-    try:
-        state = weights.get_state_dict(progress=False, check_hash=True)
-    except OSError as error:
-        raise OSError(
-            f"ImageNet's weights of ResNet-18 cannot be had ({error}): connect once, or put "
-            f"{weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints"
-        ) from error
+    weights = imagenet_weights()
     for network in encoder.networks:
         mine = network.state_dict()
         # Those of the convolutions: batch norm's have the names of group norm's.
-        taken = {name: state[name] for name in mine if mine[name].ndim == 4}
+        taken = {name: weights[name] for name in mine if mine[name].ndim == 4}
         network.load_state_dict(mine | taken)
