@@ -113,7 +113,7 @@ def test_a_prior_of_ones_own_enters_by_its_place(benchmark, dataset, tmp_path, c
         ({"device": "cuda:99"}, "--device cuda:99 does not work here"),
         ({"task": "can"}, "holds demonstrations of lift"),
         ({"task": ["lift", "can"]}, "name at most one --task"),
-        ({"demonstrations": 5}, "leave it out with a file"),
+        ({"demonstrations": 5}, "there are 3 demonstrations, fewer than the 5 to be taken"),
         ({"prior": "gaussian", "sigma": 0.5}, "--sigma belongs to warm priors"),
         ({"prior": "regression", "nfe": 9}, "regression"),
         ({"prior": "nobodys"}, "unknown prior 'nobodys'"),

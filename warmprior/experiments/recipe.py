@@ -63,17 +63,23 @@ def check_counts(options: Any, *names: str, least: int = 1, most: int = 1_000_00
                 )
 
 
+GENERATED = 150
+"""Scripted demonstrations, where no other number is asked for."""
+
+
 @dataclass(frozen=True)
 class DataOptions:
     """What policies are trained on.
 
     Attributes:
         task: manipulation tasks; by default square, or the file's.
-        data: ph (one operator) or mh (six operators).
+        data: ph (one operator) or mh (six operators); of MimicGen's files source (human) or core (made of
+            the source).
         dataset: a robomimic HDF5 file, instead of generated data.
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
-        demonstrations: scripted demonstrations to generate; two numbers for ph and mh.
+        demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
+            numbers for ph and mh.
         actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
         obs: what policies see: the state of robot and objects, or that of the robot and images.
         cameras: of the images; by default the task's two, or four with two arms.
@@ -82,11 +88,11 @@ class DataOptions:
     """
 
     task: tuple[str, ...] = ()
-    data: tuple[Literal["ph", "mh"], ...] = ("ph",)
+    data: tuple[Literal["ph", "mh", "source", "core"], ...] = ("ph",)
     dataset: Path | None = None
     download: bool = False
     force_download: bool = False
-    demonstrations: tuple[int, ...] = (150,)
+    demonstrations: tuple[int, ...] = ()
     actions: Literal["delta", "absolute"] = field(default="delta", metadata=LATER)
     obs: Literal["state", "image"] = field(default="state", metadata=LATER)
     cameras: tuple[str, ...] = field(default=(), metadata=LATER)
@@ -95,7 +101,7 @@ class DataOptions:
 
     def __post_init__(self) -> None:
         check_counts(self, "demonstrations", "image_size")
-        if not 1 <= len(self.demonstrations) <= 2:
+        if len(self.demonstrations) > 2:
             raise ValueError(
                 f"--demonstrations takes one number, or one for ph and one for mh, got "
                 f"{self.demonstrations}"
@@ -122,6 +128,12 @@ class DataOptions:
                     f"there is no scripted expert for {task}: add --download for the official data, or "
                     "--dataset FILE"
                 )
+        if self.generated:
+            for style in self.data:
+                if style not in ("ph", "mh"):
+                    raise ValueError(
+                        f"--data {style} is that of MimicGen's files: add --download, or --dataset FILE"
+                    )
         if self.dataset is None:
             return
         if self.download:
@@ -133,9 +145,18 @@ class DataOptions:
         if not self.dataset.is_file():
             raise FileNotFoundError(f"--dataset {self.dataset}: no such file")
 
+    @property
+    def generated(self) -> bool:
+        """Whether scripted experts make the data."""
+        return self.dataset is None and not self.download
+
+    def first(self, style: str) -> int | None:
+        """Demonstrations to take of a file of a style; ``None`` for all of it."""
+        return self.demonstrations[-1 if style == "mh" else 0] if self.demonstrations else None
+
     def count(self, style: str) -> int:
         """Scripted demonstrations of a style."""
-        return self.demonstrations[-1 if style == "mh" else 0]
+        return self.first(style) or GENERATED
 
 
 _NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
@@ -518,7 +539,11 @@ _SMALL = TrainingConfig(
 
 PRESETS: dict[str, Recipe] = {
     # One seed, small network: a first table within 15 minutes on two cores.
-    "quick": Recipe(network=NetworkOptions(hidden_dim=384), training=_SMALL),
+    "quick": Recipe(
+        data=DataOptions(demonstrations=(GENERATED,)),
+        network=NetworkOptions(hidden_dim=384),
+        training=_SMALL,
+    ),
     # The same policies with three seeds and twice the episodes: a table with seeds.
     "cpu": Recipe(
         data=DataOptions(demonstrations=(150, 300)),

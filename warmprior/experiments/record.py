@@ -101,7 +101,7 @@ def differences(kind: type, mine: dict[str, Any], theirs: dict[str, Any]) -> Ite
                 yield told if flat else told.replace("--", f"--{name}.", 1)
             continue
         option = "--" + name.replace("_", "-")
-        if other is None or other is False:
+        if other is None or other is False or other == []:
             yield f"no {option}"
         elif other is True:
             yield option
