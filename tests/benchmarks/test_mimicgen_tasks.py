@@ -27,12 +27,18 @@ def script():
     return importlib.import_module("mimicgen_tasks")
 
 
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    write_mimicgen(tmp_path / "site")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+
+
 def read(script, out, *argv):
     words = [*argv, "--out", str(out)]
     return parse(script.FEW, words, study="mimicgen", preset=script.preset)
 
 
-def test_papers_recipe(script, tmp_path, monkeypatch):
+def test_papers_recipe(script, package, tmp_path, monkeypatch):
     """Table 4 of the paper, MimicGen's column."""
     monkeypatch.setattr("warmprior.experiments.recipe.require_rendering", lambda: None)
     recipe = read(script, tmp_path, "--preset", "paper", "--download")
@@ -51,7 +57,7 @@ def test_papers_recipe(script, tmp_path, monkeypatch):
     assert paper_success("threading_d0", "source", "past", 3) == 16.6
 
 
-def test_what_can_be_had_decides_the_task(script, tmp_path):
+def test_what_can_be_had_decides_the_task(script, package, tmp_path):
     quick = read(script, tmp_path)
     assert quick.data.task == ("stack",) and quick.data.count("ph") == 10
     assert (quick.training.iterations, quick.training.batch_size) == (5_000, 128)
@@ -66,6 +72,15 @@ def test_tasks_without_an_expert_say_where_data_are(script, tmp_path, capsys, no
     assert "choose one of lift, " in (told := refused(script.main, argv, capsys))
     assert "coffee_d0" in told
     assert not (tmp_path / "out" / "results.json").exists()
+
+
+def test_without_the_package_nothing_is_begun(script, tmp_path, capsys, no_work, monkeypatch):
+    monkeypatch.setattr("warmprior.envs.mimicgen.find_spec", lambda name: None)
+    file = tmp_path / "stack.hdf5"
+    write_robomimic_file(file, task="stack_d0")
+    for source in (["--download"], ["--dataset", str(file)]):
+        argv = [*source, "--out", str(tmp_path / "out")]
+        assert "need NVlabs' package" in refused(script.main, argv, capsys)
 
 
 def test_robosuites_stack_from_scripted_demonstrations(script, tmp_path, capsys, monkeypatch):

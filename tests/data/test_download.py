@@ -222,12 +222,18 @@ def test_default_cache(hub, content, tmp_path, monkeypatch):
 def test_unknown_task_or_style_asks_nobody(hub):
     with pytest.raises(ValueError, match="choose one of lift, can, square, transport, tool_hang"):
         download_robomimic("stack", endpoint=hub.address)
+    with pytest.raises(ValueError, match=r"task 'stack' here \(download_mimicgen has stack_d0\)"):
+        download_robomimic("stack", endpoint=hub.address)
+    with pytest.raises(ValueError, match="task 'stack' here; choose one of stack_d0"):
+        download_mimicgen("stack", endpoint=hub.address)
     with pytest.raises(ValueError, match="'mg' data; it has: ph, mh"):
         download_robomimic("lift", "mg", endpoint=hub.address)
-    with pytest.raises(ValueError, match=r"\(download_mimicgen has it\); choose one of lift"):
+    with pytest.raises(
+        ValueError, match=r"\(download_mimicgen has coffee_d0\); choose one of lift"
+    ):
         download_robomimic("coffee_d0", endpoint=hub.address)
     with pytest.raises(
-        ValueError, match=r"\(download_robomimic has it\); choose one of stack_d0, cof"
+        ValueError, match=r"\(download_robomimic has square\); choose one of stack_d0, cof"
     ):
         download_mimicgen("square", endpoint=hub.address)
     with pytest.raises(ValueError, match="no official 'ph' data; it has: source, core"):

@@ -120,7 +120,8 @@ def _check_official(task: str, style: str, *, mimicgen: bool) -> None:
     }
     if task not in official:
         theirs = "download_robomimic" if mimicgen else "download_mimicgen"
-        hint = f" ({theirs} has it)" if task in TASKS and TASKS[task].official else ""
+        meant = [t for t in (task, f"{task}_d0") if t in TASKS and TASKS[t].official]
+        hint = f" ({theirs} has {meant[0]})" if meant and meant[0] not in official else ""
         raise ValueError(
             f"no official data for task {task!r} here{hint}; choose one of {', '.join(official)}"
         )

@@ -12,7 +12,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-__all__ = ["is_mimicgen", "register_mimicgen"]
+__all__ = ["find_mimicgen", "is_mimicgen", "register_mimicgen"]
 
 _TASKS = ("stack", "coffee", "threading")
 _INSTALL = (
@@ -31,32 +31,16 @@ def is_mimicgen(env_name: str) -> bool:
     return re.search(r"_[DO]\d$", env_name) is not None
 
 
-def register_mimicgen() -> None:
-    """Make MimicGen's tasks known to ``robosuite.make``. A second call changes nothing.
-
-    The package has to be that of https://github.com/NVlabs/mimicgen, which is not on the package index;
-    the one of that name there is another project, and is refused without being imported.
+def find_mimicgen() -> Path:
+    """The folder of NVlabs' package, found without running any of its code.
 
     Raises:
-        ImportError: if the package is missing, another one, or cannot be imported.
+        ImportError: if the package is missing, or another one has its name.
 
     Examples:
-        >>> register_mimicgen()  # doctest: +SKIP
-        >>> robosuite.make("Coffee_D0", "Panda")  # doctest: +SKIP
+        >>> find_mimicgen().name  # doctest: +SKIP
+        'mimicgen'
     """
-    folder = _find_package()
-    _restore_robosuite_14()
-    try:
-        # It prints what further packages its other tasks need.
-        with redirect_stdout(io.StringIO()):
-            for task in _TASKS:
-                import_module(f"mimicgen.envs.robosuite.{task}")
-    except ImportError as error:
-        raise ImportError(f"MimicGen's tasks in {folder} cannot be imported: {error}") from error
-
-
-def _find_package() -> Path:
-    """The folder of NVlabs' package, found without running any of its code."""
     spec = find_spec("mimicgen")
     if spec is None:
         raise ImportError(
@@ -72,6 +56,30 @@ def _find_package() -> Path:
         "envs/robosuite with stack, coffee and threading, and was not imported. The package index has "
         f"another project of that name: pip uninstall mimicgen, then run: {_INSTALL}"
     )
+
+
+def register_mimicgen() -> None:
+    """Make MimicGen's tasks known to ``robosuite.make``. A second call changes nothing.
+
+    The package has to be that of https://github.com/NVlabs/mimicgen, which is not on the package index;
+    the one of that name there is another project, and is refused without being imported.
+
+    Raises:
+        ImportError: if the package is missing, another one, or cannot be imported.
+
+    Examples:
+        >>> register_mimicgen()  # doctest: +SKIP
+        >>> robosuite.make("Coffee_D0", "Panda")  # doctest: +SKIP
+    """
+    folder = find_mimicgen()
+    _restore_robosuite_14()
+    try:
+        # It prints what further packages its other tasks need.
+        with redirect_stdout(io.StringIO()):
+            for task in _TASKS:
+                import_module(f"mimicgen.envs.robosuite.{task}")
+    except ImportError as error:
+        raise ImportError(f"MimicGen's tasks in {folder} cannot be imported: {error}") from error
 
 
 def _restore_robosuite_14() -> None:

@@ -21,11 +21,11 @@ from warmprior.data import (
     generate_demonstrations,
     render_demonstrations,
 )
-from warmprior.data.hdf5 import read_index
+from warmprior.data.hdf5 import read_env_args, read_index
 from warmprior.data.render import check_upright
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.envs.description import environment_description, robosuite_parts
-from warmprior.envs.mimicgen import is_mimicgen
+from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
 from warmprior.envs.tasks import get_task
 from warmprior.experiments.labels import with_actions
@@ -141,11 +141,14 @@ def robosuite_problem(
         DatasetError: if the file cannot be read or has fewer demonstrations, or images are to be rendered
             and it has no states.
         ValueError: if it has no pose deltas to make absolute poses of, or there is no such camera.
+        ImportError: if its simulator is MimicGen's, and its package is missing.
     """
     options = DataOptions() if options is None else options
     actions = options.actions
     # A generated file has as many as were asked for.
     demos = None if source == "scripted" else options.first(style)
+    if is_mimicgen(read_env_args(path)["env_name"]):
+        find_mimicgen()  # not after hours of training
     dataset, images = _read(path, options, demos)
     description = environment_description(
         dataset.recorded_env_args, style, observation_steps, actions, images

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 import torch
 import tyro
 
+from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
 from warmprior.io.options import LATER
@@ -113,6 +114,7 @@ class DataOptions:
         Raises:
             ValueError: naming the options.
             FileNotFoundError: if the file does not exist.
+            ImportError: if MimicGen's data are to be fetched without its package, which plays its tasks.
         """
         if self.force_download and not self.download:
             raise ValueError("--force-download belongs to --download")
@@ -128,6 +130,8 @@ class DataOptions:
                     f"there is no scripted expert for {task}: add --download for the official data, or "
                     "--dataset FILE"
                 )
+            if self.download and is_mimicgen(get_task(task).env_name):
+                find_mimicgen()
         if self.generated:
             for style in self.data:
                 if style not in ("ph", "mh"):
