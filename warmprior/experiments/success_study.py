@@ -68,10 +68,11 @@ def success_notes(recipe: Recipe, paper: Recipe) -> list[str]:
 
     Examples:
         >>> from warmprior.experiments import DataOptions, Recipe
-        >>> success_notes(Recipe(data=DataOptions(obs="image")), Recipe())
-        ["- The paper's numbers are from state observations."]
+        >>> paper = Recipe(data=DataOptions(obs="image"))
+        >>> success_notes(paper, paper), success_notes(Recipe(), paper)
+        ([], ["- The paper's numbers are from image observations."])
     """
-    told = variation_notes(recipe)
+    told = variation_notes(recipe, paper)
     if recipe.network != paper.network or recipe.training.iterations < paper.training.iterations:
         told.append("- Network and training budget are smaller than the paper's.")
     if recipe.data.obs != paper.data.obs:
