@@ -31,5 +31,5 @@ def no_work(monkeypatch):
         raise AssertionError("work was begun")
 
     monkeypatch.setattr(Store, "train", never)
-    for name in ("generate_demonstrations", "download_robomimic"):
+    for name in ("generate_demonstrations", "download_robomimic", "download_mimicgen"):
         monkeypatch.setattr(problem, name, never)

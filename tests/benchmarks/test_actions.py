@@ -13,6 +13,8 @@ from warmprior.__main__ import main
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
 
+from warmprior.experiments import success_study
+
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 
 
@@ -22,7 +24,7 @@ def finished(dataset, tmp_path_factory):
     robomimic = importlib.import_module("robomimic")
     runs = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:  # filmstrips take long, and are not tested here
-        patch.setattr(robomimic, "rendering_backend", lambda: None)
+        patch.setattr(success_study, "rendering_backend", lambda: None)
         for actions in ("absolute", "delta"):
             argv = options(dataset, runs / actions, prior=["gaussian", "past"], actions=actions)
             assert robomimic.main(argv) == 0

@@ -24,7 +24,7 @@ from warmprior import ForecastPrior, PastPrior, VelocityMLP, WarmPriorActor
 pytest.importorskip("matplotlib")
 pytest.importorskip("tyro")
 
-from warmprior.experiments import grouped, parse, started
+from warmprior.experiments import grouped, parse, started, success_study
 from warmprior.experiments.prior_space import PRIOR_SPACE_PRESETS, prior_space_preset
 from warmprior.training.behaviour_cloning import policy_path
 
@@ -343,7 +343,7 @@ def finished(dataset, tmp_path_factory):
     robomimic = importlib.import_module("robomimic")
     out = tmp_path_factory.mktemp("runs") / "main"
     with pytest.MonkeyPatch.context() as patch:  # filmstrips take long, and are not tested here
-        patch.setattr(robomimic, "rendering_backend", lambda: None)
+        patch.setattr(success_study, "rendering_backend", lambda: None)
         assert robomimic.main(options(dataset, out, prior=["gaussian", "past"])) == 0
     return out
 

@@ -19,7 +19,7 @@ from tests.benchmarks.script_parts import is_png, options, refused, stored, writ
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
 
-from warmprior.experiments import PRESETS, parse, started
+from warmprior.experiments import PRESETS, parse, started, success_study
 from warmprior.io.files import exclusive
 
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "robomimic.py"
@@ -67,7 +67,7 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
     assert "NFE 1: WP-Past" in table
     assert "Network and training budget are smaller" in table
     assert is_png(out / "success.png") and is_png(out / "learning_curves.png")
-    if benchmark.rendering_backend() is not None:
+    if success_study.rendering_backend() is not None:
         assert len(list(out.glob("filmstrip_*.png"))) == 3
 
     # The folder is never overwritten, and a second run of the same options trains nothing again. Two
@@ -78,7 +78,7 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
     policies = out.parent / "policies"
     times = written(policies)
     assert len({path.parents[1] for path in times if "policy_" in str(path)}) == 3
-    monkeypatch.setattr(benchmark, "rendering_backend", lambda: None)
+    monkeypatch.setattr(success_study, "rendering_backend", lambda: None)
     second = tmp_path / "runs" / "second"
     assert benchmark.main(options(dataset, second, episodes=3, envs=2, prior="past")) == 0
     assert "libegl1" in capsys.readouterr().out
@@ -87,7 +87,7 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
 
 
 def test_a_prior_of_ones_own_enters_by_its_place(benchmark, dataset, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(benchmark, "rendering_backend", lambda: None)
+    monkeypatch.setattr(success_study, "rendering_backend", lambda: None)
     out, place = tmp_path / "runs" / "own", "tests.benchmarks.user_priors:HeldAction"
     argv = options(dataset, out, prior=["gaussian", place], sigma=0.2, envs=2)
     assert benchmark.main(argv) == 0
@@ -113,7 +113,7 @@ def test_a_prior_of_ones_own_enters_by_its_place(benchmark, dataset, tmp_path, c
         ({"device": "cuda:99"}, "--device cuda:99 does not work here"),
         ({"task": "can"}, "holds demonstrations of lift"),
         ({"task": ["lift", "can"]}, "name at most one --task"),
-        ({"demonstrations": 5}, "leave it out with a file"),
+        ({"demonstrations": 5}, "there are 3 demonstrations, fewer than the 5 to be taken"),
         ({"prior": "gaussian", "sigma": 0.5}, "--sigma belongs to warm priors"),
         ({"prior": "regression", "nfe": 9}, "regression"),
         ({"prior": "nobodys"}, "unknown prior 'nobodys'"),

@@ -23,7 +23,7 @@ from warmprior import PastPrior
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
 
-from warmprior.experiments import PRESETS, Row, parse, started
+from warmprior.experiments import PRESETS, Row, parse, started, success_study
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 
@@ -39,7 +39,7 @@ def finished(scripts, dataset, tmp_path_factory):
     """A finished run of robomimic.py with two seeds."""
     out = tmp_path_factory.mktemp("runs") / "main"
     with pytest.MonkeyPatch.context() as patch:  # filmstrips take long, and are not tested here
-        patch.setattr(scripts["robomimic"], "rendering_backend", lambda: None)
+        patch.setattr(success_study, "rendering_backend", lambda: None)
         code = scripts["robomimic"].main(options(dataset, out, seeds=2, iterations=60))
     assert code == 0
     return out

@@ -6,10 +6,17 @@ import time
 from collections import Counter
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import numpy as np
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
-from warmprior.data.download import REPOSITORIES, download_robomimic
+from warmprior.data.download import (
+    MIMICGEN_REPOSITORY,
+    REPOSITORIES,
+    download_mimicgen,
+    download_robomimic,
+)
+from warmprior.data.mimicgen import MimicGenExperienceReplay
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.envs.tasks import TASKS
 
@@ -215,15 +222,63 @@ def test_default_cache(hub, content, tmp_path, monkeypatch):
 def test_unknown_task_or_style_asks_nobody(hub):
     with pytest.raises(ValueError, match="choose one of lift, can, square, transport, tool_hang"):
         download_robomimic("stack", endpoint=hub.address)
+    with pytest.raises(ValueError, match=r"task 'stack' here \(download_mimicgen has stack_d0\)"):
+        download_robomimic("stack", endpoint=hub.address)
+    with pytest.raises(ValueError, match="task 'stack' here; choose one of stack_d0"):
+        download_mimicgen("stack", endpoint=hub.address)
     with pytest.raises(ValueError, match="'mg' data; it has: ph, mh"):
         download_robomimic("lift", "mg", endpoint=hub.address)
+    with pytest.raises(
+        ValueError, match=r"\(download_mimicgen has coffee_d0\); choose one of lift"
+    ):
+        download_robomimic("coffee_d0", endpoint=hub.address)
+    with pytest.raises(
+        ValueError, match=r"\(download_robomimic has square\); choose one of stack_d0, cof"
+    ):
+        download_mimicgen("square", endpoint=hub.address)
+    with pytest.raises(ValueError, match="no official 'ph' data; it has: source, core"):
+        download_mimicgen("coffee_d0", "ph", endpoint=hub.address)
     assert not hub.requests
 
 
 def test_every_official_file_has_its_address(hub, content, tmp_path):
-    for task, spec in TASKS.items():
-        for style in spec.official:
+    for task in ("lift", "can", "square", "transport", "tool_hang"):
+        for style in TASKS[task].official:
             name = f"v1.5/{task}/{style}/low_dim_v15.hdf5"
             hub.files[FIRST, name] = (len(content), content)
             path = download_robomimic(task, style, root=tmp_path, endpoint=hub.address)
             assert path == tmp_path / name
+
+
+@pytest.mark.parametrize(
+    ("task", "style", "name"),
+    [
+        ("stack_d0", "source", "source/stack.hdf5"),
+        ("coffee_d0", "source", "source/coffee.hdf5"),
+        ("threading_d0", "core", "core/threading_d0.hdf5"),
+    ],
+)
+def test_mimicgens_files_have_their_addresses(hub, content, tmp_path, task, style, name):
+    hub.files[MIMICGEN_REPOSITORY, name] = (len(content), content)
+    path = download_mimicgen(task, style, root=tmp_path, endpoint=hub.address)
+    assert path == tmp_path / name
+    hub.sent = {MIMICGEN_REPOSITORY: content[:-7] + b"damaged"}
+    with pytest.raises(OSError, match="sha256"):
+        download_mimicgen(task, style, root=tmp_path, endpoint=hub.address, force=True)
+
+
+def test_mimicgens_buffer_fetches_its_file(hub, tmp_path, monkeypatch):
+    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.address)
+    monkeypatch.setattr(
+        "huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE",
+        hub.address + "/{repo_id}/resolve/{revision}/{filename}",
+    )
+    file = tmp_path / "coffee.hdf5"
+    demos = write_robomimic_file(file, lengths=(4, 3, 5), task="coffee_d0")
+    content = file.read_bytes()
+    hub.files[MIMICGEN_REPOSITORY, "source/coffee.hdf5"] = (len(content), content)
+    data = MimicGenExperienceReplay("coffee_d0", download=True, root=tmp_path / "hub", demos=2)
+    assert data.path == tmp_path / "hub" / "source" / "coffee.hdf5"
+    assert data.task is TASKS["coffee_d0"] and data.episode_lengths.tolist() == [4, 3]
+    assert data.data["observation"].shape == (7, 66)
+    np.testing.assert_allclose(data.data["action"][4:], demos[1]["actions"], rtol=1e-6)

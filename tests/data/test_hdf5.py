@@ -54,6 +54,19 @@ def test_demos_are_ordered_by_number(tmp_path):
     assert read_index(path).lengths == tuple(range(1, 13))
 
 
+def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
+    path = tmp_path / "file.hdf5"
+    write_robomimic_file(path, lengths=range(1, 13), masks={"late": [11, 3, 10]})
+    assert read_index(path, demos=11).demos == tuple(f"demo_{n}" for n in range(11))
+    assert read_index(path, demos=2, filter_key="late").demos == ("demo_3", "demo_10")
+    with pytest.raises(
+        DatasetError, match=r"file\.hdf5: there are 12 demonstrations, fewer than the 13"
+    ):
+        read_index(path, demos=13)
+    with pytest.raises(ValueError, match="demos must be at least 1, got 0"):
+        read_index(path, demos=0)
+
+
 def test_masks_select(square_file):
     path, _ = square_file
     assert read_index(path, filter_key="train").demos == ("demo_0", "demo_2")

@@ -236,7 +236,7 @@ def test_wrapper_keeps_the_environments_own_time_limit():
         ({"task": "juggle"}, "unknown task 'juggle'; choose one of lift, can"),
         ({}, "give either task or env_args"),
         ({"task": "lift", "env_args": {}}, "give either task or env_args"),
-        ({"task": "lift", "style": "mg"}, "style is 'ph' or 'mh', got 'mg'"),
+        ({"task": "lift", "style": "mg"}, "style is one of ph, mh, source, core, got 'mg'"),
         ({"task": "lift", "horizon": 0}, "horizon must be at least 1"),
         ({"task": "lift", "seed_stride": 0}, "seed_stride must be at least 1"),
         ({"task": "lift", "control_loop": "fast"}, "control_loop is lean or robosuite"),

@@ -98,7 +98,9 @@ def test_every_leaf_is_an_option_under_its_own_name(tmp_path):
         ("--device meta", "--device meta does not work here"),
         ("--task nothing", "unknown task 'nothing'"),
         ("--force-download", "--force-download belongs to --download"),
-        ("--download --demonstrations 5", "leave it out with a file"),
+        ("--download --demonstrations 0", "--demonstrations must be between 1"),
+        ("--data source", "--data source is that of MimicGen's files: add --download"),
+        ("--task coffee_d0", "no scripted expert for coffee_d0: add --download"),
         ("--prior gaussian --sigma 0.5", "--sigma belongs to warm priors"),
         ("--iterations 0", "iterations must be at least 1"),
         ("--seed -1", "seed must be at least 0"),
@@ -290,3 +292,29 @@ def test_ctrl_c_ends_a_training_within_seconds(tmp_path, group):
     assert process.returncode == 130 and told.strip().endswith("interrupted; --resume continues")
     assert "Traceback" not in told
     assert time.monotonic() - sent < 10  # two seconds on an idle machine
+
+
+def test_numbers_of_demonstrations_are_of_presets_only_where_they_are_generated(tmp_path):
+    """A preset generates as many as it likes; a file is taken whole unless its user says otherwise."""
+    file = tmp_path / "file.hdf5"
+    file.touch()
+    out = ["--out", str(tmp_path / "out")]
+    for preset, (ph, mh) in {"quick": (150, 150), "cpu": (150, 300), "paper": (200, 300)}.items():
+        data = read("--preset", preset, *out).data
+        assert (data.count("ph"), data.count("mh")) == (ph, mh)
+        for argv in (["--dataset", str(file)], ["--download"]):
+            data = read("--preset", preset, *argv, *out).data
+            assert data.first("ph") is None and data.first("mh") is None
+            some = read("--preset", preset, *argv, "--demonstrations", str(ph), *out).data
+            assert some.first("ph") == ph  # also where it is the preset's own number
+
+
+def test_continued_run_keeps_its_part_of_a_file(tmp_path):
+    file, out = tmp_path / "file.hdf5", ["--out", str(tmp_path / "out")]
+    file.touch()
+    for given in ([], ["--demonstrations", "7"]):
+        with started(read("--dataset", str(file), *given, *out), "a-study"):
+            pass
+        assert read("--resume", *out).data.demonstrations == tuple(map(int, given[1:]))
+        with pytest.raises(ValueError, match=r"was started with (no )?--demonstrations"):
+            read("--resume", *out, "--demonstrations", "8")

@@ -10,7 +10,9 @@ pytest.importorskip("robosuite")
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
 from warmprior import GaussianPrior, ODEActor, PoseTrend
-from warmprior.data import DatasetError
+from warmprior.data import DatasetError, generate_demonstrations
+from warmprior.data.hdf5 import read_index
+from warmprior.envs import rendering_backend
 from warmprior.experiments import NetworkOptions, Recipe, RunOptions, Store, robosuite_problem
 from warmprior.experiments.recipe import DataOptions
 from warmprior.experiments.record import record, restore
@@ -97,3 +99,35 @@ def test_files_without_poses_are_named(tmp_path):
         del file["data/demo_0/obs/robot0_eef_quat"]
     with pytest.raises(DatasetError, match=r"lift\.hdf5.*no 'obs/robot0_eef_quat'"):
         robosuite_problem(path, options=DataOptions(actions="absolute"))
+
+
+def test_part_of_a_file_is_its_first_demonstrations(path, tmp_path):
+    whole, part = (
+        robosuite_problem(path, options=DataOptions(demonstrations=n)) for n in ((), (1,))
+    )
+    assert part.identity == f"{whole.identity} the first 1"  # other policies, of the same file
+    assert part.facts["demonstrations"] == 1 and part.facts["steps"] == len(part.data) == 30
+    mine, all_of_it = (p.normalizer.denormalize(p.data)["action"] for p in (part, whole))
+    assert torch.allclose(mine, all_of_it[:30], atol=1e-6)
+    with pytest.raises(DatasetError, match="there are 2 demonstrations, fewer than the 3"):
+        robosuite_problem(path, options=DataOptions(demonstrations=(3,)))
+
+
+@pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
+def test_of_images_only_that_part_is_rendered(tmp_path, monkeypatch):
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
+    path = generate_demonstrations("lift", n=2, workers=1, progress=False)
+    problem = robosuite_problem(
+        path,
+        options=DataOptions(
+            demonstrations=(1,),
+            obs="image",
+            cameras=("agentview",),
+            image_size=16,
+            fast_rendering=True,
+        ),
+    )
+    assert problem.facts["demonstrations"] == 1 and problem.images == {"agentview_image": 16}
+    (rendered,) = (tmp_path / "cache" / "rendered").glob("*.hdf5")
+    index = read_index(rendered, image_keys=["agentview_image"])
+    assert index.demos == ("demo_0",)

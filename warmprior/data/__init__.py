@@ -1,11 +1,12 @@
-"""Demonstrations: robomimic's files and scripted experts."""
+"""Demonstrations: files of robomimic and MimicGen, and scripted experts."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from warmprior.data.download import download_robomimic
+from warmprior.data.download import download_mimicgen, download_robomimic
 from warmprior.data.hdf5 import DatasetError
+from warmprior.data.mimicgen import MimicGenExperienceReplay
 from warmprior.data.robomimic import RobomimicExperienceReplay
 
 if TYPE_CHECKING:
@@ -14,7 +15,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DatasetError",
+    "MimicGenExperienceReplay",
     "RobomimicExperienceReplay",
+    "download_mimicgen",
     "download_robomimic",
     "generate_demonstrations",
     "render_demonstrations",

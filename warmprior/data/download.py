@@ -1,23 +1,27 @@
-"""Fetching robomimic's official files from the Hugging Face hub."""
+"""Fetching the official files of robomimic and MimicGen from the Hugging Face hub."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from warmprior.data.hdf5 import DatasetError, open_robomimic
+from warmprior.envs.mimicgen import is_mimicgen
 from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
 
-__all__ = ["REPOSITORIES", "download_robomimic"]
+__all__ = ["MIMICGEN_REPOSITORY", "REPOSITORIES", "download_mimicgen", "download_robomimic"]
 
 REPOSITORIES = ("robomimic/robomimic_datasets", "amandlek/robomimic")
-"""The hub's dataset repositories that hold the files, in the order of trying."""
+"""The hub's dataset repositories that hold robomimic's files, in the order of trying."""
+
+MIMICGEN_REPOSITORY = "amandlek/mimicgen_datasets"
+"""The one that holds MimicGen's, under the licence CC BY-NC-SA 4.0."""
 
 LIMIT_SECONDS = 3600.0
 """For everything that one call fetches, whatever a server does."""
@@ -60,18 +64,85 @@ def download_robomimic(
             ...
         ValueError: tool_hang has no official 'mh' data; it has: ph
     """
-    official = {name: spec.official for name, spec in TASKS.items() if spec.official}
+    _check_official(task, style, mimicgen=False)
+    name = f"v1.5/{task}/{style}/low_dim_v15.hdf5"
+    return _download(name, REPOSITORIES, root, endpoint, force)
+
+
+def download_mimicgen(
+    task: str,
+    style: str = "source",
+    *,
+    root: str | Path | None = None,
+    endpoint: str | None = None,
+    force: bool = False,
+) -> Path:
+    """Download an official file of MimicGen, unless it is there already.
+
+    The file is ``source/stack.hdf5`` or ``core/stack_d0.hdf5`` (and the like) of
+    :data:`MIMICGEN_REPOSITORY`, in robomimic's layout, and checked as by :func:`download_robomimic`. Its
+    licence is CC BY-NC-SA 4.0, which excludes commercial use.
+
+    Args:
+        task: ``stack_d0``, ``coffee_d0`` or ``threading_d0``.
+        style: ``"source"`` (ten human demonstrations) or ``"core"`` (a thousand that MimicGen made of them).
+        root: the folder under which to keep the file; by default the hub client's cache.
+        endpoint: address of the hub or of a server like it; by default the hub client's own.
+        force: download again even if the file is there.
+
+    Returns:
+        The path of the local file.
+
+    Raises:
+        ValueError: if there is no official file of the task or style.
+        OSError: if the repository delivers no readable file; names the cause.
+        ImportError: if h5py or huggingface_hub is not installed.
+
+    Examples:
+        >>> download_mimicgen("coffee_d0")  # doctest: +SKIP
+        PosixPath('.../source/coffee.hdf5')
+        >>> download_mimicgen("stack")
+        Traceback (most recent call last):
+            ...
+        ValueError: no official data for task 'stack' here; choose one of stack_d0, coffee_d0, ...
+    """
+    _check_official(task, style, mimicgen=True)
+    # The human demonstrations belong to the task, those made of them to a variant of it.
+    name = task.removesuffix("_d0") if style == "source" else task
+    return _download(f"{style}/{name}.hdf5", (MIMICGEN_REPOSITORY,), root, endpoint, force)
+
+
+def _check_official(task: str, style: str, *, mimicgen: bool) -> None:
+    official = {
+        name: spec.official
+        for name, spec in TASKS.items()
+        if spec.official and is_mimicgen(spec.env_name) is mimicgen
+    }
     if task not in official:
-        raise ValueError(f"no official data for task {task!r}; choose one of {', '.join(official)}")
+        theirs = "download_robomimic" if mimicgen else "download_mimicgen"
+        meant = [t for t in (task, f"{task}_d0") if t in TASKS and TASKS[t].official]
+        hint = f" ({theirs} has {meant[0]})" if meant and meant[0] not in official else ""
+        raise ValueError(
+            f"no official data for task {task!r} here{hint}; choose one of {', '.join(official)}"
+        )
     if style not in official[task]:
         known = ", ".join(official[task])
         raise ValueError(f"{task} has no official {style!r} data; it has: {known}")
+
+
+def _download(
+    name: str,
+    repositories: Sequence[str],
+    root: str | Path | None,
+    endpoint: str | None,
+    force: bool,
+) -> Path:
+    """Fetch and check a file of the first repository that delivers it."""
     hub = require("huggingface_hub", "sim")
     require("h5py", "sim")
-    name = f"v1.5/{task}/{style}/low_dim_v15.hdf5"
     failures: list[str] = []
     deadline = time.monotonic() + LIMIT_SECONDS
-    for repository in REPOSITORIES:
+    for repository in repositories:
         where = {
             "repo_id": repository,
             "filename": name,

@@ -24,7 +24,14 @@ from warmprior.io.extras import require
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["DatasetError", "RobomimicIndex", "open_robomimic", "read_index", "read_rows"]
+__all__ = [
+    "DatasetError",
+    "RobomimicIndex",
+    "open_robomimic",
+    "read_env_args",
+    "read_index",
+    "read_rows",
+]
 
 BLOCK = 4096  # rows read at once: a bound on temporary memory, whatever the length of a demo
 LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
@@ -170,6 +177,27 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
     return parsed
 
 
+def read_env_args(path: str | Path) -> dict[str, Any]:
+    """The environment that a robomimic file names, as the file has it.
+
+    Args:
+        path: the HDF5 file.
+
+    Returns:
+        A dict with at least ``env_name`` and ``env_kwargs``.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        DatasetError: if it is no robomimic file, or names no environment.
+
+    Examples:
+        >>> read_env_args("square.hdf5")["env_name"]  # doctest: +SKIP
+        'NutAssemblySquare'
+    """
+    with open_robomimic(path) as file:
+        return _env_args(file, Path(path))
+
+
 def _demo(file: h5py.File, name: str) -> h5py.Group:
     demo = member(file["data"], name, "group")
     if demo is None:  # listed, but not to be found: its index is damaged
@@ -245,6 +273,7 @@ def read_index(
     observation_keys: Sequence[str] | None = None,
     image_keys: Sequence[str] = (),
     poses: bool = False,
+    demos: int | None = None,
 ) -> RobomimicIndex:
     """Check a robomimic file and say what it holds. No values are read.
 
@@ -256,6 +285,7 @@ def read_index(
             has them.
         image_keys: images to read as well.
         poses: also require the hand pose of every arm, from which absolute actions are built.
+        demos: how many to take, the first ones by their numbers; all if ``None``.
 
     Returns:
         The selection.
@@ -263,7 +293,9 @@ def read_index(
     Raises:
         FileNotFoundError: if there is no such file.
         DatasetError: if the file is cut short or not a robomimic file, the filter key is unknown or
-            names absent demos, a key is missing, a demo is empty, or shapes disagree.
+            names absent demos, there are fewer demos than are to be taken, a key is missing, a demo is
+            empty, or shapes disagree.
+        ValueError: if no demos are to be taken.
 
     Examples:
         >>> index = read_index("square.hdf5", filter_key="train")  # doctest: +SKIP
@@ -271,11 +303,19 @@ def read_index(
         (180, 7)
     """
     path = Path(path)
+    if demos is not None and demos < 1:
+        raise ValueError(f"demos must be at least 1, got {demos}")
     with open_robomimic(path) as file:
-        demos = _selected(file, path, filter_key)
+        selected = _selected(file, path, filter_key)
+        if demos is not None and demos > len(selected):
+            raise DatasetError(
+                f"{path}: there are {len(selected)} demonstrations, fewer than the {demos} to be taken: ask "
+                "for no more"
+            )
+        selected = selected[:demos]
         env_args = _env_args(file, path)
         task = next((t for t in TASKS.values() if t.env_name == env_args["env_name"]), None)
-        first = _demo(file, demos[0])
+        first = _demo(file, selected[0])
         observations = member(first, "obs", "group")
         available = () if observations is None else tuple(names(observations))
         if observation_keys is not None:
@@ -298,12 +338,12 @@ def read_index(
         lengths: list[int] = []
         sides: dict[int, str] = {}
         reference: dict[str, int] = {}
-        for name in demos:
+        for name in selected:
             demo = _demo(file, name)
             steps, widths = _widths(path, demo, wanted)
             _check_widths(path, demo, widths, required, env_args["env_name"])
             reference = reference or widths
-            _check_widths(path, demo, widths, reference, f"data/{demos[0]}")
+            _check_widths(path, demo, widths, reference, f"data/{selected[0]}")
             lengths.append(steps)
             if image_keys:
                 sides.setdefault(image_size(path, demo, image_keys, steps), name)
@@ -312,7 +352,7 @@ def read_index(
         raise DatasetError(f"{path}: images have several sizes: {told}. Render them anew")
     return RobomimicIndex(
         path=path,
-        demos=demos,
+        demos=selected,
         lengths=tuple(lengths),
         observation_keys=keys,
         observation_dims=tuple(reference[f"obs/{key}"] for key in keys),

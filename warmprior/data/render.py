@@ -39,6 +39,7 @@ def render_demonstrations(
     cameras: Sequence[str] | None = None,
     size: int = 84,
     *,
+    demos: int | None = None,
     fast: bool = False,
     out: str | Path | None = None,
     cache_dir: str | Path | None = None,
@@ -58,6 +59,7 @@ def render_demonstrations(
         size: side of the images in pixels.
 
     Keyword Args:
+        demos: how many to render and keep, the first ones by their numbers; all if ``None``.
         fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
         out: where to write, replacing what is there; may be ``path`` itself. ``None`` for the cache, from
             which a file rendered earlier from the same file is returned at once.
@@ -80,7 +82,7 @@ def render_demonstrations(
         >>> path.name  # doctest: +SKIP
         'square_agentview84_1f2e3d4c.hdf5'
     """
-    path, index = Path(path), read_index(path)
+    path, index = Path(path), read_index(path, demos=demos)
     if cameras is None:
         cameras = index.task.cameras if index.task else ("agentview", "robot0_eye_in_hand")
     cameras = tuple(cameras)
@@ -89,7 +91,8 @@ def render_demonstrations(
     for name, value in {"size": size, "workers": workers}.items():
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
-    identity = digest_of(file_digest(path), cameras, size, fast)[:8]
+    chosen = [] if demos is None else [demos]
+    identity = digest_of(file_digest(path), cameras, size, fast, *chosen)[:8]
     if out is None:
         told = "-".join(cameras) if len(cameras) < 3 else f"{len(cameras)}cameras"
         name = f"{path.stem}_{told}{size}{'fast' if fast else ''}_{identity}.hdf5"
@@ -203,7 +206,7 @@ class _Render:
 
 
 def _write(path: Path, illustrator: _Illustrator) -> None:
-    """The file with the images of all demos."""
+    """The file with the images of the demos, and with its masks if all of them are in it."""
     h5py, size, index = require("h5py", "sim"), illustrator.size, illustrator.index
     with open_robomimic(index.path) as source, h5py.File(path, "w") as file:
         data = file.create_group("data")
@@ -223,7 +226,7 @@ def _write(path: Path, illustrator: _Illustrator) -> None:
                     data[demo]["obs"].create_dataset(
                         name, data=images[name], chunks=(1, size, size, 3), compression="gzip"
                     )
-        if "mask" in source:
+        if "mask" in source and len(index.demos) == len(source["data"]):
             source.copy("mask", file)
 
 

@@ -74,8 +74,8 @@ def _allocate(
     if storage == "memory" and available is not None and needed > available:
         raise DatasetError(
             f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but "
-            f"{available / 1e9:.1f} GB are free: use storage='memmap', or choose fewer demos with "
-            "filter_key"
+            f"{available / 1e9:.1f} GB are free: use storage='memmap', or choose fewer with demos "
+            "or filter_key"
         )
     if storage == "memory":
         return torch.empty_like(data)
@@ -204,6 +204,7 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
             (see :func:`warmprior.data.download_robomimic`).
         root: folder for downloads; by default the hub client's cache.
         filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
+        demos: how many to take, the first ones by their numbers; all if ``None``.
         observation_keys: observations to concatenate; by default those of the task, or for an
             unknown environment the object and every robot's pose and gripper.
         image_keys: images to read as well, such as ``"agentview_image"``. They stay bytes; take
@@ -245,6 +246,7 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
         download: bool = False,
         root: str | Path | None = None,
         filter_key: str | None = None,
+        demos: int | None = None,
         observation_keys: Sequence[str] | None = None,
         image_keys: Sequence[str] = (),
         absolute_actions: bool = False,
@@ -268,6 +270,7 @@ class RobomimicExperienceReplay(TensorDictReplayBuffer):
             observation_keys=observation_keys,
             image_keys=image_keys,
             poses=absolute_actions,
+            demos=demos,
         )
         action_dim = index.action_dim
         with _understanding(path):

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import copy
 import math
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from warmprior.envs.mimicgen import is_mimicgen
 from warmprior.rotation import (
     HAND_TO_SITE,
     matrix_to_rotation_6d,
@@ -109,8 +109,8 @@ def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> d
         old = any("body_parts" not in config for config in listed)
         listed = [_modernize_controller(config, absolute) for config in listed]
         kwargs["controller_configs"] = listed if isinstance(configs, list) else listed[0]
-        # MimicGen's variants (Coffee_D0, ...) set lite_physics themselves and refuse the argument.
-        if not re.search(r"_D\d$", new["env_name"]):
+        # MimicGen's tasks have the full step (see register_mimicgen), and some refuse the argument.
+        if not is_mimicgen(new["env_name"]):
             kwargs.setdefault("lite_physics", not old)
     elif absolute:
         raise ValueError("absolute actions need the controller_configs of the file's env_kwargs")

@@ -21,7 +21,7 @@ from warmprior.envs.simulator import (
     make_simulator,
     task_env_args,
 )
-from warmprior.envs.tasks import TASKS, TaskSpec, get_task
+from warmprior.envs.tasks import STYLES, TASKS, TaskSpec, get_task
 from warmprior.envs.tasks import low_dim_keys as default_keys
 
 __all__ = ["RobosuiteEnv", "RobosuiteWrapper"]
@@ -297,10 +297,11 @@ class RobosuiteEnv(RobosuiteWrapper):
     See :class:`RobosuiteWrapper` for keys and seeds.
 
     Args:
-        task: ``lift``, ``can``, ``square``, ``stack``, ``transport`` or ``tool_hang``.
+        task: a name of :data:`warmprior.envs.TASKS`. Those that end in ``_d0`` are MimicGen's and need its
+            package (see :func:`~warmprior.envs.mimicgen.register_mimicgen`).
         env_args: instead of ``task``: the parsed ``data.attrs["env_args"]`` of a robomimic or
             MimicGen file of any version.
-        style: ``"ph"`` or ``"mh"``, the data whose time limit applies.
+        style: of the data whose time limit applies: ``"ph"``, ``"mh"``, ``"source"`` or ``"core"``.
         horizon: time limit in control steps; ``None`` for the task's, or for an environment that is
             not in the table that of ``env_args["env_kwargs"]``, or else robosuite's own.
         control_loop: as for the wrapper.
@@ -318,7 +319,7 @@ class RobosuiteEnv(RobosuiteWrapper):
         device: as for the wrapper.
 
     Raises:
-        ImportError: if robosuite is not installed.
+        ImportError: if robosuite is not installed, or MimicGen is not where the task is one of its.
         ValueError: if the task is unknown, or not exactly one of ``task`` and ``env_args`` is given.
 
     Examples:
@@ -328,7 +329,7 @@ class RobosuiteEnv(RobosuiteWrapper):
         >>> RobosuiteEnv("life")
         Traceback (most recent call last):
             ...
-        ValueError: unknown task 'life'; choose one of lift, can, square, stack, transport, tool_hang
+        ValueError: unknown task 'life'; choose one of lift, can, square, stack, transport, ...
     """
 
     def __init__(
@@ -354,8 +355,8 @@ class RobosuiteEnv(RobosuiteWrapper):
     ) -> None:
         if (task is None) == (env_args is None):
             raise ValueError("give either task or env_args")
-        if style not in ("ph", "mh"):
-            raise ValueError(f"style is 'ph' or 'mh', got {style!r}")
+        if style not in STYLES:
+            raise ValueError(f"style is one of {', '.join(STYLES)}, got {style!r}")
         spec: TaskSpec | None
         if env_args is None:
             spec = get_task(str(task))

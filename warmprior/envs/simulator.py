@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from warmprior.envs.mimicgen import is_mimicgen, register_mimicgen
 from warmprior.envs.tasks import get_task
 from warmprior.io.extras import require
 
@@ -142,6 +143,8 @@ def task_env_args(task: str) -> dict[str, Any]:
             "body_parts": {"right": {key: _copy(value) for key, value in _ARM_CONTROLLER.items()}},
         },
     }
+    if is_mimicgen(spec.env_name):
+        del kwargs["lite_physics"]  # some of its tasks refuse the argument
     if spec.arms == 2:
         kwargs["env_configuration"] = "opposed"
     return {"env_name": spec.env_name, "env_version": "1.5.1", "type": 1, "env_kwargs": kwargs}
@@ -167,7 +170,8 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
         A ``robosuite.environments.base.MujocoEnv``.
 
     Raises:
-        ImportError: if robosuite is not installed.
+        ImportError: if robosuite is not installed, or MimicGen is not (see :func:`register_mimicgen`)
+            where the environment is one of its.
         ValueError: if robosuite has no environment of that name.
 
     Examples:
@@ -176,10 +180,13 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
     """
     robosuite = import_robosuite()
     name = env_args["env_name"]
+    if name not in robosuite.ALL_ENVIRONMENTS and is_mimicgen(name):
+        with _without_warnings():
+            register_mimicgen()
     if name not in robosuite.ALL_ENVIRONMENTS:
         raise ValueError(
-            f"robosuite has no environment {name!r}; if another package registers it (as mimicgen "
-            f"does), import that package first. Registered: {', '.join(sorted(robosuite.ALL_ENVIRONMENTS))}"
+            f"robosuite has no environment {name!r}; if another package registers it, import that package "
+            f"first. Registered: {', '.join(sorted(robosuite.ALL_ENVIRONMENTS))}"
         )
     kwargs = dict(env_args["env_kwargs"])
     kwargs.update(

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["EVALUATION_SEED", "TASKS", "TaskSpec", "get_task", "low_dim_keys"]
+__all__ = ["EVALUATION_SEED", "STYLES", "TASKS", "TaskSpec", "get_task", "low_dim_keys"]
 
 #: Simulator seed of the first evaluation episode. Demonstrations are generated from smaller ones,
 #: so a policy is never evaluated on an initial state it was trained on.
 EVALUATION_SEED = 10_000_000
+
+#: Of demonstrations: robomimic's one or six operators, MimicGen's ten human ones, and those made of them.
+STYLES = ("ph", "mh", "source", "core")
 
 _ARM_KEYS = ("eef_pos", "eef_quat", "gripper_qpos")
 
@@ -34,15 +37,15 @@ class TaskSpec:
     """What the library knows about one task.
 
     Attributes:
-        name: the short name used by robomimic and by this library's options.
+        name: the short name used by robomimic or MimicGen and by this library's options.
         env_name: the robosuite environment.
         arms: the number of Panda arms (1 or 2).
-        horizon_ph: time limit in control steps for one-operator (``ph``) data.
+        horizon_ph: time limit in control steps, but for six-operator data.
         horizon_mh: time limit in control steps for six-operator (``mh``) data.
         object_dim: width of the ``object`` observation.
         cameras: the cameras of robomimic's image files, third person first.
         scripted: whether a scripted expert exists.
-        official: the robomimic dataset styles published for the task.
+        official: the styles of the data that robomimic or MimicGen publish for the task.
     """
 
     name: str
@@ -71,7 +74,7 @@ class TaskSpec:
         return 7 * self.arms
 
     def horizon(self, style: str) -> int:
-        """Time limit in control steps for data of ``style`` (``"ph"`` or ``"mh"``)."""
+        """Time limit in control steps for data of ``style``, one of :data:`STYLES`."""
         return self.horizon_mh if style == "mh" else self.horizon_ph
 
 
@@ -107,6 +110,16 @@ TASKS: dict[str, TaskSpec] = {
             scripted=False,
             official=("ph",),
         ),
+        *(
+            TaskSpec(
+                name, env_name, 1, 400, 400, width, scripted=False, official=("source", "core")
+            )
+            for name, env_name, width in (
+                ("stack_d0", "Stack_D0", 23),
+                ("coffee_d0", "Coffee_D0", 57),
+                ("threading_d0", "Threading_D0", 28),
+            )
+        ),
     )
 }
 
@@ -115,7 +128,7 @@ def get_task(name: str) -> TaskSpec:
     """Look a task up by its short name.
 
     Args:
-        name: one of ``lift``, ``can``, ``square``, ``stack``, ``transport``, ``tool_hang``.
+        name: a key of :data:`TASKS`.
 
     Raises:
         ValueError: if there is no such task.

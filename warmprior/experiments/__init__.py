@@ -44,6 +44,7 @@ from warmprior.experiments.results import Results, Row, grouped, mean_known, sel
 from warmprior.experiments.store import Store, finished_policies
 from warmprior.experiments.straightness import straightness
 from warmprior.experiments.study_figures import plot_budget, plot_chunk_lengths, plot_sigma
+from warmprior.experiments.success_study import study_success
 from warmprior.experiments.tables import (
     curvature_table,
     flow_table,
@@ -105,6 +106,7 @@ __all__ = [
     "source_labels",
     "started",
     "straightness",
+    "study_success",
     "success_cell",
     "success_summary",
     "success_table",

@@ -72,6 +72,8 @@ def parse[R: Recipe](
         told = ", ".join(presets)
         raise ValueError(f"--preset must be one of {told}, got {asked.run.preset!r}")
     base = presets[asked.run.preset] if preset is None else preset(asked)
+    if not asked.data.generated:  # those of presets are numbers to generate
+        base = replace(base, data=replace(base.data, demonstrations=()))
     recipe = read(base)
     out = _output_folder(recipe, study)
     if recipe.run.resume:
@@ -82,9 +84,6 @@ def parse[R: Recipe](
             raise ValueError(
                 f"{out} was started with {', '.join(changed)}: leave these out, or choose another --out"
             )
-    generates = recipe.data.dataset is None and not recipe.data.download
-    if recipe.data.demonstrations != base.data.demonstrations and not generates:
-        raise ValueError("--demonstrations says how many to generate: leave it out with a file")
     refuse_ignored(recipe, base, record(recipe), f"{study} makes no use of it", only=unused)
     if recipe.sources.sigma != base.sources.sigma:
         recipe.sources.check_sigma()

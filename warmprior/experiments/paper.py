@@ -4,7 +4,8 @@ from __future__ import annotations
 
 __all__ = ["PAPER_CURVATURE", "PAPER_SIGMA", "PAPER_SUCCESS", "paper_success"]
 
-#: Table 1, Robomimic with state observations, H = 8, percent: (task, data) -> prior -> NFE -> success rate.
+#: Table 1, Robomimic with state and MimicGen with image observations, H = 8, percent: (task, data) -> prior
+#: -> NFE -> success rate.
 PAPER_SUCCESS: dict[tuple[str, str], dict[str, dict[int, float]]] = {
     ("square", "ph"): {
         "gaussian": {9: 86.7, 3: 86.2, 1: 83.6},
@@ -30,6 +31,21 @@ PAPER_SUCCESS: dict[tuple[str, str], dict[str, dict[int, float]]] = {
         "gaussian": {9: 79.4, 3: 72.3, 1: 77.7},
         "past": {9: 80.6, 3: 75.1, 1: 78.2},
         "preview": {9: 82.8, 3: 75.8, 1: 81.9},
+    },
+    ("stack_d0", "source"): {
+        "gaussian": {9: 21.4, 3: 21.3, 1: 21.3},
+        "past": {9: 22.8, 3: 23.7, 1: 22.4},
+        "preview": {9: 31.6, 3: 30.7, 1: 28.7},
+    },
+    ("coffee_d0", "source"): {
+        "gaussian": {9: 26.8, 3: 23.3, 1: 16.2},
+        "past": {9: 29.6, 3: 24.1, 1: 20.4},
+        "preview": {9: 34.7, 3: 33.4, 1: 29.4},
+    },
+    ("threading_d0", "source"): {
+        "gaussian": {9: 13.8, 3: 16.3, 1: 12.5},
+        "past": {9: 15.5, 3: 16.6, 1: 15.6},
+        "preview": {9: 20.9, 3: 22.0, 1: 18.0},
     },
 }
 

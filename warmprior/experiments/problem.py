@@ -16,15 +16,18 @@ from torchrl.envs.transforms import Transform
 
 from warmprior.data import (
     RobomimicExperienceReplay,
+    download_mimicgen,
     download_robomimic,
     generate_demonstrations,
     render_demonstrations,
 )
-from warmprior.data.hdf5 import read_index
+from warmprior.data.hdf5 import read_env_args, read_index
 from warmprior.data.render import check_upright
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.envs.description import environment_description, robosuite_parts
+from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
+from warmprior.envs.tasks import get_task
 from warmprior.experiments.labels import with_actions
 from warmprior.experiments.recipe import DataOptions, HeldOutOptions
 from warmprior.io.files import digest_of, file_digest
@@ -126,20 +129,27 @@ def robosuite_problem(
 
     Args:
         path: of the file.
-        style: ``"ph"`` or ``"mh"``; decides the time limit of tasks of ours.
+        style: of the demonstrations, such as ``"ph"``; decides the time limit of tasks of ours.
 
     Keyword Args:
         source: where the file comes from: ``"scripted"``, ``"official"`` or ``"file"``.
         observation_steps: ``To`` of the policies.
-        options: the policies' actions and observations; those of the file by default.
+        options: the policies' actions and observations, and how many demonstrations to take; those of the
+            file by default.
 
     Raises:
-        DatasetError: if the file cannot be read, or images are to be rendered and it has no states.
+        DatasetError: if the file cannot be read or has fewer demonstrations, or images are to be rendered
+            and it has no states.
         ValueError: if it has no pose deltas to make absolute poses of, or there is no such camera.
+        ImportError: if its simulator is MimicGen's, and its package is missing.
     """
     options = DataOptions() if options is None else options
     actions = options.actions
-    dataset, images = _read(path, options)
+    # A generated file has as many as were asked for.
+    demos = None if source == "scripted" else options.first(style)
+    if is_mimicgen(read_env_args(path)["env_name"]):
+        find_mimicgen()  # not after hours of training
+    dataset, images = _read(path, options, demos)
     description = environment_description(
         dataset.recorded_env_args, style, observation_steps, actions, images
     )
@@ -165,6 +175,7 @@ def robosuite_problem(
                 # Policies of absolute poses once had a single bound, and remembered grippers wider than any.
                 *(f"{name}, a bound per dimension" for name in space.values()),
                 *([] if images is None else [digest_of(images)]),
+                *([] if demos is None else [f"the first {demos}"]),
             ]
         ),
         facts={
@@ -186,13 +197,13 @@ def robosuite_problem(
 
 
 def _read(
-    path: Path, options: DataOptions
+    path: Path, options: DataOptions, demos: int | None = None
 ) -> tuple[RobomimicExperienceReplay, dict[str, Any] | None]:
     """The demonstrations as policies are to see them, and what images are among it, if any."""
     if options.obs == "state":
         absolute = options.actions == "absolute"
-        return RobomimicExperienceReplay(path, absolute_actions=absolute), None
-    index = read_index(path)
+        return RobomimicExperienceReplay(path, absolute_actions=absolute, demos=demos), None
+    index = read_index(path, demos=demos)
     known = [key.removesuffix("_image") for key in index.available_keys if key.endswith("_image")]
     cameras = options.cameras or (index.task.cameras if index.task else tuple(known))
     if not cameras:
@@ -201,11 +212,11 @@ def _read(
     if set(cameras) <= set(known):
         check_upright(path, names, fast)
     else:
-        path = render_demonstrations(path, cameras, options.image_size, fast=fast)
+        path = render_demonstrations(path, cameras, options.image_size, demos=demos, fast=fast)
     # What robomimic's image policies see besides: the robot, and not where the objects are.
     vector = [key for key in index.observation_keys if key != "object"]
     dataset = RobomimicExperienceReplay(
-        path, observation_keys=vector, image_keys=names, storage="memmap"
+        path, observation_keys=vector, image_keys=names, storage="memmap", demos=demos
     )
     if dataset.image_size != options.image_size:
         raise ValueError(
@@ -268,7 +279,9 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
     for task in dict.fromkeys(options.task or ("square",)):
         for style in dict.fromkeys(options.data):
             if options.download:
-                path = download_robomimic(task, style, force=options.force_download)
+                theirs = is_mimicgen(get_task(task).env_name)
+                download = download_mimicgen if theirs else download_robomimic
+                path = download(task, style, force=options.force_download)
                 source = "official"
             else:
                 path = generate_demonstrations(task, style, options.count(style))
@@ -316,7 +329,7 @@ def observe(
             told = "the TRAINING demonstrations (not held out)"
     elif facts["source"] != "scripted":
         raise ValueError(
-            f"these policies are trained on all demonstrations of {facts['file']}: add --validation FILE "
+            f"these policies are trained on demonstrations of {facts['file']}: add --validation FILE "
             "with others (or with the same file, to measure on the training data)"
         )
     else:

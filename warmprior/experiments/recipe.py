@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 import torch
 import tyro
 
+from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
 from warmprior.io.options import LATER
@@ -65,17 +66,23 @@ def check_counts(options: Any, *names: str, least: int = 1, most: int = 1_000_00
                 )
 
 
+GENERATED = 150
+"""Scripted demonstrations, where no other number is asked for."""
+
+
 @dataclass(frozen=True)
 class DataOptions:
     """What policies are trained on.
 
     Attributes:
         task: manipulation tasks; by default square, or the file's.
-        data: ph (one operator) or mh (six operators).
+        data: ph (one operator) or mh (six operators); of MimicGen's files source (human) or core (made of
+            the source).
         dataset: a robomimic HDF5 file, instead of generated data.
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
-        demonstrations: scripted demonstrations to generate; two numbers for ph and mh.
+        demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
+            numbers for ph and mh.
         actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
         obs: what policies see: the state of robot and objects, or that of the robot and images.
         cameras: of the images; by default the task's two, or four with two arms.
@@ -84,11 +91,11 @@ class DataOptions:
     """
 
     task: tuple[str, ...] = ()
-    data: tuple[Literal["ph", "mh"], ...] = ("ph",)
+    data: tuple[Literal["ph", "mh", "source", "core"], ...] = ("ph",)
     dataset: Path | None = None
     download: bool = False
     force_download: bool = False
-    demonstrations: tuple[int, ...] = (150,)
+    demonstrations: tuple[int, ...] = ()
     actions: Literal["delta", "absolute"] = field(default="delta", metadata=LATER)
     obs: Literal["state", "image"] = field(default="state", metadata=LATER)
     cameras: tuple[str, ...] = field(default=(), metadata=LATER)
@@ -97,7 +104,7 @@ class DataOptions:
 
     def __post_init__(self) -> None:
         check_counts(self, "demonstrations", "image_size")
-        if not 1 <= len(self.demonstrations) <= 2:
+        if len(self.demonstrations) > 2:
             raise ValueError(
                 f"--demonstrations takes one number, or one for ph and one for mh, got "
                 f"{self.demonstrations}"
@@ -109,6 +116,7 @@ class DataOptions:
         Raises:
             ValueError: naming the options.
             FileNotFoundError: if the file does not exist.
+            ImportError: if MimicGen's data are to be fetched without its package, which plays its tasks.
         """
         if self.force_download and not self.download:
             raise ValueError("--force-download belongs to --download")
@@ -124,6 +132,14 @@ class DataOptions:
                     f"there is no scripted expert for {task}: add --download for the official data, or "
                     "--dataset FILE"
                 )
+            if self.download and is_mimicgen(get_task(task).env_name):
+                find_mimicgen()
+        if self.generated:
+            for style in self.data:
+                if style not in ("ph", "mh"):
+                    raise ValueError(
+                        f"--data {style} is that of MimicGen's files: add --download, or --dataset FILE"
+                    )
         if self.dataset is None:
             return
         if self.download:
@@ -135,9 +151,18 @@ class DataOptions:
         if not self.dataset.is_file():
             raise FileNotFoundError(f"--dataset {self.dataset}: no such file")
 
+    @property
+    def generated(self) -> bool:
+        """Whether scripted experts make the data."""
+        return self.dataset is None and not self.download
+
+    def first(self, style: str) -> int | None:
+        """Demonstrations to take of a file of a style; ``None`` for all of it."""
+        return self.demonstrations[-1 if style == "mh" else 0] if self.demonstrations else None
+
     def count(self, style: str) -> int:
         """Scripted demonstrations of a style."""
-        return self.demonstrations[-1 if style == "mh" else 0]
+        return self.first(style) or GENERATED
 
 
 _PRETRAINED = "resnet18-imagenet"
@@ -523,7 +548,11 @@ _SMALL = TrainingConfig(
 
 PRESETS: dict[str, Recipe] = {
     # One seed, small network: a first table within 15 minutes on two cores.
-    "quick": Recipe(network=NetworkOptions(hidden_dim=384), training=_SMALL),
+    "quick": Recipe(
+        data=DataOptions(demonstrations=(GENERATED,)),
+        network=NetworkOptions(hidden_dim=384),
+        training=_SMALL,
+    ),
     # The same policies with three seeds and twice the episodes: a table with seeds.
     "cpu": Recipe(
         data=DataOptions(demonstrations=(150, 300)),
@@ -563,26 +592,30 @@ _IMAGES: dict[str, dict[str, dict[str, Any]]] = {
 """What a preset does differently where policies see images."""
 
 
-def comparison_preset(asked: Recipe) -> Recipe:
+def comparison_preset(asked: Recipe, presets: Mapping[str, Recipe] | None = None) -> Recipe:
     """The preset that is asked for, for what policies are to see.
 
     Where ImageNet's weights cannot be had, an encoder that would start from them starts from random ones.
 
     Args:
         asked: names both.
+        presets: by name; :data:`PRESETS` by default.
 
     Examples:
         >>> comparison_preset(Recipe(data=DataOptions(obs="image"))).network.encoder
         'small'
     """
-    preset = PRESETS[asked.run.preset]
-    if asked.data.obs == "state":
+    preset = (PRESETS if presets is None else presets)[asked.run.preset]
+    if "image" not in (asked.data.obs, preset.data.obs):
         return preset
-    changed: dict[str, dict[str, Any]] = {"data": {"obs": "image"}}
-    for part, values in _IMAGES[asked.run.preset].items():
-        changed[part] = changed.get(part, {}) | values
-    made = {part: replace(getattr(preset, part), **values) for part, values in changed.items()}
-    preset = replace(preset, **made)
+    if preset.data.obs == "state":
+        changed = {part: dict(values) for part, values in _IMAGES[asked.run.preset].items()}
+        data = changed.setdefault("data", {})
+        if preset.data.task:  # it is of certain demonstrations
+            data = {name: v for name, v in data.items() if name not in ("task", "demonstrations")}
+        changed["data"] = data | {"obs": "image"}
+        made = {part: replace(getattr(preset, part), **values) for part, values in changed.items()}
+        preset = replace(preset, **made)
     if preset.network.encoder == asked.network.encoder == _PRETRAINED:
         try:
             imagenet_weights()

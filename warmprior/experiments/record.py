@@ -101,7 +101,7 @@ def differences(kind: type, mine: dict[str, Any], theirs: dict[str, Any]) -> Ite
                 yield told if flat else told.replace("--", f"--{name}.", 1)
             continue
         option = "--" + name.replace("_", "-")
-        if other is None or other is False:
+        if other is None or other is False or other == []:
             yield f"no {option}"
         elif other is True:
             yield option
@@ -151,16 +151,22 @@ def refuse_ignored(
         raise ValueError(f"{told}: leave out {options}")
 
 
-def variation_notes(recipe: Any) -> list[str]:
+def variation_notes(recipe: Any, paper: Any = None) -> list[str]:
     """What tables say of options beside the paper's recipe, if there are any.
 
     Args:
         recipe: of all rows of the table.
+        paper: the paper's, if it has later options itself.
 
     Examples:
         >>> from warmprior.experiments import EvaluationOptions, Recipe
         >>> variation_notes(Recipe(evaluation=EvaluationOptions(grid="dense-jump")))
         ['- Beside the paper, for all sources: --grid dense-jump.']
     """
-    given = [f"--{name.replace('_', '-')} {value}" for name, value in variations(recipe).items()]
+    theirs = {} if paper is None else variations(paper)
+    given = [
+        f"--{name.replace('_', '-')} {value}"
+        for name, value in variations(recipe).items()
+        if theirs.get(name) != value
+    ]
     return [f"- Beside the paper, for all sources: {', '.join(given)}."] if given else []

@@ -1,0 +1,127 @@
+"""The benchmark on MimicGen's tasks: what it chooses, and runs with a package of their interface."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks.script_parts import command_line, options, refused, stored
+from tests.data.synthetic import env_args_14, write_robomimic_file
+from tests.envs.mimicgen_stub import write_mimicgen
+
+pytest.importorskip("robosuite")
+pytest.importorskip("tyro")
+
+from warmprior.experiments import paper_success, parse, success_study
+
+SCRIPT = Path(__file__).parents[2] / "benchmarks" / "mimicgen_tasks.py"
+
+
+@pytest.fixture(scope="module")
+def script():
+    return importlib.import_module("mimicgen_tasks")
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    write_mimicgen(tmp_path / "site")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+
+
+def read(script, out, *argv):
+    words = [*argv, "--out", str(out)]
+    return parse(script.FEW, words, study="mimicgen", preset=script.preset)
+
+
+def test_papers_recipe(script, package, tmp_path, monkeypatch):
+    """Table 4 of the paper, MimicGen's column."""
+    monkeypatch.setattr("warmprior.experiments.recipe.require_rendering", lambda: None)
+    monkeypatch.setattr("warmprior.experiments.recipe.imagenet_weights", dict)
+    recipe = read(script, tmp_path, "--preset", "paper", "--download")
+    training, network = recipe.training, recipe.network
+    assert (training.batch_size, training.iterations) == (128, 50_000)
+    assert (training.learning_rate, training.warmup_ratio) == (1e-4, 0.2)
+    assert (network.network, network.encoder) == ("chi_transformer", "resnet18-imagenet")
+    assert (recipe.data.obs, network.crop_size, recipe.data.image_size) == ("image", 76, 84)
+    assert recipe.data.task == ("stack_d0", "coffee_d0", "threading_d0")
+    assert recipe.data.data == ("source",) and recipe.data.first("source") is None
+    assert paper_success("coffee_d0", "source", "preview", 1) == 29.4
+    assert paper_success("threading_d0", "source", "past", 3) == 16.6
+
+
+def test_what_can_be_had_decides_the_task(script, package, tmp_path):
+    quick = read(script, tmp_path)
+    assert quick.data.task == ("stack",) and quick.data.count("ph") == 10
+    assert (quick.training.iterations, quick.training.batch_size) == (5_000, 128)
+    core = ["--download", "--task", "coffee_d0", "--data", "core", "--demonstrations", "10"]
+    assert read(script, tmp_path, *core).data.first("core") == 10
+
+
+def test_tasks_without_an_expert_say_where_data_are(script, tmp_path, capsys, no_work):
+    argv = command_line(task="coffee_d0", out=tmp_path / "out")
+    assert "no scripted expert for coffee_d0: add --download" in refused(script.main, argv, capsys)
+    argv = command_line(task="coffee", out=tmp_path / "out")
+    assert "choose one of lift, " in (told := refused(script.main, argv, capsys))
+    assert "coffee_d0" in told
+    assert not (tmp_path / "out" / "results.json").exists()
+
+
+def test_without_the_package_nothing_is_begun(script, tmp_path, capsys, no_work, monkeypatch):
+    monkeypatch.setattr("warmprior.envs.mimicgen.find_spec", lambda name: None)
+    file = tmp_path / "stack.hdf5"
+    write_robomimic_file(file, task="stack_d0")
+    for source in (["--download"], ["--dataset", str(file)]):
+        argv = [*source, "--out", str(tmp_path / "out")]
+        assert "need NVlabs' package" in refused(script.main, argv, capsys)
+
+
+def test_robosuites_stack_from_scripted_demonstrations(script, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(success_study, "rendering_backend", lambda: None)
+    argv = command_line(
+        demonstrations=3,
+        iterations=20,
+        episodes=1,
+        envs=1,
+        nfe=1,
+        prior="past",
+        logger="none",
+        out=tmp_path / "out",
+    )
+    assert script.main(argv) == 0
+    (row,) = stored(tmp_path / "out")["rows"]
+    assert (row["task"], row["data"], row["iterations"]) == ("stack", "ph", 20)
+    (problem,) = stored(tmp_path / "out")["meta"]["problems"]
+    assert problem["demonstrations"] == 3 and problem["source"] == "scripted"
+    assert "paper (official data)" not in capsys.readouterr().out  # it has another Stack
+
+
+def test_a_file_in_mimicgens_environment(tmp_path):
+    """As a user starts it: the package is not taken for the script, nor is it missed by workers."""
+    pytest.importorskip("matplotlib")
+    write_mimicgen(tmp_path / "site")
+    file, out = tmp_path / "stack.hdf5", tmp_path / "out"
+    write_robomimic_file(
+        file, lengths=(30, 20, 9), task="stack_d0", env_args=env_args_14("stack_d0")
+    )
+    argv = options(file, out, task=None, prior="past", envs=2, demonstrations=2)
+    root = SCRIPT.parents[1]
+    path = os.pathsep.join(map(str, (root, tmp_path / "site")))
+    done = subprocess.run(
+        [sys.executable, str(SCRIPT), *argv],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    (row,) = stored(out)["rows"]
+    assert (row["task"], row["data"]) == ("stack_d0", "source")
+    (problem,) = stored(out)["meta"]["problems"]
+    assert problem["demonstrations"] == 2 and problem["steps"] == 50
+    assert "paper (official data) | 22.4 (+1.1) |" in done.stdout
+    assert "The paper's numbers are from image observations." in done.stdout

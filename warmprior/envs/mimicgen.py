@@ -1,0 +1,105 @@
+"""MimicGen's tasks under robosuite 1.5; their package is written for 1.4."""
+
+from __future__ import annotations
+
+import io
+import re
+import sys
+from contextlib import redirect_stdout
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+__all__ = ["find_mimicgen", "is_mimicgen", "register_mimicgen"]
+
+_TASKS = ("stack", "coffee", "threading")
+_INSTALL = (
+    "git clone https://github.com/NVlabs/mimicgen ~/mimicgen && pip install --no-deps -e ~/mimicgen"
+)
+_SINGLE_ARM = "robosuite.environments.manipulation.single_arm_env"
+
+
+def is_mimicgen(env_name: str) -> bool:
+    """Whether an environment is one of MimicGen's, by its name: they end in a variant.
+
+    Examples:
+        >>> is_mimicgen("Stack_D0"), is_mimicgen("MugCleanup_O1"), is_mimicgen("Stack")
+        (True, True, False)
+    """
+    return re.search(r"_[DO]\d$", env_name) is not None
+
+
+def find_mimicgen() -> Path:
+    """The folder of NVlabs' package, found without running any of its code.
+
+    Raises:
+        ImportError: if the package is missing, or another one has its name.
+
+    Examples:
+        >>> find_mimicgen().name  # doctest: +SKIP
+        'mimicgen'
+    """
+    spec = find_spec("mimicgen")
+    if spec is None:
+        raise ImportError(
+            "MimicGen's tasks need NVlabs' package, which is not on the package index (what has its "
+            f"name there is another project); run: {_INSTALL}"
+        )
+    folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
+    for folder in folders:
+        if all((folder / "envs" / "robosuite" / f"{task}.py").is_file() for task in _TASKS):
+            return folder
+    raise ImportError(
+        f"the package mimicgen in {', '.join(map(str, folders)) or spec.origin} is not NVlabs': it has no "
+        "envs/robosuite with stack, coffee and threading, and was not imported. The package index has "
+        f"another project of that name: pip uninstall mimicgen, then run: {_INSTALL}"
+    )
+
+
+def register_mimicgen() -> None:
+    """Make MimicGen's tasks known to ``robosuite.make``. A second call changes nothing.
+
+    The package has to be that of https://github.com/NVlabs/mimicgen, which is not on the package index;
+    the one of that name there is another project, and is refused without being imported.
+
+    Raises:
+        ImportError: if the package is missing, another one, or cannot be imported.
+
+    Examples:
+        >>> register_mimicgen()  # doctest: +SKIP
+        >>> robosuite.make("Coffee_D0", "Panda")  # doctest: +SKIP
+    """
+    folder = find_mimicgen()
+    _restore_robosuite_14()
+    try:
+        # It prints what further packages its other tasks need.
+        with redirect_stdout(io.StringIO()):
+            for task in _TASKS:
+                import_module(f"mimicgen.envs.robosuite.{task}")
+    except ImportError as error:
+        raise ImportError(f"MimicGen's tasks in {folder} cannot be imported: {error}") from error
+
+
+def _restore_robosuite_14() -> None:
+    """Add what MimicGen uses of robosuite 1.4; robosuite's own tasks use none of it."""
+    if _SINGLE_ARM in sys.modules:
+        return
+    from robosuite.environments.manipulation.manipulation_env import ManipulationEnv
+    from robosuite.robots.robot import Robot
+
+    class SingleArmEnv(ManipulationEnv):
+        def __init__(self, *args: Any, mount_types: Any = "default", **kwargs: Any) -> None:
+            kwargs.setdefault("base_types", mount_types)
+            # The physics step of robosuite 1.4, with which MimicGen's data were recorded.
+            super().__init__(*args, **kwargs | {"lite_physics": False})
+
+    module = ModuleType(_SINGLE_ARM)
+    vars(module)["SingleArmEnv"] = SingleArmEnv
+    sys.modules[_SINGLE_ARM] = module
+    Robot.controller = property(
+        lambda robot: SimpleNamespace(
+            eef_name=robot.composite_controller.part_controllers["right"].ref_name
+        )
+    )
