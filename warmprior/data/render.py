@@ -16,7 +16,7 @@ from warmprior.data.hdf5 import RobomimicIndex, open_robomimic, read_index
 from warmprior.data.hdf5_members import DatasetError, member, reading
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer, require_rendering
-from warmprior.envs.simulator import make_simulator
+from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
 from warmprior.io.extras import require
 from warmprior.io.files import (
     cache_folder,
@@ -140,6 +140,8 @@ class _Illustrator:
     @cached_property
     def renderer(self) -> CameraRenderer:
         env = make_simulator(modernize_env_args(self.index.env_args))
+        with isolated_numpy_seed(0):
+            env.reset()  # hides the grippers' markers, which no episode shows
         return CameraRenderer(env.sim.model._model, self.size, self.size, fast=self.fast)
 
     def part(self, demo: str) -> Path:
