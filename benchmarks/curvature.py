@@ -35,7 +35,7 @@ from warmprior.experiments import (
     straightness,
     write_report,
 )
-from warmprior.experiments.labels import with_actions
+from warmprior.experiments.labels import with_space
 from warmprior.experiments.navigation_figures import plot_flow_paths
 from warmprior.experiments.recipe import Flat
 from warmprior.experiments.record import refuse_ignored
@@ -136,7 +136,7 @@ def draw(recipe: CurvatureRecipe, measured: Measured, rows: Sequence[Row]) -> No
         path = flow_paths(actor, windows, recipe.held_out.steps, generator=generator)
         paths[label(group[0])] = path[..., 0, recipe.coordinate].cpu()
     facts = measured.facts
-    told = with_actions(f"{facts['task']} {facts['style']}", facts.get("actions"))
+    told = with_space(f"{facts['task']} {facts['style']}", facts)
     title = f"{told}: action coordinate {recipe.coordinate} "
     plot_flow_paths(
         paths,
@@ -168,15 +168,7 @@ def run(argv: Sequence[str] | None) -> None:
         measured.results.meta["observations"] = measured.source
         measured.results.add(*rows)
         draw(recipe, measured, rows)
-        facts = measured.facts
-        told = curvature_table(
-            rows,
-            task=facts["task"],
-            data=facts["style"],
-            actions=facts.get("actions"),
-            source=measured.source,
-        )
-        write_report(out, told)
+        write_report(out, curvature_table(rows, measured.facts, source=measured.source))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

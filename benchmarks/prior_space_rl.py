@@ -39,7 +39,7 @@ from warmprior.experiments import (
     write_report,
 )
 from warmprior.experiments.figures import agent_label
-from warmprior.experiments.labels import source_of, with_actions
+from warmprior.experiments.labels import source_of, space_of, with_space
 from warmprior.experiments.prior_space import (
     PRIOR_SPACE_PRESETS,
     PriorSpaceRecipe,
@@ -242,7 +242,7 @@ def run(argv: Sequence[str] | None) -> None:
             facts = {
                 "task": problem["task"],
                 "data": problem["style"],
-                **{name: problem[name] for name in ("actions",) if name in problem},
+                **space_of(problem),
                 "algorithm": algorithm,
                 "prior": source[0],
                 "options": source[1],
@@ -255,7 +255,7 @@ def run(argv: Sequence[str] | None) -> None:
             results.add(*(evaluated(facts, point) for point in training.curve))
         complete = [row for row in results.rows if (*agent_of(row), row["seed"]) not in diverged]
         if complete:
-            name = with_actions(f"{problem['task']} {problem['style']}", problem.get("actions"))
+            name = with_space(f"{problem['task']} {problem['style']}", problem)
             title = f"{name}, NFE {recipe.evaluation.nfe[0]}"
             draw(complete, out, title, recipe.rl.warmup_steps)
             write_report(out, make_table(complete))

@@ -101,7 +101,8 @@ def run(argv: Sequence[str] | None) -> None:
             out / "sigma.png",
             top_k=top_k,
             title=f"{problem.name}, H = {chunk}, NFE {nfe}, {recipe.evaluation.seeds} seed(s)",
-            paper=(problem.task, problem.style, chunk, nfe) == ("square", "mh", 8, 1),
+            paper=(problem.task, problem.style, chunk, nfe) == ("square", "mh", 8, 1)
+            and not problem.images,
         )
         write_report(out, text, comparison.failures)
 

@@ -33,9 +33,11 @@ from tqdm import tqdm
 
 from warmprior import (
     ChiTransformer,
+    ImageEncoder,
     Normalizer,
     PastPrior,
     VelocityMLP,
+    VisionNetwork,
     WarmPriorActor,
     policy_transforms,
     window_replay_buffer,
@@ -263,6 +265,56 @@ def chunk_step_overhead(clock: Clock) -> float:
     return clock.ratio(decisions, lambda: [alone.loop.step(a) for a in actions], before=before) - 1
 
 
+def image_windows_over_h5py(clock: Clock) -> float:
+    """Batches of windows with images, over decoding their frames from a rendered file."""
+    import h5py
+
+    length, episodes, size, batch = 100, 10, 84, 64
+    camera, frames = "agentview_image", length * episodes
+    smooth = np.add.outer(np.arange(size), np.arange(size))[..., None] + np.arange(3)
+    noise = np.random.default_rng(0).integers(0, 8, (frames, size, size, 3))
+    images = (smooth + noise).astype(np.uint8)  # compresses about as much as a rendered image
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "images.hdf5"
+        with h5py.File(path, "w") as file:
+            chunk = (1, size, size, 3)
+            file.create_dataset(camera, data=images, chunks=chunk, compression="gzip")
+        data = steps(episodes, length)
+        vector = data["observation"]
+        channels_first = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
+        data["observation"] = TensorDict({"state": vector, camera: channels_first}, [frames])
+        data = data.memmap(Path(folder) / "memmap")
+        buffer = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO)
+        with h5py.File(path) as file:
+            stored = file[camera]
+
+            def decode() -> None:
+                for i in torch.randint(frames, (batch,)).tolist():
+                    first = i - i % length
+                    for step in range(TO):
+                        stored[max(first, i - step)]
+
+            return clock.ratio(decode, buffer.sample)
+
+
+def encoder_share(clock: Clock) -> dict[str, float]:
+    """Share of a decision's time that the ResNets of two cameras take."""
+    torch.manual_seed(0)
+    cameras = ["agentview_image", "robot0_eye_in_hand_image"]
+    encoder = ImageEncoder(cameras, 9)
+    network = ChiTransformer(D_A, encoder.observation_dim, PRIOR.prediction_length, TO)
+    actor = WarmPriorActor(VisionNetwork(encoder, network), PRIOR).eval()
+    images = {name: torch.zeros(1, TO, 3, 84, 84, dtype=torch.uint8) for name in cameras}
+    observation = TensorDict({"state": torch.randn(1, TO, 9), **images}, [1])
+    mean = {"loc": torch.randn(1, H, D_A), "warm": torch.ones(1, H, 1, dtype=torch.bool)}
+    data = TensorDict({"observation": observation, "prior": mean}, [1])
+    with torch.no_grad():
+        return {
+            str(nfe): clock.ratio(partial(encoder, observation), partial(actor, data, nfe=nfe))
+            for nfe in (1, 3, 9)
+        }
+
+
 LOAD = """
 import sys
 from warmprior.data import RobomimicExperienceReplay
@@ -309,6 +361,8 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "env_over_robosuite": (env_over_robosuite, ">= 2"),
     "chunk_step_overhead": (chunk_step_overhead, "<= 0.15"),
     "load_memory_over_data": (load_memory_over_data, "<= 1.3"),
+    "image_windows_over_h5py": (image_windows_over_h5py, ">= 5"),
+    "encoder_share": (encoder_share, ""),
     "prior_space_decoding": (prior_space.decoding, ""),
     "prior_space_collection_over_env": (prior_space.collection_over_env, ""),
 }

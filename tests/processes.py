@@ -2,9 +2,49 @@
 
 from __future__ import annotations
 
+import functools
+import multiprocessing
+import traceback
 from pathlib import Path
+
+from warmprior.io.workers import end_with_parent
 
 
 def ended(pid):
     state = Path(f"/proc/{pid}/stat")
     return not state.exists() or state.read_text().split()[2] == "Z"
+
+
+def apart(function):
+    """Let a function or test run in a process forked for it, and give its result or error.
+
+    Whatever renders in a test does it there: OpenGL does not survive a fork, and the tests' own process
+    forks workers that render.
+    """
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        fork = multiprocessing.get_context("fork")
+        ours, theirs = fork.Pipe(duplex=False)
+
+        def work():
+            end_with_parent()
+            try:
+                outcome = function(*args, **kwargs), None
+            except BaseException as error:  # pytest's own outcomes included
+                error.add_note(traceback.format_exc())
+                outcome = None, error
+            theirs.send(outcome)
+
+        process = fork.Process(target=work)
+        process.start()
+        theirs.close()
+        try:
+            result, error = ours.recv()
+        finally:
+            process.join()
+        if error is not None:
+            raise error
+        return result
+
+    return call

@@ -7,6 +7,7 @@ import shutil
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
+from tests.processes import apart
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.__main__ import main
 
@@ -53,7 +54,7 @@ def test_video_has_a_frame_per_control_step(saved, tmp_path, capsys):
     folder, episode = saved
     film = tmp_path / "films" / "out.mp4"
     argv = ["evaluate", str(folder), "--episodes", "1", "--nfe", "1", "--video", str(film)]
-    assert main(argv) == 0
+    assert apart(main)(argv) == 0
     with av.open(str(film)) as container:
         frames = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
         assert container.streams.video[0].average_rate == 20

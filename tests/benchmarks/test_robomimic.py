@@ -15,6 +15,7 @@ import pytest
 from safetensors.torch import load_file
 
 from tests.benchmarks.script_parts import is_png, options, refused, stored, written
+from tests.processes import apart
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
@@ -43,9 +44,9 @@ def start(*argv):
     return recipe
 
 
-def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, capsys, monkeypatch):
+def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, capfd, monkeypatch):
     out = tmp_path / "runs" / "first"
-    assert benchmark.main(options(dataset, out, episodes=3)) == 0
+    assert apart(benchmark.main)(options(dataset, out, episodes=3)) == 0
     result = stored(out)
     assert [row["prior"] for row in result["rows"]] == ["gaussian", "past", "preview"]
     row = result["rows"][0]
@@ -63,7 +64,7 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
     assert meta["identity"]["recipe"]["training"]["iterations"] == 30
     assert meta["hardware"]["workers"] == 1
     table = (out / "table.md").read_text()
-    assert "measured (file data)" in table and table in capsys.readouterr().out
+    assert "measured (file data)" in table and table in capfd.readouterr().out
     assert "NFE 1: WP-Past" in table
     assert "Network and training budget are smaller" in table
     assert is_png(out / "success.png") and is_png(out / "learning_curves.png")
@@ -73,7 +74,7 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
     # The folder is never overwritten, and a second run of the same options trains nothing again. Two
     # workers play other episodes one after another in their simulators than one, with the same rows.
     before = (out / "results.json").read_bytes()
-    assert "--resume" in refused(benchmark.main, options(dataset, out), capsys)
+    assert "--resume" in refused(benchmark.main, options(dataset, out), capfd)
     assert (out / "results.json").read_bytes() == before
     policies = out.parent / "policies"
     times = written(policies)
@@ -81,7 +82,7 @@ def test_run_writes_results_table_and_pictures(benchmark, dataset, tmp_path, cap
     monkeypatch.setattr(success_study, "rendering_backend", lambda: None)
     second = tmp_path / "runs" / "second"
     assert benchmark.main(options(dataset, second, episodes=3, envs=2, prior="past")) == 0
-    assert "libegl1" in capsys.readouterr().out
+    assert "libegl1" in capfd.readouterr().out
     assert written(policies) == times
     assert stored(second)["rows"] == [row for row in result["rows"] if row["prior"] == "past"]
 

@@ -23,6 +23,8 @@ KEYS = {
     "env_over_robosuite",
     "chunk_step_overhead",
     "load_memory_over_data",
+    "image_windows_over_h5py",
+    "encoder_share",
     "prior_space_decoding",
     "prior_space_collection_over_env",
     "meta",
@@ -49,6 +51,17 @@ def test_writes_every_key(throughput, tmp_path):
     assert results["env_over_robosuite"] is None
     assert {"python", "torch", "warmprior"} <= results["meta"]["versions"].keys()
     assert {"cpu", "torch_threads", "date"} <= results["meta"]["hardware"].keys()
+
+
+def test_images(throughput, tmp_path):
+    names = ["image_windows_over_h5py", "encoder_share"]
+    throughput.main(["--only", *names, "--repeats", "1", "--out", str(tmp_path)])
+    results = json.loads((tmp_path / "throughput.json").read_text())
+    assert results["image_windows_over_h5py"] > 1
+    share = results["encoder_share"]
+    assert share.keys() == {"1", "3", "9"}
+    # The observation is encoded once, however many evaluations follow.
+    assert 0 < share["9"] < share["1"] < 1
 
 
 def test_ratio_of_known_times(throughput):

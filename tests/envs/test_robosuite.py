@@ -16,6 +16,7 @@ pytest.importorskip("robosuite")
 from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
+from tests.processes import apart
 from warmprior.data.scripted.episode import PLANS
 from warmprior.data.scripted.motion import ArmRunner
 from warmprior.data.scripted.operators import SKILLED, Demonstrator
@@ -268,6 +269,7 @@ logging.getLogger("robosuite_logs").error("still heard")
     assert "still heard" in line
 
 
+@apart
 def test_pixels(can_render):
     env = make_lift(from_pixels=True, camera_size=(48, 64))
     check_env_specs(env)
@@ -277,6 +279,7 @@ def test_pixels(can_render):
     assert pixels.float().std() > 10
 
 
+@apart
 def test_frames_are_upright(can_render, lift):
     from robosuite.utils import camera_utils
 
@@ -290,6 +293,7 @@ def test_frames_are_upright(can_render, lift):
     assert red > 2 * max(green, blue), "the red cube is not where the camera should see it"
 
 
+@apart
 def test_rendering_does_not_change_the_episode(can_render):
     actions = torch.rand(10, 7, generator=torch.manual_seed(2)) * 2 - 1
     plain = play(make_lift(), actions, seed=6)

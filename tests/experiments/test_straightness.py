@@ -39,7 +39,7 @@ def shared(count=20):
 def test_a_field_worse_than_none_is_flagged():
     rows = straightness({"gaussian": [policy(turning(9.0))]}, shared(), n_steps=10)
     assert rows[0].measures["ratio"] is None
-    text = curvature_table(rows, task="lift", data="ph", source="a test")
+    text = curvature_table(rows, {"task": "lift", "style": "ph"}, source="a test")
     assert "| Lift-PH, whole prediction, training mean | no motion |" in text
     assert "20 observations of a test, one seed" in text
 
@@ -77,16 +77,21 @@ def test_ratios_follow_from_the_fields(monkeypatch):
     assert rows["gaussian", 0, "training"]["bound"] > rows["past", 0, "training"]["bound"]
 
     # The paper's numbers are for H = 8 and relative to the Gaussian source.
-    own = curvature_table(list(rows.values()), task="square", data="mh", source="a test")
+    own = curvature_table(list(rows.values()), {"task": "square", "style": "mh"}, source="a test")
     assert "paper (official data)" not in own
     eight = [Row({**row.facts, "chunk": 8}, row.measures) for row in rows.values()]
     warm = [row for row in eight if row["prior"] != "gaussian"]
-    assert "paper (official" not in curvature_table(warm, task="square", data="mh", source="")
-    text = curvature_table(eight, task="square", data="mh", source="a test")
+    assert "paper (official" not in curvature_table(
+        warm, {"task": "square", "style": "mh"}, source=""
+    )
+    text = curvature_table(eight, {"task": "square", "style": "mh"}, source="a test")
     assert "| Square-MH, executed H, training mean | 1.000 | 0.625" in text
     assert "| Square-MH, paper (official data) | 1.000 | 0.705 | 0.559 |" in text
     assert "20 observations of a test, averaged over 2 training seeds" in text
-    unknown = curvature_table(list(rows.values()), task="lift", data="ph", source="a test")
+    images = {"task": "square", "style": "mh", "obs": "image"}
+    text = curvature_table(eight, images, source="a test")
+    assert "| Square-MH, image observations, executed H" in text and "paper (off" not in text
+    unknown = curvature_table(list(rows.values()), {"task": "lift", "style": "ph"}, source="a test")
     assert "paper (official data)" not in unknown
 
 

@@ -58,6 +58,21 @@ def test_gains_are_over_the_baseline_of_the_same_nfe():
     assert "One seed has no spread: no gain is marked" in text
 
 
+def test_policies_that_see_images_are_a_problem_of_their_own():
+    """Not averaged with those that see the state, nor put beside the paper's, which do (Table 1)."""
+    rows = [
+        row(k, prior=prior, data="mh", **space)
+        for space, wins in (({}, (2, 5)), ({"obs": "image"}, (6, 7)))
+        for prior, k in zip(("gaussian", "past"), wins, strict=True)
+    ]
+    told = lines(success_table(rows, top_k=1, source="official"), "| Square-MH")
+    assert "| Square-MH, measured (official data) | 20.0 | **50.0** (+30.0) |" in told
+    images = [line for line in told if line.startswith("| Square-MH, image observations,")]
+    assert images[0].endswith("measured (official data) | 60.0 | **70.0** (+10.0) |")
+    assert sum("paper (official data)" in line for line in told) == 1
+    assert not any("paper" in line for line in images)
+
+
 def test_gains_are_over_the_first_source_wherever_it_is():
     rows = [
         row(k, prior=prior, nfe=nfe)

@@ -16,7 +16,7 @@ from warmprior.data.hdf5 import RobomimicIndex, open_robomimic, read_index
 from warmprior.data.hdf5_members import DatasetError, member, reading
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer, require_rendering
-from warmprior.envs.simulator import make_simulator
+from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
 from warmprior.io.extras import require
 from warmprior.io.files import (
     cache_folder,
@@ -29,6 +29,9 @@ from warmprior.io.files import (
 from warmprior.io.workers import WorkerPool, available_cores
 
 __all__ = ["check_upright", "render_demonstrations"]
+
+RENDERER_VERSION = 2
+"""Part of every cached file's name; raised whenever the same states give other images."""
 
 CLEARLY = 8.0
 """Mean difference of two images, of 255, from which on they show something else."""
@@ -92,7 +95,7 @@ def render_demonstrations(
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     chosen = [] if demos is None else [demos]
-    identity = digest_of(file_digest(path), cameras, size, fast, *chosen)[:8]
+    identity = digest_of(RENDERER_VERSION, file_digest(path), cameras, size, fast, *chosen)[:8]
     if out is None:
         told = "-".join(cameras) if len(cameras) < 3 else f"{len(cameras)}cameras"
         name = f"{path.stem}_{told}{size}{'fast' if fast else ''}_{identity}.hdf5"
@@ -143,6 +146,8 @@ class _Illustrator:
     @cached_property
     def renderer(self) -> CameraRenderer:
         env = make_simulator(modernize_env_args(self.index.env_args))
+        with isolated_numpy_seed(0):
+            env.reset()  # hides the grippers' markers, which no episode shows
         return CameraRenderer(env.sim.model._model, self.size, self.size, fast=self.fast)
 
     def part(self, demo: str) -> Path:

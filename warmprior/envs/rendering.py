@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from warmprior.io.extras import require
+from warmprior.io.workers import stop_forking
 
 __all__ = ["CameraRenderer", "EnvRenderers", "rendering_backend", "require_rendering"]
 
@@ -156,7 +157,9 @@ class CameraRenderer:
 
         Raises:
             ValueError: if the model has no such camera.
+            RuntimeError: if the process was forked from the one that made the renderer.
         """
+        _check_process()
         mujoco, model, data = self._mujoco, self.model, self._data
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)
         if number < 0:
@@ -184,10 +187,11 @@ def _check_process() -> None:
     global _rendering_process
     if _rendering_process not in (None, os.getpid()):
         raise RuntimeError(
-            "this process was forked from one that had rendered, and OpenGL does not survive that: render in "
-            "workers alone, or start them first"
+            "this process was forked from one that had rendered, and OpenGL does not survive that: start it "
+            'with mp_start_method="spawn", or before anything is rendered'
         )
     _rendering_process = os.getpid()
+    stop_forking()
 
 
 def _close_all() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Any
 
 from warmprior.experiments.results import Row
@@ -14,25 +14,47 @@ __all__ = [
     "source_colors",
     "source_labels",
     "source_of",
-    "with_actions",
+    "space_of",
+    "with_space",
 ]
 
 PALEST = 0.6
 """Share of white (or black, where the prior's own colour is bright) in the last shade of a prior."""
 
 
-def with_actions(told: str, actions: str | None) -> str:
-    """Add the space of the actions to what is told of a problem, where it is not the recorded one.
+def space_of(facts: Row | Mapping[str, Any]) -> dict[str, str]:
+    """The spaces of actions and observations, where they are not the recorded one and the state.
+
+    Args:
+        facts: of a problem, or a row.
+
+    Examples:
+        >>> space_of({"task": "square"}), space_of({"task": "square", "obs": "image"})
+        ({}, {'obs': 'image'})
+    """
+    found = {name: facts.get(name) for name in ("actions", "obs")}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def with_space(told: str, facts: Row | Mapping[str, Any]) -> str:
+    """Add to what is told of a problem what :func:`space_of` tells, and how images are rendered.
 
     Args:
         told: of the problem.
-        actions: as facts of a problem and its rows have them.
+        facts: of the problem, or a row, which does not know how images are rendered.
 
     Examples:
-        >>> with_actions("square ph", None), with_actions("square ph", "absolute")
+        >>> with_space("square ph", {}), with_space("square ph", {"actions": "absolute"})
         ('square ph', 'square ph, absolute actions')
+        >>> with_space("square ph", {"obs": "image", "images": {"fast_rendering": True}})
+        'square ph, image observations, rendered fast'
     """
-    return told if actions is None else f"{told}, {actions} actions"
+    space = space_of(facts)
+    words = {"actions": "actions", "obs": "observations"}
+    parts = [told, *(f"{value} {words[name]}" for name, value in space.items())]
+    if (facts.get("images") or {}).get("fast_rendering"):
+        parts.append("rendered fast")
+    return ", ".join(parts)
 
 
 def source_of(row: Row) -> tuple[str, str]:

@@ -28,7 +28,7 @@ from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
 from warmprior.envs.tasks import get_task
-from warmprior.experiments.labels import with_actions
+from warmprior.experiments.labels import space_of, with_space
 from warmprior.experiments.recipe import DataOptions, HeldOutOptions
 from warmprior.io.files import digest_of, file_digest
 from warmprior.keys import ACTION, OBSERVATION, STATE
@@ -92,10 +92,10 @@ class Problem:
 
     @property
     def name(self) -> str:
-        """Task and style, for titles."""
+        """Task, style and what is unusual, for titles."""
         source = self.facts.get("source")
         told = f"{self.task} {self.style}" + (f" ({source} data)" if source else "")
-        return with_actions(told, self.facts.get("actions"))
+        return with_space(told, self.facts)
 
     @property
     def vector(self) -> Tensor:
@@ -113,8 +113,8 @@ class Problem:
 
     @property
     def space(self) -> dict[str, str]:
-        """The space of the actions, as rows and results tell it: nothing of the recorded one."""
-        return {name: self.facts[name] for name in ("actions",) if name in self.facts}
+        """The spaces of actions and observations, as rows tell them: nothing of the usual ones."""
+        return space_of(self.facts)
 
 
 def robosuite_problem(

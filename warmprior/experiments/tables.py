@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 from warmprior.diagnostics.source_leak import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.diagnostics.statistics import (
@@ -12,7 +13,7 @@ from warmprior.diagnostics.statistics import (
     probability_better,
     summarize_seeds,
 )
-from warmprior.experiments.labels import source_labels, with_actions
+from warmprior.experiments.labels import source_labels, space_of, with_space
 from warmprior.experiments.paper import PAPER_CURVATURE, paper_success
 from warmprior.experiments.results import Row, grouped, mean_known, select, success_summary
 from warmprior.experiments.straightness import RATIOS, pooled
@@ -148,9 +149,11 @@ def success_table(
     base = label(rows[0])
     rows = sorted(rows, key=lambda row: -row["nfe"])
 
+    def beside(row: Row) -> list[Row]:
+        return select(_of_problem(rows, row), nfe=row["nfe"])
+
     def measured(cell: list[Row]) -> str:
-        same = {name: cell[0][name] for name in ("task", "data", "nfe")}
-        sources = grouped(select(rows, **same), label)
+        sources = grouped(beside(cell[0]), label)
         summaries = {name: success_summary(group, top_k) for name, group in sources.items()}
         mine, baseline = summaries[label(cell[0])], summaries.get(base)
         text = f"{100 * mine.mean:.1f}"
@@ -163,8 +166,7 @@ def success_table(
         return f"{text} ({gain:+.1f}{mark})"
 
     def better(cell: list[Row]) -> str | None:
-        same = {name: cell[0][name] for name in ("task", "data", "nfe")}
-        sources = grouped(last_checkpoints(select(rows, **same)), label)
+        sources = grouped(last_checkpoints(beside(cell[0])), label)
         if label(cell[0]) == base or base not in sources:
             return None
         counts = (
@@ -175,8 +177,7 @@ def success_table(
         return f"{probability_better(*counts):.2f}"
 
     def paired(cell: list[Row]) -> str | None:
-        same = {name: cell[0][name] for name in ("task", "data", "nfe")}
-        sources = grouped(last_checkpoints(select(rows, **same)), label)
+        sources = grouped(last_checkpoints(beside(cell[0])), label)
         if label(cell[0]) == base or base not in sources:
             return None
         counts = wins_and_losses(sources[label(cell[0])], sources[base])
@@ -188,7 +189,7 @@ def success_table(
         value, baseline = (
             paper_success(*place, p, row["nfe"], row["chunk"]) for p in (row["prior"], "gaussian")
         )
-        if value is None or baseline is None or row.get("options"):
+        if value is None or baseline is None or row.get("options") or row.get("obs"):
             return None
         gain = "" if row["prior"] == "gaussian" else f" ({value - baseline:+.1f})"
         return f"{value:.1f}{gain}"
@@ -252,8 +253,7 @@ def flow_table(rows: Sequence[Row]) -> str:
 
     def relative(measure: str) -> Cell:
         def cell(cell: list[Row]) -> str | None:
-            same = {name: cell[0][name] for name in ("task", "data")}
-            baseline = [row for row in select(rows, **same) if label(row) == base]
+            baseline = [row for row in _of_problem(rows, cell[0]) if label(row) == base]
             value, reference = mean_known(cell, measure), mean_known(baseline, measure)
             return None if value is None or not reference else f"{value / reference:.2f}"
 
@@ -282,9 +282,14 @@ def flow_table(rows: Sequence[Row]) -> str:
 
 
 def problem_title(row: Row) -> str:
-    """Task, style and, where it is not the recorded one, space of the actions, as tables show them."""
+    """Task, style and, where they are not the usual ones, actions and observations, as tables show them."""
     title = f"{row['task'].replace('_', '-').title()}-{row['data'].upper()}"
-    return with_actions(title, row.get("actions"))
+    return with_space(title, row)
+
+
+def _of_problem(rows: Iterable[Row], row: Row) -> list[Row]:
+    """Those of the problem of a row."""
+    return [other for other in rows if problem_title(other) == problem_title(row)]
 
 
 def _jump(rows: list[Row]) -> str | None:
@@ -342,25 +347,22 @@ def _success_notes(rows: Sequence[Row], top_k: int, source: str | None, base: st
     return notes
 
 
-def curvature_table(
-    rows: Sequence[Row], *, task: str, data: str, source: str, actions: str | None = None
-) -> str:
+def curvature_table(rows: Sequence[Row], facts: Mapping[str, Any], *, source: str) -> str:
     """The layout of the paper's Table 2, with the paper's own numbers in a line of their own.
 
     The paper's are for ``H = 8`` and relative to the Gaussian source; otherwise they are left out.
 
     Args:
         rows: of :func:`straightness`.
+        facts: of the policies' problem, as results tell them.
 
     Keyword Args:
-        task: short task name.
-        data: ``"ph"`` or ``"mh"``.
         source: what the observations are, in words.
-        actions: of the policies, where they are not the recorded ones.
     """
     chosen = pooled(rows)
     first = chosen[0]
-    title = problem_title(Row({"task": task, "data": data, "actions": actions}, {}))
+    task, data, space = facts["task"], facts["style"], space_of(facts)
+    title = problem_title(Row({"task": task, "data": data, **space}, {}))
 
     def ratio(name: str, mean: str) -> Cell:
         def cell(rows: list[Row]) -> str | None:
@@ -380,7 +382,7 @@ def curvature_table(
 
     def paper(rows: list[Row]) -> str | None:
         told = PAPER_CURVATURE.get((task, data))
-        if told is None or first["prior"] != "gaussian" or first["chunk"] != 8:
+        if told is None or "obs" in space or first["prior"] != "gaussian" or first["chunk"] != 8:
             return None
         value = {"gaussian": 1.0, **told}.get(rows[0]["prior"])
         return None if value is None else f"{value:.3f}"

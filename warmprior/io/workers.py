@@ -18,7 +18,16 @@ from typing import Any, Self
 import torch
 from tqdm import tqdm
 
-__all__ = ["WorkerError", "WorkerPool", "available_cores", "end_with_parent", "start_method"]
+__all__ = [
+    "WorkerError",
+    "WorkerPool",
+    "available_cores",
+    "end_with_parent",
+    "start_method",
+    "stop_forking",
+]
+
+_forks = True
 
 
 class WorkerError(RuntimeError):
@@ -36,9 +45,15 @@ def start_method() -> str:
     """How to start workers: forking takes a second instead of a minute.
 
     But autograd refuses to work in the child of a process that used it where a GPU is in sight, even if
-    that GPU is never used.
+    that GPU is never used. See also :func:`stop_forking`.
     """
-    return "spawn" if torch.cuda.is_available() else "fork"
+    return "fork" if _forks and not torch.cuda.is_available() else "spawn"
+
+
+def stop_forking() -> None:
+    """Let this process start further workers afresh: it holds something that does not survive a fork."""
+    global _forks
+    _forks = False
 
 
 def available_cores() -> int:
@@ -74,8 +89,8 @@ class WorkerPool[State]:
 
     Args:
         num_workers: number of processes.
-        state: what jobs work on; has to be picklable where CUDA is in use. What a job changes in it
-            stays in its worker.
+        state: what jobs work on; has to be picklable where CUDA is in use or this process has rendered.
+            What a job changes in it stays in its worker.
 
     Raises:
         ValueError: if ``num_workers < 1``.

@@ -1,0 +1,277 @@
+"""Images made of the states of demonstrations."""
+
+from __future__ import annotations
+
+import errno
+import shutil
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("h5py")
+pytest.importorskip("robosuite")
+
+import h5py
+
+from tests.data.synthetic import write_robomimic_file
+from tests.processes import apart
+from warmprior import PastPrior, window_replay_buffer
+from warmprior.data import (
+    DatasetError,
+    RobomimicExperienceReplay,
+    generate_demonstrations,
+    render_demonstrations,
+)
+from warmprior.data import render as render_module
+from warmprior.data.render import check_upright
+from warmprior.envs import RobosuiteEnv, rendering_backend
+
+pytestmark = pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
+
+CAMERAS = ("agentview", "robot0_eye_in_hand")
+IMAGES = [f"{camera}_image" for camera in CAMERAS]
+STEPS = 4
+render = partial(render_demonstrations, size=16, fast=True, workers=1, progress=False)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """Two scripted demos of lift, cut to a few steps."""
+    path = tmp_path_factory.mktemp("recorded") / "lift.hdf5"
+    generate_demonstrations("lift", n=2, path=path, workers=1, progress=False)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            demo.attrs["num_samples"] = STEPS
+            demo.pop("next_obs", None)
+            for group in (demo, demo["obs"]):
+                for name, rows in list(group.items()):
+                    if isinstance(rows, h5py.Dataset):
+                        kept = rows[:STEPS]
+                        del group[name]
+                        group[name] = kept
+    return path
+
+
+@pytest.fixture(scope="module")
+def rendered(recorded):
+    return render(recorded, CAMERAS, out=recorded.with_name("rendered.hdf5"))
+
+
+@pytest.fixture
+def copy(recorded, tmp_path):
+    return Path(shutil.copy(recorded, tmp_path / "lift.hdf5"))
+
+
+@pytest.fixture
+def picture(rendered, tmp_path):
+    return Path(shutil.copy(rendered, tmp_path / "images.hdf5"))
+
+
+def images_of(path):
+    with h5py.File(path) as file:
+        return {
+            f"{name}/{key}": demo["obs"][key][:]
+            for name, demo in file["data"].items()
+            for key in demo["obs"]
+            if key.endswith("_image")
+        }
+
+
+@apart
+def replayed(path):
+    """Images and observations of a file's states, by the environment."""
+    env = RobosuiteEnv("lift", camera_size=16, fast_rendering=True)
+    env.reset()
+    found = {}
+    with h5py.File(path) as file:
+        for name, demo in file["data"].items():
+            for camera in CAMERAS:
+                frames = [env.render_frame(camera, state=state) for state in demo["states"]]
+                found[f"{name}/{camera}_image"] = np.stack(frames)
+            poses = []
+            for state in demo["states"]:
+                env._env.sim.set_state_from_flattened(state)
+                env._env.sim.forward()
+                seen = env._env._get_observations(force_update=True)
+                poses.append(np.concatenate([seen["robot0_eef_pos"], seen["cube_pos"]]))
+            found[name] = np.stack(poses)
+    return found
+
+
+def test_images_are_those_of_the_recorded_states(recorded, rendered):
+    images, expected = images_of(rendered), replayed(recorded)
+    assert len(images) == 4
+    for name, value in images.items():
+        np.testing.assert_array_equal(value, expected[name])
+    with h5py.File(recorded) as file:
+        for name, demo in file["data"].items():
+            stored = np.column_stack([demo["obs/robot0_eef_pos"], demo["obs/object"][:, :3]])
+            np.testing.assert_allclose(expected[name], stored, atol=2e-3)  # 2 ms of motion at most
+
+
+def test_the_layout_is_robomimics(recorded, rendered):
+    with h5py.File(recorded) as before, h5py.File(rendered) as after:
+        assert before["mask"].keys() == after["mask"].keys()
+        for name, demo in after["data"].items():
+            assert demo.attrs["num_samples"] == STEPS and "next_obs" not in demo
+            for key in ("actions", "rewards", "states"):
+                np.testing.assert_array_equal(demo[key], before["data"][name][key])
+            for key in before["data"][name]["obs"]:
+                np.testing.assert_array_equal(demo["obs"][key], before["data"][name]["obs"][key])
+            for key in IMAGES:
+                assert demo["obs"][key].dtype == np.uint8
+                assert demo["obs"][key].chunks == (1, 16, 16, 3)
+        kwargs = render_module.read_index(rendered).env_args["env_kwargs"]
+    assert (kwargs["camera_names"], kwargs["camera_heights"]) == (list(CAMERAS), 16)
+
+
+def test_images_do_not_depend_on_the_number_of_workers(recorded, rendered, tmp_path):
+    found = render(recorded, CAMERAS, out=tmp_path / "two.hdf5", workers=2)
+    expected = images_of(rendered)
+    for name, value in images_of(found).items():
+        np.testing.assert_array_equal(value, expected[name])
+
+
+def full(path, write):
+    raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+
+def test_what_is_finished_outlives_a_full_disk(copy, rendered, monkeypatch):
+    """And is not rendered again; what was there before stays until the new file is complete."""
+    before = copy.read_bytes()
+    with monkeypatch.context() as patch:
+        real = render_module.write_atomic
+        patch.setattr(
+            render_module,
+            "write_atomic",
+            lambda path, write: real(path, write) if "demo_0" in path.name else full(path, write),
+        )
+        with pytest.raises(OSError, match="No space left"):
+            render(copy, CAMERAS, out=copy)
+    assert copy.read_bytes() == before
+    (part,) = copy.parent.glob("*.parts/*.npz")
+    with np.load(part) as images:
+        marked = {name: np.full_like(images[name], 7) for name in images}
+    np.savez(part, **marked)
+    assert render(copy, CAMERAS, out=copy) == copy
+    assert not list(copy.parent.glob("*.parts"))
+    images, expected = images_of(copy), images_of(rendered)
+    for key in IMAGES:
+        assert (images[f"demo_0/{key}"] == 7).all(), "a finished demo was rendered again"
+        np.testing.assert_array_equal(images[f"demo_1/{key}"], expected[f"demo_1/{key}"])
+
+
+def test_the_cache_is_asked_first(copy, tmp_path, monkeypatch):
+    cached = render(copy, CAMERAS[:1], cache_dir=tmp_path / "cache")
+    monkeypatch.setattr(render_module, "require_rendering", lambda: pytest.fail("rendered again"))
+    assert render(copy, CAMERAS[:1], cache_dir=tmp_path / "cache") == cached
+    assert "agentview16fast" in cached.name
+
+
+def without_states(file):
+    del file["data/demo_0/states"]
+
+
+def of_another_environment(file):
+    del file["data/demo_0/states"]
+    file["data/demo_0/states"] = np.zeros((STEPS, 45))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (without_states, r"data/demo_0 has no states to render"),
+        (of_another_environment, r"states has shape \(4, 45\).*Lift has \(4, 32\)"),
+    ],
+)
+def test_states_that_cannot_be_rendered_are_refused(copy, change, said):
+    with h5py.File(copy, "a") as file:
+        change(file)
+    with pytest.raises(DatasetError, match=said):
+        render(copy, CAMERAS[:1], out=copy)
+    assert not list(copy.parent.glob("*.hdf5.*/*"))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"cameras": ["backstage"]}, "no camera 'backstage'"),
+        ({"cameras": []}, "different cameras"),
+        ({"cameras": ["agentview"] * 2}, "different cameras"),
+        ({"size": 0}, "size must be at least 1"),
+        ({"workers": 0}, "workers must be at least 1"),
+    ],
+)
+def test_bad_options(copy, options, said):
+    with pytest.raises(ValueError, match=said):
+        render(copy, **{"out": copy, **options})
+
+
+def replaced(path, value, key=f"data/demo_1/obs/{IMAGES[0]}"):
+    with h5py.File(path, "a") as file:
+        stored = file[key][:]
+        del file[key]
+        if value is not None:
+            file[key] = value(stored)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (lambda images: images / 255, r"type float64; images are uint8"),
+        (lambda images: images[..., :2], r"\(4, 16, 16, 2\).*images are uint8"),
+        (lambda images: images[:3], "but actions has 4 rows"),
+        (lambda images: images[:, :8], "only square images"),
+        (lambda images: images[:, :8, :8], "images of several sizes: agentview_image 8"),
+        (None, "no images 'agentview_image'; it has robot0_eye_in_hand_image"),
+    ],
+)
+def test_images_of_another_kind_are_refused(picture, value, said):
+    replaced(picture, value)
+    with pytest.raises(DatasetError, match=rf"data/demo_1.*{said}"):
+        RobomimicExperienceReplay(picture, image_keys=IMAGES)
+
+
+def test_demos_with_images_of_several_sizes_are_refused(picture):
+    replaced(picture, lambda images: images[:, :8, :8])
+    with pytest.raises(DatasetError, match="16 in data/demo_0, 8 in data/demo_1"):
+        RobomimicExperienceReplay(picture, image_keys=IMAGES[:1])
+
+
+def test_images_upside_down_are_refused(picture):
+    key = f"data/demo_0/obs/{IMAGES[0]}"
+    check_upright(picture, IMAGES, fast=True)
+    check_upright(picture, IMAGES, fast=False)
+    replaced(picture, lambda images: images[:, ::-1], key)
+    with pytest.raises(DatasetError, match="images of agentview are upside down"):
+        check_upright(picture, IMAGES, fast=True)
+
+
+@pytest.mark.parametrize("storage", ["memory", "memmap"])
+def test_windows_hold_the_last_images_alone(rendered, tmp_path, storage):
+    dataset = RobomimicExperienceReplay(
+        rendered,
+        observation_keys=["robot0_eef_pos"],
+        image_keys=IMAGES,
+        storage=storage,
+        scratch_dir=tmp_path if storage == "memmap" else None,
+    )
+    assert (dataset.image_keys, dataset.image_size) == (tuple(IMAGES), 16)
+    buffer = window_replay_buffer(dataset.data, PastPrior(2), batch_size=32, observation_steps=2)
+    stored = images_of(rendered)
+    for row in buffer.sample():
+        images = row["observation", IMAGES[0]]
+        assert images.shape == (2, 3, 16, 16) and images.dtype == torch.uint8
+        demo, step = divmod(int(row["frame"]), STEPS)
+        frames = stored[f"demo_{demo}/{IMAGES[0]}"]
+        for image, at in zip(images, (max(0, step - 1), step), strict=True):
+            np.testing.assert_array_equal(image.permute(1, 2, 0), frames[at])
+
+
+def test_a_file_of_random_states_has_none_of_its_simulator(tmp_path):
+    write_robomimic_file(tmp_path / "lift.hdf5", lengths=(3,), task="lift")
+    with pytest.raises(DatasetError, match="its robots or objects are others"):
+        render(tmp_path / "lift.hdf5", out=tmp_path / "out.hdf5")

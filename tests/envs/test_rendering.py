@@ -1,0 +1,147 @@
+"""Images of the simulator against robosuite's own renderer, and what rendering must leave alone."""
+
+from __future__ import annotations
+
+import multiprocessing
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("robosuite")
+
+from torchrl.envs.utils import check_env_specs
+
+from tests.processes import apart
+from warmprior.envs import RobosuiteEnv, rendering_backend
+from warmprior.envs.rendering import CameraRenderer, require_rendering
+from warmprior.envs.simulator import import_robosuite, task_env_args
+from warmprior.io.workers import WorkerPool
+
+pytestmark = pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
+
+CAMERAS = ("agentview", "robot0_eye_in_hand")
+SIZE = 32
+
+
+@pytest.fixture(scope="module")
+def lift():
+    env = RobosuiteEnv("lift", horizon=20, camera_size=SIZE, sim_state=True)
+    env.reset()
+    return env
+
+
+@apart
+def test_pixels_are_those_of_robosuites_own_renderer(lift, monkeypatch):
+    """At its default quality; it returns them upside down."""
+    monkeypatch.setenv("MUJOCO_GL", require_rendering())
+    options = {
+        **task_env_args("lift")["env_kwargs"],
+        "has_offscreen_renderer": True,
+        "render_gpu_device_id": -1,
+    }
+    theirs = import_robosuite().make("Lift", **options)
+    theirs.reset()
+    renderer = CameraRenderer(theirs.sim.model._model, SIZE, SIZE)
+    for camera in CAMERAS:
+        shown = theirs.sim.render(SIZE, SIZE, camera_name=camera)[::-1]
+        assert shown.std() > 10, "an empty image would agree with another"
+        np.testing.assert_array_equal(renderer.render(camera, theirs.sim.data.qpos), shown)
+
+
+@apart
+def test_fast_images_differ_a_little(lift):
+    fast = RobosuiteEnv("lift", camera_size=SIZE, fast_rendering=True)
+    state = lift.reset()["sim_state"].numpy()
+    for camera in CAMERAS:
+        images = [env.render_frame(camera, 84, state).astype(int) for env in (lift, fast)]
+        difference = np.abs(images[0] - images[1]).mean()
+        assert 0 < difference < 6
+        # Less than what another camera or a flipped image would show.
+        assert difference < np.abs(images[0] - images[1][::-1]).mean() / 4
+
+
+@apart
+def test_episodes_go_on_as_if_nothing_was_rendered():
+    actions = torch.rand(6, 7, generator=torch.manual_seed(0)) * 2 - 1
+
+    def states(**options):
+        env = RobosuiteEnv("lift", sim_state=True, **options)
+        data, found = env.reset(), []
+        for action in actions:
+            data = env.step(data.set("action", action))["next"]
+            found.append(data["sim_state"])
+            if options:
+                env.render_frame("frontview", 16, found[0].numpy())
+        return torch.stack(found)
+
+    assert torch.equal(states(from_pixels=True, camera=CAMERAS, camera_size=16), states())
+
+
+@apart
+def test_several_cameras_lie_under_their_names(lift):
+    env = RobosuiteEnv("lift", from_pixels=True, camera=CAMERAS, camera_size=16, sim_state=True)
+    check_env_specs(env)
+    rollout = env.rollout(2)
+    for camera in CAMERAS:
+        images = rollout["next", "pixels", camera]
+        assert images.shape == (2, 16, 16, 3) and images.dtype == torch.uint8
+        expected = lift.render_frame(camera, 16, rollout["next", "sim_state"][1].numpy())
+        np.testing.assert_array_equal(images[1], expected)
+
+
+@apart
+def test_a_state_is_rendered_as_it_was_when_present(lift):
+    """Also after the episode, and another, have gone on."""
+    data = lift.reset()
+    state = data["sim_state"].numpy()
+    present = lift.render_frame()
+    lift.rollout(5)
+    assert not np.array_equal(lift.render_frame(), present)
+    np.testing.assert_array_equal(lift.render_frame(state=state), present)
+    assert lift.render_frame(size=(8, 24)).shape == (8, 24, 3)
+
+
+@apart
+def test_unknown_cameras_are_named(lift):
+    with pytest.raises(ValueError, match=r"no camera 'backstage'; choose one of .*agentview"):
+        lift.render_frame("backstage")
+    env = RobosuiteEnv("lift", from_pixels=True, camera=["backstage"])
+    with pytest.raises(ValueError, match="no camera 'backstage'"):
+        env.reset()
+    for cameras in ([], ["agentview", "agentview"]):
+        with pytest.raises(ValueError, match="camera is a name, or different ones"):
+            RobosuiteEnv("lift", camera=cameras)
+
+
+def shown(env, state=None):
+    return env.render_frame("agentview", 16).astype(int).sum()
+
+
+@apart
+def test_a_process_forked_from_one_that_has_rendered_says_so(lift):
+    """Instead of waiting for OpenGL's threads, which are not there, for ever."""
+    lift.render_frame()
+    for size in (SIZE, 16):  # with the renderer that is there, and with a new one
+        with pytest.raises(RuntimeError, match="forked from one that had rendered"):
+            apart(partial(lift.render_frame, size=size))()
+    # What is forked but does not render is none of its business.
+    assert apart(partial(sum, [1, 2]))() == 3
+
+
+@apart
+def test_workers_of_a_process_that_has_rendered_render(lift):
+    """They are started afresh."""
+    expected = shown(lift)
+    with WorkerPool(1, None) as pool:
+        pool.submit(fresh_image)
+        ((_, found),) = pool.wait()
+    assert found == expected
+    assert multiprocessing.active_children() == []
+
+
+def fresh_image(state):
+    env = RobosuiteEnv("lift")
+    env.reset()
+    return shown(env)
