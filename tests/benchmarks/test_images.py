@@ -18,7 +18,7 @@ pytest.importorskip("tyro")
 
 from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.tasks import TaskSpec
-from warmprior.experiments import NetworkOptions
+from warmprior.experiments import success_study
 
 pytestmark = [
     pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here"),
@@ -39,7 +39,7 @@ def finished(recorded, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WARMPRIOR_CACHE", str(folder / "cache"))
-        patch.setattr(robomimic, "rendering_backend", lambda: None)
+        patch.setattr(success_study, "rendering_backend", lambda: None)
         patch.setattr(TaskSpec, "horizon", lambda spec, style: 9)  # episodes of two decisions
         argv = options(recorded, folder / "run", prior=["gaussian", "past", "history"], **IMAGES)
         assert robomimic.main([*argv, "--fast-rendering"]) == 0
@@ -106,8 +106,3 @@ def test_what_cannot_be_is_refused(recorded, finished, tmp_path, capsys, monkeyp
     argv = options(recorded, tmp_path / "run", **IMAGES | {"prior": "past"} | extra)
     fast = [] if "cameras" in extra else ["--fast-rendering"]
     assert said in refused(main, [*argv, *fast], capsys)
-
-
-def test_imagenets_weights_are_for_the_resnet():
-    with pytest.raises(ValueError, match="--imagenet has weights for resnet18, not for small"):
-        NetworkOptions(encoder="small", imagenet=True)
