@@ -6,6 +6,7 @@ import importlib.util
 import subprocess
 import sys
 from functools import partial
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -209,8 +210,11 @@ def test_environment_outside_the_table():
     env = RobosuiteEnv(env_args=env_args)
     assert env.horizon == 1000  # robosuite's own
     assert env.rollout(2)["observation"].shape[-1] > 9
-    with pytest.raises(ValueError, match=r"no environment 'Coffee_D0'.*import that package first"):
-        RobosuiteEnv(env_args={**env_args, "env_name": "Coffee_D0"})
+    with pytest.raises(ValueError, match=r"no environment 'Coffee'.*import that package first"):
+        RobosuiteEnv(env_args={**env_args, "env_name": "Coffee"})
+    if find_spec("mimicgen") is None:
+        with pytest.raises(ImportError, match="MimicGen's tasks need NVlabs' package"):
+            RobosuiteEnv(env_args={**env_args, "env_name": "Coffee_D0"})
 
 
 def test_environment_outside_the_table_has_the_files_time_limit():

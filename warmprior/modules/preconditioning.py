@@ -239,7 +239,7 @@ class PreconditionedNetwork(VelocityNetwork):
             network.observation_steps,
         )
         self.network = network
-        self.encodes = network.encodes
+        self.encodes = getattr(network, "encodes", False)
         self.interpolant = LinearInterpolant() if interpolant is None else interpolant
         ends = self.interpolant.coefficients(torch.tensor([0.0, 1.0]))
         if not all(bool(torch.isfinite(value).all()) for value in ends):
@@ -272,7 +272,7 @@ class PreconditionedNetwork(VelocityNetwork):
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """As the network inside does."""
-        return self.network.encode(observation)
+        return self.network.encode(observation) if self.encodes else observation
 
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
         """The groups of the network inside."""
