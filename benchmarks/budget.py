@@ -13,15 +13,17 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
-from warmprior.diagnostics import SharedObservations, action_error
+from warmprior.diagnostics import SharedObservations, action_error, encoded_windows
 from warmprior.experiments import (
     PRESETS,
     Comparison,
     HeldOutOptions,
     MeasuredRecipe,
     Row,
+    comparison_preset,
     mean_known,
     parse,
     plot_budget,
@@ -65,8 +67,9 @@ def with_errors(comparison: Comparison, observations: SharedObservations) -> lis
     """The rows, with the error of their policies on demonstrations that none was trained on."""
     errors: dict[tuple[Any, ...], float] = {}
     for contestant in comparison.contestants:
-        windows = observations.windows(contestant.prior)
-        found = action_error(comparison.player(contestant), windows, nfes=comparison.nfes)
+        player = comparison.player(contestant)
+        windows = encoded_windows(player, observations.windows(contestant.prior))
+        found = action_error(player, windows, nfes=comparison.nfes)
         for nfe, error in found.items():
             errors[(*contestant.facts().values(), nfe)] = error
     names = (*comparison.contestants[0].facts(), "nfe")
@@ -104,6 +107,7 @@ def run(argv: Sequence[str] | None) -> None:
         argv,
         study="budget",
         description=__doc__,
+        preset=partial(comparison_preset, presets=presets),
         # Every budget is a number of iterations, with its last policy; no curvature is measured.
         unused=("iterations", "checkpoints", "steps", "draws"),
     )

@@ -12,11 +12,13 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from warmprior.experiments import (
     PRESETS,
     Comparison,
     Row,
+    comparison_preset,
     mean_cell,
     parse,
     plot_chunk_lengths,
@@ -55,7 +57,8 @@ def run(argv: Sequence[str] | None) -> None:
         name: replace(preset, sources=replace(preset.sources, chunk=(1, 2, 4, 8, 16)))
         for name, preset in PRESETS.items()
     }
-    recipe = parse(presets, argv, study="chunking", description=__doc__)
+    seen = partial(comparison_preset, presets=presets)
+    recipe = parse(presets, argv, study="chunking", description=__doc__, preset=seen)
     recipe.check_single(problem=True, sigma=True)
     with started(recipe, "chunking") as out:
         comparison = Comparison(recipe, "chunking")

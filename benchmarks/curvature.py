@@ -9,13 +9,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 
 from warmprior import WarmPriorActor
-from warmprior.diagnostics import SharedObservations, flow_paths
+from warmprior.diagnostics import SharedObservations, encoded_windows, flow_paths
 from warmprior.experiments import (
     PRESETS,
     Comparison,
@@ -24,6 +25,7 @@ from warmprior.experiments import (
     PolicyOptions,
     Results,
     Row,
+    comparison_preset,
     curvature_table,
     finished_policies,
     grouped,
@@ -132,7 +134,7 @@ def draw(recipe: CurvatureRecipe, measured: Measured, rows: Sequence[Row]) -> No
     for policy, group in grouped(rows, lambda row: row["policy"]).items():
         actor = next(iter(measured.actors[policy].values()))
         generator = torch.Generator(recipe.run.device).manual_seed(0)
-        windows = few.windows(actor.prior)
+        windows = encoded_windows(actor, few.windows(actor.prior))
         path = flow_paths(actor, windows, recipe.held_out.steps, generator=generator)
         paths[label(group[0])] = path[..., 0, recipe.coordinate].cpu()
     facts = measured.facts
@@ -153,6 +155,7 @@ def run(argv: Sequence[str] | None) -> None:
         argv,
         study="curvature",
         description=__doc__,
+        preset=partial(comparison_preset, presets=presets),
         unused=("episodes", "nfe", "top_k", "play_on", "grid", "checkpoints"),
     )
     with started(recipe, "curvature") as out:

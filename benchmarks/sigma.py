@@ -12,12 +12,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from warmprior.experiments import (
     PRESETS,
     Comparison,
     MeasuredRecipe,
     Recipe,
+    comparison_preset,
     mean_cell,
     parse,
     plot_sigma,
@@ -48,7 +50,8 @@ def study(preset: Recipe) -> MeasuredRecipe:
 
 def run(argv: Sequence[str] | None) -> None:
     presets = {name: study(preset) for name, preset in PRESETS.items()}
-    recipe = parse(presets, argv, study="sigma", description=__doc__)
+    seen = partial(comparison_preset, presets=presets)
+    recipe = parse(presets, argv, study="sigma", description=__doc__, preset=seen)
     recipe.check_single(nfe=True)
     recipe.sources.check_sigma()
     with started(recipe, "sigma") as out:

@@ -96,12 +96,12 @@ def test_diagnostics_see_what_the_encoder_makes_of_images(finished):
         ({"actions": "absolute"}, "--obs image goes with --actions delta"),
         ({"obs": "state", "cameras": "agentview"}, "--cameras and --fast-rendering belong to"),
         ({"crop_size": 20}, "--crop-size 20 does not fit into --image-size 16"),
-        ({"prior": "forecast"}, "learns from observations that are one vector"),
+        ({"prior": "forecast"}, "reads observations that are one vector"),
     ],
 )
 def test_what_cannot_be_is_refused(recorded, finished, tmp_path, capsys, monkeypatch, extra, said):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(finished / "cache"))
-    monkeypatch.setattr("warmprior.experiments.problem.check_upright", lambda *args: None)
+    monkeypatch.setattr("warmprior.experiments.problem.compare_images", lambda *args: None)
     main = importlib.import_module("robomimic").main
     argv = options(recorded, tmp_path / "run", **IMAGES | {"prior": "past"} | extra)
     fast = [] if "cameras" in extra else ["--fast-rendering"]

@@ -26,7 +26,7 @@ from warmprior.data import (
     render_demonstrations,
 )
 from warmprior.data import render as render_module
-from warmprior.data.render import check_upright
+from warmprior.data.render import compare_images
 from warmprior.envs import RobosuiteEnv, rendering_backend
 
 pytestmark = pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
@@ -243,11 +243,27 @@ def test_demos_with_images_of_several_sizes_are_refused(picture):
 
 def test_images_upside_down_are_refused(picture):
     key = f"data/demo_0/obs/{IMAGES[0]}"
-    check_upright(picture, IMAGES, fast=True)
-    check_upright(picture, IMAGES, fast=False)
-    replaced(picture, lambda images: images[:, ::-1], key)
-    with pytest.raises(DatasetError, match="images of agentview are upside down"):
-        check_upright(picture, IMAGES, fast=True)
+    compare_images(picture, IMAGES, fast=True)
+    with pytest.raises(DatasetError, match=r"rendered fast.*add --fast-rendering"):
+        compare_images(picture, IMAGES, fast=False)
+    changes = {
+        "are upside down": lambda images: images[:, ::-1],
+        "have red and blue exchanged": lambda images: images[..., ::-1],
+        "show something else": lambda images: 255 - images,
+    }
+    with h5py.File(picture) as file:
+        before = file[key][()]
+    for told, change in changes.items():
+        replaced(picture, lambda images, change=change: change(before), key)
+        with pytest.raises(DatasetError, match=f"images of agentview {told}"):
+            compare_images(picture, IMAGES, fast=True)
+
+
+def test_images_without_states_are_taken_with_a_warning(picture):
+    with h5py.File(picture, "a") as file:
+        del file["data/demo_0/states"]
+    with pytest.warns(UserWarning, match="could not be compared"):
+        compare_images(picture, IMAGES, fast=True)
 
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])

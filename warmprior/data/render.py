@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +30,7 @@ from warmprior.io.files import (
 )
 from warmprior.io.workers import WorkerPool, available_cores
 
-__all__ = ["check_upright", "render_demonstrations"]
+__all__ = ["compare_images", "render_demonstrations", "renderer_versions"]
 
 RENDERER_VERSION = 2
 """Part of every cached file's name; raised whenever the same states give other images."""
@@ -95,7 +97,7 @@ def render_demonstrations(
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
     chosen = [] if demos is None else [demos]
-    identity = digest_of(RENDERER_VERSION, file_digest(path), cameras, size, fast, *chosen)[:8]
+    identity = digest_of(*renderer_versions(), file_digest(path), cameras, size, fast, *chosen)[:8]
     if out is None:
         told = "-".join(cameras) if len(cameras) < 3 else f"{len(cameras)}cameras"
         name = f"{path.stem}_{told}{size}{'fast' if fast else ''}_{identity}.hdf5"
@@ -103,6 +105,8 @@ def render_demonstrations(
         if out.exists():
             return out
     out = Path(out)
+    if demos is not None and out.resolve() == path.resolve():
+        raise ValueError(f"{out} would lose all but {demos} demonstrations: choose another out")
     parts = out.with_name(f"{out.name}.{identity}.parts")
     require_rendering()
     check_writable(out.parent)
@@ -132,6 +136,11 @@ def render_demonstrations(
             illustrator.part(demo).unlink()
     parts.rmdir()
     return out
+
+
+def renderer_versions() -> tuple[int | str, ...]:
+    """What the same states' images depend on, beside how they are asked for."""
+    return RENDERER_VERSION, version("mujoco"), version("robosuite")
 
 
 class _Illustrator:
@@ -176,7 +185,7 @@ class _Illustrator:
         for camera in self.cameras:
             self.renderer.render(camera, self.positions(self.index.demos[0])[0])
 
-    def check_upright(self) -> None:
+    def compare(self) -> None:
         """Compare the first images of the file with the simulator's."""
         path, demo = self.index.path, self.index.demos[0]
         position = self.positions(demo)[0]
@@ -184,11 +193,21 @@ class _Illustrator:
             for camera in self.cameras:
                 shown = self.renderer.render(camera, position).astype(np.float32)
                 stored = file[f"data/{demo}/obs/{camera}_image"][0].astype(np.float32)
-                upright, flipped = (np.abs(shown - i).mean() for i in (stored, stored[::-1]))
-                if upright > CLEARLY and 2 * flipped < upright:
+                views = {
+                    "show something else than the simulator": stored,
+                    "are upside down": stored[::-1],
+                    "have red and blue exchanged": stored[..., ::-1],
+                }
+                off = {name: float(np.abs(shown - image).mean()) for name, image in views.items()}
+                (as_stored, *_), told = off.values(), min(off, key=lambda name: off[name])
+                # Most of a scene may look alike upside down, and have little colour.
+                other = as_stored > 1 and off[told] < as_stored / 2
+                if other or as_stored > CLEARLY:
+                    told = told if other else next(iter(views))
                     raise DatasetError(
-                        f"{path}: the images of {camera} are upside down. robosuite returns them so: write "
-                        f"them with images[:, ::-1], or render them anew (python -m warmprior render {path})"
+                        f"{path}: the images of {camera} {told} ({as_stored:.0f} of 255 off on average). "
+                        "Policies would see other ones in evaluation: render these anew (python -m warmprior "
+                        f"render {path})"
                     )
 
 
@@ -216,6 +235,7 @@ def _write(path: Path, illustrator: _Illustrator) -> None:
     with open_robomimic(index.path) as source, h5py.File(path, "w") as file:
         data = file.create_group("data")
         data.attrs.update(source["data"].attrs)
+        data.attrs["total"] = sum(index.lengths)
         data.attrs["env_args"] = json.dumps(_with_cameras(index.env_args, illustrator), indent=4)
         data.attrs["rendering"] = json.dumps(
             {"size": size, "cameras": illustrator.cameras, "fast": illustrator.fast}
@@ -244,7 +264,7 @@ def _with_cameras(env_args: Mapping[str, Any], illustrator: _Illustrator) -> dic
     return {**env_args, "env_kwargs": kwargs}
 
 
-def check_upright(path: Path, image_keys: Sequence[str], fast: bool = False) -> None:
+def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) -> None:
     """Compare the first images of a file with what the simulator shows there.
 
     Args:
@@ -253,12 +273,27 @@ def check_upright(path: Path, image_keys: Sequence[str], fast: bool = False) -> 
         fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
 
     Raises:
-        DatasetError: if they are upside down.
+        DatasetError: if they are upside down, or show something else, or the file says that they were
+            rendered in the other quality.
         ValueError: if the simulator has no such camera.
         RuntimeError: if nothing here can render.
     """
     index = read_index(path, image_keys=image_keys)
     cameras = tuple(key.removesuffix("_image") for key in image_keys)
+    with open_robomimic(path) as file:
+        written = file["data"].attrs.get("rendering")
+        has_states = member(file, f"data/{index.demos[0]}/states", "dataset") is not None
+    if written is not None and bool(json.loads(written)["fast"]) != fast:
+        raise DatasetError(
+            f"{path}: its images were rendered {'in full quality' if fast else 'fast'}, and in evaluation "
+            f"they would not be: {'leave out' if fast else 'add'} --fast-rendering"
+        )
+    if not has_states:
+        warnings.warn(
+            f"{path} holds no states: its images could not be compared with the simulator's",
+            stacklevel=2,
+        )
+        return
     with WorkerPool(1, _Illustrator(index, cameras, index.image_size, fast, path)) as pool:
-        pool.submit(_Illustrator.check_upright)
+        pool.submit(_Illustrator.compare)
         pool.wait()

@@ -126,7 +126,14 @@ def encoded_windows(
     device = next(policy.parameters()).device
     with evaluation_mode(policy):
         parts = [encoded(policy.network, part.to(device)) for part in observation.split(split)]
-    return windows.copy().to(device).set(key, torch.cat(parts))  # type: ignore[arg-type]
+    features = torch.cat(parts)  # type: ignore[arg-type]
+    result = windows.copy().to(device).set(key, features)
+    if policy.prior.conditions_network:  # the same without the mean, which stands behind the vector
+        bare = windows[keys.OBSERVATION][keys.STATE].shape[-1]
+        extended = observation[keys.STATE].shape[-1]
+        without = torch.cat([features[..., :bare], features[..., extended:]], -1)
+        result.set(keys.OBSERVATION, without)
+    return result
 
 
 def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:

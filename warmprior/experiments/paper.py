@@ -4,49 +4,32 @@ from __future__ import annotations
 
 __all__ = ["PAPER_CURVATURE", "PAPER_SIGMA", "PAPER_SUCCESS", "paper_success"]
 
-#: Table 1, Robomimic with state and MimicGen with image observations, H = 8, percent: (task, data) -> prior
-#: -> NFE -> success rate.
-PAPER_SUCCESS: dict[tuple[str, str], dict[str, dict[int, float]]] = {
-    ("square", "ph"): {
-        "gaussian": {9: 86.7, 3: 86.2, 1: 83.6},
-        "past": {9: 88.1, 3: 88.0, 1: 86.6},
-        "preview": {9: 88.1, 3: 87.9, 1: 87.3},
-    },
-    ("square", "mh"): {
-        "gaussian": {9: 65.9, 3: 65.4, 1: 65.9},
-        "past": {9: 69.2, 3: 73.2, 1: 70.1},
-        "preview": {9: 72.7, 3: 72.9, 1: 77.8},
-    },
-    ("transport", "ph"): {
-        "gaussian": {9: 34.1, 3: 39.0, 1: 36.8},
-        "past": {9: 36.2, 3: 44.0, 1: 39.8},
-        "preview": {9: 43.3, 3: 49.1, 1: 47.6},
-    },
-    ("transport", "mh"): {
-        "gaussian": {9: 16.3, 3: 21.3, 1: 23.3},
-        "past": {9: 20.7, 3: 30.7, 1: 30.2},
-        "preview": {9: 24.3, 3: 30.4, 1: 34.5},
-    },
-    ("tool_hang", "ph"): {
-        "gaussian": {9: 79.4, 3: 72.3, 1: 77.7},
-        "past": {9: 80.6, 3: 75.1, 1: 78.2},
-        "preview": {9: 82.8, 3: 75.8, 1: 81.9},
-    },
-    ("stack_d0", "source"): {
-        "gaussian": {9: 21.4, 3: 21.3, 1: 21.3},
-        "past": {9: 22.8, 3: 23.7, 1: 22.4},
-        "preview": {9: 31.6, 3: 30.7, 1: 28.7},
-    },
-    ("coffee_d0", "source"): {
-        "gaussian": {9: 26.8, 3: 23.3, 1: 16.2},
-        "past": {9: 29.6, 3: 24.1, 1: 20.4},
-        "preview": {9: 34.7, 3: 33.4, 1: 29.4},
-    },
-    ("threading_d0", "source"): {
-        "gaussian": {9: 13.8, 3: 16.3, 1: 12.5},
-        "past": {9: 15.5, 3: 16.6, 1: 15.6},
-        "preview": {9: 20.9, 3: 22.0, 1: 18.0},
-    },
+STATE, IMAGE = "state", "image"
+
+
+def _row(*values: float) -> dict[str, dict[int, float]]:
+    """A line of Table 1: of each NFE the base, WP-Past and WP-Preview."""
+    return {
+        prior: {nfe: values[3 * column + place] for column, nfe in enumerate((9, 3, 1))}
+        for place, prior in enumerate(("gaussian", "past", "preview"))
+    }
+
+
+#: Table 1, H = 8, percent: (task, data, what policies see) -> prior -> NFE -> success rate.
+PAPER_SUCCESS: dict[tuple[str, str, str], dict[str, dict[int, float]]] = {
+    ("square", "ph", STATE): _row(86.7, 88.1, 88.1, 86.2, 88.0, 87.9, 83.6, 86.6, 87.3),
+    ("square", "mh", STATE): _row(65.9, 69.2, 72.7, 65.4, 73.2, 72.9, 65.9, 70.1, 77.8),
+    ("transport", "ph", STATE): _row(34.1, 36.2, 43.3, 39.0, 44.0, 49.1, 36.8, 39.8, 47.6),
+    ("transport", "mh", STATE): _row(16.3, 20.7, 24.3, 21.3, 30.7, 30.4, 23.3, 30.2, 34.5),
+    ("tool_hang", "ph", STATE): _row(79.4, 80.6, 82.8, 72.3, 75.1, 75.8, 77.7, 78.2, 81.9),
+    ("square", "ph", IMAGE): _row(86.9, 88.2, 88.7, 87.7, 89.2, 89.6, 88.7, 89.3, 89.1),
+    ("square", "mh", IMAGE): _row(76.1, 78.0, 77.8, 73.8, 77.9, 77.1, 72.4, 77.6, 75.1),
+    ("transport", "ph", IMAGE): _row(92.8, 94.5, 94.3, 92.1, 93.9, 94.9, 91.3, 93.4, 93.7),
+    ("transport", "mh", IMAGE): _row(74.8, 79.7, 79.8, 73.8, 80.0, 80.7, 74.3, 78.6, 79.7),
+    ("tool_hang", "ph", IMAGE): _row(43.7, 45.8, 56.3, 36.9, 38.4, 50.7, 41.3, 38.9, 54.0),
+    ("stack_d0", "source", IMAGE): _row(21.4, 22.8, 31.6, 21.3, 23.7, 30.7, 21.3, 22.4, 28.7),
+    ("coffee_d0", "source", IMAGE): _row(26.8, 29.6, 34.7, 23.3, 24.1, 33.4, 16.2, 20.4, 29.4),
+    ("threading_d0", "source", IMAGE): _row(13.8, 15.5, 20.9, 16.3, 16.6, 22.0, 12.5, 15.6, 18.0),
 }
 
 #: Table 2, curvature relative to the Gaussian source: (task, data) -> prior -> ratio.
@@ -65,13 +48,25 @@ PAPER_SIGMA: dict[str, dict[float, float]] = {
 }
 
 
-def paper_success(task: str, data: str, prior: str, nfe: int, chunk: int = 8) -> float | None:
+def paper_success(
+    task: str, data: str, prior: str, nfe: int, chunk: int = 8, seen: str = STATE
+) -> float | None:
     """The paper's success rate in percent, or ``None`` where it reports none.
+
+    Args:
+        task: its short name.
+        data: the style of the demonstrations.
+        prior: by name.
+        nfe: network evaluations per chunk.
+        chunk: ``H``.
+        seen: what policies see, ``"state"`` or ``"image"``.
 
     Examples:
         >>> paper_success("square", "mh", "preview", 1)
         77.8
+        >>> paper_success("square", "mh", "preview", 1, seen="image")
+        75.1
     """
     if chunk != 8:
         return None
-    return PAPER_SUCCESS.get((task, data), {}).get(prior, {}).get(nfe)
+    return PAPER_SUCCESS.get((task, data, seen), {}).get(prior, {}).get(nfe)

@@ -128,6 +128,7 @@ class PriorSpaceRecipe(Recipe):
                     raise ValueError(f"{told}: leave out --{name}")
         else:
             self.data.check()
+            self.check_observations()
         configs: dict[tuple[str, str], dict[str, Any]] = {}
         for prior in self.sources.priors():
             same = configs.setdefault((prior.name, prior.options), prior.config())

@@ -22,7 +22,7 @@ from warmprior.data import (
     render_demonstrations,
 )
 from warmprior.data.hdf5 import read_env_args, read_index
-from warmprior.data.render import check_upright
+from warmprior.data.render import compare_images, renderer_versions
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
@@ -147,6 +147,8 @@ def robosuite_problem(
     actions = options.actions
     # A generated file has as many as were asked for.
     demos = None if source == "scripted" else options.first(style)
+    if demos is not None and demos == len(read_index(path).demos):
+        demos = None  # all of them
     if is_mimicgen(read_env_args(path)["env_name"]):
         find_mimicgen()  # not after hours of training
     dataset, images = _read(path, options, demos)
@@ -174,7 +176,7 @@ def robosuite_problem(
                 digest,
                 # Policies of absolute poses once had a single bound, and remembered grippers wider than any.
                 *(f"{name}, a bound per dimension" for name in space.values()),
-                *([] if images is None else [digest_of(images)]),
+                *([] if images is None else [digest_of(images, renderer_versions())]),
                 *([] if demos is None else [f"the first {demos}"]),
             ]
         ),
@@ -210,7 +212,13 @@ def _read(
         raise ValueError(f"{path} has no images, and its task is unknown: name --cameras")
     names, fast = [f"{camera}_image" for camera in cameras], options.fast_rendering
     if set(cameras) <= set(known):
-        check_upright(path, names, fast)
+        size = read_index(path, image_keys=names, demos=demos).image_size
+        if size != options.image_size:
+            raise ValueError(
+                f"{path} has images of {size} pixels: add --image-size {size} (and a --crop-size below), or "
+                "render it anew"
+            )
+        compare_images(path, names, fast)
     else:
         path = render_demonstrations(path, cameras, options.image_size, demos=demos, fast=fast)
     # What robomimic's image policies see besides: the robot, and not where the objects are.
@@ -218,11 +226,6 @@ def _read(
     dataset = RobomimicExperienceReplay(
         path, observation_keys=vector, image_keys=names, storage="memmap", demos=demos
     )
-    if dataset.image_size != options.image_size:
-        raise ValueError(
-            f"{path} has images of {dataset.image_size} pixels: add --image-size {dataset.image_size} "
-            f"(and a --crop-size below), or render it anew"
-        )
     return dataset, {
         "cameras": list(cameras),
         "size": dataset.image_size,

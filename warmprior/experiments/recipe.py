@@ -13,6 +13,7 @@ import tyro
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
+from warmprior.io.extras import require
 from warmprior.io.options import LATER
 from warmprior.modules import (
     ChiTransformer,
@@ -70,6 +71,18 @@ GENERATED = 150
 """Scripted demonstrations, where no other number is asked for."""
 
 
+def check_images(prior: Prior) -> None:
+    """Refuse a prior that cannot go with observations that have images.
+
+    Raises:
+        ValueError: naming it.
+    """
+    if prior.needs_vector:
+        raise ValueError(
+            f"{prior.name} reads observations that are one vector: leave it out with --obs image"
+        )
+
+
 @dataclass(frozen=True)
 class DataOptions:
     """What policies are trained on.
@@ -124,6 +137,8 @@ class DataOptions:
             require_rendering()
             if self.actions == "absolute":
                 raise ValueError("--obs image goes with --actions delta, as in the paper")
+            if len(set(self.cameras)) < len(self.cameras):
+                raise ValueError(f"--cameras names one twice: {' '.join(self.cameras)}")
         elif self.cameras or self.fast_rendering:
             raise ValueError("--cameras and --fast-rendering belong to --obs image")
         for task in self.task:
@@ -200,6 +215,12 @@ class NetworkOptions:
 
     def __post_init__(self) -> None:
         check_counts(self, "hidden_dim", "observation_steps", "crop_size")
+
+    def without_images(self) -> NetworkOptions:
+        """With the defaults for what has no effect where no images are seen."""
+        usual = NetworkOptions()
+        names = ("encoder", "crop_size", "share_encoder")
+        return replace(self, **{name: getattr(usual, name) for name in names})
 
     def make(
         self,
@@ -447,13 +468,7 @@ class Recipe:
                 "--weighting standardised needs --precondition: add --weighting velocity to "
                 "--no-precondition"
             )
-        if self.data.obs == "image" and self.network.crop_size > self.data.image_size:
-            raise ValueError(
-                f"--crop-size {self.network.crop_size} does not fit into --image-size "
-                f"{self.data.image_size}"
-            )
-        if self.data.obs == "image" and self.network.encoder == _PRETRAINED:
-            imagenet_weights()
+        self.check_observations()
         priors, played = self.sources.priors(), set[int]()
         for prior in priors:
             played.update(prior.allowed_nfes(self.evaluation.nfes))
@@ -473,6 +488,36 @@ class Recipe:
                 "--grid has no effect at NFE 1, which is one step on every grid, and these priors are "
                 "evaluated at no other: leave it out"
             )
+
+    def check_observations(self) -> None:
+        """Refuse options of images that cannot work, or are without effect.
+
+        Raises:
+            ValueError: naming the option.
+            OSError: if ImageNet's weights are asked for and cannot be had.
+        """
+        network, size = self.network, self.data.image_size
+        if self.data.obs == "state":
+            usual = (DataOptions().image_size, NetworkOptions().crop_size, False)
+            if (
+                size,
+                network.crop_size,
+                network.share_encoder,
+            ) != usual or network.encoder == "small":
+                raise ValueError(
+                    "--image-size, --crop-size, --share-encoder and --encoder belong to --obs image"
+                )
+            return
+        if not 8 <= network.crop_size <= size:
+            raise ValueError(
+                f"--crop-size {network.crop_size} does not fit into --image-size {size}, or is below 8"
+            )
+        for prior in self.sources.priors():
+            check_images(prior)
+        if network.encoder == _PRETRAINED:
+            imagenet_weights()
+        elif network.encoder != "small":
+            require("torchvision", "vision")
 
     def check_single(
         self,

@@ -18,7 +18,7 @@ from torch import nn
 from torchrl.record.loggers import get_logger
 
 from warmprior.experiments.problem import Problem
-from warmprior.experiments.recipe import NetworkOptions, RunOptions
+from warmprior.experiments.recipe import NetworkOptions, RunOptions, check_images
 from warmprior.io.files import check_writable, digest_of, read_json, write_atomic
 from warmprior.io.options import identity_of
 from warmprior.modules.actor import WarmPriorActor
@@ -86,12 +86,10 @@ class Store:
         """A prior for the widths of this problem, see :meth:`Prior.sized`.
 
         Raises:
-            ValueError: if it learns from observation vectors, and the problem's have images.
+            ValueError: if it reads observation vectors, and the problem's have images.
         """
-        if self.problem.images and isinstance(prior, LearnedPrior) and prior.sees_observation:
-            raise ValueError(
-                f"{prior.name} learns from observations that are one vector: leave it out with --obs image"
-            )
+        if self.problem.images:
+            check_images(prior)
         return prior.sized(*self._widths(prior), self.network.observation_steps)
 
     def _widths(self, prior: Prior) -> tuple[int, int]:
@@ -175,7 +173,7 @@ class Store:
             self.problem.identity,
             identity_of(training),
             self.sized(prior).config(),
-            identity_of(self.network),
+            identity_of(self.network if self.problem.images else self.network.without_images()),
             self.run.device,
             self.run.compile,
             version("torch"),

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from warmprior.diagnostics.branching import branching_bound
 from warmprior.diagnostics.coverage import source_coverage
 from warmprior.diagnostics.curvature import curvature
+from warmprior.diagnostics.flow import encoded_windows
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.statistics import bootstrap_ratio
 from warmprior.experiments.results import Row
@@ -121,7 +122,7 @@ def straightness(
         device = next(actor.parameters()).device
         # Of the earlier prediction: at deployment its noise and that of the next are independent.
         earlier = torch.Generator(device).manual_seed(seed + 1)
-        batches = {"training": observations.windows(actor.prior)}
+        batches = {"training": encoded_windows(actor, observations.windows(actor.prior))}
         if batches["training"]["prior", "warm"].any():
             batches["deployed"] = observations.deployed(actor, generator=earlier)
         for mean, batch in batches.items():

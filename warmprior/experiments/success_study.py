@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 
 from warmprior.envs.rendering import rendering_backend
@@ -68,16 +69,15 @@ def success_notes(recipe: Recipe, paper: Recipe) -> list[str]:
         paper: the paper's.
 
     Examples:
-        >>> from warmprior.experiments import DataOptions, Recipe
-        >>> paper = Recipe(data=DataOptions(obs="image"))
-        >>> success_notes(paper, paper), success_notes(Recipe(), paper)
-        ([], ["- The paper's numbers are from image observations."])
+        >>> from warmprior.experiments import PRESETS
+        >>> success_notes(PRESETS["paper"], PRESETS["paper"])
+        []
     """
     told = variation_notes(recipe, paper)
-    if recipe.network != paper.network or recipe.training.iterations < paper.training.iterations:
+    # An encoder that could not start from ImageNet's weights is as large as theirs.
+    network = replace(recipe.network, encoder=paper.network.encoder)
+    if network != paper.network or recipe.training.iterations < paper.training.iterations:
         told.append("- Network and training budget are smaller than the paper's.")
-    if recipe.data.obs != paper.data.obs:
-        told.append(f"- The paper's numbers are from {paper.data.obs} observations.")
     return told
 
 

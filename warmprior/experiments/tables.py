@@ -185,11 +185,12 @@ def success_table(
 
     def paper(cell: list[Row]) -> str | None:
         row = cell[0]
-        place = row["task"], row["data"]
+        place, seen = (row["task"], row["data"]), row.get("obs") or "state"
         value, baseline = (
-            paper_success(*place, p, row["nfe"], row["chunk"]) for p in (row["prior"], "gaussian")
+            paper_success(*place, p, row["nfe"], row["chunk"], seen)
+            for p in (row["prior"], "gaussian")
         )
-        if value is None or baseline is None or row.get("options") or row.get("obs"):
+        if value is None or baseline is None or row.get("options"):
             return None
         gain = "" if row["prior"] == "gaussian" else f" ({value - baseline:+.1f})"
         return f"{value:.1f}{gain}"

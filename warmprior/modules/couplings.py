@@ -61,6 +61,11 @@ class OTPrior(GaussianPrior):
         self.observation_weight = observation_weight
         super().__init__(chunk_length)
 
+    @property
+    def needs_vector(self) -> bool:
+        """If observations are part of the cost."""
+        return self.observation_weight > 0
+
     def couple(
         self,
         a0: Tensor,

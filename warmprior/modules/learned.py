@@ -115,6 +115,11 @@ class LearnedPrior(PastPrior, nn.Module):
         return super().takes(argument) and (cls.sees_history or argument != "cold_probability")
 
     @property
+    def needs_vector(self) -> bool:
+        """If the network is given the observation."""
+        return self.sees_observation
+
+    @property
     def chunk_dim(self) -> int:
         """Numbers in a chunk, ``P d_a``."""
         return self.prediction_length * self.action_dim

@@ -156,6 +156,11 @@ class Prior(NamedPrior):
         return self.sigma if self.moves_source else 1.0
 
     @property
+    def needs_vector(self) -> bool:
+        """Whether it reads the observation, and as one tensor: it cannot go with images."""
+        return False
+
+    @property
     def is_gaussian(self) -> bool:
         """Whether the source is that of Eq. 1, drawn independently of the data given the mean."""
         return all(

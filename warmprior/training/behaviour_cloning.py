@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from warmprior.io.files import exclusive
 from warmprior.io.options import identity_of
-from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION, STATE
+from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled
 from warmprior.modules.interpolant import Interpolant
@@ -42,7 +42,7 @@ from warmprior.training.checkpoint import (
 )
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.training_config import TrainingConfig
-from warmprior.transforms.window import window_replay_buffer
+from warmprior.transforms.window import window_replay_buffer, without_images
 
 __all__ = ["BehaviourCloning", "precondition"]
 
@@ -82,7 +82,7 @@ def precondition(
     """
     generator = torch.Generator(data.device or "cpu").manual_seed(0)
     if prior.teacher is None:  # which sees them
-        data = _without_images(data)
+        data = without_images(data)
     windows = window_replay_buffer(
         data, prior, batch_size=1024, observation_steps=observation_steps, generator=generator
     )
@@ -92,14 +92,6 @@ def precondition(
         trend = PoseTrend.fit(batch, prior, rest, generator=generator)
     moments = SourceMoments.fit(windows, prior, trend=trend, generator=generator)
     return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=interpolant)
-
-
-def _without_images(data: TensorDictBase) -> TensorDictBase:
-    """Moments are of thousands of windows, whose images would fill the memory to no purpose."""
-    observation = data.get(OBSERVATION)
-    if not isinstance(observation, TensorDictBase) or STATE not in observation:
-        return data
-    return data.copy().set(OBSERVATION, observation.select(STATE))
 
 
 class BehaviourCloning:

@@ -12,7 +12,7 @@ from warmprior import keys
 from warmprior.modules.learned import LearnedPrior
 from warmprior.modules.learning_windows import LearningWindows
 from warmprior.training.optim import warmup_cosine
-from warmprior.transforms.window import window_replay_buffer
+from warmprior.transforms.window import window_replay_buffer, without_images
 
 __all__ = ["learn_prior"]
 
@@ -62,6 +62,7 @@ def learn_prior(
         raise ValueError(
             f"need iterations >= 1 and 0 < held_out <= 0.5, got {iterations} and {held_out}"
         )
+    data = without_images(data)  # no such prior sees them
     episodes = data[keys.EPISODE].flatten()
     number = episodes.unique(return_inverse=True)[1]
     every = max(2, round(1 / held_out))

@@ -15,7 +15,7 @@ from warmprior import keys
 from warmprior.modules.prior import Prior
 from warmprior.transforms.mean_observation import mean_observation
 
-__all__ = ["ActionWindow", "window_replay_buffer", "window_transforms"]
+__all__ = ["ActionWindow", "window_replay_buffer", "window_transforms", "without_images"]
 
 
 class ActionWindow(Transform):
@@ -288,3 +288,15 @@ def window_replay_buffer(
         transform=windows,
         generator=generator,
     )
+
+
+def without_images(data: TensorDictBase) -> TensorDictBase:
+    """Steps with the vector of their observations alone, where thousands of windows would fill the memory.
+
+    Args:
+        data: contiguous steps, see :class:`ActionWindow`.
+    """
+    observation = data.get(keys.OBSERVATION)
+    if not isinstance(observation, TensorDictBase) or keys.STATE not in observation:
+        return data
+    return data.copy().set(keys.OBSERVATION, observation.select(keys.STATE))
