@@ -106,3 +106,20 @@ def test_what_cannot_be_is_refused(recorded, finished, tmp_path, capsys, monkeyp
     argv = options(recorded, tmp_path / "run", **IMAGES | {"prior": "past"} | extra)
     fast = [] if "cameras" in extra else ["--fast-rendering"]
     assert said in refused(main, [*argv, *fast], capsys)
+
+
+def test_studies_measure_on_what_the_encoder_makes_of_images(
+    recorded, finished, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(finished / "cache"))
+    monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 9)
+    held_out = ["--validation", str(recorded), "--observations", "6"]
+    curvature, budget = (importlib.import_module(name) for name in ("curvature", "budget"))
+    flow = ["--run", str(finished / "run"), *held_out, "--steps", "3", "--out"]
+    assert curvature.main([*flow, str(tmp_path / "curvature")]) == 0
+    told = stored(tmp_path / "curvature")["rows"]
+    assert {row["prior"] for row in told} == {"gaussian", "past", "history"}
+    given = IMAGES | {"iterations": None, "budgets": [2, 4]}
+    argv = options(recorded, finished / "budget", prior="past", **given)
+    assert budget.main([*argv, "--fast-rendering", *held_out]) == 0
+    assert all(row["action_error"] > 0 for row in stored(finished / "budget")["rows"])
