@@ -34,6 +34,7 @@ def info(args: argparse.Namespace) -> None:
         "sampler": config["actor"],
         "normaliser": "kept" if actor.normalizer is not None else "none",
         "environment": environment_name(actor) or "not kept",
+        "images": (actor.environment or {}).get("images", "none"),
         "written by": f"warmprior {config['warmprior']}, format {config['format']}",
     }.items():
         print(f"{name:12} {value}")

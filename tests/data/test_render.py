@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import shutil
 from functools import partial
 from pathlib import Path
@@ -291,3 +292,13 @@ def test_a_file_of_random_states_has_none_of_its_simulator(tmp_path):
     write_robomimic_file(tmp_path / "lift.hdf5", lengths=(3,), task="lift")
     with pytest.raises(DatasetError, match="its robots or objects are others"):
         render(tmp_path / "lift.hdf5", out=tmp_path / "out.hdf5")
+
+
+def test_fixtures_that_a_reset_moves_are_in_no_state(recorded, tmp_path):
+    """Robosuite's Door places the door itself, and not a joint."""
+    path = Path(shutil.copy(recorded, tmp_path / "door.hdf5"))
+    with h5py.File(path, "a") as file:
+        env_args = json.loads(file["data"].attrs["env_args"]) | {"env_name": "Door"}
+        file["data"].attrs["env_args"] = json.dumps(env_args)
+    with pytest.raises(DatasetError, match="Door moves fixtures at every reset"):
+        render_demonstrations(path, ["agentview"], 16, out=tmp_path / "out.hdf5", workers=1)

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from warmprior import ODEActor, integrate
+from warmprior import ODEActor, VelocityMLP, integrate
 
 STAGES = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
 ORDERS = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
@@ -121,6 +121,11 @@ def test_batch_shapes_agree():
         for j in range(3):
             single = actor(data[i, j].clone())["vla_action", "chunk"]
             torch.testing.assert_close(whole[i, j], single)
+
+
+def test_bounds_for_another_number_of_dimensions_are_refused():
+    with pytest.raises(ValueError, match="clip has 3 bounds, but the network has 2"):
+        ODEActor(VelocityMLP(2, 3, 4), clip=(1.0, 1.0, 1.0))
 
 
 def test_clip_applies_to_the_chunk_and_not_to_the_path():

@@ -155,9 +155,18 @@ class _Illustrator:
     @cached_property
     def renderer(self) -> CameraRenderer:
         env = make_simulator(modernize_env_args(self.index.env_args))
+        placed = []
         with isolated_numpy_seed(0):
-            env.reset()  # hides the grippers' markers, which no episode shows
-        return CameraRenderer(env.sim.model._model, self.size, self.size, fast=self.fast)
+            for _ in range(2):
+                env.reset()  # which hides the grippers' markers, too, that no episode shows
+                model = env.sim.model._model
+                placed.append(np.concatenate([model.body_pos, model.body_quat], -1))
+        if not np.array_equal(*placed):
+            raise DatasetError(
+                f"{self.index.path}: {self.index.env_args['env_name']} moves fixtures at every reset, and "
+                "states do not tell where to: its images cannot be rendered from them"
+            )
+        return CameraRenderer(model, self.size, self.size, fast=self.fast)
 
     def part(self, demo: str) -> Path:
         """Where the images of a finished demo wait for the others."""

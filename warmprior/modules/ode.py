@@ -201,6 +201,11 @@ class ODEActor(TensorDictModuleBase):
             raise ValueError(
                 f"clip must be > 0, one such number per dimension, or None, got {clip}"
             )
+        width = getattr(network, "action_dim", None)
+        if isinstance(clip, list) and width not in (None, len(clip)):
+            raise ValueError(
+                f"clip has {len(clip)} bounds, but the network has {width} action dimensions"
+            )
         self.network = network
         self.nfe = nfe
         self.grid = grid
