@@ -121,6 +121,7 @@ def test_options_of_a_prior_have_cells_of_their_own(budget, monkeypatch):
     monkeypatch.setattr(
         budget, "action_error", lambda actor, windows, nfes: {1: actor.prior.correlation}
     )
+    monkeypatch.setattr(budget, "encoded_windows", lambda actor, windows: windows)
     observations = SimpleNamespace(windows=lambda prior: None)
     rows = budget.with_errors(comparison, observations)
     assert [each["action_error"] for each in rows] == [0.0, 0.5]
