@@ -13,9 +13,17 @@ from warmprior.__main__ import main
 
 pytest.importorskip("robosuite")
 from warmprior.envs import RobosuiteEnv, rendering_backend
+from warmprior.envs.tasks import TaskSpec
 from warmprior.experiments import NetworkOptions, RunOptions, Store, robosuite_problem
 from warmprior.training import TrainingConfig, play_episode
 from warmprior.training.behaviour_cloning import policy_path
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_episodes():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TaskSpec, "horizon", lambda spec, style: 40)
+        yield
 
 
 @pytest.fixture(scope="module")
