@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-LIMIT_SECONDS = 20.0
+LIMIT_SECONDS = 60.0
 LIMIT_BYTES = 2 * 2**30
 
 
