@@ -5,6 +5,15 @@ from __future__ import annotations
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
+from warmprior.envs.tasks import TaskSpec
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_episodes():
+    """Policies of a few iterations solve nothing: their episodes need not go to the time limit."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TaskSpec, "horizon", lambda spec, style: 40)
+        yield
 
 
 @pytest.fixture(scope="session")

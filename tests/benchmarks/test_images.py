@@ -27,6 +27,11 @@ pytestmark = [
 IMAGES = {"obs": "image", "image_size": 16, "crop_size": 12, "encoder": "small", "iterations": 4}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_episodes():
+    """Not here: scripted experts need their time."""
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     path = tmp_path_factory.mktemp("data") / "lift.hdf5"

@@ -27,6 +27,11 @@ def script():
     return importlib.import_module("mimicgen_tasks")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def short_episodes():
+    """Not here: scripted experts need their time."""
+
+
 @pytest.fixture
 def package(tmp_path, monkeypatch):
     write_mimicgen(tmp_path / "site")
