@@ -46,7 +46,8 @@ def read(script, out, *argv):
 def test_papers_recipe(script, package, tmp_path, monkeypatch):
     """Table 4 of the paper, MimicGen's column."""
     monkeypatch.setattr("warmprior.experiments.recipe.require_rendering", lambda: None)
-    monkeypatch.setattr("warmprior.experiments.recipe.imagenet_weights", dict)
+    for place in ("recipe", "presets"):
+        monkeypatch.setattr(f"warmprior.experiments.{place}.imagenet_weights", dict)
     recipe = read(script, tmp_path, "--preset", "paper", "--download")
     training, network = recipe.training, recipe.network
     assert (training.batch_size, training.iterations) == (128, 50_000)

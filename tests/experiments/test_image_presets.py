@@ -13,6 +13,7 @@ from warmprior.experiments import (
     Recipe,
     RunOptions,
     comparison_preset,
+    presets,
     recipe,
 )
 
@@ -26,7 +27,8 @@ def offline(monkeypatch):
             "ImageNet's weights of ResNet-18 cannot be had (no route to host): connect once"
         )
 
-    monkeypatch.setattr(recipe, "imagenet_weights", weights)
+    for place in (presets, recipe):
+        monkeypatch.setattr(place, "imagenet_weights", weights)
     monkeypatch.setattr(recipe, "require_rendering", lambda: "egl")
 
 
@@ -36,7 +38,8 @@ def test_presets_of_states_are_untouched(name):
 
 
 def test_the_papers_encoder_where_its_weights_can_be_had(monkeypatch):
-    monkeypatch.setattr(recipe, "imagenet_weights", dict)
+    for place in (presets, recipe):
+        monkeypatch.setattr(place, "imagenet_weights", dict)
     found = comparison_preset(Recipe(data=IMAGE, run=RunOptions(preset="paper")))
     # Table 4: 84 x 84 pixels, 76 x 76 random crop, ResNet-18 from ImageNet, batches of 256.
     assert (found.data.image_size, found.network.crop_size) == (84, 76)

@@ -19,6 +19,7 @@ from warmprior.experiments.navigation1d import (
 )
 from warmprior.experiments.navigation_figures import plot_flow_paths, plot_navigation
 from warmprior.experiments.paper import paper_success
+from warmprior.experiments.presets import PRESETS, comparison_preset
 from warmprior.experiments.problem import (
     Problem,
     find_problems,
@@ -27,7 +28,6 @@ from warmprior.experiments.problem import (
     robosuite_problem,
 )
 from warmprior.experiments.recipe import (
-    PRESETS,
     DataOptions,
     EvaluationOptions,
     HeldOutOptions,
@@ -37,7 +37,6 @@ from warmprior.experiments.recipe import (
     Recipe,
     RunOptions,
     SourceOptions,
-    comparison_preset,
 )
 from warmprior.experiments.record import record, restore
 from warmprior.experiments.results import Results, Row, grouped, mean_known, select, success_summary

@@ -14,8 +14,8 @@ from torchrl.envs.transforms import Compose
 from warmprior.envs import GoalNavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.experiments.navigation1d import NAVIGATION_PRESETS
+from warmprior.experiments.presets import PRESETS
 from warmprior.experiments.recipe import (
-    PRESETS,
     EvaluationOptions,
     Flat,
     PolicyOptions,
