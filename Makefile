@@ -2,7 +2,7 @@
 PYTHON ?= $(shell command -v python3.12 || command -v python3 || command -v python)
 BIN := .venv/bin
 ARGS ?=
-EXTRAS := sim,vision,lerobot,docs,dev
+EXTRAS := sim,vision,lerobot,vla,docs,dev
 
 .PHONY: install benchmark throughput test test-slow lint fuzz docs clean
 

@@ -38,7 +38,7 @@ class PriorDecoder(TensorDictModuleBase):
     switched to training mode, unfrozen or re-initialised, and does not change when the policy does.
 
     Args:
-        actor: the policy; copied.
+        actor: the policy; copied. Or what has its parts, such as :class:`~warmprior.lerobot.LeRobotActor`.
 
     Keyword Args:
         delta: half the side of the agent's box, in units of the normalised action space. The paper uses

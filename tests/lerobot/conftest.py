@@ -1,0 +1,41 @@
+"""One tiny policy per family, built once: most of the time is the import of LeRobot."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+import torch
+
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+
+
+@pytest.fixture(scope="session")
+def built():
+    pytest.importorskip("lerobot")
+    pytest.importorskip("transformers")
+    from tests.lerobot.tiny import MAKERS
+
+    policies = {}
+
+    def build(family, **options):
+        if options:
+            return MAKERS[family](**options)
+        if family not in policies:
+            torch.manual_seed(0)
+            policies[family] = MAKERS[family]()
+        return policies[family]
+
+    return build
+
+
+@pytest.fixture
+def policy(built):
+    """``policy(family, **options)``: the family's own, or a new one where there are options."""
+
+    def get(family, **options):
+        found = built(family, **options)
+        found.reset()
+        return found.eval()
+
+    return get

@@ -1,0 +1,191 @@
+"""A LeRobot policy in TorchRL's environments, and frozen under an agent."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.lerobot.seen import watch
+from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
+from warmprior import PastPrior, PreviewPrior, policy_transforms
+from warmprior.lerobot import LeRobotActor
+from warmprior.rl import PriorDecoder
+
+
+class Arm(EnvBase):
+    """A state that sums up actions, and a picture of it; ends after ``length`` steps."""
+
+    def __init__(self, length: int = 20, picture: bool = True) -> None:
+        super().__init__(device="cpu")
+        self.length, self.picture = length, picture
+        seen = {"state": Unbounded((STATE,))}
+        if picture:
+            seen["top"] = Bounded(0, 255, (3, 64, 64), dtype=torch.uint8)
+        self.observation_spec = Composite(observation=Composite(**seen))
+        self.action_spec = Unbounded((ACTION,))
+        self.reward_spec = Unbounded((1,))
+        self.at, self.steps = torch.zeros(STATE), 0
+
+    def _observed(self):
+        seen = {"state": self.at.clone()}
+        if self.picture:
+            seen["top"] = torch.full((3, 64, 64), self.steps, dtype=torch.uint8)
+        return TensorDict({"observation": TensorDict(seen, [])}, [])
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.at, self.steps = torch.zeros(STATE), 0
+        return self._observed().update(self.full_done_spec.zero())
+
+    def _step(self, tensordict):
+        self.at = self.at + tensordict["action"][:STATE]
+        self.steps += 1
+        done = torch.tensor([self.steps >= self.length])
+        told = {"reward": torch.zeros(1), "done": done, "terminated": done}
+        return self._observed().update(told)
+
+    def _set_seed(self, seed):
+        return seed
+
+
+NAMES = {"state": "observation.state", "top": CAMERA}
+
+
+def told(batch):
+    """What a preprocessor would add: the task in tokens."""
+    size = len(batch["observation.state"])
+    tokens = torch.full((size, 5), 7)
+    return {
+        **batch,
+        "observation.language.tokens": tokens,
+        "observation.language.attention_mask": torch.ones_like(tokens, dtype=torch.bool),
+    }
+
+
+def actor_of(made, prior, **options):
+    generator = torch.Generator().manual_seed(0)
+    return LeRobotActor(made, prior, names=NAMES, preprocess=told, generator=generator, **options)
+
+
+def environment(prior, base=None):
+    return TransformedEnv(
+        Arm() if base is None else base, policy_transforms(prior, observation_steps=1)
+    )
+
+
+@pytest.mark.parametrize("family", ["smolvla", "pi05", "xvla"])
+@pytest.mark.parametrize(
+    "prior", [PastPrior(LENGTH, sigma=0.0), PreviewPrior(LENGTH // 2, sigma=0.0)]
+)
+def test_rollouts_start_from_the_mean(policy, family, prior):
+    made = policy(family)
+    env, actor = environment(prior), actor_of(made, prior)
+    check_env_specs(env)
+    with watch(family, made) as seen:
+        rollout = env.rollout(4, actor, break_when_any_done=False)
+    calls = len(seen.x) // 4
+    starts = [x[0, : prior.prediction_length, :ACTION] for x in seen.x[::calls]]
+    warm = rollout["prior", "warm"][:, 0, 0].tolist()
+    assert warm == [False, True, True, prior.chunk_length < LENGTH]  # 20 steps are three chunks
+    half = prior.chunk_length
+    for step in range(1, 4):
+        if warm[step]:
+            assert torch.equal(starts[step][:half], rollout["prior", "loc"][step, :half])
+    for start, noise in zip(starts, rollout["prior", "noise"], strict=True):
+        assert torch.equal(start, noise)
+    if prior.chunk_length == LENGTH:
+        assert torch.equal(rollout["prior", "loc"][1], rollout["vla_action", "chunk"][0])
+
+
+def test_several_observations_and_the_lead_of_a_chunk(policy):
+    made, prior = policy("multi_task_dit"), PastPrior(LENGTH - 1, sigma=0.0)
+    actor = LeRobotActor(made, prior, names=NAMES, preprocess=told)
+    data = TensorDict(
+        {
+            "observation": {"state": torch.randn(3, 2, STATE)},
+            "prior": {
+                "loc": torch.randn(3, LENGTH - 1, ACTION),
+                "warm": torch.ones(3, LENGTH - 1, 1, dtype=torch.bool),
+            },
+        },
+        [3],
+    )
+    with watch("multi_task_dit", made) as seen:
+        chunk = actor(data)["vla_action", "chunk"]
+    assert torch.equal(seen.x[0][:, 1:], data["prior", "loc"])
+    by_hand = seen.x[0] + sum(seen.out) / len(seen.out)
+    torch.testing.assert_close(chunk, by_hand[:, 1:])
+    short = data.clone().update({"observation": {"state": torch.randn(3, 1, STATE)}})
+    with pytest.raises(
+        ValueError, match=r"1 observations, but the policy sees 2: append ObservationStack\(2\)"
+    ):
+        actor(short)
+
+
+def test_collectors_and_batched_environments(policy):
+    prior = PastPrior(LENGTH)
+    actor = actor_of(policy("pi05"), prior)
+    env = environment(prior, base=SerialEnv(2, lambda: Arm(12)))
+    collector = Collector(env, actor, frames_per_batch=8, total_frames=16)
+    for batch in collector:
+        assert batch["vla_action", "chunk"].shape == (2, 4, LENGTH, ACTION)
+        # A new episode starts cold.
+        first = batch["prior", "elapsed"][..., 0] == 0
+        assert not batch["prior", "warm"][first].any()
+    collector.shutdown()
+
+
+def test_a_frozen_policy_decodes_what_an_agent_chooses(policy):
+    made, prior = policy("pi05"), PastPrior(LENGTH)
+    actor = actor_of(made, prior, nfe=1)
+    decoder = PriorDecoder(actor, delta=0.5)
+    assert not list(decoder.parameters())
+    anchor, delta = torch.randn(2, LENGTH, ACTION), torch.full((2, LENGTH, ACTION), 0.25)
+    data = TensorDict(
+        {
+            "observation": {
+                "state": torch.randn(2, 1, STATE),
+                "top": torch.zeros(2, 1, 3, 64, 64, dtype=torch.uint8),
+            },
+            "prior": {"anchor": anchor, "delta": delta},
+        },
+        [2],
+    )
+    copy = decoder.ode.policy
+    assert copy is not made
+    with watch("pi05", copy) as seen:
+        chunk = decoder(data.clone())["vla_action", "chunk"]
+    assert torch.equal(seen.x[0][..., :ACTION], anchor + delta)
+    torch.testing.assert_close(chunk, (seen.x[0] - seen.out[0])[..., :ACTION])
+    # A function of the source alone, whatever else is in the batch.
+    assert torch.equal(decoder(data.clone())["vla_action", "chunk"], chunk)
+    torch.testing.assert_close(decoder(data[1:].clone())["vla_action", "chunk"], chunk[1:])
+
+
+def test_what_cannot_be_done_is_said(policy):
+    prior = PastPrior(LENGTH)
+    actor = actor_of(policy("pi05"), prior)
+    data = TensorDict(
+        {
+            "observation": {"state": torch.zeros(1, STATE)},
+            "prior": {
+                "loc": torch.zeros(LENGTH, ACTION),
+                "warm": torch.zeros(LENGTH, 1, dtype=torch.bool),
+            },
+        },
+        [],
+    )
+    with pytest.raises(KeyError, match="ActionHistory writes them"):
+        actor(data.select("observation"))
+    with pytest.raises(ValueError, match=r"what are speed of the observation"):
+        actor(data.clone().set(("observation", "speed"), torch.zeros(1, 2)))
+    with pytest.raises(ValueError, match="compute no gradients"):
+        actor.ode(
+            data.clone().set(("prior", "noise"), torch.zeros(LENGTH, ACTION, requires_grad=True))
+        )
+    with pytest.raises(ValueError, match="at least 1, got 0"):
+        actor(data.clone(), nfe=0)

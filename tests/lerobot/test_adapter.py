@@ -1,0 +1,326 @@
+"""Means, resets and bad input of the adapter, by what the network is given."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import pytest
+import torch
+
+from tests.lerobot.seen import watch
+from tests.lerobot.tiny import ACTION, LENGTH, observations, windows
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior.lerobot import RelativeActions, WarmPriorAdapter, action_std, history_indices
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def started(adapter, family, policy, batch, steps):
+    """Actions given ``[B, steps, d_a]``, and the source of each decision."""
+    sources, actions = [], []
+    for _ in range(steps):
+        with watch(family, policy) as seen:
+            actions.append(adapter.select_action(dict(batch)))
+        if seen.x:
+            sources.append(seen.x[0][..., :ACTION])
+    return torch.stack(actions, 1), sources
+
+
+@pytest.mark.parametrize("every", [3, LENGTH])
+def test_the_past_is_what_was_executed(policy, built, every):
+    made = policy("pi05") if every == LENGTH else built("pi05", n_action_steps=every)
+    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
+    actions, sources = started(adapter, "pi05", made, observations("pi05", 2), 3 * LENGTH)
+    assert len(sources) == -(-3 * LENGTH // every)
+    for decision, source in enumerate(sources):
+        now = decision * every
+        if now >= LENGTH:
+            assert torch.equal(source, actions[:, now - LENGTH : now])
+        else:
+            assert not torch.equal(source[:, -now:], actions[:, :now]) or now == 0
+
+
+def test_the_preview_is_the_last_forecast(built):
+    every, half = 3, LENGTH // 2
+    made = built("smolvla", n_action_steps=every)
+    adapter = WarmPriorAdapter(made, PreviewPrior(half, sigma=0.0), generator=generator())
+    batch, chunks = observations("smolvla", 2), []
+    for decision in range(3):
+        with watch("smolvla", made) as seen:
+            chunks.append(adapter.predict_action_chunk(dict(batch)))
+        source = seen.x[0][..., :ACTION]
+        if decision:
+            assert torch.equal(source[:, :half], chunks[-2][:, every : every + half])
+        # The second half is cold, always.
+        assert abs(source[:, half:].std() - 1) < 0.6
+
+
+def test_as_many_as_were_executed(policy):
+    made = policy("pi0")
+    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
+    batch = observations("pi0", 2)
+    first = adapter.predict_action_chunk(dict(batch))
+    second = adapter.predict_action_chunk(dict(batch), executed_steps=LENGTH)
+    with watch("pi0", made) as seen:
+        adapter.predict_action_chunk(dict(batch), executed_steps=torch.tensor([2, 5]))
+    source = seen.x[0][..., :ACTION]
+    for row, count in enumerate((2, 5)):
+        expected = torch.cat([first[row], second[row, :count]])[-LENGTH:]
+        assert torch.equal(source[row], expected)
+    with pytest.raises(ValueError, match="from 0 to chunk_length=8"):
+        adapter.predict_action_chunk(dict(batch), executed_steps=LENGTH + 1)
+
+
+def test_an_environment_that_is_reset_starts_cold(policy):
+    made = policy("pi05")
+    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
+    batch = observations("pi05", 3)
+    actions, _ = started(adapter, "pi05", made, batch, LENGTH)
+    adapter.reset(torch.tensor([True, False, False]))
+    more, (source,) = started(adapter, "pi05", made, batch, LENGTH)
+    assert torch.equal(source[1:], actions[1:]) and not torch.equal(source[0], actions[0])
+    assert abs(source[0].std() - 1) < 0.5
+    _, (source,) = started(adapter, "pi05", made, batch, LENGTH)
+    assert torch.equal(source, more)  # warm again, with what it did since
+    adapter.reset()
+    _, (source,) = started(adapter, "pi05", made, batch, LENGTH)
+    assert abs(source.std() - 1) < 0.3
+
+
+def test_a_reset_within_a_chunk(built):
+    """The rest of the chunk is executed as the beginning of the new episode."""
+    every = LENGTH // 2
+    made = built("pi05", n_action_steps=every)
+    adapter = WarmPriorAdapter(made, PastPrior(every, sigma=0.0), generator=generator())
+    batch = observations("pi05", 2)
+    before, _ = started(adapter, "pi05", made, batch, every + 1)
+    adapter.reset(torch.tensor([True, False]))
+    rest, _ = started(adapter, "pi05", made, batch, every - 1)
+    later, (source,) = started(adapter, "pi05", made, batch, every)
+    assert not torch.equal(source[0, 1:every], rest[0])  # too few steps in this episode
+    assert torch.equal(source[1, :every], torch.cat([before, rest], 1)[1, -every:])
+    _, (source,) = started(adapter, "pi05", made, batch, every)
+    assert torch.equal(source[:, :every], later)
+
+
+def test_what_was_executed_instead(policy):
+    made = policy("pi05")
+    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
+    batch = observations("pi05", 2)
+    with pytest.raises(ValueError, match="nothing to correct"):
+        adapter.record_executed(torch.zeros(2, ACTION))
+    clipped = []
+    for _ in range(LENGTH):
+        clipped.append(adapter.select_action(dict(batch)).clamp(-0.1, 0.1))
+        adapter.record_executed(clipped[-1])
+    with watch("pi05", made) as seen:
+        adapter.select_action(dict(batch))
+    assert torch.equal(seen.x[0][..., :ACTION], torch.stack(clipped, 1))
+
+
+def test_the_history_before_an_episode_does_not_leak(policy):
+    """LeRobot fills it with the first action, which is the target."""
+    made = policy("pi05").train()
+    batch = windows("pi05", 3, LENGTH)
+    batch["action_is_pad"][0, :5] = True
+    losses = []
+    for filler in (0.0, 100.0):
+        batch["action"][0, :5] = filler
+        torch.manual_seed(1)
+        adapter = WarmPriorAdapter(made, PastPrior(LENGTH), generator=generator())
+        losses.append(adapter.loss(batch, reduction="none")[0])
+    assert torch.equal(*losses)
+    batch["action"][1, :5] += 1.0  # a history that counts
+    torch.manual_seed(1)
+    adapter = WarmPriorAdapter(made, PastPrior(LENGTH), generator=generator())
+    changed, _ = adapter.loss(batch, reduction="none")
+    assert (changed != losses[0]).tolist() == [False, True, False]
+
+
+def test_one_seed_gives_one_result(policy):
+    made, results = policy("smolvla"), []
+    for seed in (0, 0, 1):
+        adapter = WarmPriorAdapter(made, PastPrior(LENGTH), generator=generator(seed))
+        adapter.reset()
+        results.append(adapter.predict_action_chunk(observations("smolvla", 2)))
+    assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
+
+
+def test_a_prior_of_ones_own(built):
+    class Halved(Prior):
+        """Half of the last action that was executed."""
+
+        name: ClassVar[str] = "halved-for-lerobot"
+
+        def training_mean(self, history, history_valid, target):
+            warm = history_valid[..., -1:, None].expand(*history.shape[:-1], 1)
+            return 0.5 * history[..., -1:, :].expand_as(history), warm
+
+        def next_mean(self, loc, chunk, executed_steps, elapsed_steps):
+            last = chunk.gather(-2, self.positions(executed_steps - 1, chunk, 1))
+            return 0.5 * last.expand_as(chunk), torch.ones_like(chunk[..., :1], dtype=torch.bool)
+
+    made = built("pi0", n_action_steps=4)
+    adapter = WarmPriorAdapter(made, Halved(4, sigma=0.0), generator=generator())
+    batch = observations("pi0", 2)
+    first = adapter.predict_action_chunk(dict(batch))
+    with watch("pi0", made) as seen:
+        adapter.predict_action_chunk(dict(batch), executed_steps=3)
+    expected = (0.5 * first[:, 2:3]).expand(-1, 4, -1)
+    assert torch.equal(seen.x[0][:, :4, :ACTION], expected)
+    made.train()
+    assert adapter.loss(windows("pi0", 2, 4))[0].isfinite()
+
+
+def test_sigma_in_units_of_the_data(policy):
+    made = policy("xvla")  # raw units
+    std = torch.linspace(0.1, 3.0, ACTION)
+    adapter = WarmPriorAdapter(
+        made,
+        PastPrior(LENGTH, sigma=0.5),
+        sigma_unit="std",
+        action_std=std,
+        generator=generator(),
+    )
+    warm, loc = torch.ones(500, LENGTH, 1, dtype=torch.bool), torch.full((500, LENGTH, ACTION), 2.0)
+    drawn = adapter.source.draw(loc, warm, generator(1)) - loc
+    torch.testing.assert_close(drawn.flatten(0, 1).std(0), 0.5 * std, rtol=0.1, atol=0)
+    cold = adapter.source.draw(loc, ~warm, generator(1))
+    torch.testing.assert_close(cold.flatten(0, 1).std(0), torch.ones(ACTION), rtol=0.1, atol=0)
+
+
+def test_the_standard_deviation_in_a_policys_units(policy):
+    values = torch.randn(1000, ACTION, generator=generator()) * torch.linspace(0.1, 3.0, ACTION)
+    quantile = {f"q{p:02d}": values.quantile(p / 100, dim=0) for p in (1, 10, 90, 99)}
+    stats = {
+        "action": {"std": values.std(0), "min": values.amin(0), "max": values.amax(0), **quantile}
+    }
+    by_hand = {
+        "smolvla": values / values.std(0),
+        "pi05": 2 * (values - quantile["q01"]) / (quantile["q99"] - quantile["q01"]) - 1,
+        "multi_task_dit": 2 * (values - values.amin(0)) / (values.amax(0) - values.amin(0)) - 1,
+    }
+    for family, normalised in by_hand.items():
+        torch.testing.assert_close(action_std(policy(family), stats), normalised.std(0))
+    with pytest.raises(ValueError, match="needs the statistics std, q01, q99 of 'action'"):
+        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit="std")
+    with pytest.raises(ValueError, match=r"by its own means \(IDENTITY\)"):
+        action_std(policy("xvla"), stats)
+    with pytest.raises(ValueError, match="'model' or 'std'"):
+        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit="data")
+
+
+def pipelines(made, stats):
+    """The steps of pi0's own, which need the hub's tokenizer besides."""
+    from lerobot.processor import (
+        NormalizerProcessorStep,
+        PolicyProcessorPipeline,
+        RelativeActionsProcessorStep,
+        UnnormalizerProcessorStep,
+    )
+
+    config = made.config
+    parts = {"norm_map": config.normalization_mapping, "stats": stats}
+    features = {**config.input_features, **config.output_features}
+    before = [
+        RelativeActionsProcessorStep(enabled=True),
+        NormalizerProcessorStep(features=features, **parts),
+    ]
+    after = [UnnormalizerProcessorStep(features=config.output_features, **parts)]
+    return PolicyProcessorPipeline(steps=before), PolicyProcessorPipeline(steps=after)
+
+
+def test_relative_actions_follow_the_state(built):
+    made = built("pi0", use_relative_actions=True)
+    stats = {
+        "action": {"mean": torch.arange(7.0), "std": torch.linspace(0.5, 2.0, 7)},
+        "observation.state": {"mean": torch.zeros(7), "std": torch.ones(7)},
+    }
+    preprocess, postprocess = pipelines(made, stats)
+    relative = RelativeActions(preprocess, postprocess)
+    adapter = WarmPriorAdapter(
+        made, PastPrior(LENGTH, sigma=0.0), relative=relative, generator=generator()
+    )
+    with pytest.raises(ValueError, match="relative=RelativeActions"):
+        WarmPriorAdapter(made, PastPrior(LENGTH))
+    batch = observations("pi0", 2)
+    states = torch.randn(2, 2, 7, generator=generator(5))
+
+    def observed(state):
+        # As a rollout does: the pipeline sees the raw state before the policy decides.
+        seen = preprocess({"observation.state": state, "task": ["", ""]})
+        return {**batch, "observation.state": seen["observation.state"]}
+
+    first = adapter.predict_action_chunk(observed(states[0]))
+    with watch("pi0", made) as seen:
+        adapter.predict_action_chunk(observed(states[1]))
+    mean, std = stats["action"]["mean"], stats["action"]["std"]
+    absolute = first * std + mean + states[0][:, None]
+    expected = (absolute - states[1][:, None] - mean) / std
+    torch.testing.assert_close(seen.x[0][..., :ACTION], expected, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("prior", "told"),
+    [
+        (PreviewPrior(5), "predicts 10 actions, .* have 8 .* chunk_length <= 4"),
+        (
+            PreviewPrior(4),
+            "n_action_steps=8 of each chunk, .* chunk_length=4: set n_action_steps to 4",
+        ),
+        (Prior.make("regression", 8), "trained at t = 0 alone"),
+        (Prior.make("history", 8), "see its mean"),
+        (Prior.make("forecast", 8), "as one vector"),
+    ],
+)
+def test_priors_that_do_not_fit(policy, prior, told):
+    with pytest.raises(ValueError, match=told):
+        WarmPriorAdapter(policy("pi05"), prior)
+
+
+def test_batches_that_do_not_fit(policy):
+    adapter = WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH))
+    batch = windows("pi05", 2, LENGTH)
+    for name in ("action", "action_is_pad"):
+        short = {key: value for key, value in batch.items() if key != name}
+        with pytest.raises(KeyError, match=f"lacks {name}"):
+            adapter.loss(short)
+    with pytest.raises(
+        ValueError, match=r"windows of \[8\] actions, expected \[16\].*history_indices\(8, 8, 0\)"
+    ):
+        adapter.loss(
+            {
+                **batch,
+                "action": batch["action"][:, 8:],
+                "action_is_pad": batch["action_is_pad"][:, 8:],
+            }
+        )
+    groot = windows("groot", 2, LENGTH)
+    del groot["action_history_is_pad"]
+    with pytest.raises(KeyError, match="not action_history_is_pad"):
+        WarmPriorAdapter(policy("groot"), PastPrior(LENGTH)).loss(groot)
+    adapter.predict_action_chunk(observations("pi05", 2))
+    with pytest.raises(ValueError, match="3 environments follow 2: call reset"):
+        adapter.predict_action_chunk(observations("pi05", 3))
+    with pytest.raises(ValueError, match="nfe is the number of integration steps"):
+        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), nfe=0)
+    with pytest.raises(ValueError, match="noise= is what the prior gives"):
+        adapter.predict_action_chunk(observations("pi05", 2), noise=torch.zeros(2, LENGTH, 12))
+
+
+def test_the_standard_source_is_lerobots(policy):
+    """With nothing ever warm, what is left is the policy with its own noise."""
+    made = policy("smolvla")
+    adapter = WarmPriorAdapter(made, GaussianPrior(LENGTH), generator=generator())
+    batch = observations("smolvla", 2)
+    with watch("smolvla", made) as seen:
+        chunk = adapter.predict_action_chunk(dict(batch))
+    assert torch.equal(chunk, made.predict_action_chunk(dict(batch), noise=seen.x[0]))
+
+
+def test_the_steps_of_windows():
+    assert history_indices(3, 2) == [-3, -2, -1, 0, 1]
+    assert history_indices(3, 4, 1) == [-3, -2, -1, 0, 1, 2]
+    assert history_indices(1, 4, 2) == [-2, -1, 0, 1]

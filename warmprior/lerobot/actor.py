@@ -1,0 +1,248 @@
+"""A flow policy of LeRobot as a TorchRL module with the library's keys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from warmprior import keys
+from warmprior.lerobot.ports import check_steps, port_for
+from warmprior.lerobot.source import ChunkSource
+from warmprior.modules.network import network_observation
+from warmprior.modules.prior import Prior
+
+__all__ = ["LeRobotActor", "LeRobotFlow"]
+
+
+class LeRobotFlow(TensorDictModuleBase):
+    """The sampler of a LeRobot policy in the place of :class:`~warmprior.ODEActor`.
+
+    A deterministic map ``(noise, observation) -> chunk``: what pads the prior's part of the source is one
+    draw, the same for every call.
+    The policy's weights are not among the parameters of this module.
+
+    Args:
+        policy: of LeRobot, see :class:`WarmPriorAdapter`.
+        source: of its chunks.
+
+    Keyword Args:
+        names: LeRobot's name of each entry of the observation, such as
+            ``{"state": "observation.state", "agentview_image": "observation.images.top"}``.
+        preprocess: what turns raw observations into the policy's batch, such as LeRobot's preprocessor; none
+            if the environment's transforms do.
+        nfe: integration steps per chunk; the policy's own by default.
+        seed: of what pads the source.
+        noise_key: the source, ``[*B, P, d_a]``.
+        observation_key: the observation, ``[*B, To, d]`` (LeRobot's ``observation.state``), or a
+            tensordict of such entries. Images of bytes become floats in [0, 1].
+        chunk_key: key written, ``[*B, P, d_a]``, the model's units.
+
+    Raises:
+        ValueError: if gradients are asked for: LeRobot's samplers compute none.
+        KeyError: if an input key is missing.
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        source: ChunkSource,
+        *,
+        names: Mapping[str, str] | None = None,
+        preprocess: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+        nfe: int | None = None,
+        seed: int = 0,
+        noise_key: NestedKey = keys.NOISE,
+        observation_key: NestedKey = keys.OBSERVATION,
+        chunk_key: NestedKey = keys.CHUNK,
+    ) -> None:
+        super().__init__()
+        check_steps(nfe)
+        self._port = port_for(policy)
+        # Not a part of this module: policies of billions of weights are trained and saved by LeRobot, and not
+        # by the agents that contain this.
+        self._policy = (policy,)
+        self.source = source
+        self.names = dict(names or {})
+        self.preprocess = preprocess
+        self.nfe = nfe
+        self.seed = seed
+        self.in_keys = [noise_key, observation_key]
+        self.out_keys = [chunk_key]
+
+    @property
+    def policy(self) -> Any:
+        """LeRobot's policy."""
+        return self._policy[0]
+
+    @property
+    def network(self) -> Any:
+        """What tells the width of actions."""
+        return self.source
+
+    def check_nfe(self, nfe: int | None) -> None:
+        """Whether ``nfe`` is a number of integration steps.
+
+        Raises:
+            ValueError: if it is below 1.
+        """
+        check_steps(nfe)
+
+    def forward(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
+        """Write the chunk."""
+        nfe = self.nfe if nfe is None else nfe
+        check_steps(nfe)
+        missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
+        if missing:
+            raise KeyError(f"LeRobotFlow needs the keys {self.in_keys}; missing: {missing}")
+        noise = tensordict.get(self.in_keys[0])
+        if torch.is_grad_enabled() and noise.requires_grad:
+            raise ValueError(
+                "LeRobot's samplers compute no gradients: use no_grad or detach the source"
+            )
+        batch = noise.shape[:-2]
+        a0 = noise.reshape(-1, *noise.shape[-2:])
+        inputs = self._batch(network_observation(tensordict.get(self.in_keys[1]), batch))
+        # One draw for all rows: a chunk does not depend on who is asked beside it.
+        generator = torch.Generator(a0.device).manual_seed(self.seed)
+        padding = self.source.place(a0[:1].detach(), generator)
+        whole = padding.expand(len(a0), -1, -1).clone()
+        whole[:, self.source.positions, : self.source.action_dim] = a0
+        chunks: list[Tensor] = []
+
+        def draw(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
+            return whole.to(dtype=dtype, device=device)
+
+        with self._port.sampling(self.policy, draw, chunks.append, nfe):
+            self._port.predict(self.policy, inputs)
+        chunk = chunks[0][:, self.source.positions, : self.source.action_dim]
+        return tensordict.set(self.out_keys[0], chunk.to(noise).reshape(noise.shape))
+
+    def _batch(self, observation: Tensor | TensorDictBase) -> dict[str, Any]:
+        if isinstance(observation, Tensor):
+            entries = {"observation.state": observation}
+        else:
+            unnamed = set(observation.keys()) - set(self.names)
+            if unnamed:
+                raise ValueError(
+                    f"what are {', '.join(sorted(unnamed))} of the observation to LeRobot? Tell by names, "
+                    "such as names={'state': 'observation.state'}"
+                )
+            entries = {self.names[str(name)]: value for name, value in observation.items()}
+        steps = self.policy.config.n_obs_steps
+        inputs: dict[str, Any] = {}
+        for name, value in entries.items():
+            if value.shape[1] < steps:
+                raise ValueError(
+                    f"{name} has {value.shape[1]} observations, but the policy sees {steps}: append "
+                    f"ObservationStack({steps})"
+                )
+            value = value[:, -1] if steps == 1 else value[:, -steps:]
+            inputs[name] = value / 255.0 if value.dtype == torch.uint8 else value
+        return inputs if self.preprocess is None else self.preprocess(inputs)
+
+
+class LeRobotActor(TensorDictModuleBase):
+    """A LeRobot policy with the keys of :class:`~warmprior.WarmPriorActor`.
+
+    ``(observation, loc, warm) -> (noise, chunk)``: it acts in ``env.rollout`` and collectors with
+    :class:`~warmprior.ActionHistory` and
+    :class:`~warmprior.ChunkStep`, resets included, and :class:`~warmprior.PriorDecoder` takes it as a frozen
+    policy. Chunks are in the model's units: append what denormalises them next to the environment.
+
+    Args:
+        policy: of LeRobot, see :class:`WarmPriorAdapter`.
+        prior: the source distribution that it was trained with.
+
+    Keyword Args:
+        names: see :class:`LeRobotFlow`.
+        preprocess: see :class:`LeRobotFlow`.
+        std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it.
+        nfe: integration steps per chunk; the policy's own by default. Per call: ``actor(data, nfe=1)``.
+        generator: source of randomness; per call: ``actor(data, generator=...)``.
+        loc_key: the mean, ``[*B, P, d_a]``.
+        warm_key: bool ``[*B, P, 1]``.
+        kwargs: further arguments of :class:`LeRobotFlow`.
+
+    Raises:
+        ValueError: see :class:`WarmPriorAdapter`.
+
+    Examples:
+        >>> actor = LeRobotActor(policy, PastPrior(16), nfe=1)  # doctest: +SKIP
+        >>> env = TransformedEnv(base, Compose(ChunkStep(16), ActionHistory(actor.prior)))  # doctest: +SKIP
+        >>> env.rollout(10, actor)["vla_action", "chunk"].shape  # doctest: +SKIP
+        torch.Size([10, 16, 7])
+    """
+
+    normalizer = None
+    environment = None
+
+    def __init__(
+        self,
+        policy: Any,
+        prior: Prior,
+        *,
+        std: Tensor | None = None,
+        generator: torch.Generator | None = None,
+        loc_key: NestedKey = keys.LOC,
+        warm_key: NestedKey = keys.WARM,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__()
+        port = port_for(policy)
+        if getattr(policy.config, "use_relative_actions", False):
+            raise ValueError(
+                "ActionHistory cannot express relative actions at the next state: use WarmPriorAdapter"
+            )
+        source = ChunkSource(
+            prior,
+            length=port.length(policy),
+            width=port.width(policy),
+            action_dim=policy.config.action_feature.shape[0],
+            lead=port.lead(policy),
+            std=std,
+        )
+        self.ode = LeRobotFlow(policy, source, **kwargs)
+        self.generator = generator
+        self._mean_keys = [loc_key, warm_key]
+        noise_key, observation_key = self.ode.in_keys
+        self.in_keys = [observation_key, *self._mean_keys]
+        self.out_keys = [noise_key, *self.ode.out_keys]
+
+    @property
+    def prior(self) -> Prior:
+        """The source distribution."""
+        return self.ode.source.prior
+
+    @property
+    def chunk_key(self) -> NestedKey:
+        """Key of the chunk."""
+        return self.ode.out_keys[0]
+
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        nfe: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> TensorDictBase:
+        """Sample the source and the chunk."""
+        loc, warm = (tensordict.get(key, None) for key in self._mean_keys)
+        if loc is None or warm is None:
+            raise KeyError(
+                f"LeRobotActor needs the keys {self._mean_keys}: ActionHistory writes them in an "
+                "environment"
+            )
+        batch = loc.shape[:-2]
+        a0 = self.ode.source.draw(
+            loc.reshape(-1, *loc.shape[-2:]),
+            warm.reshape(-1, *warm.shape[-2:]),
+            self.generator if generator is None else generator,
+        )
+        return self.ode(
+            tensordict.set(self.ode.in_keys[0], a0.reshape(*batch, *a0.shape[-2:])), nfe=nfe
+        )

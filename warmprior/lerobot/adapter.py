@@ -1,0 +1,304 @@
+"""A flow policy of LeRobot whose chunks start from a prior."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from warmprior.lerobot.memory import ActionMemory
+from warmprior.lerobot.ports import check_steps, port_for
+from warmprior.lerobot.relative import RelativeActions
+from warmprior.lerobot.source import ChunkSource, SigmaUnit, action_std
+from warmprior.modules.prior import Prior
+
+__all__ = ["HISTORY", "HISTORY_IS_PAD", "WarmPriorAdapter", "history_indices"]
+
+HISTORY = "action_history"
+"""The ``H`` actions before the current step, where they do not ride in front of ``"action"``."""
+
+HISTORY_IS_PAD = f"{HISTORY}_is_pad"
+
+
+def history_indices(chunk_length: int, length: int, lead: int = 0) -> list[int]:
+    """Steps of the dataset that a training window takes, for ``action_delta_indices``.
+
+    Args:
+        chunk_length: ``H`` of the prior.
+        length: ``T``, the length of the policy's chunk.
+        lead: positions of the chunk before the current step.
+
+    Examples:
+        >>> history_indices(2, 3)
+        [-2, -1, 0, 1, 2]
+    """
+    return list(range(-max(chunk_length, lead), length - lead))
+
+
+class WarmPriorAdapter:
+    """Trains and runs an unmodified flow policy of LeRobot from a prior's source.
+
+    Supported are pi0, pi0.5, SmolVLA, GR00T N1.7, multi_task_dit (flow matching) and X-VLA. The policy stays
+    as it is: only the noise that its loss and its sampler would draw is replaced, exactly once each, or an
+    error says that it was not. Everything is in the model's own units, after LeRobot's preprocessor and
+    before its postprocessor.
+
+    For training, the dataset gives ``H`` more actions in front of each chunk: set
+    ``delta_timestamps["action"]`` to :func:`history_indices` over the frame rate. They ride in
+    ``batch["action"]`` ``[B, H + T, d_a]``, and ``batch["action_is_pad"]`` tells which of them lie before
+    the episode. LeRobot fills those with the episode's first action, the very target, so they are never used.
+    GR00T's preprocessor takes no longer chunks: give it the history as ``"action_history"`` with
+    ``"action_history_is_pad"``.
+
+    Args:
+        policy: of LeRobot.
+        prior: the source distribution. ``H`` is its ``chunk_length``; it may predict fewer actions than
+            the policy, whose later positions then start cold.
+
+    Keyword Args:
+        sigma_unit: what ``sigma`` is in units of: ``"model"`` (the normalised action space, as in the paper)
+            or ``"std"`` (the standard deviation of the data), which does not depend on the normalisation.
+        stats: of the dataset (``dataset.meta.stats``), for ``sigma_unit="std"``.
+        action_std: the standard deviation itself, ``[d_a]`` in the model's units, instead of ``stats``.
+        relative: for policies with relative actions, how remembered ones are expressed at the next state.
+        nfe: integration steps per chunk; the policy's own by default.
+        generator: source of randomness on the policy's device; PyTorch's global one by default.
+
+    Raises:
+        ValueError: if the family is unknown, or prior, policy and options do not fit each other.
+        ImportError: if another release of lerobot is installed than the ports are for.
+
+    Examples:
+        >>> adapter = WarmPriorAdapter(policy, PastPrior(50))  # doctest: +SKIP
+        >>> loss, _ = adapter.loss(preprocessor(batch))  # doctest: +SKIP
+        >>> adapter.reset()  # doctest: +SKIP
+        >>> action = postprocessor(adapter.select_action(preprocessor(observation)))  # doctest: +SKIP
+    """
+
+    def __init__(
+        self,
+        policy: Any,
+        prior: Prior,
+        *,
+        sigma_unit: SigmaUnit = "model",
+        stats: Mapping[str, Mapping[str, Any]] | None = None,
+        action_std: Tensor | None = None,
+        relative: RelativeActions | None = None,
+        nfe: int | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        self.port = port_for(policy)
+        self.policy, self.prior, self.generator = policy, prior, generator
+        self.source = ChunkSource(
+            prior,
+            length=self.port.length(policy),
+            width=self.port.width(policy),
+            action_dim=policy.config.action_feature.shape[0],
+            lead=self.port.lead(policy),
+            std=_std(policy, sigma_unit, stats, action_std),
+        )
+        steps = policy.config.n_action_steps
+        if steps > prior.chunk_length:
+            raise ValueError(
+                f"the policy executes n_action_steps={steps} of each chunk, but {prior} remembers "
+                f"chunk_length={prior.chunk_length}: set n_action_steps to {prior.chunk_length} or fewer"
+            )
+        if getattr(policy.config, "use_relative_actions", False) and relative is None:
+            raise ValueError(
+                "the policy has relative actions, so that remembered ones must be expressed at the next "
+                "state: give relative=RelativeActions(preprocessor, postprocessor)"
+            )
+        self.nfe = nfe
+        check_steps(nfe)
+        self._relative = relative
+        self._memory = ActionMemory(prior, self.source.action_dim)
+        self._state: Tensor | None = None
+        self._sampling = False
+
+    def loss(
+        self,
+        batch: Mapping[str, Any],
+        forward: Callable[..., Any] | None = None,
+        **kwargs: Any,
+    ) -> Any:
+        """The policy's own loss, from the prior's source.
+
+        Args:
+            batch: preprocessed, with history; see the class.
+            forward: the policy's ``forward`` by default.
+            kwargs: handed to it.
+
+        Returns:
+            What it returns: the loss, and what it tells besides.
+
+        Raises:
+            KeyError: if ``"action"`` or its mask is missing.
+            ValueError: if the window has another length.
+        """
+        window = self._window(batch)
+        history, valid, target, is_pad = window
+        a0, target = self.source.learn(history, valid, target, self.generator)
+        inputs = dict(batch)
+        for name in (HISTORY, HISTORY_IS_PAD):
+            inputs.pop(name, None)
+        inputs["action"], inputs["action_is_pad"] = target, is_pad
+
+        def source(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
+            if shape != a0.shape:
+                raise ValueError(
+                    f"the policy draws noise of shape {tuple(shape)}, but its source has {tuple(a0.shape)}"
+                )
+            return a0.to(dtype=dtype, device=device)
+
+        with self.port.training(self.policy, source):
+            return (self.policy.forward if forward is None else forward)(inputs, **kwargs)
+
+    def select_action(
+        self,
+        batch: dict[str, Any],
+        select: Callable[..., Tensor] | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """The next action of every environment, ``[B, d_a]``, the model's units.
+
+        Args:
+            batch: a preprocessed observation.
+            select: the policy's ``select_action`` by default.
+            kwargs: handed to it.
+
+        Raises:
+            ValueError: if there are other environments than before; :meth:`reset` first.
+        """
+        with self._from_source():
+            action = (self.policy.select_action if select is None else select)(batch, **kwargs)
+        self._memory.step()
+        return action
+
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Any],
+        executed_steps: int | Tensor | None = None,
+        predict: Callable[..., Tensor] | None = None,
+        **kwargs: Any,
+    ) -> Tensor:
+        """A new chunk, ``[B, T', d_a]`` in the model's units.
+
+        Args:
+            batch: a preprocessed observation.
+            executed_steps: actions executed of the last chunk, a number or ``[B]``; by default the policy's
+                ``n_action_steps``, or those that :meth:`select_action` gave out.
+            predict: the policy's ``predict_action_chunk`` by default.
+            kwargs: handed to it.
+
+        Raises:
+            ValueError: see :meth:`select_action`; also if more actions were executed than are remembered.
+        """
+        call = self.policy.predict_action_chunk if predict is None else predict
+        if self._sampling:  # on the way from select_action
+            return call(batch, **kwargs)
+        if executed_steps is not None:
+            self._memory.executed(executed_steps)
+        elif self._memory.waits:
+            self._memory.executed(self.policy.config.n_action_steps)
+        with self._from_source():
+            return call(batch, **kwargs)
+
+    def record_executed(self, action: Tensor) -> None:
+        """Correct the action that :meth:`select_action` just gave: what was executed instead.
+
+        Postprocessors and robots clip; the past is what the robot did.
+
+        Args:
+            action: ``[B, d_a]``, the model's units.
+
+        Raises:
+            ValueError: if none was given yet.
+        """
+        self._memory.correct(action)
+
+    def reset(self, mask: Tensor | None = None) -> None:
+        """Begin new episodes: their next chunk starts cold.
+
+        Args:
+            mask: of environments, bool ``[B]``; all by default, which also resets the policy. LeRobot's queue
+                of actions is common to all of them, so that the rest of its chunk is executed in any case.
+        """
+        self.forget(mask)
+        if mask is None:
+            self.policy.reset()
+
+    def forget(self, mask: Tensor | None = None) -> None:
+        """The part of :meth:`reset` that leaves the policy alone."""
+        self._memory.forget(mask)
+
+    @contextmanager
+    def _from_source(self) -> Iterator[None]:
+        self._sampling = True
+        try:
+            with self.port.sampling(self.policy, self._source, self._record, self.nfe):
+                yield
+        finally:
+            self._sampling = False
+
+    def _window(self, batch: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        missing = [name for name in ("action", "action_is_pad") if name not in batch]
+        if missing:
+            raise KeyError(
+                f"the batch lacks {' and '.join(missing)}: the history would leak the target without the "
+                "mask that LeRobotDataset gives with delta_timestamps"
+            )
+        actions, is_pad = batch["action"], batch["action_is_pad"].bool()
+        length, history = self.source.length, self.prior.chunk_length
+        if HISTORY in batch:
+            if HISTORY_IS_PAD not in batch:
+                raise KeyError(f"the batch has {HISTORY}, but not {HISTORY_IS_PAD}")
+            past, past_is_pad = batch[HISTORY], batch[HISTORY_IS_PAD].bool()
+            expected = [length, history]
+        else:
+            past, past_is_pad = actions, is_pad
+            expected = [len(history_indices(history, length, self.source.lead))]
+            if actions.shape[1] == expected[0]:
+                before = max(history, self.source.lead)
+                past, past_is_pad = (value[:, :before][:, -history:] for value in (actions, is_pad))
+        given = [actions.shape[1], *([past.shape[1]] if HISTORY in batch else [])]
+        if given != expected:
+            raise ValueError(
+                f"the batch has windows of {given} actions, expected {expected}: H={history} before the "
+                f"current step and T={length} of the chunk. Take the steps of history_indices({history}, "
+                f"{length}, {self.source.lead}) from the dataset"
+            )
+        return past, ~past_is_pad, actions[:, -length:], is_pad[:, -length:]
+
+    def _source(self, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
+        """A draw around the mean of every environment."""
+        move = None
+        if self._relative is not None:
+            relative, before, now = self._relative, self._state, self._relative.state()
+            self._state = now
+
+            def move(loc: Tensor) -> Tensor:
+                assert before is not None, "there was a decision, and it had a state"
+                return relative.reanchor(loc, before, now)
+
+        loc, warm = self._memory.decide(shape[0], device, move)
+        a0 = self.source.draw(loc, warm, self.generator)
+        return self.source.place(a0, self.generator).to(dtype)
+
+    def _record(self, actions: Tensor) -> None:
+        self._memory.record(actions[:, self.source.positions, : self.source.action_dim])
+
+
+def _std(
+    policy: Any,
+    unit: SigmaUnit,
+    stats: Mapping[str, Mapping[str, Any]] | None,
+    given: Tensor | None,
+) -> Tensor | None:
+    if unit not in ("model", "std"):
+        raise ValueError(f"sigma_unit must be 'model' or 'std', got {unit!r}")
+    if unit == "model":
+        return None
+    return action_std(policy, stats) if given is None else torch.as_tensor(given)

@@ -1,0 +1,335 @@
+"""Where the flow policies of LeRobot draw their noise, one small port per family."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from functools import wraps
+from importlib.metadata import version
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from warmprior.lerobot.injection import Source, SourceInjection
+
+__all__ = ["LEROBOT_VERSIONS", "PORTS", "FlowPort", "check_steps", "port_for"]
+
+LEROBOT_VERSIONS = ("0.6",)
+"""Releases that the ports were written for and are tested with."""
+
+Record = Callable[[Tensor], None]
+"""Takes what a sampler returned, ``[B, T, >= d_a]``."""
+
+
+class FlowPort(ABC):
+    """What a source needs to know of a family of policies: the chunk's shape, and where it is drawn.
+
+    The policies themselves are not changed. Training and sampling run inside of :meth:`training` and
+    :meth:`sampling`, which see to it that the source is used exactly once.
+    """
+
+    @abstractmethod
+    def length(self, policy: Any) -> int:
+        """``T``, the length of the noisy chunk."""
+
+    @abstractmethod
+    def width(self, policy: Any) -> int:
+        """``D``, the width of the noisy chunk; what lies beyond the action's is padding."""
+
+    def lead(self, policy: Any) -> int:
+        """Positions of the chunk that lie before the current step."""
+        return 0
+
+    @abstractmethod
+    def check(self, policy: Any) -> None:
+        """Refuse options under which actions remembered are not those of the model's space.
+
+        Raises:
+            ValueError: naming the option.
+        """
+
+    @abstractmethod
+    def training(self, policy: Any, source: Source) -> AbstractContextManager[Any]:
+        """Around one ``policy.forward``: the loss is that of this source."""
+
+    @abstractmethod
+    def sampling(
+        self, policy: Any, source: Source, record: Record, nfe: int | None = None
+    ) -> AbstractContextManager[Any]:
+        """Around ``select_action`` or ``predict_action_chunk``: every new chunk starts from the source.
+
+        Args:
+            policy: of the family.
+            source: what takes the place of the noise.
+            record: told each chunk, with its positions and dimensions of padding.
+            nfe: integration steps; the policy's own by default.
+        """
+
+    def predict(self, policy: Any, batch: dict[str, Any]) -> None:
+        """Sample a chunk for a batch of observations, without regard to any queue."""
+        policy.predict_action_chunk(batch)
+
+
+def check_steps(nfe: int | None) -> None:
+    """Refuse a number of integration steps that is none.
+
+    Raises:
+        ValueError: if it is below 1.
+    """
+    if nfe is not None and nfe < 1:
+        raise ValueError(
+            f"nfe is the number of integration steps: it must be at least 1, got {nfe}"
+        )
+
+
+@contextmanager
+def _steps(holder: Any, name: str, nfe: int | None) -> Iterator[None]:
+    """Another number of integration steps for a while."""
+    before = getattr(holder, name)
+    setattr(holder, name, before if nfe is None else nfe)
+    try:
+        yield
+    finally:
+        setattr(holder, name, before)
+
+
+@contextmanager
+def _replaced(owner: Any, name: str, around: Callable[[Callable[..., Any]], Any]) -> Iterator[None]:
+    """A method of one instance within a wrapper, which its class knows nothing of."""
+    method, before = getattr(owner, name), vars(owner).get(name)
+    vars(owner)[name] = wraps(method)(around(method))
+    try:
+        yield
+    finally:
+        if before is None:
+            del vars(owner)[name]
+        else:
+            vars(owner)[name] = before
+
+
+class DrawnPort(FlowPort):
+    """Of policies that draw their noise by ``torch.randn`` inside of a sampler.
+
+    Args:
+        length: attribute of the model's configuration.
+        width: likewise.
+        sampler: ``policy -> (object, name of its method)``.
+        steps: ``policy -> (object, name of its attribute)``, the number of integration steps.
+        model_config: ``policy -> `` the configuration that the two are read from.
+        predicted: what of the sampler's output is the chunk.
+        lead: ``policy -> `` positions before the current step.
+        check: see :meth:`FlowPort.check`.
+        predict: see :meth:`FlowPort.predict`.
+    """
+
+    def __init__(
+        self,
+        length: str,
+        width: Callable[[Any], int],
+        sampler: Callable[[Any], tuple[Any, str]],
+        steps: Callable[[Any], tuple[Any, str]],
+        *,
+        model_config: Callable[[Any], Any] = lambda policy: policy.config,
+        predicted: Callable[[Any], Tensor] = lambda output: output,
+        lead: Callable[[Any], int] = lambda policy: 0,
+        check: Callable[[Any], None] = lambda policy: None,
+        predict: Callable[[Any, dict[str, Any]], Any] = (
+            lambda policy, batch: policy.predict_action_chunk(batch)
+        ),
+    ) -> None:
+        self._length, self._width, self._sampler = length, width, sampler
+        self._steps, self._predict = steps, predict
+        self._model_config, self._predicted = model_config, predicted
+        self._lead, self._check = lead, check
+
+    def length(self, policy: Any) -> int:
+        """``T``."""
+        return int(getattr(self._model_config(policy), self._length))
+
+    def width(self, policy: Any) -> int:
+        """``D``."""
+        return int(self._width(policy))
+
+    def lead(self, policy: Any) -> int:
+        """Observations before the last one, as the chunk begins with the first."""
+        return self._lead(policy)
+
+    def check(self, policy: Any) -> None:
+        """See :meth:`FlowPort.check`."""
+        self._check(policy)
+
+    def training(self, policy: Any, source: Source) -> AbstractContextManager[Any]:
+        """The draw in the loss."""
+        return SourceInjection(self.length(policy), self.width(policy), source)
+
+    def predict(self, policy: Any, batch: dict[str, Any]) -> None:
+        """See :meth:`FlowPort.predict`."""
+        self._predict(policy, batch)
+
+    @contextmanager
+    def sampling(
+        self, policy: Any, source: Source, record: Record, nfe: int | None = None
+    ) -> Iterator[None]:
+        """The draw in the sampler."""
+
+        def around(sample: Callable[..., Any]) -> Callable[..., Any]:
+            def sampled(*args: Any, **kwargs: Any) -> Any:
+                with SourceInjection(self.length(policy), self.width(policy), source):
+                    output = sample(*args, **kwargs)
+                record(self._predicted(output))
+                return output
+
+            return sampled
+
+        with _steps(*self._steps(policy), nfe), _replaced(*self._sampler(policy), around):
+            yield
+
+
+class OpenPiPort(FlowPort):
+    """Of pi0, pi0.5 and SmolVLA, whose noise is an argument (compiled samplers included)."""
+
+    def length(self, policy: Any) -> int:
+        """``T``."""
+        return int(policy.config.chunk_size)
+
+    def width(self, policy: Any) -> int:
+        """``D``."""
+        return int(policy.config.max_action_dim)
+
+    def check(self, policy: Any) -> None:
+        """See :meth:`FlowPort.check`."""
+        if getattr(policy.config, "adapt_to_pi_aloha", False):
+            raise ValueError(
+                "adapt_to_pi_aloha=True gives actions in another space than the model's, and the source "
+                "would be around the wrong ones: convert the dataset instead, and turn it off"
+            )
+
+    @contextmanager
+    def training(self, policy: Any, source: Source) -> Iterator[None]:
+        """The draw in the loss."""
+        draws = []
+
+        def around(sample_noise: Callable[..., Any]) -> Callable[..., Any]:
+            def drawn(shape: Any, device: Any) -> Tensor:
+                draws.append(shape)
+                return source(torch.Size(shape), torch.float32, torch.device(device))
+
+            return drawn
+
+        with _replaced(policy.model, "sample_noise", around):
+            yield
+        if len(draws) != 1:
+            raise RuntimeError(
+                f"{type(policy).__name__} drew its noise {len(draws)} times in one loss, not once: its "
+                "source cannot be replaced. Use the version of lerobot that this port is for"
+            )
+
+    @contextmanager
+    def sampling(
+        self, policy: Any, source: Source, record: Record, nfe: int | None = None
+    ) -> Iterator[None]:
+        """The sampler's argument."""
+        length, width = self.length(policy), self.width(policy)
+
+        def around(sample: Callable[..., Any]) -> Callable[..., Any]:
+            def sampled(images: Any, *args: Any, **kwargs: Any) -> Tensor:
+                if kwargs.get("noise") is not None:
+                    raise ValueError("noise= is what the prior gives: leave it out")
+                shape = torch.Size((images[0].shape[0], length, width))
+                kwargs["noise"] = source(shape, torch.float32, images[0].device)
+                actions = sample(images, *args, **kwargs)
+                record(actions)
+                return actions
+
+            return sampled
+
+        # SmolVLA calls it by another name.
+        steps = "num_steps" if hasattr(policy.config, "num_steps") else "num_inference_steps"
+        with _steps(policy.config, steps, nfe), _replaced(policy.model, "sample_actions", around):
+            yield
+
+
+def _check_groot(policy: Any) -> None:
+    if getattr(policy.config, "use_relative_actions", False):
+        raise ValueError(
+            "GR00T's own relative actions (use_relative_actions=True) cannot be expressed at the next "
+            "state from outside: train with absolute actions"
+        )
+
+
+def _check_multi_task_dit(policy: Any) -> None:
+    if policy.config.objective != "flow_matching":
+        raise ValueError(
+            f"multi_task_dit with objective={policy.config.objective!r} is no flow: set "
+            "objective='flow_matching'"
+        )
+
+
+def _predict_multi_task_dit(policy: Any, batch: dict[str, Any]) -> None:
+    # Its own predict_action_chunk takes the observations from its queue.
+    policy.eval()
+    with torch.no_grad():
+        policy._generate_actions(policy._prepare_batch(batch))
+
+
+_openpi = OpenPiPort()
+
+PORTS: dict[str, FlowPort] = {
+    "pi0": _openpi,
+    "pi05": _openpi,
+    "smolvla": _openpi,
+    "groot": DrawnPort(
+        "action_horizon",
+        lambda policy: policy._groot_model.config.max_action_dim,
+        lambda policy: (policy._groot_model.action_head, "get_action_with_features"),
+        lambda policy: (policy._groot_model.action_head, "num_inference_timesteps"),
+        model_config=lambda policy: policy._groot_model.config,
+        predicted=lambda output: output["action_pred"],
+        check=_check_groot,
+    ),
+    "multi_task_dit": DrawnPort(
+        "horizon",
+        lambda policy: policy.config.action_feature.shape[0],
+        lambda policy: (policy.objective, "conditional_sample"),
+        lambda policy: (policy.objective.config, "num_integration_steps"),
+        lead=lambda policy: policy.config.n_obs_steps - 1,
+        check=_check_multi_task_dit,
+        predict=_predict_multi_task_dit,
+    ),
+    "xvla": DrawnPort(
+        "chunk_size",
+        lambda policy: policy.model.dim_action,
+        lambda policy: (policy.model, "generate_actions"),
+        lambda policy: (policy.config, "num_denoising_steps"),
+    ),
+}
+"""By the name that LeRobot knows the family by."""
+
+
+def port_for(policy: Any) -> FlowPort:
+    """The port of a policy's family.
+
+    Args:
+        policy: of LeRobot, or of a class that inherits from one of its.
+
+    Raises:
+        ValueError: if there is none, or the policy has options that it does not support.
+        ImportError: if another release of lerobot is installed.
+    """
+    installed = version("lerobot")
+    if not installed.startswith(tuple(f"{known}." for known in LEROBOT_VERSIONS)):
+        supported = ", ".join(f"{known}.*" for known in LEROBOT_VERSIONS)
+        raise ImportError(
+            f"lerobot {installed} is installed, and its policies may draw their noise elsewhere: "
+            f"supported is {supported}"
+        )
+    names = [getattr(kind, "name", None) for kind in type(policy).__mro__]
+    port = next((PORTS[name] for name in names if name in PORTS), None)
+    if port is None:
+        raise ValueError(
+            f"{type(policy).__name__} is no flow policy that is known: supported are {', '.join(PORTS)}"
+        )
+    port.check(policy)
+    return port

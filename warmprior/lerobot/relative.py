@@ -1,0 +1,81 @@
+"""Actions relative to the robot's state, expressed relative to a later one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+__all__ = ["RelativeActions"]
+
+
+class RelativeActions:
+    """Takes remembered actions from the state at which they were predicted to the present one.
+
+    Policies with relative actions (``use_relative_actions``) predict offsets from the state of the
+    decision. A mean that was predicted one chunk ago is an offset from where the robot was then.
+
+    Args:
+        preprocessor: the policy's pipeline; its step ``RelativeActionsProcessorStep`` holds the raw state of
+            the last observation, so the pipeline must have run before each decision.
+        postprocessor: the policy's pipeline, which undoes the normalisation.
+
+    Raises:
+        ValueError: if the steps are not there, or relative actions are off in them.
+    """
+
+    def __init__(self, preprocessor: Any, postprocessor: Any) -> None:
+        from lerobot.processor import (
+            NormalizerProcessorStep,
+            RelativeActionsProcessorStep,
+            UnnormalizerProcessorStep,
+        )
+
+        def step(pipeline: Any, kind: type) -> Any:
+            found = [step for step in pipeline.steps if isinstance(step, kind)]
+            if not found:
+                raise ValueError(f"relative actions need a {kind.__name__} in the pipeline")
+            return found[0]
+
+        self._relative = step(preprocessor, RelativeActionsProcessorStep)
+        self._normalize = step(preprocessor, NormalizerProcessorStep)
+        self._denormalize = step(postprocessor, UnnormalizerProcessorStep)
+        if not self._relative.enabled:
+            raise ValueError("relative actions are off in the pipeline: leave relative= out")
+
+    def state(self) -> Tensor:
+        """Raw state of the last observation, ``[B, d_s]``.
+
+        Raises:
+            ValueError: if no observation has gone through the pipeline.
+        """
+        state = self._relative.get_cached_state()
+        if state is None:
+            raise ValueError("run the preprocessor before the policy decides: it tells the state")
+        # The last of several observations.
+        return (
+            state.reshape(1, -1) if state.ndim == 1 else state[:, -1] if state.ndim == 3 else state
+        )
+
+    def reanchor(self, actions: Tensor, before: Tensor, now: Tensor) -> Tensor:
+        """Actions relative to one state, as those relative to another.
+
+        Args:
+            actions: as they were predicted, ``[B, *, d_a]``, the model's units.
+            before: raw state ``[B, d_s]`` at that decision.
+            now: raw state ``[B, d_s]``.
+        """
+        from lerobot.processor import (
+            TransitionKey,
+            create_transition,
+            to_absolute_actions,
+            to_relative_actions,
+        )
+
+        def through(step: Any, value: Tensor) -> Tensor:
+            return step(create_transition(action=value))[TransitionKey.ACTION]
+
+        mask = self._relative._build_mask(actions.shape[-1])
+        raw = through(self._denormalize, actions)
+        moved = to_relative_actions(to_absolute_actions(raw, before, mask), now, mask)
+        return through(self._normalize, moved).to(actions)
