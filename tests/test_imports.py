@@ -77,6 +77,7 @@ print(actor(batch)["vla_action", "chunk"].shape)
 ROOMS = (
     "io",
     "modules",
+    "lerobot",
     "transforms",
     "objectives",
     "envs",

@@ -1,0 +1,157 @@
+"""``--policy.type=warm_flow``: a policy of this library as one of LeRobot."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from typing import Any
+
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.policies.utils import populate_queues
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
+from warmprior import (
+    ChiTransformer,
+    FlowMatchingLoss,
+    VelocityNetwork,
+    WarmPriorActor,
+    keys,
+)
+from warmprior.lerobot import ActionMemory
+
+__all__ = ["WarmFlowPolicy"]
+
+
+class WarmFlowPolicy(PreTrainedPolicy):
+    """Flow matching from a prior: :class:`~warmprior.WarmPriorActor` and its loss as a policy of LeRobot.
+
+    Args:
+        config: its options.
+        kwargs: what LeRobot tells of the dataset; nothing of it is needed.
+
+    Raises:
+        ValueError: if the network does not fit the dataset, or the prior has networks of its own, which
+            LeRobot would not train.
+    """
+
+    config_class = WarmFlowConfig
+    name = "warm_flow"
+
+    def __init__(self, config: WarmFlowConfig, **kwargs: Any) -> None:
+        super().__init__(config)
+        config.validate_features()
+        prior = config.make_prior()
+        if isinstance(prior, nn.Module) or prior.teacher or prior.conditions_network:
+            raise ValueError(
+                f"prior={config.prior!r} is trained, or conditions the network, beside the flow: "
+                "lerobot-train does not; take past, preview or gaussian"
+            )
+        width = sum(config.input_features[name].shape[0] for name in config.observed)
+        sizes = (config.action_feature.shape[0], width, prior.prediction_length, config.n_obs_steps)
+        if config.network:
+            network = VelocityNetwork.from_config(json.loads(config.network))
+            names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
+            built = tuple(getattr(network, name) for name in names)
+            if built != sizes:
+                raise ValueError(
+                    f"the network was built for {dict(zip(names, built, strict=True))}, but features and "
+                    f"prior need {dict(zip(names, sizes, strict=True))}"
+                )
+        else:
+            network = ChiTransformer(
+                *sizes,
+                embedding_dim=config.embedding_dim,
+                num_layers=config.num_layers,
+                num_heads=config.num_heads,
+                dropout=config.dropout,
+            )
+        # What the data span is [-1, 1]; nothing beyond it is executed, nor remembered.
+        self.actor = WarmPriorActor(network, prior, nfe=config.nfe, clip=1.0)
+        # Of the same weights, so that it is no part of the module and is not saved again.
+        self.__dict__["_loss"] = None
+        self.reset()
+
+    def get_optim_params(self) -> Any:
+        """Weights that decay, and those that do not."""
+        return self.actor.network.parameter_groups(self.config.optimizer_weight_decay)
+
+    def reset(self) -> None:
+        """New episodes in all environments."""
+        self._queues = {
+            name: deque(maxlen=self.config.n_obs_steps) for name in self.config.observed
+        }
+        self._queues["action"] = deque(maxlen=self.config.n_action_steps)
+        prior = self.actor.prior
+        self.__dict__["_memory"] = ActionMemory(prior, self.config.action_feature.shape[0])
+
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Conditional flow matching (Algorithm 1).
+
+        Args:
+            batch: ``"action"`` ``[B, H + P, d_a]`` and ``"action_is_pad"``, with the history in front, and
+                the observations ``[B, To, d]``.
+
+        Raises:
+            KeyError: if the mask is missing, without which the history would leak the target.
+        """
+        if "action_is_pad" not in batch:
+            raise KeyError(
+                "the batch lacks action_is_pad: the history before an episode is its first action, the "
+                "target, and must be masked"
+            )
+        prior = self.actor.prior
+        history, target = batch["action"].split(
+            [prior.chunk_length, prior.prediction_length], dim=1
+        )
+        valid, inside = (~batch["action_is_pad"].bool()).split(
+            [prior.chunk_length, prior.prediction_length], dim=1
+        )
+        loc, warm = prior.training_mean(history, valid, target)
+        data = TensorDict(
+            {
+                keys.OBSERVATION: self._observation(batch),
+                keys.LOC: loc,
+                keys.WARM: prior.withhold(warm),
+                keys.CHUNK: target,
+                keys.IS_PAD: ~inside,
+            },
+            [len(target)],
+        )
+        if self._loss is None:
+            self.__dict__["_loss"] = FlowMatchingLoss(self.actor)
+        loss = self._loss(data)["loss_flow_matching"]
+        return loss, {"flow_matching": loss.item()}
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """A new chunk from the last observations, ``[B, P, d_a]``, normalised."""
+        self.eval()
+        if self._memory.waits:  # asked for chunks alone
+            self._memory.executed(self.config.n_action_steps)
+        seen = {name: torch.stack(list(self._queues[name]), dim=1) for name in self.config.observed}
+        observation = self._observation(seen)
+        loc, warm = self._memory.decide(len(observation), observation.device)
+        data = TensorDict(
+            {keys.OBSERVATION: observation, keys.LOC: loc, keys.WARM: warm}, [len(observation)]
+        )
+        chunk = self.actor(data)[keys.CHUNK]
+        self._memory.record(chunk)
+        return chunk
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """The next action of every environment, ``[B, d_a]``, normalised."""
+        batch = {name: batch[name] for name in self.config.observed}
+        self._queues = populate_queues(self._queues, batch)
+        if not self._queues["action"]:
+            chunk = self.predict_action_chunk(batch)
+            self._queues["action"].extend(chunk.transpose(0, 1)[: self.config.n_action_steps])
+        self._memory.step()
+        return self._queues["action"].popleft()
+
+    def _observation(self, batch: dict[str, Tensor]) -> Tensor:
+        """``[B, To, d_o]``."""
+        return torch.cat([batch[name] for name in self.config.observed], dim=-1)

@@ -1,0 +1,98 @@
+"""A simulated task with gymnasium's interface, as LeRobot evaluates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDict
+
+from warmprior.envs import RobosuiteEnv
+
+__all__ = ["RobosuiteGymEnv"]
+
+
+class RobosuiteGymEnv(gymnasium.Env):
+    """One environment of :class:`~warmprior.envs.RobosuiteEnv`.
+
+    Args:
+        task: a name of ``warmprior.envs.TASKS``.
+        style: of the demonstrations; decides the time limit.
+        cameras: to render.
+        image_size: side of the images in pixels.
+        render_mode: ``"rgb_array"`` for films.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
+
+    def __init__(
+        self,
+        task: str,
+        style: str = "ph",
+        cameras: Sequence[str] = (),
+        image_size: int = 84,
+        render_mode: str | None = None,
+    ) -> None:
+        options: dict[str, Any] = {"style": style, "camera_size": image_size}
+        if cameras:
+            options |= {"camera": list(cameras), "from_pixels": True}
+        self._env = RobosuiteEnv(task, **options)
+        spec = self._env.task
+        self.task = self.task_description = spec.name
+        self._object_dim, self._cameras = spec.object_dim, list(cameras)
+        self._max_episode_steps = spec.horizon(style)
+        self.render_mode = render_mode
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
+
+        def box(width: int) -> gymnasium.spaces.Box:
+            return gymnasium.spaces.Box(-np.inf, np.inf, (width,), np.float32)
+
+        seen: dict[str, gymnasium.Space] = {
+            "agent_pos": box(spec.observation_dim - spec.object_dim)
+        }
+        if cameras:
+            image = gymnasium.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
+            seen["pixels"] = gymnasium.spaces.Dict({camera: image for camera in cameras})
+        else:
+            seen["environment_state"] = box(spec.object_dim)
+        self.observation_space = gymnasium.spaces.Dict(seen)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin the episode of a seed, or the next one."""
+        super().reset(seed=seed)
+        if seed is not None:
+            self._env.set_seed(seed, static_seed=True)
+        return self._seen(self._env.reset()), {"is_success": False}
+
+    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One control step; actions beyond ``[-1, 1]`` are clipped, as the simulator's are."""
+        value = torch.as_tensor(np.clip(action, -1.0, 1.0), dtype=torch.float32)
+        step = self._env.step(TensorDict({"action": value}, []))["next"]
+        info = {"is_success": bool(step["success"])}
+        ended = bool(step["terminated"]), bool(step["truncated"])
+        return self._seen(step), float(step["reward"]), *ended, info
+
+    def render(self) -> np.ndarray:
+        """A picture of the scene, ``[h, w, 3]`` uint8."""
+        return self._env.render_frame(size=256)
+
+    def close(self) -> None:
+        """Free the simulator."""
+        self._env.close(raise_if_closed=False)
+
+    def _seen(self, data: Any) -> dict[str, Any]:
+        observation = data["observation"].numpy()
+        seen: dict[str, Any] = {"agent_pos": observation[self._object_dim :]}
+        if not self._cameras:
+            return {**seen, "environment_state": observation[: self._object_dim]}
+        pixels = data["pixels"]
+        images = {self._cameras[0]: pixels} if torch.is_tensor(pixels) else dict(pixels.items())
+        return {**seen, "pixels": {name: image.numpy() for name, image in images.items()}}
+
+
+gymnasium.register("warmprior/robosuite-v0", entry_point=RobosuiteGymEnv)
