@@ -3,17 +3,19 @@ PYTHON ?= $(shell command -v python3.12 || command -v python3 || command -v pyth
 BIN := .venv/bin
 ARGS ?=
 EXTRAS := sim,vision,lerobot,vla,docs,dev
+PLUGIN := plugins/lerobot_policy_warmprior
 
 .PHONY: install benchmark throughput test test-slow lint fuzz docs clean
 
 install: .venv/installed
 
-.venv/installed: pyproject.toml constraints.txt
+.venv/installed: pyproject.toml constraints.txt $(PLUGIN)/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] < (3, 12))' || \
 		{ echo "warmprior needs Python 3.12 or newer; name it: make PYTHON=/path/to/python3.12 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(EXTRAS)]"
+	$(BIN)/python -m pip install --quiet --no-deps --editable $(PLUGIN)
 	@touch $@
 
 benchmark: install

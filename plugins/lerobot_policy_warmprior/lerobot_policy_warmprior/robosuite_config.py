@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
+import gymnasium
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
@@ -23,6 +25,7 @@ class RobosuiteEnvConfig(EnvConfig):
         style: of the demonstrations, ``ph`` or ``mh``; decides the time limit.
         cameras: to render; with them the state of the objects is left out, as in image datasets.
         image_size: side of the images in pixels.
+        episode_length: time limit in control steps; the task's by default.
     """
 
     task: str = "lift"
@@ -30,6 +33,7 @@ class RobosuiteEnvConfig(EnvConfig):
     style: str = "ph"
     cameras: list[str] = field(default_factory=list)
     image_size: int = 84
+    episode_length: int | None = None
     features_map: dict[str, str] = field(
         default_factory=lambda: {
             "action": "action",
@@ -56,16 +60,6 @@ class RobosuiteEnvConfig(EnvConfig):
         }
 
     @property
-    def package_name(self) -> str:
-        """Where the environment registers itself with gymnasium."""
-        return "lerobot_policy_warmprior.robosuite_env"
-
-    @property
-    def gym_id(self) -> str:
-        """As it is registered there."""
-        return "warmprior/robosuite-v0"
-
-    @property
     def gym_kwargs(self) -> dict[str, Any]:
         """Arguments of the environment."""
         return {
@@ -73,4 +67,21 @@ class RobosuiteEnvConfig(EnvConfig):
             "style": self.style,
             "cameras": self.cameras,
             "image_size": self.image_size,
+            "horizon": self.episode_length,
         }
+
+    def create_envs(
+        self, n_envs: int, use_async_envs: bool = False
+    ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
+        """One batch of environments; in worker processes, they need not know of any registry."""
+        from lerobot_policy_warmprior.robosuite_env import RobosuiteGymEnv
+
+        make = partial(RobosuiteGymEnv, **self.gym_kwargs)
+        options: dict[str, Any] = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
+        if use_async_envs and n_envs > 1:
+            batch = gymnasium.vector.AsyncVectorEnv(
+                [make] * n_envs, context="forkserver", **options
+            )
+        else:
+            batch = gymnasium.vector.SyncVectorEnv([make] * n_envs, **options)
+        return {self.type: {0: batch}}

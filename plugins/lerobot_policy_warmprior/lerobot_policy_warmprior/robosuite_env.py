@@ -23,6 +23,7 @@ class RobosuiteGymEnv(gymnasium.Env):
         style: of the demonstrations; decides the time limit.
         cameras: to render.
         image_size: side of the images in pixels.
+        horizon: time limit in control steps; the task's by default.
         render_mode: ``"rgb_array"`` for films.
     """
 
@@ -34,16 +35,17 @@ class RobosuiteGymEnv(gymnasium.Env):
         style: str = "ph",
         cameras: Sequence[str] = (),
         image_size: int = 84,
+        horizon: int | None = None,
         render_mode: str | None = None,
     ) -> None:
-        options: dict[str, Any] = {"style": style, "camera_size": image_size}
+        options: dict[str, Any] = {"style": style, "camera_size": image_size, "horizon": horizon}
         if cameras:
             options |= {"camera": list(cameras), "from_pixels": True}
         self._env = RobosuiteEnv(task, **options)
         spec = self._env.task
         self.task = self.task_description = spec.name
         self._object_dim, self._cameras = spec.object_dim, list(cameras)
-        self._max_episode_steps = spec.horizon(style)
+        self._max_episode_steps = spec.horizon(style) if horizon is None else horizon
         self.render_mode = render_mode
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (spec.action_dim,), np.float32)
 
@@ -93,6 +95,3 @@ class RobosuiteGymEnv(gymnasium.Env):
         pixels = data["pixels"]
         images = {self._cameras[0]: pixels} if torch.is_tensor(pixels) else dict(pixels.items())
         return {**seen, "pixels": {name: image.numpy() for name, image in images.items()}}
-
-
-gymnasium.register("warmprior/robosuite-v0", entry_point=RobosuiteGymEnv)

@@ -1,0 +1,117 @@
+"""A policy of this library as one that ``lerobot-eval`` runs.
+
+python -m lerobot_policy_warmprior.export POLICY_FOLDER LEROBOT_FOLDER
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from torch import Tensor
+
+from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
+from lerobot_policy_warmprior.modeling_warm_flow import WarmFlowPolicy
+from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post_processors
+from warmprior import WarmPriorActor, keys
+from warmprior.envs import TASKS
+from warmprior.envs.description import environment_name
+from warmprior.io.script import run_script
+
+__all__ = ["export_policy"]
+
+_FEATURES = {
+    "observation.environment_state": FeatureType.ENV,
+    "observation.state": FeatureType.STATE,
+}
+
+
+def export_policy(folder: str | Path, out: str | Path) -> Path:
+    """Write a saved policy, its normaliser included, as LeRobot's ``warm_flow``.
+
+    Its observation is what converted demonstrations have (``python -m warmprior convert``): the state of the
+    objects as ``observation.environment_state``, that of the robot as ``observation.state``. Of an unknown
+    environment all of it is the latter.
+
+    Args:
+        folder: of :meth:`WarmPriorActor.save_pretrained <warmprior.WarmPriorActor.save_pretrained>`.
+        out: to write; must not exist.
+
+    Returns:
+        ``out``.
+
+    Raises:
+        FileExistsError: if ``out`` exists.
+        ValueError: if the policy has images, absolute actions, no normaliser, or a prior that a policy of
+            LeRobot cannot have.
+    """
+    out = Path(out)
+    if out.exists():
+        raise FileExistsError(f"{out} exists: choose another folder")
+    actor = WarmPriorActor.from_pretrained(folder)
+    described = actor.environment or {}
+    if "images" in described or "actions" in described:
+        raise ValueError(
+            f"{folder}: policies of images or absolute actions need what stands beside the environment here; "
+            "only policies of states and pose deltas can be exported"
+        )
+    if actor.normalizer is None or actor.ode.clip != 1.0:
+        raise ValueError(
+            f"{folder}: the policy needs a normaliser, and the bound clip=1.0 on its actions (it has "
+            f"{actor.ode.clip}), which are those of LeRobot's policy"
+        )
+    prior, network, normalizer = actor.prior, actor.network, actor.normalizer
+    spec = next((t for t in TASKS.values() if t.env_name == environment_name(actor)), None)
+    objects = 0 if spec is None else spec.object_dim
+    widths = [objects, network.observation_dim - objects]
+
+    def bounds(key: str, part: slice) -> dict[str, Tensor]:
+        loc, scale = normalizer.loc(key)[part], normalizer.scale(key)[part]
+        return {"min": loc - scale, "max": loc + scale}
+
+    inputs, stats, first = {}, {"action": bounds(keys.ACTION, slice(None))}, 0
+    for (name, kind), width in zip(_FEATURES.items(), widths, strict=True):
+        if width:
+            inputs[name] = PolicyFeature(type=kind, shape=(width,))
+            stats[name] = bounds(keys.OBSERVATION, slice(first, first + width))
+        first += width
+    sigma = f"sigma={prior.sigma}" if prior.takes("sigma") else ""
+    config = WarmFlowConfig(
+        input_features=inputs,
+        output_features={
+            "action": PolicyFeature(type=FeatureType.ACTION, shape=(network.action_dim,))
+        },
+        n_obs_steps=network.observation_steps,
+        n_action_steps=prior.chunk_length,
+        prior=",".join(filter(None, (prior.name, sigma, prior.options))),
+        nfe=actor.ode.nfe,
+        network=json.dumps(network.config()),
+        device="cpu",
+        push_to_hub=False,
+    )
+    policy = WarmFlowPolicy(config)
+    with torch.no_grad():
+        policy.actor.network.load_state_dict(network.state_dict())
+    policy.save_pretrained(out)
+    for pipeline in make_warm_flow_pre_post_processors(config, stats):
+        pipeline.save_pretrained(out)
+    return out
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(prog="lerobot_policy_warmprior.export", description=__doc__)
+    parser.add_argument("folder", type=Path, help="of a saved policy")
+    parser.add_argument("out", type=Path, help="to write; must not exist")
+    args = parser.parse_args(argv)
+    print(export_policy(args.folder, args.out))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run_script(main, "lerobot_policy_warmprior.export"))

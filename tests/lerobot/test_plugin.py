@@ -1,0 +1,363 @@
+"""The plugin, found and run by LeRobot itself."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.lerobot.seen import watch
+from tests.lerobot.tiny import (
+    ACTION,
+    LENGTH,
+    make_pi,
+    make_smolvla,
+    observations,
+    tiny_gemma,
+    tiny_smolvlm,
+    windows,
+)
+
+pytest.importorskip("lerobot")
+pytest.importorskip("lerobot_policy_warmprior")
+pytest.importorskip("transformers")
+
+STATE, OBJECT = 9, 10  # of lift
+
+
+@pytest.fixture(scope="module")
+def found():
+    """The policies' classes, by LeRobot's own discovery."""
+    from lerobot.policies.factory import get_policy_class
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    register_third_party_plugins()
+    return {name: get_policy_class(name) for name in ("warm_smolvla", "warm_pi05", "warm_flow")}
+
+
+def warm(found, name, **options):
+    kind = found[name]
+    config = kind.config_class
+    if name == "warm_smolvla":
+        return make_smolvla(kind, config, **options)
+    return make_pi("pi05", kind, config, **options)
+
+
+def small(name):
+    if name == "warm_smolvla":
+        from lerobot.policies.smolvla import smolvlm_with_expert
+
+        return tiny_smolvlm(smolvlm_with_expert)
+    from lerobot.policies.pi05 import modeling_pi05
+
+    return tiny_gemma(modeling_pi05)
+
+
+@pytest.mark.parametrize("name", ["warm_smolvla", "warm_pi05"])
+def test_a_base_checkpoint_becomes_a_warm_policy(found, name, built, tmp_path):
+    base = built(name.removeprefix("warm_"))
+    base.save_pretrained(tmp_path / "base")
+    taken = {
+        f.name: getattr(base.config, f.name) for f in dataclasses.fields(base.config) if f.init
+    }
+    config = found[name].config_class(**taken, prior="past,sigma=0.0")
+    assert config.action_delta_indices == list(range(-LENGTH, LENGTH))
+    with small(name):
+        policy = found[name].from_pretrained(tmp_path / "base", config=config)
+    for key, value in base.state_dict().items():
+        assert torch.equal(policy.state_dict()[key], value), key
+    # And is saved, and loaded, as what it is.
+    policy.save_pretrained(tmp_path / "warm")
+    assert json.loads((tmp_path / "warm" / "config.json").read_text())["type"] == name
+    with small(name):
+        again = found[name].from_pretrained(tmp_path / "warm")
+    assert again.config.prior == "past,sigma=0.0"
+    assert all(map(torch.equal, again.state_dict().values(), policy.state_dict().values()))
+
+
+@pytest.mark.parametrize("name", ["warm_smolvla", "warm_pi05"])
+def test_losses_and_chunks_start_from_the_prior(found, name):
+    torch.manual_seed(0)
+    family = name.removeprefix("warm_")
+    policy = warm(found, name, prior="past,sigma=0.0", n_action_steps=4).train()
+    batch = windows(family, 2, LENGTH)
+    with watch(family, policy) as seen:
+        loss, _ = policy.forward(dict(batch))
+    history, target = batch["action"][:, :LENGTH], batch["action"][:, LENGTH:]
+    # On the line between the two, at one time per sample: t = 1 is the source.
+    x = seen.x[0][..., :ACTION]
+    t = ((x - target) / (history - target)).flatten(1)
+    torch.testing.assert_close(t, t.mean(1, keepdim=True).expand_as(t), rtol=1e-2, atol=1e-3)
+    assert loss.isfinite()
+    policy.eval()
+    policy.reset()
+    start, actions, sources = observations(family, 2), [], []
+    for _ in range(9):
+        with watch(family, policy) as seen:
+            actions.append(policy.select_action(dict(start)))
+        sources += [x[..., :ACTION] for x in seen.x[:1]]
+    assert len(sources) == 3
+    assert torch.equal(sources[2], torch.stack(actions[:LENGTH], 1))
+    policy.reset()
+    with watch(family, policy) as seen:
+        policy.predict_action_chunk(dict(start))
+    assert not torch.equal(seen.x[0][..., :ACTION], sources[2])
+
+
+def test_sigma_in_units_of_the_dataset_is_kept(found, tmp_path):
+    stats = {
+        "action": {
+            "std": torch.ones(ACTION),
+            "q01": -4 * torch.ones(ACTION),
+            "q99": torch.ones(ACTION),
+        }
+    }
+    kind = found["warm_pi05"]
+
+    class WithStats:  # as LeRobot's factory hands them to the constructor
+        def __new__(cls, config):
+            return kind(config, dataset_stats=stats)
+
+    policy = make_pi("pi05", WithStats, kind.config_class, sigma_unit="std")
+    assert policy.config.action_std == pytest.approx([0.4] * ACTION)
+    policy.save_pretrained(tmp_path)
+    with small("warm_pi05"):
+        again = kind.from_pretrained(tmp_path)
+    assert again.config.action_std == policy.config.action_std
+    with pytest.raises(ValueError, match="needs the statistics"):
+        make_pi("pi05", kind, kind.config_class, sigma_unit="std")
+
+
+def test_options_that_do_not_fit(found):
+    with pytest.raises(ValueError, match="n_action_steps=8 of each chunk"):
+        warm(found, "warm_smolvla", prior="preview")
+    with pytest.raises(ValueError, match="unknown prior 'nothing'"):
+        warm(found, "warm_smolvla", prior="nothing")
+    with pytest.raises(ValueError, match="use_relative_actions=true needs"):
+        warm(found, "warm_pi05", use_relative_actions=True)
+
+
+def write_dataset(root, episodes=3, steps=12):
+    """Of lift's widths."""
+    import numpy as np
+    from lerobot.datasets import LeRobotDataset
+
+    widths = {"observation.state": STATE, "observation.environment_state": OBJECT, "action": 7}
+    features = {
+        name: {"dtype": "float32", "shape": (width,), "names": None}
+        for name, width in widths.items()
+    }
+    dataset = LeRobotDataset.create(
+        "local/tiny", fps=20, root=root, use_videos=False, features=features
+    )
+    rng = np.random.default_rng(0)
+    for _ in range(episodes):
+        for _ in range(steps):
+            frame = {
+                name: rng.uniform(-1, 1, width).astype("float32") for name, width in widths.items()
+            }
+            dataset.add_frame({**frame, "task": "lift the cube"})
+        dataset.save_episode()
+    dataset.finalize()
+
+
+TRAIN = """--policy.type=warm_flow --policy.embedding_dim=24 --policy.num_layers=1 --policy.device=cpu
+--policy.push_to_hub=false --steps=2 --batch_size=4 --num_workers=0 --save_freq=2"""
+
+
+def test_lerobot_trains_and_evaluates_it(found, tmp_path, monkeypatch):
+    """The commands of the documentation, offline."""
+    pytest.importorskip("robosuite")
+    pytest.importorskip("accelerate")
+    write_dataset(tmp_path / "data")
+    scripts, options = Path(sys.executable).parent, os.environ | {"HF_HUB_OFFLINE": "1"}
+
+    def run(script, *argv):
+        done = subprocess.run(
+            [sys.executable, str(scripts / script), *argv],
+            env=options,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr[-3000:]
+
+    data = [f"--dataset.root={tmp_path / 'data'}", "--dataset.repo_id=local/tiny"]
+    run("lerobot-train", *data, *TRAIN.split(), f"--output_dir={tmp_path / 'run'}")
+    policy = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    environment = ["--env.type=warmprior_robosuite", "--env.task=lift", "--env.episode_length=20"]
+    episodes = ["--eval.n_episodes=1", "--eval.batch_size=1", "--policy.device=cpu"]
+    out = f"--output_dir={tmp_path / 'evaluation'}"
+    run("lerobot-eval", f"--policy.path={policy}", *environment, *episodes, out)
+    told = json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())
+    assert told["overall"]["n_episodes"] == 1
+
+
+def flow_policy(found, **options):
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    inputs = {
+        "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(3,)),
+        "observation.environment_state": PolicyFeature(type=FeatureType.ENV, shape=(2,)),
+    }
+    outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(2,))}
+    chosen = {"embedding_dim": 24, "num_layers": 1, "nfe": 1, "n_action_steps": 4, "device": "cpu"}
+    config = found["warm_flow"].config_class(
+        input_features=inputs, output_features=outputs, **chosen | options
+    )
+    torch.manual_seed(0)
+    return found["warm_flow"](config)
+
+
+def flow_batch(length, size=3):
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape):
+        return torch.randn(*shape, generator=generator)
+
+    return {
+        "observation.state": normal(size, 2, 3),
+        "observation.environment_state": normal(size, 2, 2),
+        "action": normal(size, length, 2),
+        "action_is_pad": torch.zeros(size, length, dtype=torch.bool),
+    }
+
+
+def test_the_flow_policys_loss_is_algorithm_1(found):
+    policy = flow_policy(found, prior="past,sigma=0.0").eval()
+    batch = flow_batch(8)
+    batch["action_is_pad"][0, :2] = True  # the beginning of an episode
+    batch["action_is_pad"][1, 6:] = True  # and an end
+    torch.manual_seed(5)
+    loss, _ = policy.forward(batch)
+    # By hand. The first draw is of the source, of which only the cold sample is left, then the times.
+    torch.manual_seed(5)
+    eps, t = torch.randn(3, 4, 2), torch.rand(3)
+    history, target = batch["action"].split(4, 1)
+    a0 = torch.where(torch.tensor([True, False, False])[:, None, None], eps, history)
+    a_t = a0 + t[:, None, None] * (target - a0)
+    seen = torch.cat([batch["observation.environment_state"], batch["observation.state"]], -1)
+    with torch.no_grad():
+        error = (policy.actor.network(t, a_t, seen) - (target - a0)).square()
+    inside = (~batch["action_is_pad"][:, 4:])[..., None].expand_as(error)
+    torch.testing.assert_close(loss.detach(), error[inside].mean())
+    with pytest.raises(KeyError, match="lacks action_is_pad"):
+        policy.forward({k: v for k, v in batch.items() if k != "action_is_pad"})
+
+
+def test_the_flow_policy_remembers(found):
+    policy = flow_policy(found, prior="past,sigma=0.0").eval()
+    sources = []
+    sample = policy.actor.prior.start
+    policy.actor.prior.start = lambda *args: sources.append(sample(*args)) or sources[-1]
+    batch = {
+        "observation.state": torch.randn(2, 3),
+        "observation.environment_state": torch.randn(2, 2),
+    }
+    actions = torch.stack([policy.select_action(dict(batch)) for _ in range(9)], 1)
+    assert len(sources) == 3
+    assert torch.equal(sources[1], actions[:, :4]) and torch.equal(sources[2], actions[:, 4:8])
+    assert actions.abs().max() <= 1
+    policy.reset()
+    policy.select_action(dict(batch))
+    assert not torch.equal(sources[3], actions[:, 4:8])
+
+
+def test_flow_policies_that_lerobot_could_not_train(found):
+    with pytest.raises(ValueError, match="lerobot-train does not"):
+        flow_policy(found, prior="history")
+    from warmprior import VelocityMLP
+
+    network = json.dumps(VelocityMLP(2, 5, 9).config())
+    with pytest.raises(ValueError, match=r"'prediction_length': 9.*'prediction_length': 4"):
+        flow_policy(found, network=network)
+    assert flow_policy(found, network=json.dumps(VelocityMLP(2, 5, 4).config())).actor is not None
+
+
+def saved_policy(folder, **options):
+    """A policy of lift's widths, with the environment that it was made for."""
+    from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor
+    from warmprior.envs.description import environment_description
+    from warmprior.envs.simulator import task_env_args
+
+    torch.manual_seed(0)
+    data = torch.rand(2, 50, OBJECT + STATE), torch.rand(2, 50, 7)
+    (low, high), (least, most) = ((value.amin(1), value.amax(1)) for value in data)
+    low[0, 3] = high[0, 3] = 0.5  # constant
+    normalizer = Normalizer(
+        {"observation": low[0], "action": least[0]}, {"observation": high[0], "action": most[0]}
+    )
+    network = VelocityMLP(7, OBJECT + STATE, 8)
+    with torch.no_grad():  # fresh ones predict nothing
+        for weight in network.parameters():
+            weight.add_(0.05 * torch.randn_like(weight))
+    environment = environment_description(task_env_args("lift"), "ph", 2, "delta", None)
+    chosen = {"nfe": 3, "clip": 1.0, "normalizer": normalizer, "environment": environment} | options
+    actor = WarmPriorActor(network, PastPrior(8, sigma=0.3, correlation=0.5), **chosen)
+    actor.save_pretrained(folder)
+    return actor
+
+
+def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
+    pytest.importorskip("robosuite")
+    from lerobot.policies.factory import make_pre_post_processors
+    from lerobot_policy_warmprior.export import export_policy, main
+    from tensordict import TensorDict
+
+    actor = saved_policy(tmp_path / "ours")
+    out = export_policy(tmp_path / "ours", tmp_path / "theirs")
+    policy = found["warm_flow"].from_pretrained(out)
+    before, after = make_pre_post_processors(policy.config, pretrained_path=str(out))
+    assert policy.actor.prior.config() == actor.prior.config()
+    raw = torch.randn(OBJECT + STATE)
+    seen = {"observation.environment_state": raw[:OBJECT], "observation.state": raw[OBJECT:]}
+    torch.manual_seed(7)
+    action = after(policy.select_action(before(dict(seen))))
+    # The same by this library: normalised, the observation twice, cold, and back.
+    data = TensorDict({"observation": raw.expand(1, 2, -1)}, [1])
+    data = actor.normalizer.normalize(data)
+    data.set(("prior", "loc"), torch.zeros(1, 8, 7))
+    data.set(("prior", "warm"), torch.zeros(1, 8, 1, dtype=torch.bool))
+    torch.manual_seed(7)
+    chunk = actor(data)["vla_action", "chunk"]
+    expected = actor.normalizer.denormalize(TensorDict({"action": chunk[:, 0]}, [1]))["action"]
+    torch.testing.assert_close(action, expected)
+    with pytest.raises(FileExistsError, match="choose another folder"):
+        export_policy(tmp_path / "ours", out)
+    assert main([str(tmp_path / "ours"), str(tmp_path / "again")]) == 0
+    saved_policy(tmp_path / "unbounded", clip=None)
+    with pytest.raises(ValueError, match=r"the bound clip=1\.0"):
+        export_policy(tmp_path / "unbounded", tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+
+
+def test_the_environment_has_the_observations_of_converted_demonstrations():
+    pytest.importorskip("robosuite")
+    import numpy as np
+    from gymnasium.utils.env_checker import check_env
+    from lerobot_policy_warmprior import RobosuiteEnvConfig
+
+    from warmprior.envs import RobosuiteEnv
+
+    config = RobosuiteEnvConfig(task="lift", episode_length=5)
+    ((batch,),) = (suite.values() for suite in config.create_envs(2).values())
+    single = batch.envs[0]
+    check_env(single, skip_render_check=True)
+    observation, _ = batch.reset(seed=[3, 4])
+    ours = RobosuiteEnv("lift", seed=3).reset()["observation"]
+    assert np.array_equal(observation["environment_state"][0], ours[:OBJECT])
+    assert np.array_equal(observation["agent_pos"][0], ours[OBJECT:])
+    for _ in range(5):
+        *_, truncated, info = batch.step(np.zeros((2, 7), np.float32))
+    assert truncated.all() and info["final_info"]["is_success"].tolist() == [False, False]
+    features = {name: entry.shape for name, entry in config.features.items()}
+    assert features == {"action": (7,), "agent_pos": (STATE,), "environment_state": (OBJECT,)}
+    batch.close()
+    with pytest.raises(ValueError, match="unknown task 'life'"):
+        RobosuiteEnvConfig(task="life")
