@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from warmprior.data.hdf5 import RobomimicIndex, open_robomimic, read_index
+from warmprior.data.hdf5 import open_robomimic, read_index
 from warmprior.data.hdf5_members import DatasetError, member, reading
+from warmprior.data.index import DatasetIndex
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer, require_rendering
 from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
@@ -147,7 +148,7 @@ class _Illustrator:
     """Renders the demos of a file; its simulator is made in the worker that renders."""
 
     def __init__(
-        self, index: RobomimicIndex, cameras: tuple[str, ...], size: int, fast: bool, parts: Path
+        self, index: DatasetIndex, cameras: tuple[str, ...], size: int, fast: bool, parts: Path
     ) -> None:
         self.index, self.cameras, self.parts = index, cameras, parts
         self.size, self.fast = size, fast
