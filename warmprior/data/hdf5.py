@@ -18,6 +18,7 @@ import numpy as np
 from warmprior.data.hdf5_images import image_size
 from warmprior.data.hdf5_members import DatasetError, member, names, reading
 from warmprior.data.index import (
+    BLOCK,
     DatasetIndex,
     check_count,
     check_env_args,
@@ -34,10 +35,10 @@ __all__ = [
     "open_robomimic",
     "read_env_args",
     "read_index",
+    "read_masks",
     "read_rows",
 ]
 
-BLOCK = 4096  # rows read at once: a bound on temporary memory, whatever the length of a demo
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
 
@@ -89,6 +90,22 @@ def _number(path: Path, name: str) -> int:
     if not (name.startswith("demo_") and name[5:].isdecimal()):
         raise DatasetError(f"{path}: data/{name} is not called demo_<number>; rename the group")
     return int(name[5:])
+
+
+def read_masks(path: str | Path) -> dict[str, set[str]]:
+    """The names of the demos in each mask of a robomimic file.
+
+    Args:
+        path: the HDF5 file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        DatasetError: if a mask is no list of names.
+    """
+    with open_robomimic(path) as file:
+        group, demos = member(file, "mask", "group"), len(names(file["data"]))
+        known = [] if group is None else names(group)
+        return {name: _mask(file, Path(path), name, demos) for name in known}
 
 
 def _mask(file: h5py.File, path: Path, filter_key: str, demos: int) -> set[str]:

@@ -12,8 +12,9 @@ import numpy as np
 from warmprior.data.hdf5_members import DatasetError
 from warmprior.envs.tasks import TASKS, TaskSpec
 
-__all__ = ["DatasetIndex", "check_count", "check_env_args", "store_finite", "task_of_env"]
+__all__ = ["BLOCK", "DatasetIndex", "check_count", "check_env_args", "store_finite", "task_of_env"]
 
+BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
 LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
 
 

@@ -19,7 +19,7 @@ from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorS
 from tqdm import tqdm
 
 from warmprior.data.hdf5_members import DatasetError
-from warmprior.data.index import DatasetIndex
+from warmprior.data.index import BLOCK, DatasetIndex
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
@@ -28,7 +28,6 @@ from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 
 __all__ = ["DemonstrationReader", "DemonstrationReplay", "check_storage"]
 
-BLOCK = 4096  # rows converted at once: a bound on temporary memory, whatever the length of a demo
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
 
 
