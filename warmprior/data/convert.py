@@ -35,6 +35,7 @@ from warmprior.keys import ACTION, OBSERVATION, STATE
 __all__ = ["convert_robomimic"]
 
 KINDS = ("image", "video")
+VIDEO_SIZE = 32  # of the least side; the AV1 encoder ends the process at smaller ones
 
 
 def convert_robomimic(
@@ -82,7 +83,7 @@ def convert_robomimic(
         FileNotFoundError: if there is no such file.
         FileExistsError: if there is something at ``folder``.
         DatasetError: if the file is not as it should be, or has no images to write.
-        ValueError: if ``images`` is unknown.
+        ValueError: if ``images`` is unknown, or the file's are too small for a video.
         OSError: if the disk is full, or another process converts to the same folder.
         ImportError: if lerobot is not installed.
 
@@ -105,6 +106,11 @@ def convert_robomimic(
                 f"{path} has no images: render them first (python -m warmprior render {path} --out FILE)"
             )
         index = read_index(path, demos=demos, image_keys=keys)
+        if images == "video" and index.image_size < VIDEO_SIZE:
+            raise ValueError(
+                f"{path}: images of {index.image_size} pixels are too small for a video, which takes "
+                f"{VIDEO_SIZE}: write pictures (--images), or render larger ones"
+            )
     if os.path.lexists(folder):
         raise FileExistsError(
             f"{folder} exists: choose another folder, or remove it to convert anew"

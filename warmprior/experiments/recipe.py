@@ -90,8 +90,8 @@ class DataOptions:
         task: manipulation tasks; by default square, or the file's.
         data: ph (one operator) or mh (six operators); of MimicGen's files source (human) or core (made of
             the source).
-        dataset: a robomimic HDF5 file, or a LeRobotDataset, as lerobot:FOLDER or lerobot:USER/NAME in the hub,
-            instead of generated data.
+        dataset: a robomimic HDF5 file, or a LeRobotDataset: lerobot:FOLDER, or lerobot:USER/NAME of the hub.
+            Instead of generated data.
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
         demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
