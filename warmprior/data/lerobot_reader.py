@@ -103,10 +103,12 @@ class LeRobotReader(DemonstrationReader):
 
     def name(self, demo: str, key: str) -> str:
         """What errors call an array of an episode, with the file that holds it."""
-        part = self.index.slices.get(key.removeprefix("obs/"))
-        feature = {"actions": "action", "rewards": self._reward}.get(key, part and part.feature)
-        told = f" ({key.removeprefix('obs/')})" if part and part.feature != feature else ""
-        return f"{self.index.path / self._episodes[demo].file}: {feature}{told} of episode {demo}"
+        told = {"actions": "action", "rewards": str(self._reward)}.get(key)
+        if told is None:
+            observation = key.removeprefix("obs/")
+            feature = self.index.slices[observation].feature
+            told = feature if feature.endswith(observation) else f"{feature} ({observation})"
+        return f"{self.index.path / self._episodes[demo].file}: {told} of episode {demo}"
 
     def images(self, demo: str, key: str, out: Tensor) -> None:
         """Read the first frames of an episode; see the base class."""
