@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -215,13 +215,20 @@ def _write(
         disable=not progress,
     )
     with _quiet():
-        for start, stop in bar:
-            for row in range(start, stop):
-                frame = {name: value[row].numpy() for name, value in numbers.items()}
-                for key in index.image_keys:
-                    frame[_camera(key)] = data[OBSERVATION, key][row].permute(1, 2, 0).numpy()
-                dataset.add_frame(frame | {"task": task})
-            dataset.save_episode()
+        try:
+            for start, stop in bar:
+                for row in range(start, stop):
+                    frame = {name: value[row].numpy() for name, value in numbers.items()}
+                    for key in index.image_keys:
+                        frame[_camera(key)] = data[OBSERVATION, key][row].permute(1, 2, 0).numpy()
+                    dataset.add_frame(frame | {"task": task})
+                # In parallel every camera of every episode would start a process that imports LeRobot.
+                dataset.save_episode(parallel_encoding=False)
+        except BaseException:
+            # Left to the garbage collector, its files would appear once the folder is gone.
+            with suppress(Exception):
+                dataset.finalize()
+            raise
         dataset.finalize()
     described = json.dumps(_description(index, layout), indent=1)
     write_atomic(root / DESCRIPTION, lambda file: file.write_text(described))
