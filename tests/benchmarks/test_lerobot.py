@@ -116,7 +116,7 @@ def test_what_does_not_fit_is_refused(folder, bare, tmp_path, capsys):
     main = importlib.import_module("robomimic").main
     described, undescribed = f"lerobot:{folder}", f"lerobot:{bare}"
     for place, extra, said in (
-        (described, {"task": "can"}, "holds demonstrations of lift, not of can"),
+        (described, {"task": "can"}, "was recorded in Lift, not in PickPlaceCan"),
         (undescribed, {"task": None}, "does not say which environment .* name it with --task"),
         (
             undescribed,

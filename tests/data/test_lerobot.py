@@ -23,6 +23,7 @@ from warmprior.data import LeRobotExperienceReplay, lerobot
 from warmprior.data.download import download_lerobot
 from warmprior.data.lerobot_index import action_names, read_lerobot_index, state_names
 from warmprior.data.lerobot_reader import lerobot_digest
+from warmprior.data.opening import open_demonstrations
 from warmprior.envs.tasks import TASKS
 
 H, TO = 4, 3
@@ -232,6 +233,13 @@ def test_of_a_repository_only_what_is_read_is_fetched(written, tmp_path, monkeyp
     assert (replay.data == expected.data).all()
     LeRobotExperienceReplay("user/lift", demos=1, revision="main")
     assert asked[2:] == [("user/lift", "main", ["meta/*"])]  # the rest is there
+    # Digest and checks of a part need no more than that part.
+    found = open_demonstrations("lerobot:user/lift")
+    assert len(found.index().demos) == 3 and found.name == "lerobot:lift"
+    whole = open_demonstrations(f"lerobot:{source}")
+    assert found.digest(demos=1) == whole.digest(demos=1) != whole.digest()
+    assert [files for *_, files in asked[3:]] == [["meta/*"]] * 2
+    del asked[3:]
     # What was recorded here is taken from where LeRobot keeps it.
     local = shutil.copytree(source, tmp_path / "home" / "user" / "mine")
     assert LeRobotExperienceReplay("user/mine").path == local and len(asked) == 3

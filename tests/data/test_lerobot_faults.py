@@ -138,6 +138,14 @@ META = {
     ),
     "empty entries": (table(EPISODES, length=entry(1, None, None)), [EPISODES, "empty entries"]),
     "no data path": (info(lambda i: i.update(data_path="{episode}")), ["info.json", "{episode}"]),
+    "a path of gigabytes": (
+        info(lambda i: i.update(data_path="{chunk_index:09999999999d}")),
+        ["info.json", "is no path of the format"],
+    ),
+    "a way in": (
+        info(lambda i: i.update(data_path="{chunk_index.__class__}")),
+        ["info.json", "is no path of the format"],
+    ),
     "a way out": (
         info(lambda i: i.update(data_path="../{chunk_index}/{file_index}")),
         ["info.json", "leads out of the dataset"],
@@ -145,6 +153,27 @@ META = {
     "no JSON of ours": (description("{"), ["warmprior.json is not valid JSON"]),
     "description of the future": (description('{"format": 2}'), ["warmprior.json", "version"]),
     "no environment": (description('{"format": 1}'), ["warmprior.json: env_args lacks env_name"]),
+    "no numbers in the state": (
+        description(
+            '{"format": 1, "env_args": {"env_name": "Lift", "env_kwargs": {}}, "first_state": ["a"], '
+            '"observations": {"object": ["observation.environment_state", 0, 10]}}'
+        ),
+        ["warmprior.json: first_state is not what a conversion writes"],
+    ),
+    "another environment": (
+        description(
+            '{"format": 1, "env_args": {"env_name": "Stack", "env_kwargs": {}}, '
+            '"observations": {"object": ["observation.environment_state", 0, 10]}}'
+        ),
+        ["warmprior.json: the dataset was recorded in Stack, not in Lift"],
+    ),
+    "no list of columns": (
+        description(
+            '{"format": 1, "env_args": {"env_name": "Lift", "env_kwargs": {}}, '
+            '"observations": {"object": [["observation.state"], 0, 1]}}'
+        ),
+        ["warmprior.json: observations['object']", "convert"],
+    ),
     "other columns": (
         description(
             '{"format": 1, "env_args": {"env_name": "Lift", "env_kwargs": {}}, '

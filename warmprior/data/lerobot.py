@@ -15,7 +15,7 @@ from warmprior.data.lerobot_meta import DESCRIPTION
 from warmprior.data.lerobot_reader import open_lerobot
 from warmprior.data.replay import DemonstrationReplay, check_storage
 
-__all__ = ["LeRobotExperienceReplay", "find_lerobot", "is_repository"]
+__all__ = ["LeRobotExperienceReplay", "fetch_lerobot", "find_lerobot", "is_repository"]
 
 
 def is_repository(dataset: str | Path) -> bool:
@@ -30,7 +30,7 @@ def is_repository(dataset: str | Path) -> bool:
 def find_lerobot(
     dataset: str | Path, *, revision: str | None = None, **options: Any
 ) -> LeRobotIndex:
-    """Check a LeRobotDataset, and fetch of it what is to be read if it is in the hub.
+    """Check what describes a LeRobotDataset; of one in the hub nothing else is fetched.
 
     Args:
         dataset: its folder, or its repository in the hub.
@@ -44,11 +44,31 @@ def find_lerobot(
         DatasetError: if it is not as it should be.
         OSError: if a download fails.
     """
-    if not is_repository(dataset):
-        return read_lerobot_index(Path(dataset).expanduser(), **options)
-    # What is wrong is known, and what is not needed left out, before anything big is fetched.
-    index = read_lerobot_index(download_lerobot(str(dataset), revision=revision), **options)
-    if not all((index.path / file).is_file() for file in index.files):
+    root = Path(dataset).expanduser()
+    if is_repository(dataset):
+        root = download_lerobot(str(dataset), revision=revision)
+    return read_lerobot_index(root, **options)
+
+
+def fetch_lerobot(
+    dataset: str | Path, *, revision: str | None = None, **options: Any
+) -> LeRobotIndex:
+    """Check a LeRobotDataset, and then fetch what is to be read of it, where it is in the hub.
+
+    Args:
+        dataset: as of :func:`find_lerobot`.
+
+    Keyword Args:
+        revision: likewise.
+        options: likewise.
+
+    Raises:
+        FileNotFoundError: likewise.
+        DatasetError: likewise.
+        OSError: likewise.
+    """
+    index = find_lerobot(dataset, revision=revision, **options)
+    if is_repository(dataset) and not all((index.path / file).is_file() for file in index.files):
         needed = [str(file) for file in index.files]
         index = replace(index, path=download_lerobot(str(dataset), needed, revision=revision))
     return index
@@ -75,9 +95,9 @@ class LeRobotExperienceReplay(DemonstrationReplay):
         dataset: the dataset's folder, or its repository in the hub (``"user/name"``).
         revision: branch, tag or commit of a repository.
         env_args: of the environment in which it was recorded (see :func:`warmprior.envs.task_env_args`),
-            for datasets that :func:`convert_robomimic` did not write. Frequency, widths and names are
-            checked against it, and robomimic's observations found by it. Without, whole features are
-            observations.
+            for datasets that :func:`convert_robomimic` did not write; those are refused if it names
+            another. Frequency, widths and names are checked against it, and robomimic's observations found
+            by it. Without, whole features are observations.
         filter_key: a mask of the converted file, such as ``"train"``; all episodes if ``None``.
         demos: how many to take, the first ones by their numbers; all if ``None``.
         observation_keys: observations to concatenate; by default those of the task, or of an unknown
@@ -135,7 +155,7 @@ class LeRobotExperienceReplay(DemonstrationReplay):
         **kwargs: Any,
     ) -> None:
         device = check_storage(storage, device)
-        index = find_lerobot(
+        index = fetch_lerobot(
             dataset,
             revision=revision,
             filter_key=filter_key,

@@ -166,7 +166,7 @@ def read_lerobot_index(
     info = read_info(root)
     features = info["features"]
     described = read_description(root, features)
-    recorded = described.get("env_args") or dict(env_args or {})
+    recorded = _environment(root, described, env_args)
     task = task_of_env(recorded) if recorded else None
     _check_frequency(root, info, recorded)
     vectors = {name: width for name in features if (width := _width(features[name])) is not None}
@@ -195,7 +195,8 @@ def read_lerobot_index(
                 f"{info_path(root)}: there is no observation {key!r} among {', '.join(slices)}: choose "
                 "others with observation_keys, or convert or record the dataset with it"
             )
-    _check_widths(root, slices, task if observation_keys is None else None)
+    if task is not None and observation_keys is None:
+        _check_widths(root, slices, task)
     check_statistics(root, ["action", *(slices[key].feature for key in wanted)])
     cameras = _cameras(features)
     images, size = _images(root, features, cameras, image_keys)
@@ -222,6 +223,21 @@ def read_lerobot_index(
         rendering=described.get("rendering"),
         first_state=described.get("first_state"),
     )
+
+
+def _environment(
+    root: Path, described: Mapping[str, Any], env_args: Mapping[str, Any] | None
+) -> dict[str, Any]:
+    """The one that the dataset describes, or else the given one."""
+    if not described or env_args is None:
+        return described.get("env_args") or dict(env_args or {})
+    mine, theirs = described["env_args"]["env_name"], env_args["env_name"]
+    if mine != theirs:
+        raise DatasetError(
+            f"{root / DESCRIPTION}: the dataset was recorded in {mine}, not in {theirs}: leave the task "
+            "(env_args) out or correct it"
+        )
+    return described["env_args"]
 
 
 def _check_frequency(root: Path, info: Mapping[str, Any], env_args: Mapping[str, Any]) -> None:
@@ -333,10 +349,10 @@ def _slices(
     return {key: found[key] for key in widths}
 
 
-def _check_widths(root: Path, slices: Mapping[str, LeRobotSlice], task: TaskSpec | None) -> None:
-    for key, width in ({} if task is None else task.low_dim_widths).items():
+def _check_widths(root: Path, slices: Mapping[str, LeRobotSlice], task: TaskSpec) -> None:
+    for key, width in task.low_dim_widths.items():
         columns = slices[key].stop - slices[key].start
-        if task is not None and columns != width:
+        if columns != width:
             raise DatasetError(
                 f"{root}: the observation {key!r} has {columns} columns, but that of {task.env_name} has "
                 f"{width}: convert the file again"
@@ -349,7 +365,7 @@ def _cameras(features: Mapping[str, Any]) -> dict[str, str]:
         f"{name.rpartition('.')[2]}_image": name
         for name, feature in features.items()
         if feature["dtype"] in ("image", "video")
-        and not (feature.get("info") or {}).get("is_depth_map", False)
+        and not (isinstance(feature.get("info"), dict) and feature["info"].get("is_depth_map"))
     }
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
+from string import Formatter
 from typing import Any
 
 from warmprior.data.hdf5_members import DatasetError
@@ -31,8 +33,6 @@ DESCRIPTION = PurePosixPath("meta/warmprior.json")
 
 AGAIN = "Copy or download it again, or record or convert the dataset anew"
 """What to do about files that are not whole."""
-
-_TEMPLATE_KEYS = {"chunk_index": 0, "file_index": 0, "video_key": ""}
 
 
 @dataclass(frozen=True)
@@ -163,22 +163,33 @@ def read_description(root: Path, features: Mapping[str, Any]) -> dict[str, Any]:
     check_env_args(f"{path}: env_args", found.get("env_args"))
     observations, masks = found.get("observations"), found.get("masks", {})
     for key, value in (observations if isinstance(observations, dict) else {"": None}).items():
-        if not (
-            isinstance(value, list)
-            and len(value) == 3
-            and value[0] in features
-            and all(isinstance(n, int) for n in value[1:])
-            and 0 <= value[1] < value[2] <= features[value[0]]["shape"][0]
-        ):
+        if not _is_slice(value, features):
             raise DatasetError(
                 f"{path}: observations[{key!r}] names no columns of a feature of meta/info.json, but "
                 f"{value}: convert the file again, or remove {path.name}"
             )
-    if not isinstance(masks, dict) or not all(
-        isinstance(mask, list) and all(isinstance(n, int) for n in mask) for mask in masks.values()
-    ):
-        raise DatasetError(f"{path}: masks are no lists of numbers of episodes: convert anew")
+    rendering, state = found.get("rendering"), found.get("first_state")
+    checks = {
+        "masks": isinstance(masks, dict)
+        and all(isinstance(m, list) and all(type(n) is int for n in m) for m in masks.values()),
+        "rendering": rendering is None or (isinstance(rendering, dict) and "fast" in rendering),
+        "first_state": state is None
+        or (isinstance(state, list) and all(isinstance(x, float) for x in state)),
+    }
+    for name, well in checks.items():
+        if not well:
+            raise DatasetError(f"{path}: {name} is not what a conversion writes: convert again")
     return found
+
+
+def _is_slice(value: Any, features: Mapping[str, Any]) -> bool:
+    """Whether a value is the name of a feature that is a vector, and two of its columns."""
+    if not (isinstance(value, list) and len(value) == 3 and isinstance(value[0], str)):
+        return False
+    shape = features[value[0]]["shape"] if value[0] in features else []
+    start, stop = value[1:]
+    whole = type(start) is int and type(stop) is int
+    return whole and len(shape) == 1 and 0 <= start < stop <= shape[0]
 
 
 def check_statistics(root: Path, features: Sequence[str]) -> None:
@@ -206,9 +217,14 @@ def check_statistics(root: Path, features: Sequence[str]) -> None:
 def _file(root: Path, template: Any, **numbers: Any) -> PurePosixPath:
     """A file that ``meta/info.json`` names by a template."""
     try:
-        path = PurePosixPath(str(template).format(**_TEMPLATE_KEYS | numbers))
-    except (AttributeError, IndexError, KeyError, ValueError) as error:
-        raise DatasetError(f"{info_path(root)}: {template!r} is no path ({error!r})") from error
+        # Nothing else than the numbers, and of no width that would fill the memory.
+        for _, name, spec, conversion in Formatter().parse(template):
+            known = name is None or name in numbers
+            if not known or conversion or not re.fullmatch(r"(0?\d{1,2}d)?", spec or ""):
+                raise ValueError(template)
+        path = PurePosixPath(template.format(**numbers))
+    except (TypeError, ValueError) as error:
+        raise DatasetError(f"{info_path(root)}: {template!r} is no path of the format") from error
     if path.is_absolute() or ".." in path.parts:
         raise DatasetError(f"{info_path(root)}: {template!r} leads out of the dataset")
     return path
@@ -291,6 +307,8 @@ def _episode_rows(root: Path, videos: Sequence[str]) -> list[dict[str, Any]]:
             if any(column.null_count for column in table.columns):
                 raise DatasetError(f"{path}: there are empty entries. {AGAIN}.")
             rows += table.to_pylist()
+            if any(not isinstance(value, int | float) for row in rows for value in row.values()):
+                raise DatasetError(f"{path}: there is text where a number belongs. {AGAIN}.")
     return sorted(rows, key=lambda row: row["episode_index"])
 
 

@@ -12,7 +12,12 @@ import torch
 
 from warmprior.data.hdf5 import read_index
 from warmprior.data.index import DatasetIndex
-from warmprior.data.lerobot import LeRobotExperienceReplay, find_lerobot, is_repository
+from warmprior.data.lerobot import (
+    LeRobotExperienceReplay,
+    fetch_lerobot,
+    find_lerobot,
+    is_repository,
+)
 from warmprior.data.lerobot_index import LeRobotIndex
 from warmprior.data.lerobot_reader import lerobot_digest, open_lerobot
 from warmprior.data.replay import DemonstrationReplay
@@ -135,11 +140,12 @@ class Demonstrations(ABC):
         """
 
     @abstractmethod
-    def digest(self, image_keys: Sequence[str] = ()) -> str:
+    def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
         """SHA-256 of the contents.
 
         Args:
             image_keys: the images that are used.
+            demos: how many demonstrations are used; all if ``None``.
         """
 
     @abstractmethod
@@ -182,8 +188,8 @@ class RobomimicFile(Demonstrations):
         """Read them."""
         return RobomimicExperienceReplay(self.path, **options)
 
-    def digest(self, image_keys: Sequence[str] = ()) -> str:
-        """SHA-256 of the file."""
+    def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
+        """SHA-256 of the whole file."""
         return file_digest(self.path)
 
     def with_images(
@@ -216,13 +222,16 @@ class LeRobotFolder(Demonstrations):
         """What is there."""
         return find_lerobot(self.dataset, env_args=self.env_args, **options)
 
+    def _fetched(self, **options: Any) -> LeRobotIndex:
+        return fetch_lerobot(self.dataset, env_args=self.env_args, **options)
+
     def replay(self, **options: Any) -> LeRobotExperienceReplay:
         """Read them."""
         return LeRobotExperienceReplay(self.dataset, env_args=self.env_args, **options)
 
-    def digest(self, image_keys: Sequence[str] = ()) -> str:
+    def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
         """SHA-256 of the files that are read."""
-        return lerobot_digest(self.index(image_keys=image_keys))
+        return lerobot_digest(self._fetched(image_keys=image_keys, demos=demos))
 
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
@@ -231,7 +240,7 @@ class LeRobotFolder(Demonstrations):
         from warmprior.data.render import compare_first_images
 
         keys = [f"{camera}_image" for camera in cameras]
-        index, images = self.index(image_keys=keys, demos=1), {}
+        index, images = self._fetched(image_keys=keys, demos=1), {}
         with open_lerobot(index) as reader:
             for key in keys:
                 image = torch.empty(1, 3, index.image_size, index.image_size, dtype=torch.uint8)

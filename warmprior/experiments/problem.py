@@ -166,7 +166,8 @@ def robosuite_problem(
     units = {ACTION: absolute.one_step} if isinstance(absolute, AbsoluteActions) else None
     vector = OBSERVATION if images is None else (OBSERVATION, STATE)
     normalizer = Normalizer.fit(dataset.data, (vector, ACTION), units=units)
-    data, digest = normalizer.normalize(dataset.data.exclude("next")), found.digest(_names(images))
+    data = normalizer.normalize(dataset.data.exclude("next"))
+    digest = found.digest(_names(images), demos)
     # Of what is usual nothing is said: policies and rows from before there was a choice have these.
     space = {} if actions == "delta" else {"actions": actions}
     seen = {} if images is None else {"obs": "image", "images": images}
@@ -338,7 +339,8 @@ def observe(
     if options.validation is not None:
         found = _open(options.validation, task)
         told = found.name
-        if found.digest(_names(facts.get("images"))) == facts["sha256"]:
+        demos = min(facts["demonstrations"], len(found.index().demos))
+        if found.digest(_names(facts.get("images")), demos) == facts["sha256"]:
             told = "the TRAINING demonstrations (not held out)"
     elif facts["source"] != "scripted":
         raise ValueError(
