@@ -42,6 +42,7 @@ from warmprior import (
     policy_transforms,
     window_replay_buffer,
 )
+from warmprior.data import LeRobotExperienceReplay
 from warmprior.data.scripted.episode import Episode
 from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs import RobosuiteEnv
@@ -103,10 +104,11 @@ def windows_per_second(clock: Clock) -> float:
     return BATCH / statistics.median(seconds)
 
 
-def windows_over_lerobot(clock: Clock) -> float | None:
+def lerobot_windows_over_getitem(clock: Clock) -> float | None:
+    """Windows of a LeRobotDataset, over those that its own ``__getitem__`` gives."""
     os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1"}
     if not all(importlib.util.find_spec(name) for name in ("lerobot", "datasets", "pyarrow")):
-        tqdm.write("windows_over_lerobot: skipped, needs warmprior[lerobot]")
+        tqdm.write("lerobot_windows_over_getitem: skipped, needs warmprior[lerobot]")
         return None
     logging.disable(logging.WARNING)  # about video decoders, which are not used here
     from lerobot.datasets import LeRobotDataset
@@ -129,7 +131,8 @@ def windows_over_lerobot(clock: Clock) -> float | None:
             "observation.state": [i / fps for i in range(1 - TO, 1)],
         }
         theirs = LeRobotDataset(name, root=root, delta_timestamps=offsets)
-        buffer = window_replay_buffer(data, PRIOR, batch_size=BATCH, observation_steps=TO)
+        read = LeRobotExperienceReplay(root).data
+        buffer = window_replay_buffer(read, PRIOR, batch_size=BATCH, observation_steps=TO)
         for row in buffer.sample():
             item = theirs[int(row["frame"])]
             action, pad = item["action"], item["action_is_pad"]
@@ -352,7 +355,7 @@ def load_memory_over_data(clock: Clock) -> float:
 
 FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "windows_per_second": (windows_per_second, ">= 150000"),
-    "windows_over_lerobot": (windows_over_lerobot, ""),
+    "lerobot_windows_over_getitem": (lerobot_windows_over_getitem, ">= 500"),
     "train_step_over_network": (train_step_over_network, "<= 1.10"),
     "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
     "modulation_over_input": (modulation_over_input, "<= 1.20"),

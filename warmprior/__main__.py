@@ -121,6 +121,13 @@ def render(args: argparse.Namespace) -> None:
     print(render_demonstrations(args.file, args.cameras, args.size, **options))
 
 
+def convert(args: argparse.Namespace) -> None:
+    """Write a robomimic HDF5 file as a LeRobotDataset v3."""
+    from warmprior.data import convert_robomimic
+
+    print(convert_robomimic(args.file, args.folder, images=args.images, demos=args.demonstrations))
+
+
 def make_parser() -> argparse.ArgumentParser:
     """The commands and their options."""
     parser = argparse.ArgumentParser(prog="python -m warmprior", description=__doc__)
@@ -169,6 +176,14 @@ def make_parser() -> argparse.ArgumentParser:
     add("--fast", action="store_true", help="no reflections, shadows and smooth edges")
     add("--out", type=Path, help="HDF5 file, also FILE itself (default: in the cache)")
     add("--workers", type=int, help="processes (default: one per core)")
+
+    add = command(convert)
+    add("file", type=Path, help="robomimic HDF5 file, such as one of scripted demonstrations")
+    add("folder", type=Path, help="to write; must not exist")
+    kept = {"action": "store_const", "dest": "images"}
+    add("--images", **kept, const="image", help="with those of the file, as lossless pictures")
+    add("--video", **kept, const="video", help="with those of the file, as videos: lossy, smaller")
+    add("--demonstrations", type=int, help="how many, from the first on (default: all)")
     return parser
 
 

@@ -106,7 +106,7 @@ def test_diagnostics_see_what_the_encoder_makes_of_images(finished):
 )
 def test_what_cannot_be_is_refused(recorded, finished, tmp_path, capsys, monkeypatch, extra, said):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(finished / "cache"))
-    monkeypatch.setattr("warmprior.experiments.problem.compare_images", lambda *args: None)
+    monkeypatch.setattr("warmprior.data.render.compare_images", lambda *args: None)
     main = importlib.import_module("robomimic").main
     argv = options(recorded, tmp_path / "run", **IMAGES | {"prior": "past"} | extra)
     fast = [] if "cameras" in extra else ["--fast-rendering"]

@@ -14,7 +14,7 @@ pytest.importorskip("robosuite")
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "throughput.py"
 KEYS = {
     "windows_per_second",
-    "windows_over_lerobot",
+    "lerobot_windows_over_getitem",
     "train_step_over_network",
     "preconditioning_over_network",
     "modulation_over_input",
@@ -91,5 +91,5 @@ def test_every_figure_can_be_measured(throughput, tmp_path):
     throughput.main(["--repeats", "1", "--out", str(tmp_path)])
     results = json.loads((tmp_path / "throughput.json").read_text())
     missing = {name for name, value in results.items() if value is None}
-    assert missing <= {"windows_over_lerobot"}
+    assert missing <= {"lerobot_windows_over_getitem"}
     assert results["actor_over_network"].keys() == {"1", "3", "9"}

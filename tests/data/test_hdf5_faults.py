@@ -198,10 +198,10 @@ def test_a_mask_that_is_no_group(square_file):
 def test_more_rows_than_memory_are_refused_before_any_is_taken(square_file, monkeypatch):
     path, _ = square_file
     needed = 47 * (23 * 4 + 7 * 4 + 4 + 3 + 16)
-    monkeypatch.setattr("warmprior.data.robomimic.available_memory", lambda: needed - 1)
+    monkeypatch.setattr("warmprior.data.replay.available_memory", lambda: needed - 1)
     with pytest.raises(DatasetError, match=r"square\.hdf5: 47 steps .*memmap"):
         RobomimicExperienceReplay(path)
-    monkeypatch.setattr("warmprior.data.robomimic.available_memory", lambda: needed)
+    monkeypatch.setattr("warmprior.data.replay.available_memory", lambda: needed)
     RobomimicExperienceReplay(path)
 
 

@@ -1,11 +1,13 @@
-"""Demonstrations: files of robomimic and MimicGen, and scripted experts."""
+"""Demonstrations: files of robomimic and MimicGen, LeRobot's datasets, and scripted experts."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from warmprior.data.download import download_mimicgen, download_robomimic
+from warmprior.data.convert import convert_robomimic
+from warmprior.data.download import download_lerobot, download_mimicgen, download_robomimic
 from warmprior.data.hdf5 import DatasetError
+from warmprior.data.lerobot import LeRobotExperienceReplay
 from warmprior.data.mimicgen import MimicGenExperienceReplay
 from warmprior.data.robomimic import RobomimicExperienceReplay
 
@@ -15,8 +17,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DatasetError",
+    "LeRobotExperienceReplay",
     "MimicGenExperienceReplay",
     "RobomimicExperienceReplay",
+    "convert_robomimic",
+    "download_lerobot",
     "download_mimicgen",
     "download_robomimic",
     "generate_demonstrations",

@@ -1,7 +1,8 @@
-"""Fetching the official files of robomimic and MimicGen from the Hugging Face hub."""
+"""Fetching robomimic's and MimicGen's official files, and LeRobot's datasets, from the Hugging Face hub."""
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -15,7 +16,13 @@ from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
 
-__all__ = ["MIMICGEN_REPOSITORY", "REPOSITORIES", "download_mimicgen", "download_robomimic"]
+__all__ = [
+    "MIMICGEN_REPOSITORY",
+    "REPOSITORIES",
+    "download_lerobot",
+    "download_mimicgen",
+    "download_robomimic",
+]
 
 REPOSITORIES = ("robomimic/robomimic_datasets", "amandlek/robomimic")
 """The hub's dataset repositories that hold robomimic's files, in the order of trying."""
@@ -110,6 +117,62 @@ def download_mimicgen(
     # The human demonstrations belong to the task, those made of them to a variant of it.
     name = task.removesuffix("_d0") if style == "source" else task
     return _download(f"{style}/{name}.hdf5", (MIMICGEN_REPOSITORY,), root, endpoint, force)
+
+
+LEROBOT_VERSION = "v3.0"
+"""The tag by which the hub's LeRobotDatasets name the version of their format."""
+
+
+def download_lerobot(
+    repository: str, files: Sequence[str] = ("meta/*",), *, revision: str | None = None
+) -> Path:
+    """Fetch files of a LeRobotDataset, unless they are here already.
+
+    A dataset that was recorded here lies in ``$HF_LEROBOT_HOME/REPOSITORY`` and is taken from there, as
+    LeRobot does. Any other is kept in LeRobot's own cache, and read from it without a connection.
+
+    Args:
+        repository: such as ``"lerobot/libero"``.
+        files: patterns of what is needed; by default what describes the dataset.
+
+    Keyword Args:
+        revision: branch, tag or commit; the tag of version 3 of the format by default.
+
+    Returns:
+        The dataset's folder.
+
+    Raises:
+        OSError: if the repository, or one of this version, cannot be had.
+        ImportError: if huggingface_hub is not installed.
+
+    Examples:
+        >>> download_lerobot("lerobot/libero")  # doctest: +SKIP
+        PosixPath('.../hub/datasets--lerobot--libero/snapshots/...')
+    """
+    hub = require("huggingface_hub", "lerobot")
+    default = Path(hub.constants.HF_HOME) / "lerobot"
+    home = Path(os.environ.get("HF_LEROBOT_HOME") or default).expanduser()
+    if revision is None and (home / repository / "meta" / "info.json").is_file():
+        return home / repository
+    revision = LEROBOT_VERSION if revision is None else revision
+    fetch = partial(
+        hub.snapshot_download,
+        repository,
+        repo_type="dataset",
+        revision=revision,
+        cache_dir=home / "hub",
+        allow_patterns=list(files),
+    )
+    try:
+        return _until(time.monotonic() + LIMIT_SECONDS, lambda: Path(fetch()))
+    except Exception as error:  # the client's errors share no base class
+        reason = str(error).strip() or "no message"
+        raise OSError(
+            f"could not download {repository} at {revision}: {type(error).__name__}: {reason}\n"
+            "Check the name and the connection. A dataset of an older version has no such revision: convert "
+            "it with python -m lerobot.scripts.convert_dataset_v21_to_v30. A folder fetched by other means "
+            "can be given by its path."
+        ) from error
 
 
 def _check_official(task: str, style: str, *, mimicgen: bool) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,14 @@ import numpy as np
 
 from warmprior.data.hdf5_images import image_size
 from warmprior.data.hdf5_members import DatasetError, member, names, reading
-from warmprior.envs.tasks import TASKS, TaskSpec
+from warmprior.data.index import (
+    BLOCK,
+    DatasetIndex,
+    check_count,
+    check_env_args,
+    store_finite,
+    task_of_env,
+)
 from warmprior.io.extras import require
 
 if TYPE_CHECKING:
@@ -26,48 +32,15 @@ if TYPE_CHECKING:
 
 __all__ = [
     "DatasetError",
-    "RobomimicIndex",
     "open_robomimic",
     "read_env_args",
     "read_index",
+    "read_masks",
     "read_rows",
 ]
 
-BLOCK = 4096  # rows read at once: a bound on temporary memory, whatever the length of a demo
-LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
-
-
-@dataclass(frozen=True)
-class RobomimicIndex:
-    """What a robomimic file holds, without its values.
-
-    Attributes:
-        path: the file.
-        demos: names of the selected demos, in the order of their numbers.
-        lengths: the number of steps of each.
-        observation_keys: the observations to read, in the order of concatenation.
-        observation_dims: the width of each.
-        image_keys: the images to read.
-        image_size: their side in pixels; 0 if there are none.
-        available_keys: every observation of the first demo.
-        action_dim: the width of ``actions``.
-        env_args: the parsed ``env_args`` as the file has them.
-        task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
-    """
-
-    path: Path
-    demos: tuple[str, ...]
-    lengths: tuple[int, ...]
-    observation_keys: tuple[str, ...]
-    observation_dims: tuple[int, ...]
-    image_keys: tuple[str, ...]
-    image_size: int
-    available_keys: tuple[str, ...]
-    action_dim: int
-    env_args: dict[str, Any]
-    task: TaskSpec | None
 
 
 @contextmanager
@@ -117,6 +90,22 @@ def _number(path: Path, name: str) -> int:
     if not (name.startswith("demo_") and name[5:].isdecimal()):
         raise DatasetError(f"{path}: data/{name} is not called demo_<number>; rename the group")
     return int(name[5:])
+
+
+def read_masks(path: str | Path) -> dict[str, set[str]]:
+    """The names of the demos in each mask of a robomimic file.
+
+    Args:
+        path: the HDF5 file.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        DatasetError: if a mask is no list of names.
+    """
+    with open_robomimic(path) as file:
+        group, demos = member(file, "mask", "group"), len(names(file["data"]))
+        known = [] if group is None else names(group)
+        return {name: _mask(file, Path(path), name, demos) for name in known}
 
 
 def _mask(file: h5py.File, path: Path, filter_key: str, demos: int) -> set[str]:
@@ -171,10 +160,7 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
         parsed = json.loads(text)
     except (ValueError, RecursionError) as error:  # not UTF-8 included
         raise DatasetError(f"{what} is not JSON ({error})") from error
-    for key, kind in (("env_name", str), ("env_kwargs", dict)):
-        if not (isinstance(parsed, dict) and isinstance(parsed.get(key), kind)):
-            raise DatasetError(f"{what} lacks {key}, or it is not a {kind.__name__}")
-    return parsed
+    return check_env_args(what, parsed)
 
 
 def read_env_args(path: str | Path) -> dict[str, Any]:
@@ -274,7 +260,7 @@ def read_index(
     image_keys: Sequence[str] = (),
     poses: bool = False,
     demos: int | None = None,
-) -> RobomimicIndex:
+) -> DatasetIndex:
     """Check a robomimic file and say what it holds. No values are read.
 
     Args:
@@ -307,14 +293,10 @@ def read_index(
         raise ValueError(f"demos must be at least 1, got {demos}")
     with open_robomimic(path) as file:
         selected = _selected(file, path, filter_key)
-        if demos is not None and demos > len(selected):
-            raise DatasetError(
-                f"{path}: there are {len(selected)} demonstrations, fewer than the {demos} to be taken: ask "
-                "for no more"
-            )
+        check_count(path, demos, len(selected))
         selected = selected[:demos]
         env_args = _env_args(file, path)
-        task = next((t for t in TASKS.values() if t.env_name == env_args["env_name"]), None)
+        task = task_of_env(env_args)
         first = _demo(file, selected[0])
         observations = member(first, "obs", "group")
         available = () if observations is None else tuple(names(observations))
@@ -350,7 +332,7 @@ def read_index(
     if len(sides) > 1:
         told = ", ".join(f"{size} in data/{name}" for size, name in sides.items())
         raise DatasetError(f"{path}: images have several sizes: {told}. Render them anew")
-    return RobomimicIndex(
+    return DatasetIndex(
         path=path,
         demos=selected,
         lengths=tuple(lengths),
@@ -377,7 +359,7 @@ def read_rows(file: h5py.File, demo: str, key: str, out: np.ndarray, first: int 
 
     Raises:
         DatasetError: if a value is not finite in the type of ``out`` or greater than
-            :data:`LARGEST`, or the file cannot be read.
+            1e9, or the file cannot be read.
     """
     name = f"data/{demo}/{key}"
     dataset = member(file, name, "dataset")
@@ -387,14 +369,5 @@ def read_rows(file: h5py.File, demo: str, key: str, out: np.ndarray, first: int 
         rows = out[start : start + BLOCK]
         with reading(file, name):
             block = dataset[first + start : first + start + len(rows)]
-        with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
-            rows[...] = block.reshape(rows.shape)
-        usable = (np.abs(rows) <= LARGEST).all(-1)  # NaN is not
-        if not usable.all():
-            worst = int(np.argmin(usable))
-            finite = np.isfinite(rows[worst]).all()
-            what = f"a value beyond {LARGEST:.0e}" if finite else "NaN or infinity"
-            raise DatasetError(
-                f"{file.filename}: {name} (shape {dataset.shape}) has {what} in row "
-                f"{first + start + worst}. {_LEAVE_OUT}"
-            )
+        what = f"{file.filename}: {name} (shape {dataset.shape})"
+        store_finite(block, rows, what, first + start, _LEAVE_OUT)

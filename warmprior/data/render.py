@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from warmprior.data.hdf5 import RobomimicIndex, open_robomimic, read_index
+from warmprior.data.hdf5 import open_robomimic, read_index
 from warmprior.data.hdf5_members import DatasetError, member, reading
+from warmprior.data.index import DatasetIndex
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer, require_rendering
 from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
@@ -30,7 +31,7 @@ from warmprior.io.files import (
 )
 from warmprior.io.workers import WorkerPool, available_cores
 
-__all__ = ["compare_images", "render_demonstrations", "renderer_versions"]
+__all__ = ["compare_first_images", "compare_images", "render_demonstrations", "renderer_versions"]
 
 RENDERER_VERSION = 2
 """Part of every cached file's name; raised whenever the same states give other images."""
@@ -147,7 +148,7 @@ class _Illustrator:
     """Renders the demos of a file; its simulator is made in the worker that renders."""
 
     def __init__(
-        self, index: RobomimicIndex, cameras: tuple[str, ...], size: int, fast: bool, parts: Path
+        self, index: DatasetIndex, cameras: tuple[str, ...], size: int, fast: bool, parts: Path
     ) -> None:
         self.index, self.cameras, self.parts = index, cameras, parts
         self.size, self.fast = size, fast
@@ -194,30 +195,36 @@ class _Illustrator:
         for camera in self.cameras:
             self.renderer.render(camera, self.positions(self.index.demos[0])[0])
 
-    def compare(self) -> None:
-        """Compare the first images of the file with the simulator's."""
-        path, demo = self.index.path, self.index.demos[0]
-        position = self.positions(demo)[0]
-        with open_robomimic(path) as file:
-            for camera in self.cameras:
-                shown = self.renderer.render(camera, position).astype(np.float32)
-                stored = file[f"data/{demo}/obs/{camera}_image"][0].astype(np.float32)
-                views = {
-                    "show something else than the simulator": stored,
-                    "are upside down": stored[::-1],
-                    "have red and blue exchanged": stored[..., ::-1],
-                }
-                off = {name: float(np.abs(shown - image).mean()) for name, image in views.items()}
-                (as_stored, *_), told = off.values(), min(off, key=lambda name: off[name])
-                # Most of a scene may look alike upside down, and have little colour.
-                other = as_stored > 1 and off[told] < as_stored / 2
-                if other or as_stored > CLEARLY:
-                    told = told if other else next(iter(views))
-                    raise DatasetError(
-                        f"{path}: the images of {camera} {told} ({as_stored:.0f} of 255 off on average). "
-                        "Policies would see other ones in evaluation: render these anew (python -m warmprior "
-                        f"render {path})"
-                    )
+    def compare(
+        self, state: np.ndarray, images: Mapping[str, np.ndarray], name: str, advice: str
+    ) -> None:
+        """Compare images of a state, by camera, with the simulator's."""
+        model = self.renderer.model
+        expected = 1 + model.nq + model.nv
+        if state.shape != (expected,):
+            raise DatasetError(
+                f"{name}: a state has shape {state.shape}, but the simulator of "
+                f"{self.index.env_args['env_name']} has {expected} numbers: its robots or objects are others "
+                "here"
+            )
+        for camera, image in images.items():
+            shown = self.renderer.render(camera, state[1 : 1 + model.nq]).astype(np.float32)
+            stored = image.astype(np.float32)
+            views = {
+                "show something else than the simulator": stored,
+                "are upside down": stored[::-1],
+                "have red and blue exchanged": stored[..., ::-1],
+            }
+            off = {name: float(np.abs(shown - image).mean()) for name, image in views.items()}
+            (as_stored, *_), told = off.values(), min(off, key=lambda name: off[name])
+            # Most of a scene may look alike upside down, and have little colour.
+            other = as_stored > 1 and off[told] < as_stored / 2
+            if other or as_stored > CLEARLY:
+                told = told if other else next(iter(views))
+                raise DatasetError(
+                    f"{name}: the images of {camera} {told} ({as_stored:.0f} of 255 off on average). "
+                    f"Policies would see other ones in evaluation: {advice}"
+                )
 
 
 @dataclass(frozen=True)
@@ -236,6 +243,17 @@ class _Render:
                 np.savez_compressed(file, **images)  # type: ignore[arg-type]
 
         write_atomic(illustrator.part(self.demo), write)
+
+
+@dataclass(frozen=True)
+class _Compare:
+    state: np.ndarray
+    images: Mapping[str, np.ndarray]
+    name: str
+    advice: str
+
+    def __call__(self, illustrator: _Illustrator) -> None:
+        illustrator.compare(self.state, self.images, self.name, self.advice)
 
 
 def _write(path: Path, illustrator: _Illustrator) -> None:
@@ -288,21 +306,63 @@ def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) ->
         RuntimeError: if nothing here can render.
     """
     index = read_index(path, image_keys=image_keys)
-    cameras = tuple(key.removesuffix("_image") for key in image_keys)
+    first = f"data/{index.demos[0]}"
     with open_robomimic(path) as file:
         written = file["data"].attrs.get("rendering")
-        has_states = member(file, f"data/{index.demos[0]}/states", "dataset") is not None
-    if written is not None and bool(json.loads(written)["fast"]) != fast:
+        states = member(file, f"{first}/states", "dataset")
+        state = None if states is None else states[0]
+        images = {key: file[f"{first}/obs/{key}"][0] for key in image_keys}
+    compare_first_images(
+        index,
+        images,
+        state=state,
+        rendering=None if written is None else json.loads(written),
+        fast=fast,
+        advice=f"render these anew (python -m warmprior render {path})",
+    )
+
+
+def compare_first_images(
+    index: DatasetIndex,
+    images: Mapping[str, np.ndarray],
+    *,
+    state: np.ndarray | None,
+    rendering: Mapping[str, Any] | None,
+    fast: bool,
+    advice: str,
+) -> None:
+    """Compare images of one state with what the simulator shows there.
+
+    Args:
+        index: of the demonstrations.
+        images: by name, uint8 ``[size, size, 3]``.
+
+    Keyword Args:
+        state: of the simulator; without, nothing is compared, with a warning.
+        rendering: how the images were rendered, where that is known.
+        fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
+        advice: what to do about images that show something else.
+
+    Raises:
+        DatasetError: if they are upside down, or show something else, or were rendered in the other
+            quality.
+        ValueError: if the simulator has no such camera.
+        RuntimeError: if nothing here can render.
+    """
+    path = index.path
+    if rendering is not None and bool(rendering["fast"]) != fast:
         raise DatasetError(
             f"{path}: its images were rendered {'in full quality' if fast else 'fast'}, and in evaluation "
             f"they would not be: {'leave out' if fast else 'add'} --fast-rendering"
         )
-    if not has_states:
+    if state is None:
         warnings.warn(
             f"{path} holds no states: its images could not be compared with the simulator's",
             stacklevel=2,
         )
         return
-    with WorkerPool(1, _Illustrator(index, cameras, index.image_size, fast, path)) as pool:
-        pool.submit(_Illustrator.compare)
+    by_camera = {key.removesuffix("_image"): image for key, image in images.items()}
+    illustrator = _Illustrator(index, tuple(by_camera), index.image_size, fast, path)
+    with WorkerPool(1, illustrator) as pool:
+        pool.submit(_Compare(state, by_camera, str(path), advice))
         pool.wait()

@@ -13,7 +13,7 @@ EVALUATION_SEED = 10_000_000
 #: Of demonstrations: robomimic's one or six operators, MimicGen's ten human ones, and those made of them.
 STYLES = ("ph", "mh", "source", "core")
 
-_ARM_KEYS = ("eef_pos", "eef_quat", "gripper_qpos")
+_ARM_WIDTHS = {"eef_pos": 3, "eef_quat": 4, "gripper_qpos": 2}
 
 
 def low_dim_keys(arms: int) -> tuple[str, ...]:
@@ -29,7 +29,7 @@ def low_dim_keys(arms: int) -> tuple[str, ...]:
         >>> low_dim_keys(1)
         ('object', 'robot0_eef_pos', 'robot0_eef_quat', 'robot0_gripper_qpos')
     """
-    return ("object", *(f"robot{i}_{key}" for i in range(arms) for key in _ARM_KEYS))
+    return ("object", *(f"robot{i}_{key}" for i in range(arms) for key in _ARM_WIDTHS))
 
 
 @dataclass(frozen=True)
@@ -64,9 +64,20 @@ class TaskSpec:
         return low_dim_keys(self.arms)
 
     @property
+    def low_dim_widths(self) -> dict[str, int]:
+        """The width of each of :attr:`low_dim_keys`.
+
+        Examples:
+            >>> get_task("lift").low_dim_widths["robot0_eef_quat"]
+            4
+        """
+        widths = [self.object_dim, *[*_ARM_WIDTHS.values()] * self.arms]
+        return dict(zip(self.low_dim_keys, widths, strict=True))
+
+    @property
     def observation_dim(self) -> int:
         """Width of the concatenated state."""
-        return self.object_dim + 9 * self.arms
+        return sum(self.low_dim_widths.values())
 
     @property
     def action_dim(self) -> int:

@@ -14,23 +14,19 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
-from warmprior.data import (
-    RobomimicExperienceReplay,
-    download_mimicgen,
-    download_robomimic,
-    generate_demonstrations,
-    render_demonstrations,
-)
-from warmprior.data.hdf5 import read_env_args, read_index
-from warmprior.data.render import compare_images, renderer_versions
+from warmprior.data import download_mimicgen, download_robomimic, generate_demonstrations
+from warmprior.data.opening import Demonstrations, open_demonstrations
+from warmprior.data.render import renderer_versions
+from warmprior.data.replay import DemonstrationReplay
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
-from warmprior.envs.tasks import get_task
+from warmprior.envs.simulator import task_env_args
+from warmprior.envs.tasks import TASKS, get_task
 from warmprior.experiments.labels import space_of, with_space
 from warmprior.experiments.recipe import DataOptions, HeldOutOptions
-from warmprior.io.files import digest_of, file_digest
+from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, OBSERVATION, STATE
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.trend import RestingAction
@@ -118,17 +114,18 @@ class Problem:
 
 
 def robosuite_problem(
-    path: Path,
+    path: Path | str,
     style: str = "ph",
     *,
     source: str = "file",
     observation_steps: int = 2,
     options: DataOptions | None = None,
 ) -> Problem:
-    """The problem of a robomimic HDF5 file, in its own simulator.
+    """The problem of demonstrations, in their own simulator.
 
     Args:
-        path: of the file.
+        path: of a robomimic HDF5 file; or ``lerobot:`` and the folder or repository of a LeRobotDataset,
+            whose environment is that of ``options.task`` where it does not describe its own.
         style: of the demonstrations, such as ``"ph"``; decides the time limit of tasks of ours.
 
     Keyword Args:
@@ -140,18 +137,25 @@ def robosuite_problem(
     Raises:
         DatasetError: if the file cannot be read or has fewer demonstrations, or images are to be rendered
             and it has no states.
-        ValueError: if it has no pose deltas to make absolute poses of, or there is no such camera.
+        ValueError: if it has no pose deltas to make absolute poses of, there is no such camera, or its
+            environment is unknown.
         ImportError: if its simulator is MimicGen's, and its package is missing.
     """
     options = DataOptions() if options is None else options
     actions = options.actions
     # A generated file has as many as were asked for.
     demos = None if source == "scripted" else options.first(style)
-    if demos is not None and demos == len(read_index(path).demos):
+    found = _open(path, next(iter(options.task), None))
+    index = found.index()
+    if demos == len(index.demos):
         demos = None  # all of them
-    if is_mimicgen(read_env_args(path)["env_name"]):
+    if not index.env_args:
+        raise ValueError(
+            f"{path} does not say which environment it was recorded in: name it with --task"
+        )
+    if is_mimicgen(index.env_args["env_name"]):
         find_mimicgen()  # not after hours of training
-    dataset, images = _read(path, options, demos)
+    dataset, images = _read(found, options, demos)
     description = environment_description(
         dataset.recorded_env_args, style, observation_steps, actions, images
     )
@@ -162,7 +166,8 @@ def robosuite_problem(
     units = {ACTION: absolute.one_step} if isinstance(absolute, AbsoluteActions) else None
     vector = OBSERVATION if images is None else (OBSERVATION, STATE)
     normalizer = Normalizer.fit(dataset.data, (vector, ACTION), units=units)
-    data, digest = normalizer.normalize(dataset.data.exclude("next")), file_digest(path)
+    data = normalizer.normalize(dataset.data.exclude("next"))
+    digest = found.digest(_names(images), demos)
     # Of what is usual nothing is said: policies and rows from before there was a choice have these.
     space = {} if actions == "delta" else {"actions": actions}
     seen = {} if images is None else {"obs": "image", "images": images}
@@ -182,7 +187,7 @@ def robosuite_problem(
         ),
         facts={
             "source": source,
-            "file": path.name,
+            "file": found.name,
             "sha256": digest,
             "demonstrations": dataset.num_episodes,
             "steps": len(dataset.data),
@@ -198,34 +203,39 @@ def robosuite_problem(
     )
 
 
+def _open(place: Path | str, task: str | None) -> Demonstrations:
+    """The demonstrations at a place; the task's environment is theirs where they do not say."""
+    return open_demonstrations(place, task_env_args(task) if task in TASKS else None)
+
+
+def _names(images: Mapping[str, Any] | None) -> list[str]:
+    """The images' names."""
+    return [] if images is None else [f"{camera}_image" for camera in images["cameras"]]
+
+
 def _read(
-    path: Path, options: DataOptions, demos: int | None = None
-) -> tuple[RobomimicExperienceReplay, dict[str, Any] | None]:
+    found: Demonstrations, options: DataOptions, demos: int | None = None
+) -> tuple[DemonstrationReplay, dict[str, Any] | None]:
     """The demonstrations as policies are to see them, and what images are among it, if any."""
     if options.obs == "state":
         absolute = options.actions == "absolute"
-        return RobomimicExperienceReplay(path, absolute_actions=absolute, demos=demos), None
-    index = read_index(path, demos=demos)
-    known = [key.removesuffix("_image") for key in index.available_keys if key.endswith("_image")]
-    cameras = options.cameras or (index.task.cameras if index.task else tuple(known))
+        return found.replay(absolute_actions=absolute, demos=demos), None
+    index = found.index(demos=demos)
+    cameras = options.cameras or (index.task.cameras if index.task else index.cameras)
     if not cameras:
-        raise ValueError(f"{path} has no images, and its task is unknown: name --cameras")
-    names, fast = [f"{camera}_image" for camera in cameras], options.fast_rendering
-    if set(cameras) <= set(known):
-        size = read_index(path, image_keys=names, demos=demos).image_size
+        raise ValueError(f"{found.name} has no images, and its task is unknown: name --cameras")
+    names, fast = _names({"cameras": cameras}), options.fast_rendering
+    if set(cameras) <= set(index.cameras):
+        size = found.index(image_keys=names, demos=demos).image_size
         if size != options.image_size:
             raise ValueError(
-                f"{path} has images of {size} pixels: add --image-size {size} (and a --crop-size below), or "
-                "render it anew"
+                f"{index.path} has images of {size} pixels: add --image-size {size} (and a --crop-size "
+                "below), or render it anew"
             )
-        compare_images(path, names, fast)
-    else:
-        path = render_demonstrations(path, cameras, options.image_size, demos=demos, fast=fast)
+    found = found.with_images(cameras, options.image_size, demos=demos, fast=fast)
     # What robomimic's image policies see besides: the robot, and not where the objects are.
     vector = [key for key in index.observation_keys if key != "object"]
-    dataset = RobomimicExperienceReplay(
-        path, observation_keys=vector, image_keys=names, storage="memmap", demos=demos
-    )
+    dataset = found.replay(observation_keys=vector, image_keys=names, storage="memmap", demos=demos)
     return dataset, {
         "cameras": list(cameras),
         "size": dataset.image_size,
@@ -241,7 +251,7 @@ def navigation_problem() -> Problem:
     )
 
 
-def task_of(dataset: RobomimicExperienceReplay) -> str:
+def task_of(dataset: DemonstrationReplay) -> str:
     """Short name of a dataset's task, or the environment's where it is none of ours."""
     task = dataset.task
     return str(dataset.env_args["env_name"]).lower() if task is None else task.name
@@ -327,8 +337,10 @@ def observe(
     """
     task, style = facts["task"], facts["style"]
     if options.validation is not None:
-        path, told = options.validation, options.validation.name
-        if file_digest(path) == facts["sha256"]:
+        found = _open(options.validation, task)
+        told = found.name
+        demos = min(facts["demonstrations"], len(found.index().demos))
+        if found.digest(_names(facts.get("images")), demos) == facts["sha256"]:
             told = "the TRAINING demonstrations (not held out)"
     elif facts["source"] != "scripted":
         raise ValueError(
@@ -340,7 +352,7 @@ def observe(
         mean_steps = facts["steps"] / facts["demonstrations"]
         usable = max(1.0, min(50.0, 0.8 * (mean_steps - chunk_length)))
         n = max(20, int(-(-options.observations // usable)))
-        path = generate_demonstrations(task, style, n, HELD_OUT_SEED)
+        found = _open(generate_demonstrations(task, style, n, HELD_OUT_SEED), None)
         told = f"{n} newly generated demonstrations"
     images = facts.get("images")
     seen: dict[str, Any] = {}
@@ -351,11 +363,11 @@ def observe(
             "image_size": images["size"],
             "fast_rendering": images["fast_rendering"],
         }
-    dataset, _ = _read(path, DataOptions(actions=facts.get("actions", "delta"), **seen))
+    dataset, _ = _read(found, DataOptions(actions=facts.get("actions", "delta"), **seen))
     if task_of(dataset) != task:
         raise ValueError(
-            f"--validation {path} holds demonstrations of {task_of(dataset)}, but these policies are for "
-            f"{task}"
+            f"--validation {found.name} holds demonstrations of {task_of(dataset)}, but these policies are "
+            f"for {task}"
         )
     # A copy: the data are normalised on the CPU, the policy may live elsewhere.
     normalizer = copy.deepcopy(normalizer).to("cpu")

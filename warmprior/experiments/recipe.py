@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal, Self
 import torch
 import tyro
 
+from warmprior.data.opening import check_place, name_of_place
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
@@ -89,7 +90,8 @@ class DataOptions:
         task: manipulation tasks; by default square, or the file's.
         data: ph (one operator) or mh (six operators); of MimicGen's files source (human) or core (made of
             the source).
-        dataset: a robomimic HDF5 file, instead of generated data.
+        dataset: a robomimic HDF5 file, or a LeRobotDataset: lerobot:FOLDER, or lerobot:USER/NAME of the hub.
+            Instead of generated data.
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
         demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
@@ -161,8 +163,7 @@ class DataOptions:
             raise ValueError(
                 "--dataset is of one task and style: name at most one --task and --data"
             )
-        if not self.dataset.is_file():
-            raise FileNotFoundError(f"--dataset {self.dataset}: no such file")
+        check_place(self.dataset, "--dataset")
 
     @property
     def generated(self) -> bool:
@@ -391,7 +392,7 @@ class HeldOutOptions:
     """Observations to measure on, which no policy was trained on.
 
     Attributes:
-        validation: robomimic HDF5 file of held-out demonstrations (default: newly generated ones).
+        validation: held-out demonstrations, as --dataset names them (default: newly generated ones).
         observations: how many; the paper's curvature has 2000.
         steps: Euler steps of a curvature.
         draws: source samples per observation.
@@ -405,8 +406,8 @@ class HeldOutOptions:
     def __post_init__(self) -> None:
         check_counts(self, "observations", "draws")
         check_counts(self, "steps", least=2)
-        if self.validation is not None and not self.validation.is_file():
-            raise FileNotFoundError(f"--validation {self.validation}: no such file")
+        if self.validation is not None:
+            check_place(self.validation, "--validation")
 
 
 @dataclass(frozen=True)
@@ -444,7 +445,7 @@ class Recipe:
     def name(self) -> str:
         """Of the problems, in names of folders."""
         file = self.data.dataset
-        tasks = self.data.task or ("square" if file is None else file.stem,)
+        tasks = self.data.task or ("square" if file is None else name_of_place(file),)
         space = [] if self.data.actions == "delta" else [self.data.actions]
         seen = [] if self.data.obs == "state" else [self.data.obs]
         return "-".join([*tasks, *self.data.data, *space, *seen])

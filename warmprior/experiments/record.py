@@ -7,6 +7,7 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
+from warmprior.data.opening import resolved_place
 from warmprior.experiments.recipe import Flat, Recipe
 from warmprior.io.options import identity_of, variations
 
@@ -40,7 +41,7 @@ def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
         if isinstance(value, (tuple, list)):
             return [plain(v) for v in value]
         # The same file from another working directory.
-        return str(value.resolve()) if isinstance(value, Path) else value
+        return resolved_place(value) if isinstance(value, Path) else value
 
     tree = plain(identity_of(recipe))
     if not isinstance(recipe, Recipe):

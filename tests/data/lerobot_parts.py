@@ -1,0 +1,81 @@
+"""Small LeRobotDatasets, written by LeRobot itself."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+WIDTHS = {"observation.environment_state": 10, "observation.state": 9, "action": 7}
+"""Those of lift."""
+
+
+def numbers(width, names=None):
+    return {"dtype": "float32", "shape": (width,), "names": names}
+
+
+def pictures(kind, side=32):
+    return {"dtype": kind, "shape": (side, side, 3), "names": ["height", "width", "channels"]}
+
+
+def scene(episode, step, side=32):
+    """An image that tells its place, and which way is up."""
+    image = np.full((side, side, 3), 60 * episode + 5 * step, np.uint8)
+    image[: side // 2] += 40
+    image[..., 2] = 200
+    return image
+
+
+def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, seed=0, **options):
+    """Write random episodes with LeRobot.
+
+    Returns:
+        Per feature the values of all steps.
+    """
+    from lerobot.datasets import LeRobotDataset
+
+    features = features or {name: numbers(width) for name, width in WIDTHS.items()}
+    cameras = {f"observation.images.{name}": pictures(kind) for name, kind in images}
+    dataset = LeRobotDataset.create(
+        "local/test",
+        fps,
+        features | cameras,
+        root=root,
+        use_videos=any(kind == "video" for _, kind in images),
+        **options,
+    )
+    rng, written = np.random.default_rng(seed), {name: [] for name in features}
+    for episode, steps in enumerate(lengths):
+        for step in range(steps):
+            frame = {}
+            for name, feature in features.items():
+                value = rng.normal(size=feature["shape"])
+                value = value > 0 if feature["dtype"] == "bool" else value.astype(feature["dtype"])
+                frame[name] = value
+                written[name].append(value)
+            frame |= {name: scene(episode, step) for name in cameras}
+            dataset.add_frame(frame | {"task": "lift"})
+        dataset.save_episode()
+    dataset.finalize()
+    return {name: np.stack(values) for name, values in written.items()}
+
+
+def edit_json(path: Path, change):
+    """Change what a JSON file holds."""
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def edit_table(path: Path, **columns):
+    """Replace columns of a parquet file by functions of their values; one row group is written."""
+    table = pq.read_table(path)
+    for name, change in columns.items():
+        name = name.replace("__", ".").replace("SLASH", "/")
+        place = table.schema.get_field_index(name)
+        column = pa.array(change(table[name].to_pylist()), table.schema.field(place).type)
+        table = table.set_column(place, name, column)
+    pq.write_table(table, path)

@@ -1,0 +1,283 @@
+"""robomimic's files as LeRobotDatasets: LeRobot reads them, and so do we, with the same values."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("lerobot")
+
+from tests.data.lerobot_parts import scene
+from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
+from tests.processes import apart
+from warmprior.__main__ import main
+from warmprior.data import (
+    DatasetError,
+    LeRobotExperienceReplay,
+    RobomimicExperienceReplay,
+    convert_robomimic,
+)
+from warmprior.data.opening import open_demonstrations
+from warmprior.envs import rendering_backend
+from warmprior.io.files import file_digest, read_json
+
+
+@pytest.fixture(scope="module", autouse=True)
+def offline():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+        yield
+
+
+def with_images(path, cameras=("agentview", "robot0_eye_in_hand"), side=32):
+    with h5py.File(path, "a") as file:
+        for number, demo in enumerate(file["data"].values()):
+            demo["obs"].pop("agentview_image", None)
+            images = [scene(number, step, side) for step in range(len(demo["actions"]))]
+            for camera in cameras:
+                demo[f"obs/{camera}_image"] = np.stack(images)
+    return path
+
+
+@pytest.fixture(scope="module")
+def converted(tmp_path_factory):
+    """A file of two arms with masks, images and a failure, and its datasets of both kinds."""
+    folder = tmp_path_factory.mktemp("data")
+    path = folder / "transport.hdf5"
+    write_robomimic_file(
+        path,
+        task="transport",
+        lengths=(6, 1, 9),
+        masks={"train": [2, 0], "valid": [1]},
+        failures=(1,),
+        env_args=env_args_14("transport"),
+    )
+    with_images(path)
+    return path, {
+        kind: convert_robomimic(path, folder / kind, images=kind, progress=False)
+        for kind in ("image", "video")
+    }
+
+
+def equal(mine, theirs):
+    keys = set(mine.keys(True, True))
+    assert keys == set(theirs.keys(True, True))
+    assert all(mine[key].dtype == theirs[key].dtype for key in keys)
+    return [key for key in keys if not torch.equal(mine[key], theirs[key])]
+
+
+OPTIONS = [
+    {},
+    {"filter_key": "train"},
+    {"demos": 2},
+    {"filter_key": "train", "demos": 1},
+    {"observation_keys": ["robot1_eef_pos", "object"]},
+    {"image_keys": ["robot0_eye_in_hand_image", "agentview_image"], "storage": "memmap"},
+]
+
+
+@pytest.mark.parametrize("options", OPTIONS, ids=str)
+def test_both_buffers_hold_the_same(converted, options):
+    path, folders = converted
+    theirs, mine = (
+        kind(place, **options)
+        for kind, place in (
+            (RobomimicExperienceReplay, path),
+            (LeRobotExperienceReplay, folders["image"]),
+        )
+    )
+    assert not equal(mine.data, theirs.data)
+    assert mine.env_args == theirs.env_args and mine.task is theirs.task
+    assert mine.recorded_env_args == theirs.recorded_env_args
+    assert mine.observation_keys == theirs.observation_keys
+    assert mine.image_keys == theirs.image_keys and mine.image_size == theirs.image_size
+    assert torch.equal(mine.episode_lengths, theirs.episode_lengths)
+
+
+def test_absolute_actions_agree_to_rounding(converted):
+    path, folders = converted
+    theirs = RobomimicExperienceReplay(path, absolute_actions=True)
+    mine = LeRobotExperienceReplay(folders["image"], absolute_actions=True)
+    torch.testing.assert_close(mine.data["action"], theirs.data["action"], rtol=0, atol=1e-6)
+    assert torch.equal(mine.pose_columns, theirs.pose_columns)
+    assert mine.env_args == theirs.env_args
+
+
+def test_lerobot_reads_what_was_converted(converted):
+    from lerobot.datasets import LeRobotDataset
+
+    path, folders = converted
+    data = RobomimicExperienceReplay(path).data
+    for kind, folder in folders.items():
+        dataset = LeRobotDataset("local/test", root=folder)
+        assert dataset.fps == 20 and dataset.num_episodes == 3 and len(dataset) == 16
+        assert dataset.meta.stats["action"]["count"].item() == 16
+        names = dataset.meta.features["action"]["names"]
+        assert names[:2] == ["robot0_x", "robot0_y"] and names[13] == "robot1_gripper"
+        with h5py.File(path) as file:
+            images = np.concatenate([d["obs/agentview_image"] for d in file["data"].values()])
+        for i in range(16):
+            item = dataset[i]
+            assert torch.equal(item["action"], data["action"][i])
+            state = (item["observation.environment_state"], item["observation.state"])
+            assert torch.equal(torch.cat(state), data["observation"][i])
+            assert item["next.reward"] == data["next", "reward"][i]
+            assert item["next.success"] == (data["next", "reward"][i] > 0)
+            assert item["next.done"] == data["next", "done"][i]
+            assert item["episode_index"] == data["episode"][i] and item["task"] == "transport"
+            shown = item["observation.images.agentview"].permute(1, 2, 0) * 255
+            off = (shown - torch.from_numpy(images[i])).abs()
+            assert off.max() < 1e-4 if kind == "image" else off.mean() < 8
+
+
+def test_what_lerobot_does_not_tell_is_written_down(converted):
+    path, folders = converted
+    told = read_json(folders["image"] / "meta" / "warmprior.json")
+    assert told["env_args"] == env_args_14("transport")
+    assert told["source"] == {"file": "transport.hdf5", "sha256": file_digest(path)}
+    assert told["masks"] == {"train": [0, 2], "valid": [1]}
+    with h5py.File(path) as file:
+        assert told["first_state"] == file["data/demo_0/states"][0].tolist()
+
+
+def test_part_of_a_file(converted, tmp_path):
+    path, _ = converted
+    folder = convert_robomimic(path, tmp_path / "part", demos=2, progress=False)
+    whole = RobomimicExperienceReplay(path, demos=2)
+    part = LeRobotExperienceReplay(folder)
+    assert not equal(part.data, whole.data)
+    train = LeRobotExperienceReplay(folder, filter_key="train")
+    assert train.episode_lengths.tolist() == [6]
+    with pytest.raises(DatasetError, match=r"warmprior\.json: unknown filter key 'test'.*train"):
+        LeRobotExperienceReplay(folder, filter_key="test")
+
+
+def test_a_target_that_exists_is_refused(converted, tmp_path):
+    path, folders = converted
+    before = read_json(folders["image"] / "meta" / "info.json")
+    (tmp_path / "file").write_text("mine")
+    (tmp_path / "link").symlink_to("nowhere")
+    for folder in (folders["image"], tmp_path / "file", tmp_path / "link", tmp_path):
+        with pytest.raises(FileExistsError, match=f"{folder} exists: choose another folder, or"):
+            convert_robomimic(path, folder)
+    assert read_json(folders["image"] / "meta" / "info.json") == before
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_an_interrupted_conversion_leaves_nothing(converted, tmp_path, monkeypatch):
+    from lerobot.datasets import LeRobotDataset
+
+    path, _ = converted
+    save, saved = LeRobotDataset.save_episode, []
+
+    def interrupted(dataset, *args, **options):
+        if saved:
+            raise KeyboardInterrupt
+        saved.append(save(dataset, *args, **options))
+
+    folder = tmp_path / "out" / "data"
+    with monkeypatch.context() as patch:
+        patch.setattr(LeRobotDataset, "save_episode", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            convert_robomimic(path, folder, progress=False)
+    assert saved and not list(folder.parent.iterdir())
+    # A killed process cannot tidy up: what it left is not continued, and not in the way.
+    left = folder.parent / ".data.converting" / "data" / "meta"
+    left.mkdir(parents=True)
+    (left / "info.json").write_text("{")
+    assert convert_robomimic(path, folder, progress=False) == folder
+    assert len(LeRobotExperienceReplay(folder)) == 16
+    assert [p.name for p in folder.parent.iterdir()] == ["data"]
+
+
+def test_two_processes_do_not_write_the_same_folder(converted, tmp_path):
+    from warmprior.io.files import exclusive
+
+    with (
+        exclusive(tmp_path / ".data.converting"),
+        pytest.raises(BlockingIOError, match="in use by another process"),
+    ):
+        convert_robomimic(converted[0], tmp_path / "data", progress=False)
+
+
+def test_what_cannot_be_converted(tmp_path):
+    path, folder = tmp_path / "lift.hdf5", tmp_path / "out"
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        convert_robomimic(path, folder)
+    write_robomimic_file(path, task="lift", lengths=(3,))
+    with pytest.raises(ValueError, match="images must be one of image, video or None, got 'gif'"):
+        convert_robomimic(path, folder, images="gif")
+    with pytest.raises(
+        ValueError, match="images of 4 pixels are too small for a video, which takes 32"
+    ):
+        convert_robomimic(path, folder, images="video")
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/obs/agentview_image"]
+        file["data/demo_0/obs/robot0_eef_pos"][1] = np.nan
+    with pytest.raises(DatasetError, match="no images: render them first"):
+        convert_robomimic(path, folder, images="image")
+    with pytest.raises(DatasetError, match=r"demo_0/obs/robot0_eef_pos .* row 1\."):
+        convert_robomimic(path, folder, progress=False)
+    env_args = env_args_15("lift")
+    env_args["env_kwargs"]["control_freq"] = 12.5
+    write_robomimic_file(path, task="lift", lengths=(3,), env_args=env_args)
+    with pytest.raises(DatasetError, match=r"control_freq is 12\.5"):
+        convert_robomimic(path, folder)
+    assert [p.name for p in tmp_path.iterdir()] == ["lift.hdf5"]
+
+
+def test_an_environment_of_ones_own(tmp_path):
+    path = tmp_path / "own.hdf5"
+    env_args = env_args_15("lift") | {"env_name": "Own"}
+    env_args["env_kwargs"]["control_freq"] = 10
+    write_robomimic_file(path, task="lift", lengths=(3, 2), env_args=env_args)
+    folder = convert_robomimic(path, tmp_path / "own", progress=False)
+    replay = LeRobotExperienceReplay(folder)
+    assert not equal(replay.data, RobomimicExperienceReplay(path).data)
+    assert replay.task is None and replay.env_args["env_name"] == "Own"
+    assert read_json(folder / "meta" / "info.json")["fps"] == 10
+
+
+def test_command(converted, tmp_path, capsys):
+    path, _ = converted
+    folder = tmp_path / "data"
+    argv = ["convert", str(path), str(folder), "--images", "--demonstrations", "1"]
+    assert main(argv) == 0
+    told = capsys.readouterr()
+    assert told.out.strip() == str(folder) and "convert transport: 100%" in told.err
+    assert LeRobotExperienceReplay(folder, image_keys=["agentview_image"]).num_episodes == 1
+    assert main(argv) == 2
+    assert "exists: choose another folder" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
+@apart
+def test_images_are_compared_with_the_simulators(tmp_path_factory):
+    from warmprior.data import generate_demonstrations, render_demonstrations
+
+    tmp_path = tmp_path_factory.mktemp("rendered")
+    path = generate_demonstrations("lift", n=1, path=tmp_path / "lift.hdf5", progress=False)
+    options = {"fast": True, "progress": False, "workers": 1}
+    render_demonstrations(path, ["agentview"], 32, out=path, **options)
+    told = {"demos": None, "fast": True}
+    for kind in ("image", "video"):
+        folder = convert_robomimic(path, tmp_path / kind, images=kind, progress=False)
+        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **told)
+    with pytest.raises(
+        DatasetError, match=r"rendered fast, and in evaluation.*add --fast-rendering"
+    ):
+        open_demonstrations(f"lerobot:{folder}").with_images(
+            ["agentview"], 32, demos=None, fast=False
+        )
+    with pytest.raises(DatasetError, match="no images 'sideview_image'"):
+        open_demonstrations(f"lerobot:{folder}").with_images(["sideview"], 32, **told)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            demo["obs/agentview_image"][...] = demo["obs/agentview_image"][()][:, ::-1]
+    folder = convert_robomimic(path, tmp_path / "flipped", images="image", progress=False)
+    with pytest.raises(
+        DatasetError, match=r"images of agentview are upside down.*convert it again"
+    ):
+        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **told)

@@ -1,0 +1,259 @@
+"""LeRobotDatasets as replay buffers, beside LeRobot's own reader."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from torchrl.data import SliceSampler
+
+pytest.importorskip("pyarrow")
+pytest.importorskip("lerobot")
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from tests.data.lerobot_parts import WIDTHS, edit_json, numbers, scene, write_lerobot
+from tests.data.synthetic import env_args_15
+from warmprior import PastPrior, window_replay_buffer
+from warmprior.data import LeRobotExperienceReplay, lerobot
+from warmprior.data.download import download_lerobot
+from warmprior.data.lerobot_index import action_names, read_lerobot_index, state_names
+from warmprior.data.lerobot_reader import lerobot_digest
+from warmprior.data.opening import open_demonstrations
+from warmprior.envs.tasks import TASKS
+
+H, TO = 4, 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def offline():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+        yield
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """Episodes in several files, with both kinds of images; and their values."""
+    root = tmp_path_factory.mktemp("data") / "lift"
+    images = (("agentview", "image"), ("robot0_eye_in_hand", "video"))
+    values = write_lerobot(root, images=images, data_files_size_in_mb=0.001)
+    assert len(list(root.glob("data/*/*.parquet"))) > 1
+    return root, values
+
+
+def test_windows_are_those_of_delta_timestamps(written):
+    from lerobot.datasets import LeRobotDataset
+
+    root, _ = written
+    deltas = {
+        "action": [i / 20 for i in range(-H, H)],
+        "observation.state": [i / 20 for i in range(1 - TO, 1)],
+    }
+    theirs = LeRobotDataset("local/test", root=root, delta_timestamps=deltas)
+    data = LeRobotExperienceReplay(root, observation_keys=["observation.state"]).data
+    windows = window_replay_buffer(data, PastPrior(H), batch_size=8, observation_steps=TO)
+    transform = windows.transform
+    assert len(data) == len(theirs) == 16
+    for i in range(len(theirs)):
+        item = theirs[i]
+        row = transform(data[i : i + 1].select("frame"))[0]
+        action, pad = item["action"], item["action_is_pad"]
+        assert torch.equal(row["vla_action", "chunk"], action[H:])
+        assert torch.equal(row["action_is_pad"], pad[H:])
+        assert torch.equal(row["observation"], item["observation.state"])
+        # The mean of the past is what LeRobot's history is where that is no padding, and cold elsewhere.
+        assert row["prior", "warm"].all() == (not pad[:H].any())
+        if not pad[:H].any():
+            assert torch.equal(row["prior", "loc"], action[:H])
+        assert item["episode_index"] == data["episode"][i]
+
+
+def test_entries_are_those_of_robomimics_buffer(written, tmp_path):
+    root, values = written
+    for options in ({}, {"storage": "memmap", "scratch_dir": tmp_path}):
+        replay = LeRobotExperienceReplay(root, env_args=env_args_15("lift"), **options)
+        data = replay.data
+        state = np.concatenate([values[f"observation.{n}state"] for n in ("environment_", "")], -1)
+        np.testing.assert_array_equal(data["observation"].numpy(), state)
+        np.testing.assert_array_equal(data["action"].numpy(), values["action"])
+        assert data["episode"].tolist() == [0] * 6 + [1] + [2] * 9
+        assert data["frame"].tolist() == list(range(16))
+        assert data["next", "done"].squeeze(-1).nonzero().squeeze(-1).tolist() == [5, 6, 15]
+        assert not data["next", "reward"].any() and not data["next", "terminated"].any()
+        assert torch.equal(data["next", "truncated"], data["next", "done"])
+        assert replay.num_episodes == 3 and replay.episode_lengths.tolist() == [6, 1, 9]
+        assert replay.task is TASKS["lift"] and replay.path == root
+        assert replay.observation_keys == TASKS["lift"].low_dim_keys
+        assert replay.pose_columns.tolist() == [list(range(10, 17))]
+
+
+def test_samplers_and_part_of_a_dataset(written):
+    root, values = written
+    replay = LeRobotExperienceReplay(
+        root, demos=1, batch_size=8, sampler=SliceSampler(slice_len=4, traj_key="episode")
+    )
+    assert (replay.sample()["frame"].reshape(2, 4).diff(dim=-1) == 1).all()
+    np.testing.assert_array_equal(replay.data["action"].numpy(), values["action"][:6])
+    # Not described, and so all features whole.
+    assert replay.observation_keys == ("observation.environment_state", "observation.state")
+    with pytest.raises(ValueError, match="does not say which environment"):
+        _ = replay.env_args
+
+
+def test_images_are_decoded_as_lerobot_does(written):
+    from lerobot.datasets import LeRobotDataset
+
+    root, _ = written
+    keys = ["agentview_image", "robot0_eye_in_hand_image"]
+    replay = LeRobotExperienceReplay(root, image_keys=keys, storage="memmap")
+    theirs = LeRobotDataset("local/test", root=root)
+    observation = replay.data["observation"]
+    assert replay.image_size == 32 and observation["state"].shape == (16, 19)
+    for i in range(16):
+        item, row = theirs[i], observation[i]
+        for key in keys:
+            image = item[f"observation.images.{key.removesuffix('_image')}"]
+            assert torch.equal(row[key], (image * 255).round().byte())
+    upright = torch.from_numpy(scene(2, 8)).permute(2, 0, 1)
+    assert torch.equal(observation["agentview_image"][15], upright)
+    off = observation["robot0_eye_in_hand_image"][15].float() - upright
+    assert off.abs().mean() < 8  # a video is lossy
+
+
+def test_only_what_is_asked_for_is_opened(written, tmp_path, monkeypatch):
+    root = shutil.copytree(written[0], tmp_path / "copy")
+    shutil.rmtree(root / "videos")
+
+    def never(*args, **options):
+        raise AssertionError("was decoded")
+
+    monkeypatch.setattr("lerobot.datasets.video_utils.decode_video_frames", never)
+    assert len(LeRobotExperienceReplay(root)) == 16
+    assert LeRobotExperienceReplay(root, image_keys=["agentview_image"], demos=2).image_size == 32
+    with pytest.raises(ValueError, match=r"file-000\.mp4: there is no such file"):
+        LeRobotExperienceReplay(root, image_keys=["robot0_eye_in_hand_image"])
+
+
+def test_other_writers_of_the_same_format(written, tmp_path):
+    """One row group for everything, and lists without a fixed length, as converters by pandas write."""
+    root = tmp_path / "rewritten"
+    values = write_lerobot(root)
+    before = LeRobotExperienceReplay(root).data
+    (path,) = root.glob("data/*/*.parquet")
+    table = pq.read_table(path)
+    for name in WIDTHS:
+        place = table.schema.get_field_index(name)
+        column = pa.array(table[name].to_pylist(), pa.list_(pa.float32()))
+        table = table.set_column(place, name, column)
+    pq.write_table(table, path, row_group_size=5)
+    data = LeRobotExperienceReplay(root).data
+    assert all(torch.equal(data[key], before[key]) for key in ("observation", "action", "episode"))
+    np.testing.assert_array_equal(data["action"].numpy(), values["action"])
+
+
+@pytest.mark.parametrize("kind", ["reward", "success"])
+def test_rewards_are_those_of_the_dataset(tmp_path, kind):
+    feature = numbers(1) if kind == "reward" else {"dtype": "bool", "shape": (1,), "names": None}
+    features = {name: numbers(w) for name, w in WIDTHS.items()} | {f"next.{kind}": feature}
+    values = write_lerobot(tmp_path / "data", features=features)[f"next.{kind}"]
+    data = LeRobotExperienceReplay(tmp_path / "data").data
+    np.testing.assert_array_equal(data["next", "reward"].numpy(), values.astype(np.float32))
+    last = torch.tensor([5, 6, 15])
+    won = torch.from_numpy(values > 0)[last]
+    assert torch.equal(data["next", "terminated"][last], won)
+
+
+LAYOUTS = {
+    "two": {"observation.environment_state": 10, "observation.state": 9},
+    "one": {"observation.state": 19},
+    "each": {f"observation.{key}": width for key, width in TASKS["lift"].low_dim_widths.items()},
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_observations_of_a_task_are_found_by_their_widths(tmp_path, layout):
+    widths = LAYOUTS[layout] | {"action": 7}
+    names = {"action": action_names(1)}
+    if layout == "one":
+        names["observation.state"] = state_names(TASKS["lift"].low_dim_widths)
+    features = {name: numbers(width, names.get(name)) for name, width in widths.items()}
+    values = write_lerobot(tmp_path / "data", features=features)
+    replay = LeRobotExperienceReplay(tmp_path / "data", env_args=env_args_15("lift"))
+    expected = np.concatenate([values[name] for name in LAYOUTS[layout]], -1)
+    np.testing.assert_array_equal(replay.data["observation"].numpy(), expected)
+    assert replay.observation_keys == TASKS["lift"].low_dim_keys
+
+
+def test_digest_is_that_of_what_is_read(written, tmp_path):
+    root = shutil.copytree(written[0], tmp_path / "copy")
+
+    def digest(image_keys=()):
+        return lerobot_digest(read_lerobot_index(root, image_keys=image_keys))
+
+    before, seen = digest(), digest(["robot0_eye_in_hand_image"])
+    assert before == lerobot_digest(read_lerobot_index(written[0])) != seen
+    (root / "README.md").write_text("a card")
+    (video,) = root.glob("videos/*/*/*.mp4")
+    video.write_bytes(video.read_bytes() + b"\0")
+    assert digest() == before
+    assert digest(["robot0_eye_in_hand_image"]) != seen
+    edit_json(root / "meta" / "info.json", lambda info: info.update(robot_type="other"))
+    assert digest() != before
+
+
+def test_of_a_repository_only_what_is_read_is_fetched(written, tmp_path, monkeypatch):
+    source, asked = written[0], []
+
+    def snapshot_download(repository, **options):
+        asked.append((repository, options["revision"], options["allow_patterns"]))
+        target = tmp_path / "snapshot"
+        for pattern in options["allow_patterns"]:
+            files = source.glob("meta/**/*") if pattern == "meta/*" else source.glob(pattern)
+            for file in files:
+                if file.is_file():
+                    to = target / file.relative_to(source)
+                    to.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copy(file, to)
+        return str(target)
+
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
+    monkeypatch.chdir(tmp_path)
+    replay = LeRobotExperienceReplay("user/lift", image_keys=["agentview_image"], demos=1)
+    assert asked == [
+        ("user/lift", "v3.0", ["meta/*"]),
+        ("user/lift", "v3.0", ["data/chunk-000/file-000.parquet"]),
+    ]
+    expected = LeRobotExperienceReplay(source, image_keys=["agentview_image"], demos=1)
+    assert (replay.data == expected.data).all()
+    LeRobotExperienceReplay("user/lift", demos=1, revision="main")
+    assert asked[2:] == [("user/lift", "main", ["meta/*"])]  # the rest is there
+    # Digest and checks of a part need no more than that part.
+    found = open_demonstrations("lerobot:user/lift")
+    assert len(found.index().demos) == 3 and found.name == "lerobot:lift"
+    whole = open_demonstrations(f"lerobot:{source}")
+    assert found.digest(demos=1) == whole.digest(demos=1) != whole.digest()
+    assert [files for *_, files in asked[3:]] == [["meta/*"]] * 2
+    del asked[3:]
+    # What was recorded here is taken from where LeRobot keeps it.
+    local = shutil.copytree(source, tmp_path / "home" / "user" / "mine")
+    assert LeRobotExperienceReplay("user/mine").path == local and len(asked) == 3
+
+
+def test_a_repository_that_cannot_be_had_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
+    with pytest.raises(OSError, match=r"could not download user/nothing at v3\.0: (?s:.*)convert"):
+        download_lerobot("user/nothing")
+
+
+def test_names_of_repositories(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert lerobot.is_repository("user/name")
+    os.makedirs("user/name")
+    for name in ("user/name", "name", "./name", "a/b/c", "/user/name", "~/name"):
+        assert not lerobot.is_repository(name)

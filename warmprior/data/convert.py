@@ -1,0 +1,277 @@
+"""Turns demonstrations in robomimic's layout into a LeRobotDataset v3."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from warmprior.data.hdf5 import open_robomimic, read_index, read_masks
+from warmprior.data.hdf5_members import DatasetError, member
+from warmprior.data.index import DatasetIndex
+from warmprior.data.lerobot_index import (
+    ENVIRONMENT_STATE,
+    REWARD,
+    ROBOT_STATE,
+    SUCCESS,
+    action_names,
+    state_names,
+)
+from warmprior.data.lerobot_meta import DESCRIPTION
+from warmprior.data.robomimic import RobomimicExperienceReplay
+from warmprior.io.extras import require
+from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
+from warmprior.keys import ACTION, OBSERVATION, STATE
+
+__all__ = ["convert_robomimic"]
+
+KINDS = ("image", "video")
+VIDEO_SIZE = 32  # of the least side; the AV1 encoder ends the process at smaller ones
+
+
+def convert_robomimic(
+    path: str | Path,
+    folder: str | Path,
+    *,
+    images: Literal["image", "video"] | None = None,
+    demos: int | None = None,
+    progress: bool = True,
+) -> Path:
+    """Write the demonstrations of a robomimic HDF5 file as a LeRobotDataset v3, which LeRobot reads.
+
+    ==================================  ===============================================================
+    robomimic                           LeRobot
+    ==================================  ===============================================================
+    ``actions``                         ``action``, named ``robot0_x`` and so on
+    ``rewards``                         ``next.reward``; positive, also ``next.success``
+    the last step                       ``next.done``
+    ``obs/object``                      ``observation.environment_state``
+    ``obs/robot0_eef_pos`` and so on    ``observation.state``, side by side
+    ``obs/agentview_image``             ``observation.images.agentview``
+    ``control_freq`` of ``env_args``    ``fps``
+    the name of the task                ``task``
+    ``env_args``, ``mask``              ``meta/warmprior.json``, which LeRobot ignores
+    ==================================  ===============================================================
+
+    Numbers become float32. Simulator states are left out but for the first one, by which images are compared
+    with the simulator's before a training. The folder appears under its name when it is complete; an
+    interrupted call leaves nothing, and is begun again.
+
+    Args:
+        path: a robomimic HDF5 file, such as one of scripted demonstrations.
+        folder: where to write; must not exist.
+
+    Keyword Args:
+        images: write those of the file as well, as pictures (``"image"``, lossless PNG) or as videos
+            (``"video"``, lossy, smaller).
+        demos: how many to convert, the first ones by their numbers; all if ``None``.
+        progress: show a bar with the remaining time.
+
+    Returns:
+        The folder.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        FileExistsError: if there is something at ``folder``.
+        DatasetError: if the file is not as it should be, or has no images to write.
+        ValueError: if ``images`` is unknown, or the file's are too small for a video.
+        OSError: if the disk is full, or another process converts to the same folder.
+        ImportError: if lerobot is not installed.
+
+    Examples:
+        >>> convert_robomimic("square.hdf5", "square_lerobot")  # doctest: +SKIP
+        PosixPath('square_lerobot')
+        >>> convert_robomimic("nowhere.hdf5", "out")
+        Traceback (most recent call last):
+            ...
+        FileNotFoundError: nowhere.hdf5: no such file; check the path
+    """
+    path, folder = Path(path), Path(folder).expanduser()
+    if images not in (None, *KINDS):
+        raise ValueError(f"images must be one of {', '.join(KINDS)} or None, got {images!r}")
+    index = read_index(path, demos=demos)
+    if images:
+        keys = [f"{camera}_image" for camera in index.cameras]
+        if not keys:
+            raise DatasetError(
+                f"{path} has no images: render them first (python -m warmprior render {path} --out FILE)"
+            )
+        index = read_index(path, demos=demos, image_keys=keys)
+        if images == "video" and index.image_size < VIDEO_SIZE:
+            raise ValueError(
+                f"{path}: images of {index.image_size} pixels are too small for a video, which takes "
+                f"{VIDEO_SIZE}: write pictures (--images), or render larger ones"
+            )
+    if os.path.lexists(folder):
+        raise FileExistsError(
+            f"{folder} exists: choose another folder, or remove it to convert anew"
+        )
+    fps = index.env_args["env_kwargs"].get("control_freq", 20)
+    if fps != int(fps):
+        raise DatasetError(
+            f"{path}: control_freq is {fps}, and LeRobot has whole numbers of steps per second"
+        )
+    datasets = require("lerobot.datasets", "lerobot")
+    check_writable(folder.parent)
+    parts = folder.with_name(f".{folder.name}.converting")
+    with exclusive(parts):
+        whole = parts / folder.name
+        try:
+            # What a killed process left is of no use: its files have no ends.
+            shutil.rmtree(whole, ignore_errors=True)
+            _write(datasets, index, whole, int(fps), images, progress)
+            os.rename(whole, folder)
+        finally:
+            shutil.rmtree(parts, ignore_errors=True)
+    return folder
+
+
+def _layout(index: DatasetIndex) -> dict[str, dict[str, int]]:
+    """The width of each observation, by the feature that holds it."""
+    widths = dict(zip(index.observation_keys, index.observation_dims, strict=True))
+    robots = {key: width for key, width in widths.items() if key.startswith("robot")}
+    others = {key: width for key, width in widths.items() if key not in robots}
+    layout = {ENVIRONMENT_STATE: others, ROBOT_STATE: robots}
+    return {feature: parts for feature, parts in layout.items() if parts}
+
+
+def _features(
+    index: DatasetIndex, layout: Mapping[str, Mapping[str, int]], images: str | None
+) -> dict[str, Any]:
+    arms, rest = divmod(index.action_dim, 7)
+    deltas = action_names(arms) if rest == 0 else None
+    features: dict[str, Any] = {"action": _vector(index.action_dim, deltas)}
+    for feature, widths in layout.items():
+        names = state_names(widths)
+        features[feature] = _vector(len(names), names)
+    features[REWARD] = _vector(1, None)
+    for flag in ("next.done", SUCCESS):
+        features[flag] = {"dtype": "bool", "shape": (1,), "names": None}
+    for key in index.image_keys:
+        features[_camera(key)] = {
+            "dtype": images,
+            "shape": (index.image_size, index.image_size, 3),
+            "names": ["height", "width", "channels"],
+        }
+    return features
+
+
+def _vector(width: int, names: list[str] | None) -> dict[str, Any]:
+    return {"dtype": "float32", "shape": (width,), "names": names}
+
+
+def _camera(key: str) -> str:
+    return f"observation.images.{key.removesuffix('_image')}"
+
+
+def _write(
+    datasets: Any,
+    index: DatasetIndex,
+    root: Path,
+    fps: int,
+    images: Literal["image", "video"] | None,
+    progress: bool,
+) -> None:
+    layout = _layout(index)
+    task = index.env_args["env_name"].lower() if index.task is None else index.task.name
+    data = RobomimicExperienceReplay(
+        index.path,
+        demos=len(index.demos),
+        image_keys=index.image_keys,
+        storage="memmap" if images else "memory",
+    ).data
+    dataset = datasets.LeRobotDataset.create(
+        f"local/{root.name}",
+        fps,
+        _features(index, layout, images),
+        root=root,
+        use_videos=images == "video",
+    )
+    numbers = {
+        "action": data[ACTION],
+        REWARD: data["next", "reward"],
+        "next.done": data["next", "done"],
+        SUCCESS: data["next", "reward"] > 0,
+    }
+    vector = data[OBSERVATION, STATE] if images else data[OBSERVATION]
+    parts = dict(zip(index.observation_keys, vector.split(index.observation_dims, -1), strict=True))
+    for feature, widths in layout.items():
+        numbers[feature] = torch.cat([parts[key] for key in widths], -1)
+    rows = np.cumsum([0, *index.lengths])
+    bar = tqdm(
+        pairwise(rows),
+        f"convert {index.path.stem}",
+        len(index.lengths),
+        unit="demo",
+        disable=not progress,
+    )
+    with _quiet():
+        try:
+            for start, stop in bar:
+                for row in range(start, stop):
+                    frame = {name: value[row].numpy() for name, value in numbers.items()}
+                    for key in index.image_keys:
+                        frame[_camera(key)] = data[OBSERVATION, key][row].permute(1, 2, 0).numpy()
+                    dataset.add_frame(frame | {"task": task})
+                # In parallel every camera of every episode would start a process that imports LeRobot.
+                dataset.save_episode(parallel_encoding=False)
+        except BaseException:
+            # Left to the garbage collector, its files would appear once the folder is gone.
+            with suppress(Exception):
+                dataset.finalize()
+            raise
+        dataset.finalize()
+    described = json.dumps(_description(index, layout), indent=1)
+    write_atomic(root / DESCRIPTION, lambda file: file.write_text(described))
+
+
+def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
+    """What LeRobot's own files do not tell."""
+    observations: dict[str, tuple[str, int, int]] = {}
+    for feature, widths in layout.items():
+        borders = pairwise(np.cumsum([0, *widths.values()]).tolist())
+        observations |= {
+            key: (feature, *border) for key, border in zip(widths, borders, strict=True)
+        }
+    with open_robomimic(index.path) as file:
+        rendering = file["data"].attrs.get("rendering")
+        states = member(file, f"data/{index.demos[0]}/states", "dataset")
+        first_state = None if states is None else np.asarray(states[0], np.float64).tolist()
+    masks = {
+        name: [index.demos.index(demo) for demo in demos if demo in index.demos]
+        for name, demos in read_masks(index.path).items()
+    }
+    return {
+        "format": 1,
+        "source": {"file": index.path.name, "sha256": file_digest(index.path)},
+        "env_args": index.env_args,
+        "observations": {key: observations[key] for key in index.observation_keys},
+        "masks": {name: sorted(numbers) for name, numbers in masks.items()},
+        "rendering": None if rendering is None else json.loads(rendering),
+        "first_state": first_state,
+    }
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without the bar and the banner that LeRobot's libraries print for every episode."""
+    utils = require("lerobot.utils.utils", "lerobot")
+    before = os.environ.get("SVT_LOG")
+    os.environ["SVT_LOG"] = "1"  # of the AV1 encoder: errors alone
+    try:
+        with utils.SuppressProgressBars():
+            yield
+    finally:
+        if before is None:
+            del os.environ["SVT_LOG"]
+        else:
+            os.environ["SVT_LOG"] = before

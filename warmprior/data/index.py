@@ -1,0 +1,120 @@
+"""What a set of demonstrations holds, whatever format it is stored in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from warmprior.data.hdf5_members import DatasetError
+from warmprior.envs.tasks import TASKS, TaskSpec
+
+__all__ = ["BLOCK", "DatasetIndex", "check_count", "check_env_args", "store_finite", "task_of_env"]
+
+BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
+LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
+
+
+@dataclass(frozen=True)
+class DatasetIndex:
+    """What demonstrations hold, without their values.
+
+    Attributes:
+        path: the file or folder.
+        demos: names of the selected demos, in the order of their numbers.
+        lengths: the number of steps of each.
+        observation_keys: the observations to read, in the order of concatenation.
+        observation_dims: the width of each.
+        image_keys: the images to read.
+        image_size: their side in pixels; 0 if there are none.
+        available_keys: every observation there is.
+        action_dim: the width of the actions.
+        env_args: the environment as it is described there; empty if it is unknown.
+        task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
+    """
+
+    path: Path
+    demos: tuple[str, ...]
+    lengths: tuple[int, ...]
+    observation_keys: tuple[str, ...]
+    observation_dims: tuple[int, ...]
+    image_keys: tuple[str, ...]
+    image_size: int
+    available_keys: tuple[str, ...]
+    action_dim: int
+    env_args: dict[str, Any]
+    task: TaskSpec | None
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras whose images there are."""
+        ending = "_image"
+        return tuple(k.removesuffix(ending) for k in self.available_keys if k.endswith(ending))
+
+
+def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
+    """Whether something read from a file describes an environment as robomimic does.
+
+    Args:
+        what: names it in errors.
+        env_args: as read.
+
+    Returns:
+        The same.
+
+    Raises:
+        DatasetError: if ``env_name`` or ``env_kwargs`` is missing, or of another type.
+    """
+    for key, kind in (("env_name", str), ("env_kwargs", dict)):
+        if not (isinstance(env_args, dict) and isinstance(env_args.get(key), kind)):
+            raise DatasetError(f"{what} lacks {key}, or it is not a {kind.__name__}")
+    return env_args
+
+
+def task_of_env(env_args: Mapping[str, Any]) -> TaskSpec | None:
+    """The task of :data:`warmprior.envs.TASKS` that uses an environment, or ``None``."""
+    return next((t for t in TASKS.values() if t.env_name == env_args["env_name"]), None)
+
+
+def check_count(path: Path, demos: int | None, available: int) -> None:
+    """Refuse to take more demonstrations than there are.
+
+    Args:
+        path: of the file or folder.
+        demos: how many to take; all if ``None``.
+        available: how many there are.
+
+    Raises:
+        DatasetError: if there are fewer.
+    """
+    if demos is not None and demos > available:
+        raise DatasetError(
+            f"{path}: there are {available} demonstrations, fewer than the {demos} to be taken: ask "
+            "for no more"
+        )
+
+
+def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advice: str) -> None:
+    """Copy numbers that were read, and check them as they are kept.
+
+    Args:
+        block: the numbers.
+        out: ``[rows, width]`` floating-point memory to fill; may be a strided view.
+        what: names them in errors.
+        first: number of the first row, in errors.
+        advice: what to do about a bad row.
+
+    Raises:
+        DatasetError: if a value is not finite in the type of ``out``, or greater than 1e9.
+    """
+    with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
+        out[...] = block.reshape(out.shape)
+    usable = (np.abs(out) <= LARGEST).all(-1)  # NaN is not
+    if not usable.all():
+        worst = int(np.argmin(usable))
+        finite = np.isfinite(out[worst]).all()
+        told = f"a value beyond {LARGEST:.0e}" if finite else "NaN or infinity"
+        raise DatasetError(f"{what} has {told} in row {first + worst}. {advice}")

@@ -1,0 +1,257 @@
+"""Where demonstrations are: a robomimic HDF5 file, or ``lerobot:`` and a LeRobotDataset."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+
+from warmprior.data.hdf5 import read_index
+from warmprior.data.index import DatasetIndex
+from warmprior.data.lerobot import (
+    LeRobotExperienceReplay,
+    fetch_lerobot,
+    find_lerobot,
+    is_repository,
+)
+from warmprior.data.lerobot_index import LeRobotIndex
+from warmprior.data.lerobot_reader import lerobot_digest, open_lerobot
+from warmprior.data.replay import DemonstrationReplay
+from warmprior.data.robomimic import RobomimicExperienceReplay
+from warmprior.io.extras import require
+from warmprior.io.files import file_digest
+
+__all__ = [
+    "LEROBOT",
+    "Demonstrations",
+    "check_place",
+    "name_of_place",
+    "open_demonstrations",
+    "resolved_place",
+]
+
+LEROBOT = "lerobot:"
+"""What stands before the folder or repository of a LeRobotDataset where a file could be meant."""
+
+
+def _lerobot(place: str | Path) -> str | None:
+    """The folder or repository behind the prefix, if there is one."""
+    told = str(place)
+    return told.removeprefix(LEROBOT) if told.startswith(LEROBOT) else None
+
+
+def check_place(place: str | Path, option: str) -> None:
+    """Refuse a place where there can be no demonstrations; nothing is read or fetched.
+
+    Args:
+        place: an HDF5 file, or ``lerobot:`` and a folder or repository.
+        option: names it in errors.
+
+    Raises:
+        FileNotFoundError: if there is no such file or folder.
+        ImportError: if what reads it is not installed.
+
+    Examples:
+        >>> check_place("lerobot:user/square", "--dataset")
+        >>> check_place("lerobot:./square", "--dataset")
+        Traceback (most recent call last):
+            ...
+        FileNotFoundError: --dataset lerobot:./square: no such folder, and no repository user/name of the hub
+    """
+    dataset = _lerobot(place)
+    if dataset is None:
+        if not Path(place).is_file():
+            folder = (Path(place) / "meta" / "info.json").is_file()
+            hint = f"; for a LeRobotDataset write {LEROBOT}{place}" if folder else ""
+            raise FileNotFoundError(f"{option} {place}: no such file{hint}")
+        return
+    require("pyarrow.parquet", "lerobot")
+    if not is_repository(dataset) and not Path(dataset).expanduser().is_dir():
+        raise FileNotFoundError(
+            f"{option} {place}: no such folder, and no repository user/name of the hub"
+        )
+
+
+def name_of_place(place: str | Path) -> str:
+    """A short name: that of the file without its ending, of the folder, or of the repository.
+
+    Examples:
+        >>> name_of_place("data/square.hdf5"), name_of_place("lerobot:user/square")
+        ('square', 'square')
+    """
+    dataset = _lerobot(place)
+    return Path(place).stem if dataset is None else Path(dataset).resolve().name
+
+
+def resolved_place(place: Path) -> str:
+    """The same place as seen from any working directory.
+
+    Examples:
+        >>> resolved_place(Path("lerobot:user/square"))
+        'lerobot:user/square'
+    """
+    dataset = _lerobot(place)
+    if dataset is None:
+        return str(place.resolve())
+    return (
+        str(place) if is_repository(dataset) else f"{LEROBOT}{Path(dataset).expanduser().resolve()}"
+    )
+
+
+def open_demonstrations(
+    place: str | Path, env_args: Mapping[str, Any] | None = None
+) -> Demonstrations:
+    """What reads the demonstrations at a place.
+
+    Args:
+        place: an HDF5 file, or ``lerobot:`` and a folder or repository.
+        env_args: of the environment, for a LeRobotDataset that does not describe its own.
+
+    """
+    dataset = _lerobot(place)
+    return RobomimicFile(place) if dataset is None else LeRobotFolder(dataset, env_args)
+
+
+class Demonstrations(ABC):
+    """Demonstrations at one place, of which nothing big is read before :meth:`replay`."""
+
+    name: str
+    """What results call the place."""
+
+    @abstractmethod
+    def index(self, **options: Any) -> DatasetIndex:
+        """What is there.
+
+        Args:
+            options: ``image_keys``, ``demos`` and so on of
+                :func:`~warmprior.data.hdf5.read_index`.
+        """
+
+    @abstractmethod
+    def replay(self, **options: Any) -> DemonstrationReplay:
+        """Read them.
+
+        Args:
+            options: those of :class:`RobomimicExperienceReplay` after ``root``.
+        """
+
+    @abstractmethod
+    def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
+        """SHA-256 of the contents.
+
+        Args:
+            image_keys: the images that are used.
+            demos: how many demonstrations are used; all if ``None``.
+        """
+
+    @abstractmethod
+    def with_images(
+        self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
+    ) -> Self:
+        """The same demonstrations with images of some cameras.
+
+        Those that are there are compared with the simulator's; others are rendered where states are known.
+
+        Args:
+            cameras: of the simulator.
+            size: side of images to render.
+
+        Keyword Args:
+            demos: how many of them are used; all if ``None``.
+            fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
+
+        Raises:
+            DatasetError: if the images show something else than the simulator, or cannot be rendered.
+        """
+
+
+class RobomimicFile(Demonstrations):
+    """The demonstrations of an HDF5 file.
+
+    Args:
+        path: of the file.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.name = self.path.name
+
+    def index(self, **options: Any) -> DatasetIndex:
+        """What is there."""
+        return read_index(self.path, **options)
+
+    def replay(self, **options: Any) -> RobomimicExperienceReplay:
+        """Read them."""
+        return RobomimicExperienceReplay(self.path, **options)
+
+    def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
+        """SHA-256 of the whole file."""
+        return file_digest(self.path)
+
+    def with_images(
+        self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
+    ) -> RobomimicFile:
+        """This file, or one with its states rendered."""
+        from warmprior.data.render import compare_images, render_demonstrations
+
+        if set(cameras) <= set(self.index(demos=demos).cameras):
+            compare_images(self.path, [f"{camera}_image" for camera in cameras], fast)
+            return self
+        return RobomimicFile(
+            render_demonstrations(self.path, cameras, size, demos=demos, fast=fast)
+        )
+
+
+class LeRobotFolder(Demonstrations):
+    """The demonstrations of a LeRobotDataset.
+
+    Args:
+        dataset: its folder, or its repository in the hub.
+        env_args: see :func:`open_demonstrations`.
+    """
+
+    def __init__(self, dataset: str, env_args: Mapping[str, Any] | None = None) -> None:
+        self.dataset, self.env_args = dataset, env_args
+        self.name = f"{LEROBOT}{name_of_place(LEROBOT + dataset)}"
+
+    def index(self, **options: Any) -> LeRobotIndex:
+        """What is there."""
+        return find_lerobot(self.dataset, env_args=self.env_args, **options)
+
+    def _fetched(self, **options: Any) -> LeRobotIndex:
+        return fetch_lerobot(self.dataset, env_args=self.env_args, **options)
+
+    def replay(self, **options: Any) -> LeRobotExperienceReplay:
+        """Read them."""
+        return LeRobotExperienceReplay(self.dataset, env_args=self.env_args, **options)
+
+    def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
+        """SHA-256 of the files that are read."""
+        return lerobot_digest(self._fetched(image_keys=image_keys, demos=demos))
+
+    def with_images(
+        self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
+    ) -> LeRobotFolder:
+        """This dataset, whose images are compared with the simulator's; none can be rendered."""
+        from warmprior.data.render import compare_first_images
+
+        keys = [f"{camera}_image" for camera in cameras]
+        index, images = self._fetched(image_keys=keys, demos=1), {}
+        with open_lerobot(index) as reader:
+            for key in keys:
+                image = torch.empty(1, 3, index.image_size, index.image_size, dtype=torch.uint8)
+                reader.images(index.demos[0], key, image)
+                images[key] = image[0].permute(1, 2, 0).numpy()
+        compare_first_images(
+            index,
+            images,
+            state=None if index.first_state is None else np.asarray(index.first_state),
+            rendering=index.rendering,
+            fast=fast,
+            advice="render the robomimic file anew (python -m warmprior render) and convert it again",
+        )
+        return self

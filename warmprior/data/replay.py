@@ -1,0 +1,380 @@
+"""What replay buffers of demonstrations share, whatever format these are stored in."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
+from tqdm import tqdm
+
+from warmprior.data.hdf5_members import DatasetError
+from warmprior.data.index import BLOCK, DatasetIndex
+from warmprior.envs.env_args import absolute_actions as to_absolute
+from warmprior.envs.env_args import delta_conventions, modernize_env_args
+from warmprior.envs.tasks import TaskSpec
+from warmprior.io.memory import available_memory
+from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
+
+__all__ = ["DemonstrationReader", "DemonstrationReplay", "check_storage"]
+
+UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
+
+
+class DemonstrationReader(ABC):
+    """Gives the values of demonstrations, whose :class:`DatasetIndex` is known."""
+
+    @abstractmethod
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """Read rows of one array of a demo, and check them.
+
+        Args:
+            demo: its name.
+            key: ``"actions"``, ``"rewards"`` or ``"obs/<key>"``.
+            out: ``[rows, width]`` floating-point memory to fill; may be a strided view.
+            first: the row of the demo that goes to the first row of ``out``.
+
+        Raises:
+            DatasetError: if a value is not finite or absurdly large, or cannot be read.
+        """
+
+    @abstractmethod
+    def images(self, demo: str, key: str, out: Tensor) -> None:
+        """Read the first images of a demo, channels first.
+
+        Args:
+            demo: its name.
+            key: of the images.
+            out: uint8 ``[rows, 3, size, size]``, to fill.
+
+        Raises:
+            DatasetError: if they cannot be read.
+        """
+
+    @abstractmethod
+    def name(self, demo: str, key: str) -> str:
+        """What errors call an array of a demo, with the file that holds it."""
+
+
+def check_storage(storage: str, device: torch.device | str) -> torch.device:
+    """Refuse a place for the data that there is not.
+
+    Args:
+        storage: ``"memory"`` or ``"memmap"``.
+        device: of the tensors.
+
+    Returns:
+        The device.
+
+    Raises:
+        ValueError: if ``storage`` is unknown or does not fit ``device``.
+    """
+    if storage not in ("memory", "memmap"):
+        raise ValueError(f"storage must be 'memory' or 'memmap', got {storage!r}")
+    device = torch.device(device)
+    if storage == "memmap" and device.type != "cpu":
+        raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
+    return device
+
+
+def _allocate(
+    index: DatasetIndex, action_dim: int, storage: str, scratch_dir: str | Path | None
+) -> TensorDict:
+    steps = sum(index.lengths)
+    vector = (torch.float32, (sum(index.observation_dims),))
+    image = (torch.uint8, (3, index.image_size, index.image_size))
+    widths = {
+        _vector_key(index): vector,
+        **{(OBSERVATION, key): image for key in index.image_keys},
+        ACTION: (torch.float32, (action_dim,)),
+        ("next", "reward"): (torch.float32, (1,)),
+        ("next", "done"): (torch.bool, (1,)),
+        ("next", "terminated"): (torch.bool, (1,)),
+        ("next", "truncated"): (torch.bool, (1,)),
+        EPISODE: (torch.int64, ()),
+        FRAME: (torch.int64, ()),
+    }
+    # Expanded scalars cost nothing, and the real memory is taken once.
+    data = TensorDict(batch_size=[steps])
+    for key, (dtype, width) in widths.items():
+        data.set(key, torch.zeros((), dtype=dtype).expand(steps, *width))
+    needed = sum(value.numel() * value.element_size() for value in data.values(True, True))
+    available = available_memory()
+    if storage == "memory" and available is not None and needed > available:
+        raise DatasetError(
+            f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but "
+            f"{available / 1e9:.1f} GB are free: use storage='memmap', or choose fewer with demos "
+            "or filter_key"
+        )
+    if storage == "memory":
+        return torch.empty_like(data)
+    data = data.memmap_like(scratch_dir)
+    try:
+        for value in data.values(True, True):
+            _reserve(value)
+    except OSError as error:
+        raise OSError(
+            f"{scratch_dir or 'the folder of temporary files'}: cannot take {needed / 1e9:.3g} GB for "
+            f"{index.path} ({error}). Free some space or choose another scratch_dir."
+        ) from error
+    return data
+
+
+def _vector_key(index: DatasetIndex) -> NestedKey:
+    return (OBSERVATION, STATE) if index.image_keys else OBSERVATION
+
+
+def _reserve(mapped: Any) -> None:
+    """Take the space of a memory map: writing to one without it kills the process (SIGBUS)."""
+    if not hasattr(os, "posix_fallocate"):
+        return
+    handler = getattr(mapped, "_handler", None)  # of a file without a name
+    file = os.open(mapped.filename, os.O_RDWR) if handler is None else os.dup(handler.fd)
+    try:
+        os.posix_fallocate(file, 0, max(1, mapped.numel() * mapped.element_size()))
+    finally:
+        os.close(file)
+
+
+def _read_absolute(
+    reader: DemonstrationReader,
+    demo: str,
+    out: np.ndarray,
+    output_max: Tensor,
+    base_rotation: Tensor,
+) -> None:
+    arms = len(base_rotation)
+    for first in range(0, len(out), BLOCK):
+        rows = out[first : first + BLOCK]
+        deltas, positions, quaternions = (np.empty((len(rows), n * arms)) for n in (7, 3, 4))
+        reader.numbers(demo, "actions", deltas, first)
+        for arm in range(arms):
+            position, quaternion = (f"obs/robot{arm}_eef_{what}" for what in ("pos", "quat"))
+            reader.numbers(demo, position, positions[:, 3 * arm : 3 * arm + 3], first)
+            turns = quaternions[:, 4 * arm : 4 * arm + 4]
+            reader.numbers(demo, quaternion, turns, first)
+            off = np.abs(np.linalg.norm(turns, axis=-1) - 1)
+            if off.max() > UNIT_TOLERANCE:
+                worst = int(off.argmax())
+                raise DatasetError(
+                    f"{reader.name(demo, quaternion)} is no rotation in row {first + worst}: "
+                    f"the quaternion {turns[worst].tolist()} does not have length 1. Rebuild or remove "
+                    "the demo, or leave it out."
+                )
+        rows[...] = to_absolute(
+            torch.from_numpy(deltas),
+            torch.from_numpy(positions),
+            torch.from_numpy(quaternions),
+            output_max=output_max,
+            base_rotation=base_rotation,
+        ).numpy()
+
+
+def _fill(
+    index: DatasetIndex, data: TensorDictBase, reader: DemonstrationReader, absolute: bool
+) -> None:
+    observation, action = data[_vector_key(index)].numpy(), data[ACTION].numpy()
+    reward = data["next", "reward"].numpy()
+    columns = np.cumsum([0, *index.observation_dims])
+    rows = np.cumsum([0, *index.lengths])
+    if absolute:
+        output_max, base_rotation = delta_conventions(index.env_args)
+    # Of what takes long: images are unpacked one by one.
+    bar = tqdm(index.demos, f"read {index.path.name}", unit="demo", disable=not index.image_keys)
+    for episode, (demo, (start, stop)) in enumerate(zip(bar, pairwise(rows), strict=True)):
+        for key, (left, right) in zip(index.observation_keys, pairwise(columns), strict=True):
+            reader.numbers(demo, f"obs/{key}", observation[start:stop, left:right])
+        if absolute:
+            _read_absolute(reader, demo, action[start:stop], output_max, base_rotation)
+        else:
+            reader.numbers(demo, "actions", action[start:stop])
+        reader.numbers(demo, "rewards", reward[start:stop])
+        for key in index.image_keys:
+            reader.images(demo, key, data[OBSERVATION, key][start:stop])
+        data[EPISODE][start:stop] = episode
+    torch.arange(len(data), out=data[FRAME])
+    last = torch.from_numpy(rows[1:] - 1)
+    success = data["next", "reward"][last] > 0
+    for key, value in (("done", True), ("terminated", success), ("truncated", ~success)):
+        flag = data["next", key]
+        flag.zero_()
+        flag[last] = value
+
+
+@contextmanager
+def _understanding(what: str) -> Iterator[None]:
+    """Name the ``env_args`` that are not understood."""
+    try:
+        yield
+    except Exception as error:  # whatever their unexpected structure leads to
+        reason = str(error) if isinstance(error, ValueError) else repr(error)
+        raise DatasetError(
+            f"{what} describes no environment as these actions need it: {reason}"
+        ) from error
+
+
+class DemonstrationReplay(TensorDictReplayBuffer):
+    """Demonstrations, as one immutable TorchRL replay buffer; formats are subclasses of it.
+
+    The whole selection becomes a flat, contiguous :class:`~tensordict.TensorDict` of ``N`` steps, in
+    the order of the demos' numbers:
+
+    - ``"observation"`` ``[N, d_o]`` float32, the observation keys side by side; with images nested,
+      ``("observation", "state")`` ``[N, d_s]`` and each as uint8 ``[N, 3, size, size]``;
+    - ``"action"`` ``[N, d_a]`` float32, as recorded (not normalised);
+    - ``("next", "reward")`` ``[N, 1]`` float32;
+    - ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` ``[N, 1]`` bool: done
+      on the last step of each demo, terminated there if its reward is positive, else truncated;
+    - ``"episode"`` ``[N]`` int64, counted from 0, and ``"frame"`` ``[N]`` int64, the row itself.
+
+    Args:
+        index: what to read.
+        reader: the context in which it can be read.
+
+    Keyword Args:
+        described: what errors call the index's ``env_args``.
+        absolute_actions: turn the recorded pose deltas into absolute poses
+            (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm.
+        storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``.
+        scratch_dir: folder of the memory maps; temporary files if ``None``.
+        device: device of the tensors; ``"cpu"`` for ``"memmap"``.
+        **kwargs: arguments of :class:`~torchrl.data.TensorDictReplayBuffer`.
+
+    Raises:
+        DatasetError: if what is stored is not as it should be; says which file, demo and key.
+        ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
+            of a controller without pose deltas.
+        OSError: if there is no space for memory maps.
+    """
+
+    def __init__(
+        self,
+        index: DatasetIndex,
+        reader: AbstractContextManager[DemonstrationReader],
+        *,
+        described: str,
+        absolute_actions: bool,
+        storage: Literal["memory", "memmap"],
+        scratch_dir: str | Path | None,
+        device: torch.device | str,
+        **kwargs: Any,
+    ) -> None:
+        device = check_storage(storage, device)
+        action_dim = index.action_dim
+        self._env_args: dict[str, Any] = {}
+        if index.env_args or absolute_actions:
+            with _understanding(described):
+                self._env_args = modernize_env_args(index.env_args, absolute=absolute_actions)
+                arms = len(delta_conventions(index.env_args)[1]) if absolute_actions else 0
+        if absolute_actions:
+            if action_dim != 7 * arms:
+                raise DatasetError(
+                    f"{index.path}: actions have {action_dim} columns, but env_args names {arms} robot(s) "
+                    f"with 7 each; absolute actions cannot be built"
+                )
+            action_dim = 10 * arms
+        data = _allocate(index, action_dim, storage, scratch_dir)
+        with reader as opened:
+            _fill(index, data, opened, absolute_actions)
+        self._index = index
+        super().__init__(
+            storage=TensorStorage(data if storage == "memmap" else data.to(device)),
+            writer=ImmutableDatasetWriter(),
+            **kwargs,
+        )
+
+    @property
+    def data(self) -> TensorDictBase:
+        """All steps, ``[N]``; shares memory with the storage."""
+        return self._storage.get(slice(None))
+
+    @property
+    def path(self) -> Path:
+        """The file or folder that was read."""
+        return self._index.path
+
+    def _check_described(self) -> None:
+        if not self._index.env_args:
+            raise ValueError(f"{self.path} does not say which environment it was recorded in")
+
+    @property
+    def env_args(self) -> dict[str, Any]:
+        """The environment of the data, for robosuite 1.5, fit for the actions as they are stored.
+
+        A copy; see :func:`warmprior.envs.modernize_env_args`.
+
+        Raises:
+            ValueError: if it is unknown.
+        """
+        self._check_described()
+        return modernize_env_args(self._env_args)
+
+    @property
+    def recorded_env_args(self) -> dict[str, Any]:
+        """The environment of the data, for robosuite 1.5, fit for the actions as they were recorded.
+
+        That is what :attr:`env_args` is where the actions are not absolute.
+
+        Raises:
+            ValueError: if it is unknown.
+        """
+        self._check_described()
+        return modernize_env_args(self._index.env_args)
+
+    @property
+    def task(self) -> TaskSpec | None:
+        """The task of :data:`warmprior.envs.TASKS` recorded here, or ``None`` if it is another."""
+        return self._index.task
+
+    @property
+    def observation_keys(self) -> tuple[str, ...]:
+        """The keys whose values stand side by side in the observation's vector."""
+        return self._index.observation_keys
+
+    @property
+    def image_keys(self) -> tuple[str, ...]:
+        """The images next to ``("observation", "state")``."""
+        return self._index.image_keys
+
+    @property
+    def image_size(self) -> int:
+        """Side of the images in pixels, 0 if there are none."""
+        return self._index.image_size
+
+    @property
+    def pose_columns(self) -> Tensor:
+        """Where in ``"observation"`` each gripper's position and quaternion are, int64 ``[arms, 7]``.
+
+        Raises:
+            KeyError: if they were not read.
+        """
+        first = dict(
+            zip(self.observation_keys, np.cumsum([0, *self._index.observation_dims]), strict=False)
+        )
+        columns: list[list[int]] = []
+        while not columns or f"robot{len(columns)}_eef_pos" in first:
+            position, quaternion = (
+                first[f"robot{len(columns)}_eef_{end}"] for end in ("pos", "quat")
+            )
+            columns.append([*range(position, position + 3), *range(quaternion, quaternion + 4)])
+        return torch.tensor(columns)
+
+    @property
+    def num_episodes(self) -> int:
+        """The number of demos read."""
+        return len(self._index.demos)
+
+    @property
+    def episode_lengths(self) -> Tensor:
+        """Steps of each episode, ``[num_episodes]`` int64 on the CPU."""
+        return torch.tensor(self._index.lengths)
