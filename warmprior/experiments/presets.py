@@ -54,7 +54,7 @@ PRESETS: dict[str, Recipe] = {
 """Budgets of comparisons of sources."""
 
 _IMAGES: dict[str, dict[str, dict[str, Any]]] = {
-    # Small images and networks, on a task that is solved from them: half an hour on two cores.
+    # Small images and networks, on a task that is solved from them: 15 minutes on two cores.
     "quick": {
         "data": {
             "task": ("lift",),
