@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -188,7 +189,7 @@ class DrawnPort(FlowPort):
 
 
 class OpenPiPort(FlowPort):
-    """Of pi0, pi0.5 and SmolVLA, whose noise is an argument (compiled samplers included)."""
+    """Of pi0, pi0.5 and SmolVLA, whose noise is an argument of the model (a compiled one included)."""
 
     def length(self, policy: Any) -> int:
         """``T``."""
@@ -208,21 +209,24 @@ class OpenPiPort(FlowPort):
 
     @contextmanager
     def training(self, policy: Any, source: Source) -> Iterator[None]:
-        """The draw in the loss."""
-        draws = []
+        """The model's argument."""
+        signature, calls = inspect.signature(type(policy.model).forward), []
 
-        def around(sample_noise: Callable[..., Any]) -> Callable[..., Any]:
-            def drawn(shape: Any, device: Any) -> Tensor:
-                draws.append(shape)
-                return source(torch.Size(shape), torch.float32, torch.device(device))
+        def around(forward: Callable[..., Any]) -> Callable[..., Any]:
+            def from_source(*args: Any, **kwargs: Any) -> Any:
+                bound = signature.bind(policy.model, *args, **kwargs)
+                actions = bound.arguments["actions"]
+                calls.append(actions.shape)
+                bound.arguments["noise"] = source(actions.shape, torch.float32, actions.device)
+                return forward(*bound.args[1:], **bound.kwargs)
 
-            return drawn
+            return from_source
 
-        with _replaced(policy.model, "sample_noise", around):
+        with _replaced(policy.model, "forward", around):
             yield
-        if len(draws) != 1:
+        if len(calls) != 1:
             raise RuntimeError(
-                f"{type(policy).__name__} drew its noise {len(draws)} times in one loss, not once: its "
+                f"{type(policy).__name__} evaluated its model {len(calls)} times in one loss, not once: its "
                 "source cannot be replaced. Use the version of lerobot that this port is for"
             )
 
