@@ -86,8 +86,9 @@ class RealTimeChunking:
     Examples:
         >>> import torch
         >>> rtc = RealTimeChunking(schedule="linear")
-        >>> rtc.weights(torch.tensor(2), torch.tensor(6), 8).tolist()  # of 8 positions 6 are left
-        [1.0, 1.0, 0.8..., 0.6..., 0.4..., 0.2..., 0.0, 0.0]
+        >>> weights = rtc.weights(torch.tensor(2), torch.tensor(6), 8)  # of 8 positions 6 are left
+        >>> (10 * weights).round().tolist()
+        [10.0, 10.0, 8.0, 6.0, 4.0, 2.0, 0.0, 0.0]
         >>> rtc.guidance_weight(torch.tensor([0.0, 0.5, 0.75])).tolist()
         [5.0, 2.0, 3.33...]
     """
