@@ -79,6 +79,7 @@ ROOMS = (
     "modules",
     "transforms",
     "objectives",
+    "deploy",
     "envs",
     "data",
     "training",

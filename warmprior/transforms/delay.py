@@ -12,7 +12,30 @@ from torchrl.envs.transforms import Transform
 from warmprior import keys
 from warmprior.modules.real_time_chunking import with_leftover
 
-__all__ = ["InferenceDelay", "executed_chunk", "shift_chunk"]
+__all__ = ["InferenceDelay", "check_delay", "executed_chunk", "shift_chunk"]
+
+
+def check_delay(delay: int, execute: int, length: int | None = None) -> None:
+    """Whether chunks can take effect so late.
+
+    Args:
+        delay: ``d``, control steps until a chunk takes effect.
+        execute: actions executed per decision.
+        length: ``P``, how many a chunk has, if it is known.
+
+    Raises:
+        ValueError: if not ``0 <= delay <= execute``, or ``execute + delay`` exceeds ``length``.
+    """
+    if not 0 <= delay <= execute:
+        raise ValueError(
+            f"a delay of {delay} control steps does not go with {execute} actions per decision: need "
+            "0 <= delay <= execute, or the next decision is due before the last one took effect"
+        )
+    if length is not None and execute + delay > length:
+        raise ValueError(
+            f"predictions of {length} actions do not reach {execute} executed ones and a delay of {delay} "
+            f"more: execute at most {length - delay} per decision, or predict longer chunks"
+        )
 
 
 def executed_chunk(tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK) -> Tensor:
@@ -115,11 +138,7 @@ class InferenceDelay(Transform):
         executed_key: NestedKey = keys.EXECUTED,
     ) -> None:
         super().__init__(in_keys=[chunk_key], out_keys=[keys.LEFTOVER, keys.VALID, keys.DELAY])
-        if not 0 <= delay <= execute:
-            raise ValueError(
-                f"a delay of {delay} control steps does not go with {execute} actions per decision: need "
-                "0 <= delay <= execute, or the next decision is due before the last one took effect"
-            )
+        check_delay(delay, execute)
         self.delay = delay
         self.execute = execute
         self.chunk_key = unravel_key(chunk_key)
@@ -179,13 +198,7 @@ class InferenceDelay(Transform):
                 f"{list(action_spec.keys(True, True))}: append it after ChunkStep"
             )
         chunk = action_spec[self.chunk_key]
-        length = chunk.shape[-2]
-        if self.execute + self.delay > length:
-            raise ValueError(
-                f"predictions of {length} actions do not reach {self.execute} executed ones and a delay of "
-                f"{self.delay} more: execute at most {length - self.delay} per decision, or predict longer "
-                "chunks"
-            )
+        check_delay(self.delay, self.execute, chunk.shape[-2])
         # Kept because resets are frequent and TorchRL rebuilds specs on every access.
         self._chunk = chunk
         return chunk
