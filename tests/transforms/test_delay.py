@@ -237,6 +237,12 @@ def test_numbers_that_do_not_go_together():
     alone = TransformedEnv(CountingEnv(9), InferenceDelay(1, execute=2))
     with pytest.raises(KeyError, match="append it after ChunkStep"):
         alone.reset()
+    whole = TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], delay=2))
+    data = told(6)(whole.reset())
+    with pytest.raises(KeyError, match=r"leftover.*delay.*hand over"):
+        whole.step(data.exclude("rtc"))
+    with pytest.raises(ValueError, match=r"expects a chunk \[\*B, 6, d_a\]"):
+        whole.step(whole.reset())
     wrong = TransformedEnv(
         CountingEnv(9),
         Compose(ChunkStep(6), ActionHistory(PRIORS["past"]), InferenceDelay(1, execute=4)),

@@ -71,8 +71,8 @@ class RealTimeChunking:
             the official studies. It never reaches further than that.
         schedule: ``"exp"`` (the official default), ``"linear"`` (LeRobot's), ``"ones"`` or ``"zeros"``.
         max_guidance_weight: :math:`\beta`; 5 in the official code, 10 in LeRobot.
-        jacobian: ``False`` takes the identity for :math:`J`, as LeRobot 0.6 does: no gradients, half to a
-            third of the time, and another method (its errors do not vanish where the formula is exact).
+        jacobian: ``False`` takes the identity for :math:`J`, as LeRobot 0.6 does: no gradients, 0.6 of the
+            time, and another method, which is not exact where the formula is.
         sigma: what to take for the source's standard deviation; its own by default. 1 is the published
             weight whatever the source.
         data_std: :math:`S`, how far actions spread where the observation is known, in normalised units. A

@@ -112,7 +112,7 @@ class InferenceDelay(Transform):
     Raises:
         ValueError: if not ``0 <= delay <= execute`` (the next decision would be due before the last one took
             effect), or (in an environment) ``execute + delay`` exceeds the length of predictions.
-        KeyError: if :class:`ChunkStep` does not come before.
+        KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks what is left.
         RuntimeError: (on a step) if a decision executed more than ``execute`` actions.
 
     Examples:
@@ -146,6 +146,14 @@ class InferenceDelay(Transform):
         self._chunk: TensorSpec | None = None
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        missing = [k for k in (keys.LEFTOVER, keys.DELAY) if tensordict.get(k, None) is None]
+        if missing:
+            raise KeyError(
+                f"InferenceDelay found no {missing} in a step's input: hand over what the reset or the step "
+                "before gave, with the chunk"
+            )
+        if tensordict.get(self.chunk_key, None) is None:
+            return tensordict  # ChunkStep tells
         return tensordict.set(self.chunk_key, executed_chunk(tensordict, self.chunk_key))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
