@@ -6,7 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
@@ -144,6 +144,30 @@ def test_the_preview_is_the_forecast_of_the_same_steps(execute, delay):
         assert valid.flatten().tolist() == [i < 12 - execute for i in range(12)]
         assert torch.equal(leftover[:6], rollout["prior", "loc"][decision, :6])
         assert not leftover[12 - execute :].any()
+
+
+def late(length):
+    transforms = policy_transforms(PRIORS["past"], observation_steps=1, execute=4, delay=2)
+    return TransformedEnv(CountingEnv(length), transforms)
+
+
+@pytest.mark.parametrize("batched", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
+def test_inside_of_batched_environments(batched):
+    lengths = (7, 16)
+    env = batched(2, [partial(late, n) for n in lengths])
+    try:
+        rollout = env.rollout(10, told(6), break_when_any_done=False)
+    finally:
+        env.close(raise_if_closed=False)
+    actions, _, episode = executed_actions(rollout)
+    for row, length in enumerate(lengths):
+        alone = executed_actions(late(length).rollout(10, told(6)))[0]
+        for number in range(int(episode[row].max())):
+            torch.testing.assert_close(actions[row][episode[row] == number], alone)
+        # And the simulators were given these.
+        last = (rollout["next", "executed_steps"][row] - 1).unsqueeze(-1).expand(-1, 1, ACTION_DIM)
+        given = executed_chunk(rollout)[row].gather(-2, last).squeeze(-2)
+        torch.testing.assert_close(given, rollout["next", "observation"][row, :, 0, 2:])
 
 
 def test_only_the_rows_of_a_partial_step_change():
