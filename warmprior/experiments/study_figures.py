@@ -248,6 +248,7 @@ def plot_delays(
         )
         above.set_title(task, fontsize=10)
         above.set_ylim(0, 1.08)
+        below.margins(y=0.1)  # for the numbers above the bars
         below.set_ylim(bottom=0)
     axes[0].set_ylabel(f"success rate (NFE {rows[0]['nfe']})")
     axes[len(tasks)].set_ylabel("jump where chunks take effect")
