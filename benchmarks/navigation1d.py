@@ -136,8 +136,7 @@ def run(argv: Sequence[str] | None) -> None:
     )
     with started(recipe, "navigation1d") as out:
         problem = navigation_problem()
-        store = Store(problem, recipe.network, out.parent / "policies", out / "logs", recipe.run)
-        comparison = Comparison(recipe, "navigation1d", stores=[store])
+        comparison = Comparison(recipe, "navigation1d", stores=[Store.of(recipe, problem)])
         comparison.train()
         observations = SharedObservations(problem.data, recipe.sources.chunk[0])
         rows = [*judge(comparison), *curvatures(comparison, observations)]

@@ -80,6 +80,7 @@ ROOMS = (
     "lerobot",
     "transforms",
     "objectives",
+    "deploy",
     "envs",
     "data",
     "training",

@@ -25,6 +25,9 @@ constant                key                                    shape and dtype
 :data:`CHUNK`           ``("vla_action", "chunk")``            ``[*B, P, d_a]`` float
 :data:`DECODED_NOISE`   ``("decoded", "noise")``               ``[*B, P, d_a]`` float
 :data:`DECODED_CHUNK`   ``("decoded", "chunk")``               ``[*B, P, d_a]`` float
+:data:`LEFTOVER`        ``("rtc", "leftover")``                ``[*B, P, d_a]`` float
+:data:`VALID`           ``("rtc", "valid")``                   ``[*B, P, 1]`` bool
+:data:`DELAY`           ``("rtc", "delay")``                   ``[*B, 1]`` int64
 :data:`IS_PAD`          ``"action_is_pad"``                    ``[*B, P]`` bool
 :data:`EXECUTED`        ``"executed_steps"``                   ``[*B, 1]`` int64
 :data:`SUCCESS`         ``"success"``                          ``[*B, 1]`` bool
@@ -35,6 +38,10 @@ constant                key                                    shape and dtype
 An observation with images has several entries, nested under :data:`OBSERVATION`: the vector
 :data:`STATE`, and images uint8 ``[*B, To, 3, h, w]`` under robomimic's names, such as
 ``"agentview_image"``.
+
+:data:`LEFTOVER` is what the chunk of the decision before holds for the control steps of the next one, where
+:data:`VALID` holds (0 behind), and :data:`DELAY` the number of control steps for which it goes on being
+executed while the next chunk is computed. At the first decision of an episode there is none, and no delay.
 
 In prior-space reinforcement learning :data:`ANCHOR` is the centre of the agent's box and :data:`DELTA` its
 action, so that the source is always ``noise = anchor + delta``. An environment that decodes by itself tells
@@ -66,6 +73,9 @@ ELAPSED = ("prior", "elapsed")
 CHUNK = ACTION_CHUNK_KEY
 DECODED_NOISE = ("decoded", "noise")
 DECODED_CHUNK = ("decoded", "chunk")
+LEFTOVER = ("rtc", "leftover")
+VALID = ("rtc", "valid")
+DELAY = ("rtc", "delay")
 IS_PAD = ACTION_IS_PAD_KEY
 EXECUTED = "executed_steps"
 EPISODE = "episode"

@@ -13,7 +13,7 @@ from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from warmprior import PastPrior, RealTimeChunking, VelocityMLP, WarmPriorActor
 from warmprior.data import RobomimicExperienceReplay, generate_demonstrations
 from warmprior.envs import RobosuiteEnv, environment_description, environment_of
 from warmprior.envs.description import environment_name, environment_parts, robosuite_parts
@@ -44,6 +44,14 @@ def test_a_saved_policy_knows_the_space_of_its_actions(tmp_path, actions):
     assert rollout["next", "executed_steps"].flatten().tolist() == [4, 2]
     assert rollout["vla_action", "chunk"].shape[-1] == (10 if actions == "absolute" else 7)
     assert ("eef_pose" in rollout.keys()) == (actions == "absolute")  # noqa: SIM118
+
+
+def test_a_guided_policy_is_told_what_is_left_of_its_chunks(tmp_path):
+    guided = actor(tmp_path).replace(guidance=RealTimeChunking())
+    rollout = environment_of(guided, horizon=6).rollout(3, guided)
+    assert not rollout["rtc", "delay"].any()
+    # H = P = 4 actions are executed, and nothing is left.
+    assert not rollout["rtc", "valid"].any()
 
 
 @pytest.mark.parametrize("batched", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])

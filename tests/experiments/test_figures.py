@@ -12,9 +12,11 @@ pytest.importorskip("tyro")
 from tests.experiments.row_parts import compared, row
 from warmprior.experiments import (
     Row,
+    guided_labels,
     navigation_figures,
     plot_budget,
     plot_chunk_lengths,
+    plot_delays,
     plot_filmstrip,
     plot_learning_curves,
     plot_navigation,
@@ -140,6 +142,34 @@ def test_bars_are_means_over_seeds_in_groups_of_one_chunk_length(tmp_path, figur
     ((axis,),) = figures
     assert [text.get_text() for text in axis.texts] == ["50", "80", "50", "100"]
     assert [text.get_text() for text in axis.get_xticklabels()] == ["H = 8", "H = 1"]
+
+
+def test_bars_of_success_and_jumps_by_delay(tmp_path, figures):
+    told = {"execute": 4}
+    shown = [
+        row(
+            wins,
+            measures={"boundary_jump": jump},
+            prior=prior,
+            guidance=guidance,
+            delay=delay,
+            **told,
+        )
+        for delay in (2, 0)
+        for prior, guidance, wins, jump in (
+            ("gaussian", "none", 3, 0.5),
+            ("gaussian", "rtc", 5, 0.25),
+            ("past", "none", 6 + delay, 0.1),
+        )
+    ]
+    plot_delays(shown, tmp_path / "a.png", label=guided_labels(shown), top_k=1, title="t")
+    assert is_png(tmp_path / "a.png")
+    ((above, below),) = figures
+    assert above.get_legend_handles_labels()[1] == ["Base", "RTC", "WP-Past"]
+    assert [text.get_text() for text in above.texts] == ["30", "50", "60", "30", "50", "80"]
+    assert [text.get_text() for text in below.texts] == 2 * ["0.50", "0.25", "0.10"]
+    assert [text.get_text() for text in below.get_xticklabels()] == ["delay 0", "delay 2"]
+    assert len({bar.get_facecolor() for bar in above.patches}) == 3
 
 
 def test_learning_curves_have_a_loss_per_seed_and_success_per_checkpoint(tmp_path, figures):

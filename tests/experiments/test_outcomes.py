@@ -100,5 +100,5 @@ def test_rows_from_before_priors_had_options_are_continued(undisturbed, tmp_path
         assert row["facts"].pop("options") == ""
     (tmp_path / "out" / "results.json").write_text(json.dumps(results))
     again = comparison(tmp_path, 1, resume=True)
-    outcomes = Outcomes(again.contestants, again.recipe.evaluation)
+    outcomes = Outcomes(again.contestants, again.recipe)
     assert not any(outcomes.missing(n, again.results) for n in range(len(again.contestants)))

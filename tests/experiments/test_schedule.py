@@ -24,7 +24,8 @@ from tests.experiments.comparison_parts import (
     drift_problem,
     rows_of,
 )
-from warmprior.experiments import Comparison, Store
+from warmprior.experiments import Comparison, Condition, Store
+from warmprior.experiments.contestant import Cell
 from warmprior.experiments.schedule import Schedule
 from warmprior.experiments.worker import Measure, Play, Train
 
@@ -34,7 +35,8 @@ def started(schedule):
     return list(iter(schedule.next, None))
 
 
-FOLLOWING = {n: [Measure(n), Play(n, 10, 1, 0)] for n in range(4)}
+CELL = Cell(checkpoint=10, nfe=1, condition=Condition())
+FOLLOWING = {n: [Measure(n), Play(n, CELL, 0)] for n in range(4)}
 
 
 def test_the_last_trainings_alone_start_at_once():
@@ -55,7 +57,7 @@ def test_what_a_failure_ends_is_told_once_and_never_starts():
     assert schedule.next() == Train(1)
     assert schedule.failed(Train(1)) == [1]
     assert schedule.failed(Measure(0)) == [0, 2]
-    assert schedule.failed(Play(0, 10, 1, 0)) == [] and started(schedule) == []
+    assert schedule.failed(Play(0, CELL, 0)) == [] and started(schedule) == []
 
 
 class WaitsForAnEpisode(Store):

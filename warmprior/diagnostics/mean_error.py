@@ -13,6 +13,7 @@ from warmprior import keys
 from warmprior.diagnostics.flow import evaluation_mode, flat_windows, predict
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
+from warmprior.transforms.delay import executed_chunk
 
 __all__ = ["MeanError", "mean_error", "mean_revision"]
 
@@ -125,10 +126,11 @@ def mean_revision(rollout: TensorDictBase, prior: Prior) -> float:
     nothing = torch.zeros_like(chunk[0]), torch.zeros_like(chunk[0, :, :1], dtype=torch.bool)
     (loc, warm), elapsed = nothing, torch.zeros_like(steps[0])
     differences = []
-    for predicted, executed, ended in zip(chunk, steps, done, strict=True):
+    taken = executed_chunk(rollout)
+    for predicted, played, executed, ended in zip(chunk, taken, steps, done, strict=True):
         differences.append((predicted - loc)[warm.expand_as(loc)])
         elapsed = elapsed + executed
-        loc, warm = prior.next_mean(loc, predicted, executed, elapsed)
+        loc, warm = prior.next_mean(loc, played, executed, elapsed)
         if bool(ended):
             (loc, warm), elapsed = nothing, torch.zeros_like(elapsed)
     return _rms(torch.cat(differences))

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.transforms.delay import executed_chunk
 
 __all__ = ["Smoothness", "compare_smoothness", "executed_actions", "smoothness"]
 
@@ -50,12 +51,12 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     Args:
         rollout: ``[*B, D]`` decisions, time last, with ``("vla_action", "chunk")`` ``[*B, D, P, d_a]``,
             ``("next", "executed_steps")`` ``[*B, D, 1]`` and, if episodes end inside,
-            ``("next", "done")``.
+            ``("next", "done")``; where chunks take effect late, also what :class:`InferenceDelay` tells.
 
     Returns:
         The actions ``[*B, T, d_a]``, filled up with NaN where a row executed fewer than the longest;
-        the index of their decision, int64 ``[*B, T]``, -1 where filled up; and the index of their
-        episode in the row, likewise.
+        the index of the decision that predicted them, int64 ``[*B, T]``, -1 where filled up; and the index
+        of their episode in the row, likewise.
 
     Raises:
         KeyError: if a key is missing.
@@ -70,9 +71,8 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         >>> actions.flatten().tolist(), decision.tolist()
         ([0.0, 1.0, 3.0, 4.0, 5.0], [0, 0, 1, 1, 1])
     """
-    chunk = rollout.get(keys.CHUNK, None)
     steps = rollout.get(("next", keys.EXECUTED), None)
-    if chunk is None or steps is None:
+    if rollout.get(keys.CHUNK, None) is None or steps is None:
         raise KeyError(
             f"the rollout lacks {keys.CHUNK} or ('next', '{keys.EXECUTED}'): roll out a chunk policy in "
             "an environment with ChunkStep"
@@ -83,9 +83,13 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     if done is None:
         done = torch.zeros_like(steps, dtype=torch.bool)
     longest = int(steps.max())
-    chunk = chunk[..., :longest, :]
-    kept = torch.arange(longest, device=chunk.device) < steps  # [*B, D, K]
+    chunk = executed_chunk(rollout)[..., :longest, :]
+    position = torch.arange(longest, device=chunk.device)
+    kept = position < steps  # [*B, D, K]
     decision = torch.arange(rollout.shape[-1], device=chunk.device)[:, None].expand_as(kept)
+    delay = rollout.get(keys.DELAY, None)
+    if delay is not None:  # what was executed before a chunk took effect is of the decision before
+        decision = decision - (position < delay).long()
     ended = done.squeeze(-1).long()
     episode = (ended.cumsum(-1) - ended).unsqueeze(-1).expand_as(kept)
     kept = kept.flatten(-2)

@@ -115,6 +115,8 @@ def environment_parts(
         normalizer=None if normalizer is None else normalizer.to("cpu"),
         **adapters,
         observation_steps=description["observation_steps"],
+        # A guided policy reads what is left of its last chunk.
+        delay=None if actor.ode.guidance is None else 0,
     )
     return make_env, transforms
 

@@ -2,7 +2,9 @@
 
 from warmprior.experiments.cli import parse, started, write_report
 from warmprior.experiments.comparison import Comparison
+from warmprior.experiments.condition import Condition
 from warmprior.experiments.contestant import Contestant
+from warmprior.experiments.delayed import DelayedRecipe, guided_labels
 from warmprior.experiments.figures import (
     plot_filmstrip,
     plot_learning_curves,
@@ -42,7 +44,12 @@ from warmprior.experiments.record import record, restore
 from warmprior.experiments.results import Results, Row, grouped, mean_known, select, success_summary
 from warmprior.experiments.store import Store, finished_policies
 from warmprior.experiments.straightness import straightness
-from warmprior.experiments.study_figures import plot_budget, plot_chunk_lengths, plot_sigma
+from warmprior.experiments.study_figures import (
+    plot_budget,
+    plot_chunk_lengths,
+    plot_delays,
+    plot_sigma,
+)
 from warmprior.experiments.success_study import study_success
 from warmprior.experiments.tables import (
     curvature_table,
@@ -57,8 +64,10 @@ __all__ = [
     "NAVIGATION_PRESETS",
     "PRESETS",
     "Comparison",
+    "Condition",
     "Contestant",
     "DataOptions",
+    "DelayedRecipe",
     "EvaluationOptions",
     "HeldOutOptions",
     "MeasuredRecipe",
@@ -78,6 +87,7 @@ __all__ = [
     "finished_policies",
     "flow_table",
     "grouped",
+    "guided_labels",
     "judge_navigation",
     "mean_cell",
     "mean_known",
@@ -88,6 +98,7 @@ __all__ = [
     "play_navigation",
     "plot_budget",
     "plot_chunk_lengths",
+    "plot_delays",
     "plot_filmstrip",
     "plot_flow_paths",
     "plot_learning_curves",

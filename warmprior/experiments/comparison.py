@@ -67,10 +67,8 @@ class Comparison:
             prior.allowed_nfes(self.nfes)
         check_writable(self.directory)
         if stores is None:
-            out = recipe.run.directory
-            policies, logs = out.parent / "policies", out / "logs"
             problems = find_problems(recipe.data, recipe.network.observation_steps)
-            stores = [Store(p, recipe.network, policies, logs, recipe.run) for p in problems]
+            stores = [Store.of(recipe, problem) for problem in problems]
         self.stores = list(stores)
         self.contestants = self._contestants()
         self._order = {tuple(c.facts().values()): i for i, c in enumerate(self.contestants)}
@@ -251,7 +249,7 @@ class Comparison:
     def _compute(self, *, play: bool) -> None:
         """Train, and measure and play what the missing rows need."""
         self.results.save()
-        outcomes = Outcomes(self.contestants, self.recipe.evaluation)
+        outcomes = Outcomes(self.contestants, self.recipe)
         following = {}
         if play:
             following = {n: outcomes.missing(n, self.results) for n in range(len(self.contestants))}
@@ -315,15 +313,19 @@ class Comparison:
             trainings_at_once=self.trainings_at_once,
         )
 
-    def _place(self, row: Row) -> tuple[int, int, int]:
+    def _place(self, row: Row) -> tuple[int, int, int, int, str]:
         """Where a row stands among all."""
         number = self._order.get(self._policy(row), len(self._order))
-        return number, row.get("checkpoint") or 0, -(row.get("nfe") or 0)
+        condition = row.get("delay") or 0, row.get("guidance") or ""
+        return number, row.get("checkpoint") or 0, -(row.get("nfe") or 0), *condition
 
 
 def _told(chosen: Contestant, row: Row) -> str:
+    late = ""
+    if row.get("delay") is not None:
+        late = f", delay {row['delay']}, guidance {row['guidance']}"
     told = (
-        f"played {chosen}, iteration {row['checkpoint']}, NFE {row['nfe']}: {row['successes']} of "
+        f"played {chosen}, iteration {row['checkpoint']}, NFE {row['nfe']}{late}: {row['successes']} of "
         f"{row['episodes']} solved"
     )
     if row.get("source_leak") is not None:

@@ -7,13 +7,33 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from warmprior.experiments.condition import Condition
 from warmprior.experiments.store import Store
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.training.behaviour_cloning import policy_path
 from warmprior.training.training_config import TrainingConfig
 
-__all__ = ["Contestant"]
+__all__ = ["Cell", "Contestant"]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Episodes that make one row.
+
+    Attributes:
+        checkpoint: of the policy's training, an iteration.
+        nfe: network evaluations per chunk.
+        condition: how else they are played.
+    """
+
+    checkpoint: int
+    nfe: int
+    condition: Condition
+
+    def facts(self) -> dict[str, Any]:
+        """What rows tell of it."""
+        return {"checkpoint": self.checkpoint, "nfe": self.nfe, **self.condition.facts()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +86,16 @@ class Contestant:
             "iterations": self.training.iterations,
         }
 
-    def cells(self, nfes: Sequence[int]) -> list[dict[str, Any]]:
-        """Facts of the rows that tell how it was played: one per checkpoint and NFE.
+    def cells(self, nfes: Sequence[int], conditions: Sequence[Condition]) -> list[Cell]:
+        """How it is played: a row per checkpoint, NFE and condition.
 
         Args:
             nfes: numbers of network evaluations to play it with, where its field allows them.
+            conditions: how else.
         """
         return [
-            self.facts() | {"checkpoint": checkpoint, "nfe": nfe}
+            Cell(checkpoint, nfe, condition)
             for checkpoint in self.training.checkpoint_iterations
             for nfe in self.prior.allowed_nfes(nfes)
+            for condition in conditions
         ]

@@ -110,6 +110,62 @@ def plot_success(
     figure.savefig(path, dpi=150)
 
 
+def grouped_bars(
+    axis: Any,
+    rows: Sequence[Row],
+    group: Callable[[Row], str],
+    label: Callable[[Row], str],
+    summary: Callable[[list[Row]], SeedSummary],
+    text: Callable[[float], str],
+) -> int:
+    """Bars of what was measured, side by side in groups, with one seed standard deviation.
+
+    Args:
+        axis: to draw on.
+        rows: in the order of groups and bars.
+        group: names the group of a row.
+        label: names its bar, for the legend.
+        summary: of the rows of a bar.
+        text: above a bar, of its mean.
+
+    Returns:
+        How many bars a group has.
+    """
+    groups = grouped(rows, group)
+    sources, colors = list(grouped(rows, label)), source_colors(rows, label)
+    shown: set[str] = set()
+    for g, members in enumerate(groups.values()):
+        for j, source in enumerate(sources):
+            cell = [row for row in members if label(row) == source]
+            if not cell:
+                continue
+            found = summary(cell)
+            x = g * (len(sources) + 0.8) + j
+            axis.bar(
+                x,
+                found.mean,
+                0.85,
+                yerr=None if math.isnan(found.std) else found.std,
+                capsize=3,
+                color=colors(cell[0]),
+                label=None if source in shown else source,
+            )
+            shown.add(source)
+            axis.annotate(
+                text(found.mean),
+                (x, found.mean),
+                (0, 2),
+                textcoords="offset points",
+                ha="center",
+                fontsize=8,
+            )
+    centre = (len(sources) - 1) / 2
+    at = [g * (len(sources) + 0.8) + centre for g in range(len(groups))]
+    axis.set_xticks(at, list(groups))
+    axis.grid(axis="y", alpha=0.25)
+    return len(sources)
+
+
 def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, title: str) -> None:
     """Success rates as bars, a group per chunk length, with one seed standard deviation (Fig. 6).
 
@@ -121,35 +177,18 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
         top_k: checkpoints averaged per seed.
         title: of the figure.
     """
-    label, groups = source_labels(rows, chunks=False), grouped(rows, lambda row: row["chunk"])
-    sources, colors = list(grouped(rows, label)), source_colors(rows, label)
-    shown: set[str] = set()
-    figure, (axis,) = new_figure(1.8 + 1.5 * len(groups), 3.6)
-    for g, members in enumerate(groups.values()):
-        for j, source in enumerate(sources):
-            cell = [row for row in members if label(row) == source]
-            if not cell:
-                continue
-            summary = success_summary(cell, top_k)
-            x = g * (len(sources) + 0.8) + j
-            axis.bar(
-                x,
-                summary.mean,
-                0.85,
-                yerr=None if math.isnan(summary.std) else summary.std,
-                capsize=3,
-                color=colors(cell[0]),
-                label=None if source in shown else source,
-            )
-            shown.add(source)
-            axis.text(x, summary.mean + 0.015, f"{100 * summary.mean:.0f}", ha="center", fontsize=8)
-    centre = (len(sources) - 1) / 2
-    at = [g * (len(sources) + 0.8) + centre for g in range(len(groups))]
-    axis.set_xticks(at, [f"H = {chunk}" for chunk in groups])
+    figure, (axis,) = new_figure(1.8 + 1.5 * len(grouped(rows, lambda row: row["chunk"])), 3.6)
+    columns = grouped_bars(
+        axis,
+        rows,
+        lambda row: f"H = {row['chunk']}",
+        source_labels(rows, chunks=False),
+        lambda cell: success_summary(cell, top_k),
+        lambda mean: f"{100 * mean:.0f}",
+    )
     axis.set_ylim(0, 1.08)
     axis.set_ylabel(f"success rate (NFE {rows[0]['nfe']})")
-    axis.grid(axis="y", alpha=0.25)
-    figure.legend(loc="outside lower center", ncols=min(4, len(sources)), frameon=False, fontsize=9)
+    figure.legend(loc="outside lower center", ncols=min(4, columns), frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=150)
 

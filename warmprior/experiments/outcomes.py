@@ -10,9 +10,9 @@ import torch
 from warmprior.diagnostics.mean_error import mean_revision
 from warmprior.diagnostics.smoothness import smoothness
 from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.experiments.contestant import Contestant
+from warmprior.experiments.contestant import Cell, Contestant
 from warmprior.experiments.measures import Measures
-from warmprior.experiments.recipe import EvaluationOptions
+from warmprior.experiments.recipe import Recipe
 from warmprior.experiments.results import Results, Row, played
 from warmprior.experiments.worker import Measure, Play
 from warmprior.modules.prior import Prior
@@ -28,12 +28,14 @@ class Outcomes:
 
     Args:
         contestants: the policies that jobs name by number.
-        options: how they are played.
+        recipe: how they are played.
     """
 
-    def __init__(self, contestants: Sequence[Contestant], options: EvaluationOptions) -> None:
-        self._contestants, self._options = contestants, options
-        self._episodes: dict[tuple[int, int, int], list[Episode]] = {}
+    def __init__(self, contestants: Sequence[Contestant], recipe: Recipe) -> None:
+        self._contestants, self._options = contestants, recipe.evaluation
+        nfes = self._options.nfes
+        self._cells = [c.cells(nfes, recipe.conditions(c.prior)) for c in contestants]
+        self._episodes: dict[tuple[int, Cell], list[Episode]] = {}
         self._measures: dict[int, Measures] = {}
 
     def missing(self, number: int, results: Results) -> list[Measure | Play]:
@@ -45,15 +47,15 @@ class Outcomes:
         """
         chosen = self._contestants[number]
         cells = [
-            (facts["checkpoint"], facts["nfe"])
-            for facts in chosen.cells(self._options.nfes)
-            if results.find(facts) is None
+            cell
+            for cell in self._cells[number]
+            if results.find(chosen.facts() | cell.facts()) is None
         ]
-        is_last = any(checkpoint == chosen.training.iterations for checkpoint, _ in cells)
+        is_last = any(cell.checkpoint == chosen.training.iterations for cell in cells)
         seeds = range(EVALUATION_SEED, EVALUATION_SEED + self._options.episodes)
         return [
             *([Measure(number)] if is_last else []),
-            *(Play(number, *cell, seed) for cell in cells for seed in seeds),
+            *(Play(number, cell, seed) for cell in cells for seed in seeds),
         ]
 
     def add(self, job: Measure | Play, outcome: Any) -> list[Row]:
@@ -69,22 +71,21 @@ class Outcomes:
         if isinstance(job, Measure):
             self._measures[job.number] = outcome
         else:
-            cell = job.number, job.checkpoint, job.nfe
-            self._episodes.setdefault(cell, []).append(outcome)
+            self._episodes.setdefault((job.number, job.cell), []).append(outcome)
         return self._complete(job.number)
 
     def _complete(self, number: int) -> list[Row]:
         chosen, rows = self._contestants[number], []
-        for facts in chosen.cells(self._options.nfes):
-            cell = number, facts["checkpoint"], facts["nfe"]
-            is_last = facts["checkpoint"] == chosen.training.iterations
-            count = len(self._episodes.get(cell, ()))
+        for cell in self._cells[number]:
+            is_last = cell.checkpoint == chosen.training.iterations
+            count = len(self._episodes.get((number, cell), ()))
             if count < self._options.episodes or (is_last and number not in self._measures):
                 continue
             # Sums depend on the order: that of the seeds, not that in which the episodes ended.
-            episodes = sorted(self._episodes.pop(cell), key=lambda episode: episode.seed)
-            measured = self._measures[number].at(facts["nfe"]) if is_last else {}
-            motion = _motion(episodes, chosen.prior)
+            played_out = self._episodes.pop((number, cell))
+            episodes = sorted(played_out, key=lambda episode: episode.seed)
+            measured = self._measures[number].at(cell.nfe) if is_last else {}
+            motion, facts = _motion(episodes, chosen.prior), chosen.facts() | cell.facts()
             rows.append(played(facts, [e.success for e in episodes], **motion, **measured))
         return rows
 

@@ -14,6 +14,7 @@ from warmprior.data.opening import check_place, name_of_place
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
+from warmprior.experiments.condition import AT_ONCE, Condition
 from warmprior.io.extras import require
 from warmprior.io.options import LATER
 from warmprior.modules import (
@@ -547,6 +548,14 @@ class Recipe:
         for name, values in given.items():
             if len(values) > 1:
                 raise ValueError(f"this study has one --{name}, got {' '.join(map(str, values))}")
+
+    def conditions(self, prior: Prior) -> list[Condition]:
+        """How policies are played, each a cell of its own.
+
+        Args:
+            prior: of the policy.
+        """
+        return [AT_ONCE]
 
     def trainings(self) -> list[TrainingConfig]:
         """The recipes of behaviour cloning to compare, one per length, without seeds."""

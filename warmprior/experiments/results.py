@@ -255,9 +255,9 @@ def _read_rows(records: Sequence[Any]) -> list[Row]:
     return rows
 
 
-_TEXTS = ("task", "data", "prior", "options")
+_TEXTS = ("task", "data", "prior", "options", "guidance")
 _COUNTS = {"chunk": 1, "nfe": 1, "seed": 0, "iterations": 1, "checkpoint": 0, "episodes": 1}
-_COUNTS |= {"successes": 0}
+_COUNTS |= {"successes": 0, "execute": 1, "delay": 0}
 _NOT_NEGATIVE = ("sigma", "mean_steps", "boundary_jump", "inner_jump", "source_leak")
 
 

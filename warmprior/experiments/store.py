@@ -18,7 +18,7 @@ from torch import nn
 from torchrl.record.loggers import get_logger
 
 from warmprior.experiments.problem import Problem
-from warmprior.experiments.recipe import NetworkOptions, RunOptions, check_images
+from warmprior.experiments.recipe import NetworkOptions, Recipe, RunOptions, check_images
 from warmprior.io.files import check_writable, digest_of, read_json, write_atomic
 from warmprior.io.options import identity_of
 from warmprior.modules.actor import WarmPriorActor
@@ -81,6 +81,20 @@ class Store:
 
     def __post_init__(self) -> None:
         check_writable(self.directory)
+
+    @classmethod
+    def of(cls, recipe: Recipe, problem: Problem) -> Store:
+        """Where the runs of a recipe keep their policies: beside the output folder, for all to share.
+
+        Args:
+            recipe: of the run.
+            problem: what they are trained for.
+
+        Raises:
+            OSError: if the folder cannot be written to.
+        """
+        out = recipe.run.directory
+        return cls(problem, recipe.network, out.parent / "policies", out / "logs", recipe.run)
 
     def sized(self, prior: Prior) -> Prior:
         """A prior for the widths of this problem, see :meth:`Prior.sized`.

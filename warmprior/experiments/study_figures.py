@@ -1,12 +1,12 @@
-"""Figures of the studies of sigma, of the chunk length and of the training budget."""
+"""Figures of the studies of sigma, of the chunk length, of the training budget and of delays."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from warmprior.diagnostics.statistics import summarize_seeds
-from warmprior.experiments.figures import band, new_figure
+from warmprior.experiments.figures import band, grouped_bars, new_figure
 from warmprior.experiments.labels import (
     prior_color,
     prior_label,
@@ -19,7 +19,7 @@ from warmprior.experiments.results import Row, grouped, mean_known, select, succ
 from warmprior.experiments.straightness import pooled
 from warmprior.modules.prior import Prior
 
-__all__ = ["plot_budget", "plot_chunk_lengths", "plot_sigma"]
+__all__ = ["plot_budget", "plot_chunk_lengths", "plot_delays", "plot_sigma"]
 
 
 def plot_sigma(
@@ -191,5 +191,75 @@ def plot_budget(rows: Sequence[Row], path: str | Path, *, top_k: int, title: str
     axes[0].set_ylabel("success rate")
     axes[len(by_nfe)].set_ylabel("squared error of executed actions, held out", fontsize=9)
     axes[0].legend(frameon=False, fontsize=8)
+    figure.suptitle(title, fontsize=10)
+    figure.savefig(path, dpi=150)
+
+
+def plot_delays(
+    rows: Sequence[Row],
+    path: str | Path,
+    *,
+    label: Callable[[Row], str],
+    top_k: int,
+    title: str,
+) -> None:
+    """Success and jumps where chunks take effect, a group of bars per delay.
+
+    A column per task; the layout is that of the paper's comparison with Real-Time Chunking.
+
+    Args:
+        rows: evaluations at one NFE and several delays.
+        path: of the PNG.
+
+    Keyword Args:
+        label: names the source and guidance of a row.
+        top_k: checkpoints averaged per seed.
+        title: of the figure.
+    """
+    rows = sorted(rows, key=lambda row: row["delay"])
+    tasks = grouped(rows, lambda row: f"{row['task']} {row['data']}")
+    delays = len({row["delay"] for row in rows})
+    bars = len(grouped(rows, label))
+    width = 1.0 + delays * (0.6 + 0.33 * bars)
+    figure, axes = new_figure(width * len(tasks), 6.0, 2, len(tasks))
+    for column, (task, members) in enumerate(tasks.items()):
+        above, below = axes[column], axes[len(tasks) + column]
+
+        def delay(row: Row) -> str:
+            return f"delay {row['delay']}"
+
+        grouped_bars(
+            above,
+            members,
+            delay,
+            label,
+            lambda cell: success_summary(cell, top_k),
+            lambda mean: f"{100 * mean:.0f}",
+        )
+        last = [row for row in members if row["checkpoint"] == row["iterations"]]
+        known = [row for row in last if row.get("boundary_jump") is not None]
+        grouped_bars(
+            below,
+            known,
+            delay,
+            label,
+            lambda cell: summarize_seeds([row["boundary_jump"] for row in cell]),
+            lambda mean: f"{mean:.2f}",
+        )
+        above.set_title(task, fontsize=10)
+        above.set_ylim(0, 1.08)
+        below.margins(y=0.1)  # for the numbers above the bars
+        below.set_ylim(bottom=0)
+    axes[0].set_ylabel(f"success rate (NFE {rows[0]['nfe']})")
+    axes[len(tasks)].set_ylabel("jump where chunks take effect")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=min(3 * len(tasks), bars),
+        frameon=False,
+        fontsize=9,
+    )
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=150)

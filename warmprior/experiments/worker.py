@@ -11,7 +11,8 @@ from typing import Any
 import torch
 from torchrl.envs import EnvBase, TransformedEnv
 
-from warmprior.experiments.contestant import Contestant
+from warmprior.experiments.condition import Condition
+from warmprior.experiments.contestant import Cell, Contestant
 from warmprior.experiments.measures import Measures, measure
 from warmprior.experiments.recipe import EvaluationOptions
 from warmprior.experiments.store import Losses, Store
@@ -58,14 +59,12 @@ class Play:
 
     Attributes:
         number: of the policy.
-        checkpoint: of its training, an iteration.
-        nfe: network evaluations per chunk.
+        cell: how it is played.
         episode_seed: of the episode.
     """
 
     number: int
-    checkpoint: int
-    nfe: int
+    cell: Cell
     episode_seed: int
 
     def __call__(self, worker: Worker) -> Episode:
@@ -119,7 +118,7 @@ class Worker:
         self.iterations = multiprocessing.RawArray("q", len(contestants))
         self._store: Store | None = None
         self._simulator: EnvBase | None = None
-        self._playing: tuple[int, int] | None = None
+        self._playing: tuple[int, int, Condition] | None = None
 
     def train(self, number: int) -> Losses:
         """Train a policy, see :meth:`Store.train`."""
@@ -146,26 +145,31 @@ class Worker:
 
     def play(self, job: Play) -> Episode:
         """Play an episode; its noise is that of the policy's seed."""
-        chosen = self.contestants[job.number]
-        if (job.number, job.checkpoint) != self._playing:
+        chosen, cell = self.contestants[job.number], job.cell
+        prepared = job.number, cell.checkpoint, cell.condition
+        if prepared != self._playing:
             self._playing = None  # whatever fails on the way
-            self._actor, self._env = self._prepare(chosen, job.checkpoint)
-            self._playing = job.number, job.checkpoint
+            self._actor, self._env = self._prepare(chosen, cell)
+            self._playing = prepared
         seed = chosen.training.seed
-        return play_episode(self._actor, self._env, job.episode_seed, nfe=job.nfe, policy_seed=seed)
+        return play_episode(
+            self._actor, self._env, job.episode_seed, nfe=cell.nfe, policy_seed=seed
+        )
 
     def _load(self, chosen: Contestant, checkpoint: int | None = None) -> WarmPriorActor:
         policy = chosen.store.load(chosen.prior, chosen.training, checkpoint)
         return policy.replace(grid=self.options.grid)
 
-    def _prepare(self, chosen: Contestant, checkpoint: int) -> tuple[WarmPriorActor, EnvBase]:
+    def _prepare(self, chosen: Contestant, cell: Cell) -> tuple[WarmPriorActor, EnvBase]:
         if self._store is not chosen.store:
             if self._simulator is not None:
                 self._simulator.close(raise_if_closed=False)
             self._store, self._simulator = None, None
             self._simulator = chosen.store.problem.make_env(**self.options.environment)
             self._store = chosen.store
-        policy = self._load(chosen, checkpoint)
+        condition = cell.condition
+        policy = self._load(chosen, cell.checkpoint).replace(guidance=condition.guidance)
         # The policy's own prior, which may have learnt.
-        transforms = chosen.store.transforms(policy.prior)()
+        make_transforms = chosen.store.transforms(policy.prior)
+        transforms = make_transforms(execute=condition.execute, delay=condition.delay)
         return policy, TransformedEnv(self._simulator, transforms)

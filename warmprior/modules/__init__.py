@@ -23,6 +23,7 @@ from warmprior.modules.ode import ODEActor, integrate
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.priors import GaussianPrior, PastPrior, PreviewPrior
+from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
 from warmprior.modules.sampler import PriorSampler
 from warmprior.modules.step import StepPrior
 from warmprior.modules.trend import PoseTrend, RestingAction
@@ -51,6 +52,7 @@ __all__ = [
     "PreviewPrior",
     "Prior",
     "PriorSampler",
+    "RealTimeChunking",
     "ReflowPrior",
     "RegressionPrior",
     "RestingAction",
@@ -65,4 +67,5 @@ __all__ = [
     "imagenet_weights",
     "integrate",
     "load_imagenet",
+    "with_leftover",
 ]

@@ -33,6 +33,7 @@ from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import DEFAULT_NFE, ODEActor, Solver
 from warmprior.modules.prior import Prior
+from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.sampler import PriorSampler
 
 __all__ = ["WarmPriorActor"]
@@ -63,6 +64,8 @@ class WarmPriorActor(TensorDictModuleBase):
         solver: see :func:`~warmprior.modules.ode.integrate`.
         grid: likewise.
         clip: see :class:`ODEActor`.
+        guidance: leads to chunks that continue the one being executed; it knows the source's standard
+            deviation position by position. None by default.
         normalizer: the normaliser of the data, kept here so that it is saved with the policy; its
             :meth:`~warmprior.Normalizer.env_transforms` go next to the base environment.
         environment: description of the environment that the policy was made for, as JSON holds it; kept
@@ -78,7 +81,7 @@ class WarmPriorActor(TensorDictModuleBase):
 
     Raises:
         ValueError: if the network was built for another prediction length than the prior's, ``nfe``
-            exceeds what the prior allows, or there is no such grid.
+            exceeds what the prior allows, there is no such grid, or the guidance is of what is no flow.
 
     Examples:
         >>> import torch
@@ -103,6 +106,7 @@ class WarmPriorActor(TensorDictModuleBase):
         solver: Solver = "euler",
         grid: str = "uniform",
         clip: float | Sequence[float] | None = None,
+        guidance: RealTimeChunking | None = None,
         normalizer: Normalizer | None = None,
         environment: Mapping[str, Any] | None = None,
         generator: torch.Generator | None = None,
@@ -136,13 +140,14 @@ class WarmPriorActor(TensorDictModuleBase):
             solver=solver,
             grid=grid,
             clip=clip,
+            guidance=guidance,
             observation_key=observation_key,
             chunk_key=chunk_key,
             path_key=path_key,
         )
         self.normalizer = normalizer
         self.environment = environment
-        self.in_keys = [observation_key, *self.sampler.in_keys]
+        self.in_keys = [observation_key, *self.sampler.in_keys, *self.ode.in_keys[2:]]
         self.out_keys = [*self.sampler.out_keys, *self.ode.out_keys]
 
     @property
@@ -167,7 +172,15 @@ class WarmPriorActor(TensorDictModuleBase):
         generator: torch.Generator | None = None,
     ) -> TensorDictBase:
         """Sample the source and integrate it to the chunk."""
-        return self.ode(self.sampler(tensordict, generator=generator), nfe=nfe)
+        tensordict = self.sampler(tensordict, generator=generator)
+        return self.ode(tensordict, nfe=nfe, sigma=self._sigma(tensordict))
+
+    def _sigma(self, tensordict: TensorDictBase) -> Tensor | None:
+        """Standard deviation of the source, broadcastable to ``[*B, P, d_a]``, where guidance asks for it."""
+        if self.ode.guidance is None:
+            return None
+        observation, loc, warm = (tensordict.get(key) for key in self.in_keys[:3])
+        return self.prior.distribution(loc, warm, observation)[1]
 
     def replace(self, **changes: Any) -> WarmPriorActor:
         """A policy of the same parts and options, but for those given.
@@ -191,6 +204,7 @@ class WarmPriorActor(TensorDictModuleBase):
             "solver": self.ode.solver,
             "grid": self.ode.grid,
             "clip": self.ode.clip,
+            "guidance": self.ode.guidance,
             "normalizer": self.normalizer,
             "environment": self.environment,
             "generator": self.sampler.generator,
@@ -203,7 +217,7 @@ class WarmPriorActor(TensorDictModuleBase):
 
     def _keys(self) -> dict[str, NestedKey]:
         """The constructor's keys."""
-        return dict(zip(_SAVED_KEYS, (*self.in_keys, self.chunk_key), strict=True))
+        return dict(zip(_SAVED_KEYS, (*self.in_keys[:3], self.chunk_key), strict=True))
 
     def config(self) -> dict[str, Any]:
         """JSON-serialisable description of everything but the weights.
@@ -218,6 +232,7 @@ class WarmPriorActor(TensorDictModuleBase):
                 f"cannot save {type(network).__name__}: only VelocityNetwork subclasses carry the "
                 "configuration that from_pretrained needs"
             )
+        guidance = self.ode.guidance
         config = {
             "format": FORMAT,
             "warmprior": version("warmprior"),
@@ -228,6 +243,8 @@ class WarmPriorActor(TensorDictModuleBase):
                 "solver": self.ode.solver,
                 "grid": self.ode.grid,
                 "clip": self.ode.clip,
+                # Policies saved before there was guidance have none.
+                **({} if guidance is None else {"guidance": guidance.config()}),
                 **self._keys(),
             },
             "normalizer": None if self.normalizer is None else self.normalizer.config(),
@@ -376,6 +393,8 @@ class WarmPriorActor(TensorDictModuleBase):
         for name in _SAVED_KEYS:
             if name in options:
                 options[name] = _key_from_json(name, options[name])
+        if "guidance" in options:
+            options["guidance"] = RealTimeChunking(**options["guidance"])
         normalizer = config["normalizer"]
         actor = cls(
             VelocityNetwork.from_config(config["network"]),

@@ -174,6 +174,6 @@ class ReflowPrior(GaussianPrior):
                 self.policy.to(a0.device)
                 break
         ode = self.policy.ode
-        noise_key, observation_key = ode.in_keys
+        noise_key, observation_key = ode.in_keys[:2]
         data = TensorDict({noise_key: a0, observation_key: observation}, a0.shape[:-2])
         return a0, ode(data, nfe=self.teacher_nfe)[ode.out_keys[0]]

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from warmprior import keys
 from warmprior.modules.grid import check_grid, grid_parts
 from warmprior.modules.network import network_observation, velocity_field
+from warmprior.modules.real_time_chunking import RealTimeChunking
 
 __all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "integrate"]
 
@@ -145,6 +146,9 @@ class ODEActor(TensorDictModuleBase):
         clip: the chunk is clamped to ``[-clip, clip]``, one bound for all action dimensions or ``d_a`` of
             them; ``None`` (default) leaves it as integrated. Set it to what the normalised data span, such as
             1, so that what the environment executes is what the prior remembers.
+        guidance: leads to chunks that continue the one being executed; none by default. It reads its
+            leftover ``[*B, P, d_a]``, where that counts, bool ``[*B, P, 1]``, and the delay, int64
+            ``[*B, 1]``, under the keys of :mod:`warmprior.keys`.
         noise_key: key of the source, ``[*B, P, d_a]``.
         observation_key: key of the observation, ``[*B, To, d_o]``.
         chunk_key: key written, ``[*B, P, d_a]``.
@@ -152,7 +156,7 @@ class ODEActor(TensorDictModuleBase):
 
     Raises:
         ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend or that exceeds ``max_nfe``, or
-            an unknown solver or grid.
+            an unknown solver or grid, or guidance of what is no flow (``max_nfe=1``).
         KeyError: if an input key is missing.
 
     Examples:
@@ -177,6 +181,7 @@ class ODEActor(TensorDictModuleBase):
         solver: Solver = "euler",
         grid: str = "uniform",
         clip: float | Sequence[float] | None = None,
+        guidance: RealTimeChunking | None = None,
         noise_key: NestedKey = keys.NOISE,
         observation_key: NestedKey = keys.OBSERVATION,
         chunk_key: NestedKey = keys.CHUNK,
@@ -206,13 +211,31 @@ class ODEActor(TensorDictModuleBase):
             raise ValueError(
                 f"clip has {len(clip)} bounds, but the network has {width} action dimensions"
             )
+        if guidance is not None and max_nfe == 1:
+            raise ValueError(
+                "the network's field means something at t = 0 alone, and is no flow to guide: leave the "
+                "guidance out"
+            )
         self.network = network
         self.nfe = nfe
         self.grid = grid
         self.clip = clip
+        self.guidance = guidance
         self.path_key = path_key
         self.in_keys = [noise_key, observation_key]
+        if guidance is not None:
+            self.in_keys += [keys.LEFTOVER, keys.VALID, keys.DELAY]
         self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
+
+    @staticmethod
+    def _told(missing: Sequence[NestedKey]) -> str:
+        """Who writes what guidance reads, if that is what is missing."""
+        if not {keys.LEFTOVER, keys.VALID, keys.DELAY} & set(missing):
+            return ""
+        return (
+            ". What is left of the last chunk is written by InferenceDelay in an environment, as by "
+            "policy_transforms(prior, delay=0), and by AsyncExecutor on a robot"
+        )
 
     def check_nfe(self, nfe: int) -> None:
         """Whether the solver and the network can spend ``nfe`` network evaluations.
@@ -227,18 +250,43 @@ class ODEActor(TensorDictModuleBase):
                 f"nfe={nfe}"
             )
 
-    def forward(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
-        """Write the chunk (and the path, where asked for)."""
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        nfe: int | None = None,
+        sigma: Tensor | None = None,
+    ) -> TensorDictBase:
+        """Write the chunk (and the path, where asked for).
+
+        Args:
+            tensordict: with the input keys.
+            nfe: network evaluations of this call.
+            sigma: standard deviation of the source, broadcastable to ``[*B, P, d_a]``, for the guidance; 1
+                by default.
+        """
         nfe = self.nfe if nfe is None else nfe
         self.check_nfe(nfe)
-        a0, observation = (tensordict.get(key, None) for key in self.in_keys)
+        a0, observation, *rest = (tensordict.get(key, None) for key in self.in_keys)
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
         if missing:
-            raise KeyError(f"ODEActor needs the keys {self.in_keys}; missing: {missing}")
+            raise KeyError(
+                f"ODEActor needs the keys {self.in_keys}; missing: {missing}{self._told(missing)}"
+            )
         batch = a0.shape[:-2]
         observation = network_observation(observation, batch)
+        velocity = velocity_field(self.network, observation)
+        if self.guidance is not None:
+            leftover, valid, delay = rest
+            scale = torch.ones_like(a0) if sigma is None else sigma.expand_as(a0)
+            velocity = self.guidance.guided(
+                velocity,
+                leftover.reshape(-1, *a0.shape[-2:]).to(a0.dtype),
+                valid.reshape(-1, a0.shape[-2], 1),
+                delay.reshape(-1, 1),
+                scale.reshape(-1, *a0.shape[-2:]),
+            )
         path_or_chunk = integrate(
-            velocity_field(self.network, observation),
+            velocity,
             a0.reshape(-1, *a0.shape[-2:]),
             nfe=nfe,
             solver=self.solver,

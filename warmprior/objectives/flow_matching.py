@@ -241,7 +241,7 @@ class FlowMatchingLoss(LossModule):
                 raise ValueError(f"a velocity predicts the sample {told}")
         self.reduction = reduction
         self.generator = actor_network.sampler.generator if generator is None else generator
-        observation, loc, warm = actor_network.in_keys
+        observation, loc, warm = actor_network.in_keys[:3]
         self.set_keys(observation=observation, loc=loc, warm=warm, chunk=actor_network.chunk_key)
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:

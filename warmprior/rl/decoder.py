@@ -51,7 +51,7 @@ class PriorDecoder(TensorDictModuleBase):
 
     Raises:
         ValueError: if ``delta`` is not a finite number > 0, the policy regresses (its field is defined at
-            a single source point) or ``nfe`` does not suit it.
+            a single source point) or is guided, or ``nfe`` does not suit it.
         KeyError: (when called) if an input key is missing.
 
     Examples:
@@ -85,6 +85,10 @@ class PriorDecoder(TensorDictModuleBase):
             raise ValueError(
                 f"{actor.prior} starts at a single point and its field means nothing elsewhere: there is "
                 "no source space to act in"
+            )
+        if actor.ode.guidance is not None:
+            raise ValueError(
+                "an agent's residual alone decides what is decoded: take actor.replace(guidance=None)"
             )
         self.delta = float(delta)
         self.differentiable = differentiable

@@ -146,7 +146,7 @@ class BehaviourCloning:
         self.logger = logger
         device = data.device or torch.device("cpu")
         self.generator = torch.Generator(device).manual_seed(config.seed)
-        observation_key, loc_key, warm_key = actor.in_keys
+        observation_key, loc_key, warm_key = actor.in_keys[:3]
         renamed = {"loc_key": loc_key, "warm_key": warm_key, "chunk_key": actor.chunk_key}
         if actor.prior.conditions_network:  # what it reads is made of the data's observation
             if observation_key != CONDITIONED:

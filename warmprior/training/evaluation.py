@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 from tqdm import tqdm
@@ -40,7 +39,8 @@ class Episode:
         success: whether the task was solved at any step.
         steps: control steps executed.
         decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, whatever the policy's own
-            key for it, and under ``"next"`` ``"executed_steps"`` and ``"done"``. Episodes concatenated along
+            key for it, under ``"next"`` ``"executed_steps"`` and ``"done"``, and what
+            :class:`~warmprior.InferenceDelay` told, if chunks took effect late. Episodes concatenated along
             ``D`` are a rollout for :func:`~warmprior.diagnostics.smoothness`.
     """
 
@@ -228,20 +228,18 @@ def play_episode(
     device = _device(policy)
     home = env.device or torch.device("cpu")
     chunk_key = _chunk_key(policy, env)
-    chunks: list[Tensor] = []
-    executed: list[Tensor] = []
+    decisions: list[TensorDictBase] = []
     success = False
     with acting_in_episode(policy, seed, nfe=nfe, policy_seed=policy_seed) as act:
         env.set_seed(seed)
         data = env.reset()
         while True:
             data = env.step(act(data.to(device)).to(home))
-            chunks.append(data[chunk_key].cpu())
-            executed.append(data["next", keys.EXECUTED].cpu())
+            decisions.append(_decision(data, chunk_key))
             success |= bool(data["next", keys.SUCCESS])
             if data["next", "done"].all():
                 steps = int(data["next", keys.ELAPSED])
-                return Episode(seed, success, steps, _decisions(chunks, executed))
+                return Episode(seed, success, steps, _rollout(decisions))
             data = env.step_mdp(data)
 
 
@@ -327,8 +325,7 @@ def _play_batched(
     chunk_key = _chunk_key(policy, env)
     played = [0] * num_envs
     success = [False] * num_envs
-    chunks: list[list[Tensor]] = [[] for _ in played]
-    executed: list[list[Tensor]] = [[] for _ in played]
+    decisions: list[list[TensorDictBase]] = [[] for _ in played]
     # The simulators need the cores; a policy's call is small, and its idle threads would spin.
     with torch_threads(1), watched(env), _acting(policy, policy_seed, nfe) as act:
         env.set_seed(seeds.start, static_seed=True)
@@ -342,18 +339,17 @@ def _play_batched(
             if not active.all():
                 data.set("_step", active.to(home))
             data = env.step(act(data.to(device)).to(home))
-            told = data["next"].select("done", keys.SUCCESS, keys.EXECUTED, keys.ELAPSED).cpu()
+            told = data["next"].select("done", keys.SUCCESS, keys.ELAPSED).cpu()
             done = told["done"].flatten() & active
-            chunk = data[chunk_key].cpu()
+            decided = _decision(data, chunk_key)
             for i in active.nonzero().flatten().tolist():
-                chunks[i].append(chunk[i])
-                executed[i].append(told[keys.EXECUTED][i])
+                decisions[i].append(decided[i])
                 success[i] |= bool(told[keys.SUCCESS][i])
             for i in done.nonzero().flatten().tolist():
                 episode = i + num_envs * played[i]
-                decisions = _decisions(chunks[i], executed[i])
-                report(Episode(seeds[episode], success[i], int(told[keys.ELAPSED][i]), decisions))
-                chunks[i], executed[i], success[i] = [], [], False
+                steps = int(told[keys.ELAPSED][i])
+                report(Episode(seeds[episode], success[i], steps, _rollout(decisions[i])))
+                decisions[i], success[i] = [], False
                 played[i] += 1
                 if episode + num_envs < len(seeds):
                     seed_row(i, seeds[episode + num_envs])
@@ -416,13 +412,14 @@ def _device(policy: TensorDictModuleBase) -> torch.device:
     return next((tensor.device for tensor in tensors), torch.device("cpu"))
 
 
-def _decisions(chunks: list[Tensor], executed: list[Tensor]) -> TensorDict:
-    done = torch.zeros(len(chunks), 1, dtype=torch.bool)
+def _decision(data: TensorDictBase, chunk_key: NestedKey) -> TensorDictBase:
+    """What :attr:`Episode.decisions` keeps of a step, on the CPU."""
+    kept = data.select(keys.LEFTOVER, keys.DELAY, ("next", keys.EXECUTED), strict=False).cpu()
+    return kept.set(keys.CHUNK, data[chunk_key].cpu())
+
+
+def _rollout(decisions: list[TensorDictBase]) -> TensorDictBase:
+    """The decisions of an episode, ``[D]``, of which the last one is done."""
+    done = torch.zeros(len(decisions), 1, dtype=torch.bool)
     done[-1] = True
-    return TensorDict(
-        {
-            keys.CHUNK: torch.stack(chunks),
-            "next": {keys.EXECUTED: torch.stack(executed), "done": done},
-        },
-        batch_size=[len(chunks)],
-    )
+    return TensorDictBase.stack(decisions).set(("next", "done"), done)

@@ -3,6 +3,7 @@
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.camera_images import CameraImages
 from warmprior.transforms.chunk import ChunkStep
+from warmprior.transforms.delay import InferenceDelay, executed_chunk, shift_chunk
 from warmprior.transforms.encode import EncodeObservation
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.mean_observation import MeanObservation
@@ -17,9 +18,12 @@ __all__ = [
     "CameraImages",
     "ChunkStep",
     "EncodeObservation",
+    "InferenceDelay",
     "MeanObservation",
     "ObservationStack",
+    "executed_chunk",
     "policy_transforms",
+    "shift_chunk",
     "window_replay_buffer",
     "window_transforms",
 ]

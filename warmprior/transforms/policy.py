@@ -9,6 +9,7 @@ from warmprior import keys
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
+from warmprior.transforms.delay import InferenceDelay
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.mean_observation import mean_observation
 from warmprior.transforms.stack import ObservationStack
@@ -24,6 +25,7 @@ def policy_transforms(
     images: Transform | None = None,
     observation_steps: int = 2,
     execute: int | None = None,
+    delay: int | None = None,
     gamma: float = 1.0,
     observation_key: NestedKey = keys.OBSERVATION,
     action_key: NestedKey = keys.ACTION,
@@ -35,9 +37,9 @@ def policy_transforms(
 
     In this order: what makes actions the environment's own, images of its cameras, normalisation of
     observations and denormalisation of actions, a stack of the last ``To`` observations (the first one
-    repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`, and :class:`MeanObservation` where the
-    prior conditions the network. It works around a single environment, and inside or outside of batched ones
-    (with images, inside).
+    repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`, :class:`MeanObservation` where the
+    prior conditions the network, and :class:`InferenceDelay` where asked for. It works around a single
+    environment, and inside or outside of batched ones (with images, inside).
 
     Args:
         prior: the policy's source distribution.
@@ -48,13 +50,19 @@ def policy_transforms(
             :class:`AbsoluteActions`; a copy of it is used. None if they are the same.
         images: makes observations with images, such as :class:`CameraImages`; a copy of it is used.
         observation_steps: ``To``.
-        execute: actions executed per decision; all ``H`` by default.
+        execute: actions executed per decision; all ``H`` by default, with a ``delay`` as many as predictions
+            allow.
+        delay: control steps until a chunk takes effect, see :class:`InferenceDelay`; 0 only tells what is
+            left of the last chunk, for :class:`~warmprior.RealTimeChunking`. By default nothing is told.
         gamma: discount per control step inside a chunk.
         observation_key: as for :class:`~warmprior.WarmPriorActor`, also for the following.
         action_key: the single action that the environment takes.
         chunk_key: the chunk.
         loc_key: the mean of the source.
         warm_key: where it counts.
+
+    Raises:
+        ValueError: for numbers that do not go together, see :class:`ChunkStep` and :class:`InferenceDelay`.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -63,6 +71,11 @@ def policy_transforms(
         >>> env.reset()["observation"].shape
         torch.Size([2, 3])
     """
+    late: list[Transform] = []
+    if delay is not None:
+        if execute is None:
+            execute = min(prior.chunk_length, prior.prediction_length - delay)
+        late = [InferenceDelay(delay, execute=execute, chunk_key=chunk_key)]
     per_step = [transform.clone() for transform in (actions, images) if transform is not None]
     per_step += [] if normalizer is None else normalizer.env_transforms()
     return Compose(
@@ -80,4 +93,5 @@ def policy_transforms(
         *mean_observation(
             prior, observation_key=observation_key, loc_key=loc_key, warm_key=warm_key
         ),
+        *late,
     )

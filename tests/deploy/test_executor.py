@@ -1,0 +1,325 @@
+"""A policy beside a control loop: against the same in simulation, on a fake clock, and in a real thread."""
+
+from __future__ import annotations
+
+import threading
+import time
+from concurrent.futures import Executor, Future
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import TransformedEnv
+
+from tests.toy_env import ACTION_DIM, CountingEnv
+from warmprior import (
+    GaussianPrior,
+    HistoryPrior,
+    Normalizer,
+    PastPrior,
+    PreviewPrior,
+    RealTimeChunking,
+    VelocityMLP,
+    WarmPriorActor,
+    policy_transforms,
+)
+from warmprior.deploy import AsyncExecutor
+from warmprior.diagnostics import executed_actions
+
+OBSERVATION_DIM = 2 + ACTION_DIM
+
+
+def actor(prior, **options):
+    torch.manual_seed(0)
+    extra = prior.prediction_length * ACTION_DIM + 1 if prior.conditions_network else 0
+    network = VelocityMLP(
+        ACTION_DIM, OBSERVATION_DIM + extra, prior.prediction_length, hidden_dim=16
+    )
+    with torch.no_grad():  # its head starts at zero
+        for parameter in network.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    generator = torch.Generator().manual_seed(5)
+    return WarmPriorActor(network, prior, nfe=3, clip=1.0, generator=generator, **options)
+
+
+@pytest.mark.parametrize(("execute", "latency"), [(4, 0), (4, 2), (5, 1), (3, 3)])
+@pytest.mark.parametrize("prior", [GaussianPrior(6), PastPrior(6), PreviewPrior(6)], ids=str)
+def test_a_simulated_latency_is_that_of_the_environment(prior, execute, latency):
+    """Closed loop: the observations hold the last action, and the policy draws at every decision."""
+    length = 23
+    env = TransformedEnv(
+        CountingEnv(length), policy_transforms(prior, execute=execute, delay=latency)
+    )
+    with torch.no_grad():
+        rollout = env.rollout(99, actor(prior, guidance=RealTimeChunking()))
+    expected = executed_actions(rollout)[0]
+    robot = CountingEnv(length)
+    found = []
+    with AsyncExecutor(
+        actor(prior, guidance=RealTimeChunking()), execute=execute, latency=latency
+    ) as executor:
+        for _ in range(2):
+            data, done = robot.reset(), False
+            actions = []
+            while not done:
+                actions.append(executor.act(data["observation"]))
+                data = robot.step(data.set("action", actions[-1]))["next"]
+                done = bool(data["done"])
+            found.append(torch.stack(actions))
+            executor.reset()
+        assert set(executor.delays) == {latency}
+    torch.testing.assert_close(found[0], expected)
+    assert not torch.equal(found[0], found[1])  # other noise
+
+
+class Told(TensorDictModuleBase):
+    """Action i of a chunk tells which step it was made at and which it is for; keeps what it was given."""
+
+    def __init__(self, length):
+        super().__init__()
+        self.in_keys, self.out_keys = ["observation"], [("vla_action", "chunk")]
+        self.length, self.given = length, []
+
+    def forward(self, data):
+        self.given.append(data.clone())
+        step = data["observation"][-1, :1]
+        target = step + torch.arange(self.length).view(-1, 1)
+        return data.set(self.out_keys[0], torch.cat([step.expand_as(target), target], -1))
+
+
+class FakeClock(Executor):
+    """Computations that end so many ticks after they were begun; the first one ends at once."""
+
+    def __init__(self, durations):
+        self.durations, self.tick, self.running = [0, *durations], 0, []
+
+    def submit(self, fn, /, *args, **kwargs):
+        future = Future()
+        duration = self.durations.pop(0)
+        if duration == 0:
+            future.set_result(fn(*args, **kwargs))
+        else:
+            self.running.append((self.tick + duration, future, fn, args))
+        return future
+
+    def advance(self):
+        self.tick += 1
+        for job in [job for job in self.running if job[0] <= self.tick]:
+            self.running.remove(job)
+            _, future, fn, args = job
+            if not future.cancelled():
+                future.set_result(fn(*args))
+
+
+def drive(executor, clock, ticks):
+    actions = []
+    for tick in range(ticks):
+        actions.append(executor.act(torch.tensor([float(tick)])))
+        clock.advance()
+    return torch.stack(actions)
+
+
+def test_measured_delays_on_a_fake_clock():
+    """P = 12, H = 6: decisions every 4 steps, or as soon as the last one took effect."""
+    durations = [2, 1, 5, 1, 1, 1, 1]
+    clock, policy = FakeClock(durations), Told(12)
+    executor = AsyncExecutor(
+        policy,
+        prior=PreviewPrior(6),
+        action_dim=2,
+        execute=4,
+        delay=1,
+        window=3,
+        observation_steps=1,
+        pool=clock,
+    )
+    actions = drive(executor, clock, 31)
+    # Every action is the one for the step at which it is executed, whoever is late.
+    assert actions[:, 1].tolist() == [float(i) for i in range(31)]
+    # Begun at 4, 8, 12, at 17 as soon as the one of 12 took effect, 21, 25, 29.
+    made = [0] * 6 + [4] * 3 + [8] * 8 + [12] * 1 + [17] * 4 + [21] * 4 + [25] * 4 + [29]
+    assert actions[:, 0].tolist() == [float(i) for i in made]
+    assert [int(data["observation"]) for data in policy.given] == [0, 4, 8, 12, 17, 21, 25, 29]
+    assert executor.delays == (1, 1, 1)
+    # What was expected: 1 until there was a measurement, then the largest of the last three.
+    told = [int(data["rtc", "delay"]) for data in policy.given]
+    assert told == [0, 1, 2, 2, 5, 5, 5, 1]
+    for data in policy.given[1:]:
+        step, left = float(data["observation"]), data["rtc", "valid"].sum()
+        expected = step + torch.arange(float(left))
+        assert data["rtc", "leftover"][:left, 1].tolist() == expected.tolist()
+        assert not data["rtc", "leftover"][left:].any()
+        # WP-Preview's mean: the forecast of these very steps.
+        assert data["prior", "loc"][:6, 1].tolist() == [step + i for i in range(6)]
+        assert data["prior", "warm"].flatten().tolist() == [True] * 6 + [False] * 6
+
+
+def test_the_past_is_what_was_handed_out():
+    clock, policy = FakeClock([1, 3, 2, 1, 2, 1, 1, 1]), Told(8)
+    executor = AsyncExecutor(
+        policy, prior=PastPrior(8), action_dim=2, execute=5, observation_steps=1, pool=clock
+    )
+    actions = drive(executor, clock, 36)
+    warm = 0
+    for data in policy.given:
+        step = int(data["observation"])
+        assert int(data["prior", "elapsed"]) == step
+        assert bool(data["prior", "warm"].all()) == (step >= 8)
+        if step >= 8:
+            warm += 1
+            assert torch.equal(data["prior", "loc"], actions[step - 8 : step])
+    assert warm >= 5
+
+
+def test_an_observation_overwritten_by_the_driver_and_stacks():
+    policy = Told(6)
+    executor = AsyncExecutor(policy, prior=GaussianPrior(6), action_dim=2, execute=3, latency=1)
+    buffer = torch.zeros(1)
+    for tick in range(4):
+        buffer[0] = tick
+        executor.act(buffer)
+    assert [data["observation"].flatten().tolist() for data in policy.given] == [[0, 0], [2, 3]]
+
+
+def test_several_entries_raw_units_and_means_that_networks_see():
+    """An observation of entries; raw units on the robot's side; a prior that conditions the network."""
+    raw = TensorDict(
+        {"observation": 3 * torch.rand(20, OBSERVATION_DIM) + 1, "action": 5 * torch.rand(20, 2)},
+        [20],
+    )
+    normalizer = Normalizer.fit(raw)
+    prior = HistoryPrior(4)
+    inside, outside = (
+        AsyncExecutor(actor(prior), execute=3, latency=1, normalizer=n) for n in (None, normalizer)
+    )
+    for i in range(9):
+        row = raw[i]
+        one = inside.act(normalizer.normalize(row)["observation"])
+        two = outside.act(row["observation"])
+        torch.testing.assert_close(
+            normalizer.denormalize(TensorDict({"action": one}))["action"], two
+        )
+
+    class Nested(Told):
+        def forward(self, data):
+            assert data["observation", "image"].shape == (2, 3, 4, 4)
+            flat = data.clone().set("observation", data["observation", "state"])
+            return data.set(self.out_keys[0], super().forward(flat)[self.out_keys[0]])
+
+    executor = AsyncExecutor(Nested(6), prior=GaussianPrior(6), action_dim=2, execute=3, latency=1)
+    seen = TensorDict({"state": torch.tensor([7.0]), "image": torch.zeros(3, 4, 4).byte()})
+    assert executor.act(seen).tolist() == [7.0, 7.0]
+
+
+# ------------------------------------------------------------------------------------------ a real thread
+
+
+class Slow(Told):
+    """Waits for leave from its second call on."""
+
+    def __init__(self, length):
+        super().__init__(length)
+        self.leave, self.threads = threading.Event(), []
+
+    def forward(self, data):
+        self.threads.append(threading.current_thread())
+        if len(self.threads) > 1:
+            assert self.leave.wait(30)
+        return super().forward(data)
+
+
+def test_a_slow_policy_does_not_hold_the_loop_up():
+    policy = Slow(8)
+    executor = AsyncExecutor(
+        policy, prior=PastPrior(8), action_dim=2, execute=5, observation_steps=1, timeout=0.05
+    )
+    started = time.monotonic()
+    for tick in range(8):  # decided at 5; three more steps are left of the first chunk
+        assert executor.act(torch.tensor([float(tick)])).tolist() == [0.0, tick]
+    assert time.monotonic() - started < 5  # it waited for nothing but the first chunk
+    for _ in range(2):
+        with pytest.raises(
+            TimeoutError, match=r"after 3 control steps and 0\.05 s.*Hold the robot"
+        ):
+            executor.act(torch.tensor([8.0]))
+    assert executor.delays == ()
+    policy.leave.set()
+    executor.timeout = 30.0
+    assert executor.act(torch.tensor([8.0])).tolist() == [5.0, 8.0]
+    assert executor.delays == (3,)
+    assert policy.threads[0] is policy.threads[1] is not threading.current_thread()
+    executor.close()
+    assert not policy.threads[0].is_alive()
+    with pytest.raises(RuntimeError, match="closed"):
+        executor.act(torch.zeros(1))
+
+
+class Failing(Told):
+    def forward(self, data):
+        if len(self.given) == 1:
+            self.given.append(data)
+            raise ZeroDivisionError("the camera fell off")
+        return super().forward(data)
+
+
+@pytest.mark.parametrize("latency", [None, 1])
+def test_errors_of_the_thread_reach_the_loop(latency):
+    policy = Failing(8)
+    with AsyncExecutor(
+        policy, prior=GaussianPrior(8), action_dim=2, execute=4, timeout=30.0, latency=latency
+    ) as executor:
+        with pytest.raises(ZeroDivisionError, match="camera"):
+            for tick in range(9):
+                executor.act(torch.tensor([float(tick)]))
+        for _ in range(2):  # until it is begun anew
+            with pytest.raises(ZeroDivisionError, match="camera"):
+                executor.act(torch.zeros(1))
+        executor.reset()
+        assert executor.act(torch.tensor([3.0])).tolist() == [3.0, 3.0]
+
+
+def test_a_reset_forgets_what_is_under_way():
+    policy = Slow(8)
+    with AsyncExecutor(
+        policy, prior=GaussianPrior(8), action_dim=2, execute=4, observation_steps=1
+    ) as executor:
+        for tick in range(6):
+            executor.act(torch.tensor([float(tick)]))
+        executor.reset()
+        policy.leave.set()
+        assert executor.act(torch.tensor([100.0])).tolist() == [100.0, 100.0]
+        assert executor.act(torch.tensor([101.0])).tolist() == [100.0, 101.0]
+        last = policy.given[-1]
+        assert not last["rtc", "valid"].any() and int(last["rtc", "delay"]) == 0
+
+
+def test_chunks_that_no_robot_should_get():
+    class Wrong(Told):
+        def forward(self, data):
+            return data.set(self.out_keys[0], torch.full((self.length, 2), torch.nan))
+
+    usual = {"prior": GaussianPrior(8), "action_dim": 2, "execute": 4, "latency": 1}
+    with pytest.raises(FloatingPointError, match="NaN"):
+        AsyncExecutor(Wrong(8), **usual).act(torch.zeros(1))
+    with pytest.raises(ValueError, match=r"\(8, 2\).*found shape \(7, 2\)"):
+        AsyncExecutor(Told(7), **usual).act(torch.zeros(1))
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"execute": 6, "delay": 3}, r"8 actions do not reach 6.*delay of 3.*at most 5"),
+        ({"execute": 3, "delay": 4}, r"0 <= delay <= execute"),
+        ({"latency": 5}, r"0 <= delay <= execute"),
+        ({"execute": 0, "delay": 0}, r"need 1 <= execute <= 8"),
+        ({"window": 0}, "window must be a whole number"),
+        ({"latency": 1, "pool": FakeClock([])}, "leave out pool"),
+        ({"prior": None}, "Told does not tell: give prior and action_dim"),
+    ],
+)
+def test_options_that_cannot_be(options, told):
+    usual = {"prior": GaussianPrior(8), "action_dim": 2}
+    with pytest.raises(ValueError, match=told):
+        AsyncExecutor(Told(8), **(usual | options))
+    assert not [t for t in threading.enumerate() if t.name.startswith("warmprior-policy")]

@@ -1,0 +1,368 @@
+"""Guidance by the rest of the last chunk: against the published formulas, LeRobot and known posteriors."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from warmprior import (
+    GaussianPrior,
+    PastPrior,
+    PriorDecoder,
+    RealTimeChunking,
+    VelocityMLP,
+    WarmPriorActor,
+)
+from warmprior.modules import RegressionPrior, with_leftover
+
+B, P, D = 3, 10, 4
+
+
+def reference_weight(schedule, i, start, end):
+    """Position by position, as the paper and the comments of the official code tell it."""
+    start = min(start, end)
+    if i >= end:
+        return 0.0
+    if i < start or schedule == "ones":
+        return 1.0
+    if schedule == "zeros":
+        return 0.0
+    linear = (end - i) / (end - start + 1)
+    return linear if schedule == "linear" else linear * (math.exp(linear) - 1) / (math.e - 1)
+
+
+@pytest.mark.parametrize("schedule", ["exp", "linear", "ones", "zeros"])
+def test_weights_of_every_delay_and_horizon(schedule):
+    pairs = torch.cartesian_prod(torch.arange(P + 1), torch.arange(P + 1))
+    found = RealTimeChunking(schedule=schedule).weights(pairs[:, 0], pairs[:, 1], P)
+    expected = [
+        [reference_weight(schedule, i, start, end) for i in range(P)]
+        for start, end in pairs.tolist()
+    ]
+    torch.testing.assert_close(found, torch.tensor(expected))
+
+
+@pytest.mark.parametrize("schedule", ["exp", "linear", "ones", "zeros"])
+def test_weights_are_lerobots(schedule):
+    rtc = pytest.importorskip("lerobot.policies.rtc")
+    from lerobot.configs import RTCAttentionSchedule
+
+    config = rtc.RTCConfig(prefix_attention_schedule=RTCAttentionSchedule[schedule.upper()])
+    theirs = rtc.RTCProcessor(config)
+    ours = RealTimeChunking(schedule=schedule, horizon=7)
+    for delay in range(8):
+        found = ours.weights(torch.tensor(delay), torch.tensor(P), P)
+        torch.testing.assert_close(found, theirs.get_prefix_weights(delay, 7, P))
+
+
+def network():
+    """A velocity in which every position depends on all others."""
+    torch.manual_seed(0)
+    mix = torch.nn.Linear(P * D + 1, P * D).double()
+
+    def velocity(t, a):
+        return torch.tanh(mix(torch.cat([a.flatten(1), t[:, None]], 1))).view_as(a)
+
+    return velocity
+
+
+def batch(dtype=torch.float64):
+    generator = torch.Generator().manual_seed(1)
+    a, y = (torch.randn(B, P, D, generator=generator, dtype=dtype) for _ in range(2))
+    left, delay = torch.tensor([7, 4, 10]), torch.tensor([[3], [0], [4]])
+    valid = (torch.arange(P) < left[:, None]).unsqueeze(-1)
+    return a, torch.where(valid, y, 0.0), valid, delay, left
+
+
+def at(t, a):
+    return torch.full(a.shape[:1], t, dtype=a.dtype)
+
+
+@pytest.mark.parametrize("t", [0.0, 0.1, 0.5, 0.9])
+def test_the_official_formula(t):
+    """With the Jacobian written out: v + min(c / r^2, beta) J^T W (Y - a_hat)."""
+    velocity = network()
+    a, y, valid, delay, left = batch()
+    found = RealTimeChunking().guided(velocity, y, valid, delay)(at(t, a), a)
+    for row in range(B):
+
+        def clean(x):
+            return x + (1 - t) * velocity(torch.tensor([t], dtype=x.dtype), x)
+
+        x = a[row : row + 1]
+        jacobian = torch.autograd.functional.jacobian(clean, x).view(P * D, P * D)
+        weights = torch.tensor(
+            [reference_weight("exp", i, int(delay[row]), int(left[row])) for i in range(P)],
+            dtype=a.dtype,
+        )
+        error = weights[:, None] * (y[row] - clean(x)[0])
+        inverse_r2 = (t**2 + (1 - t) ** 2) / (1 - t) ** 2
+        weight = min((1 - t) / t * inverse_r2, 5.0) if t else 5.0
+        v = velocity(torch.tensor([t], dtype=x.dtype), x)[0]
+        expected = v + weight * (jacobian.T @ error.flatten()).view(P, D)
+        torch.testing.assert_close(found[row], expected.detach())
+
+
+@pytest.mark.parametrize("time", [1.0, 0.8, 0.5, 0.1])
+def test_without_the_jacobian_it_is_lerobots(time):
+    """Their time runs from 1 (noise) to 0, and their velocity points to the noise."""
+    rtc = pytest.importorskip("lerobot.policies.rtc")
+    from lerobot.configs import RTCAttentionSchedule
+
+    velocity = network()
+    a, y, *_ = batch()
+    config = rtc.RTCConfig(
+        prefix_attention_schedule=RTCAttentionSchedule.LINEAR,
+        max_guidance_weight=10.0,
+        execution_horizon=7,
+    )
+    with torch.no_grad():
+        theirs = rtc.RTCProcessor(config).denoise_step(
+            a, y, 3, time, lambda x: -velocity(at(1 - time, x), x)
+        )
+    ours = RealTimeChunking(
+        schedule="linear", max_guidance_weight=10.0, horizon=7, jacobian=False, sigma=1.0
+    )
+    everything = torch.ones(B, P, 1, dtype=torch.bool)
+    delay = torch.full((B, 1), 3)
+    guided = ours.guided(velocity, y, everything, delay, sigma=torch.tensor(0.3))
+    # Theirs computes the weight in single precision.
+    torch.testing.assert_close(guided(at(1 - time, a), a), -theirs, rtol=1e-5, atol=1e-5)
+    exact = RealTimeChunking(schedule="linear", max_guidance_weight=10.0, horizon=7)
+    difference = exact.guided(velocity, y, everything, delay)(at(1 - time, a), a) + theirs
+    assert difference.abs().max() > 0.05  # another method
+
+
+def gaussian_velocity(mean, std, mu, sigma):
+    """Of data N(mean, std^2) from a source N(mu, sigma^2), drawn independently of each other."""
+
+    def velocity(t, a):
+        t = t[:, None, None]
+        gain = std**2 * t / (std**2 * t**2 + sigma**2 * (1 - t) ** 2)
+        clean = mean + gain * (a - t * mean - (1 - t) * mu)
+        return (clean - a) / (1 - t)
+
+    return velocity
+
+
+@pytest.mark.parametrize("std", [1.0, 0.3])
+@pytest.mark.parametrize("t", [0.1, 0.5, 0.9])
+def test_known_posteriors_of_gaussians(t, std):
+    """Given the whole of Y, the velocity at the positions of Y is (Y - a_t) / (1 - t), whatever the source.
+
+    The source is warm on half of the positions, and has a mean: each position has a sigma of its own.
+    """
+    a, y, *_ = batch()
+    generator = torch.Generator().manual_seed(2)
+    mean, mu = (torch.randn(1, P, D, generator=generator, dtype=a.dtype) for _ in range(2))
+    sigma = torch.where(torch.arange(P) < P // 2, 0.5, 1.0).to(a).view(1, P, 1)
+    velocity = gaussian_velocity(mean, std, mu, sigma)
+    left = torch.arange(P) % 2 == 0  # of the leftover every second position is made to count
+    rtc = RealTimeChunking(schedule="ones", max_guidance_weight=1e9, data_std=std)
+    valid, delay = torch.ones(B, P, 1, dtype=torch.bool), torch.zeros(B, 1, dtype=torch.int64)
+    target = torch.where(left.view(1, P, 1), y, a + (1 - t) * velocity(at(t, a), a))
+    found = rtc.guided(velocity, target, valid, delay, sigma)(at(t, a), a)
+    expected = torch.where(left.view(1, P, 1), (y - a) / (1 - t), velocity(at(t, a), a))
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
+    published = RealTimeChunking(
+        schedule="ones", max_guidance_weight=1e9, data_std=std, sigma=1.0
+    ).guided(velocity, target, valid, delay, sigma)(at(t, a), a)
+    warm = torch.arange(P) < P // 2
+    assert (published - expected)[:, left & warm].abs().max() > 0.01
+    torch.testing.assert_close(published[:, ~warm], expected[:, ~warm], rtol=1e-9, atol=1e-9)
+
+
+def test_the_published_weight_and_its_limits():
+    t = torch.linspace(0.05, 0.95, 19, dtype=torch.float64)
+    published = (1 - t) / t * (t**2 + (1 - t) ** 2) / (1 - t) ** 2
+    rtc = RealTimeChunking(max_guidance_weight=1e9)
+    torch.testing.assert_close(rtc.guidance_weight(t), published)
+    ends = torch.tensor([0.0, 1.0])
+    assert RealTimeChunking().guidance_weight(ends).tolist() == [5.0, 5.0]
+    # A source without noise says at once where its flow ends: there is nothing to weigh at its start.
+    assert RealTimeChunking().guidance_weight(ends, torch.tensor(0.0)).tolist() == [0.0, 5.0]
+
+
+def test_rows_without_a_leftover_are_not_guided():
+    velocity = network()
+    a, y, valid, delay, _ = batch()
+    valid, delay = valid.clone(), delay.clone()
+    valid[1] = False
+    delay[1] = 0
+    plain = velocity(at(0.3, a), a)
+    guided = RealTimeChunking().guided(velocity, y, valid, delay)(at(0.3, a), a)
+    assert torch.equal(guided[1], plain[1].detach()) and not torch.equal(guided[0], plain[0])
+    assert RealTimeChunking().guided(velocity, y, valid & False, delay) is velocity
+
+
+def test_gradients_are_its_own_affair():
+    velocity = network()
+    a, y, valid, delay, _ = batch()
+    rtc = RealTimeChunking()
+    expected = rtc.guided(velocity, y, valid, delay)(at(0.3, a), a)
+    with torch.no_grad():
+        found = rtc.guided(velocity, y, valid, delay)(at(0.3, a), a)
+    assert torch.equal(found, expected) and not found.requires_grad
+    with torch.inference_mode():
+        with pytest.raises(RuntimeError, match=r"torch\.no_grad.*jacobian=False"):
+            rtc.guided(velocity, y, valid, delay)(at(0.3, a), a)
+        free = RealTimeChunking(jacobian=False)
+        assert free.guided(velocity, y, valid, delay)(at(0.3, a), a).isfinite().all()
+
+
+def test_trust_region_bounds_what_is_perpendicular_to_the_velocity():
+    velocity = network()
+    a, y, valid, delay, _ = batch()
+    t = at(0.1, a)
+    v = velocity(t, a).detach().flatten(1)
+    unit = v / v.norm(dim=1, keepdim=True)
+    plain, bounded = (
+        RealTimeChunking(trust_region=bound).guided(velocity, y, valid, delay)(t, a).flatten(1) - v
+        for bound in (None, 0.2)
+    )
+    (along, across), (bounded_along, bounded_across) = (
+        ((c * unit).sum(1), (c - (c * unit).sum(1, keepdim=True) * unit).norm(dim=1))
+        for c in (plain, bounded)
+    )
+    torch.testing.assert_close(along, bounded_along)
+    assert (across > 0.2 * v.norm(dim=1)).all()
+    torch.testing.assert_close(bounded_across, 0.2 * v.norm(dim=1))
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"schedule": "cosine"}, "unknown schedule 'cosine'.*exp, linear, ones, zeros"),
+        ({"horizon": 0}, "horizon must be a whole number"),
+        ({"max_guidance_weight": 0.0}, "max_guidance_weight must be > 0"),
+        ({"max_guidance_weight": math.inf}, "max_guidance_weight must be a finite number"),
+        ({"data_std": -1.0}, "data_std must be > 0"),
+        ({"sigma": -0.1}, "sigma must be >= 0"),
+        ({"trust_region": math.nan}, "trust_region must be a finite number"),
+    ],
+)
+def test_options_that_cannot_be(options, told):
+    with pytest.raises(ValueError, match=told):
+        RealTimeChunking(**options)
+
+
+def test_delays_that_cannot_be():
+    _, y, valid, delay, _ = batch()
+    late = delay + torch.tensor([[5], [0], [0]])
+    with pytest.raises(ValueError, match=r"a delay of 8 control steps.*7 are left"):
+        RealTimeChunking().guided(network(), y, valid, late)
+    with pytest.raises(ValueError, match="horizon=2, before the delay of 3"):
+        RealTimeChunking(horizon=2).guided(network(), y, valid, delay)
+    with pytest.raises(ValueError, match=r"valid has to be \[B, P, 1\]"):
+        RealTimeChunking().guided(network(), y, valid[:, :4], delay)
+
+
+# ---------------------------------------------------------------------------------------------- the actor
+
+
+def decision(prior, *batch):
+    generator = torch.Generator().manual_seed(3)
+    chunk = torch.randn(*batch, prior.prediction_length, 2, generator=generator)
+    valid = torch.arange(prior.prediction_length).view(-1, 1) < 3
+    return TensorDict(
+        {
+            "observation": torch.randn(*batch, 2, 3, generator=generator),
+            "prior": {
+                "loc": torch.randn(chunk.shape, generator=generator),
+                "warm": torch.ones_like(chunk[..., :1], dtype=torch.bool),
+            },
+            "rtc": {
+                "leftover": torch.where(valid, chunk, 0.0),
+                "valid": valid.expand(*batch, -1, 1).clone(),
+                "delay": torch.full((*batch, 1), 2),
+            },
+        },
+        batch,
+    )
+
+
+def actor(prior, **options):
+    torch.manual_seed(0)
+    network = VelocityMLP(2, 3, prior.prediction_length, hidden_dim=16)
+    with torch.no_grad():  # its head starts at zero, and nothing would depend on the point
+        for parameter in network.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    return WarmPriorActor(network, prior, nfe=4, **options)
+
+
+def test_the_actor_knows_the_sigma_of_its_source():
+    """Positions that are cold have 1; the chunk is that of the guided integration by hand."""
+    prior, rtc = PastPrior(4, sigma=0.5), RealTimeChunking(schedule="linear")
+    policy, data = actor(prior, guidance=rtc), decision(PastPrior(4), 5)
+    data["prior", "warm"][:, 2:] = False
+    with torch.no_grad():
+        found = policy(data.clone(), generator=torch.Generator().manual_seed(7))
+        a = found["prior", "noise"]
+        sigma = torch.tensor([0.5, 0.5, 1.0, 1.0]).view(1, 4, 1)
+        guided = rtc.guided(
+            lambda t, x: policy.network(t, x, data["observation"]),
+            data["rtc", "leftover"],
+            data["rtc", "valid"],
+            data["rtc", "delay"],
+            sigma,
+        )
+        for i in range(4):
+            a = a + guided(torch.full((5,), i / 4), a) / 4
+    torch.testing.assert_close(found["vla_action", "chunk"], a)
+
+
+def test_guidance_brings_the_chunk_to_the_leftover():
+    data = decision(GaussianPrior(4), 64)
+    distances = []
+    for rtc in (None, RealTimeChunking()):
+        policy = actor(GaussianPrior(4), guidance=rtc)
+        with torch.no_grad():
+            chunk = policy(data.clone(), nfe=16, generator=torch.Generator().manual_seed(7))[
+                "vla_action", "chunk"
+            ]
+        distances.append((chunk - data["rtc", "leftover"])[:, :2].abs().mean())
+    assert distances[1] < 0.2 * distances[0]
+
+
+def test_one_environment_and_a_batch_of_none():
+    policy = actor(PastPrior(4), guidance=RealTimeChunking())
+    assert policy(decision(PastPrior(4)))["vla_action", "chunk"].shape == (4, 2)
+
+
+def test_it_is_saved_with_the_policy(tmp_path):
+    rtc = RealTimeChunking(horizon=3, schedule="ones", jacobian=False, sigma=1.0, trust_region=0.5)
+    policy = actor(PastPrior(4), guidance=rtc)
+    policy.save_pretrained(tmp_path)
+    again = WarmPriorActor.from_pretrained(tmp_path)
+    assert again.ode.guidance == rtc
+    data = decision(PastPrior(4), 2)
+    one, two = (
+        p(data.clone(), generator=torch.Generator().manual_seed(0))["vla_action", "chunk"]
+        for p in (policy.eval(), again)
+    )
+    assert torch.equal(one, two)
+    plain = policy.replace(guidance=None)
+    assert plain.ode.guidance is None and "guidance" not in plain.config()["actor"]
+    assert policy.replace(nfe=1).ode.guidance == rtc
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert config["actor"]["guidance"]["schedule"] == "ones"
+
+
+def test_missing_keys_and_sources_without_a_flow():
+    data = decision(PastPrior(4), 2).exclude("rtc")
+    with pytest.raises(KeyError, match=r"InferenceDelay.*AsyncExecutor"):
+        actor(PastPrior(4), guidance=RealTimeChunking())(data)
+    with pytest.raises(ValueError, match="no flow to guide"):
+        WarmPriorActor(VelocityMLP(2, 3, 4), RegressionPrior(4), guidance=RealTimeChunking())
+    with pytest.raises(ValueError, match="replace\\(guidance=None\\)"):
+        PriorDecoder(actor(PastPrior(4), guidance=RealTimeChunking()), delta=0.5)
+
+
+def test_what_is_executed_of_a_late_chunk():
+    chunk, leftover = torch.zeros(3, 4, 1), torch.ones(3, 4, 1)
+    found = with_leftover(chunk, leftover, torch.tensor([[0], [1], [4]]))
+    assert found.squeeze(-1).tolist() == [[0, 0, 0, 0], [1, 0, 0, 0], [1, 1, 1, 1]]

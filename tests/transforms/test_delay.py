@@ -1,0 +1,286 @@
+"""Late chunks against a simulation, step by step, of a robot that goes on while its policy computes."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import pytest
+import torch
+from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs.utils import check_env_specs
+
+from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
+from warmprior import (
+    ActionHistory,
+    ChunkStep,
+    GaussianPrior,
+    InferenceDelay,
+    PastPrior,
+    PreviewPrior,
+    RealTimeChunking,
+    VelocityMLP,
+    WarmPriorActor,
+    policy_transforms,
+)
+from warmprior.diagnostics import executed_actions, mean_revision, smoothness
+from warmprior.training import play_episode
+from warmprior.transforms import executed_chunk, shift_chunk
+
+PRIORS = {prior.name: prior for prior in (GaussianPrior(6), PastPrior(6), PreviewPrior(6))}
+
+
+def told(length):
+    """Action i of a chunk tells which episode and step it was decided at, and which step it is for."""
+
+    def chunk(data):
+        step = data["observation"][..., -1, 0, None, None]  # of the last observation in the stack
+        target = step + torch.arange(length).view(-1, 1)
+        made = step.expand_as(target)
+        return torch.cat([made, target], -1) / 1000
+
+    return ChunkPolicy(chunk)
+
+
+def lone_robot(length, prediction, execute, delay, decide):
+    """What is executed in an episode: a loop over control steps, as a robot runs it.
+
+    ``decide(step)`` gives the chunk of a decision. The first one is waited for.
+    """
+    actions, made, current, started, pending = [], [], None, 0, None
+    for step in range(length):
+        if pending is not None and step == pending[0] + delay:
+            current, pending = pending, None
+        if current is None:
+            current, started = (step, decide(step)), step
+        elif step == started + execute:
+            assert pending is None  # one thought at a time
+            started, pending = step, (step, decide(step))
+            if delay == 0:
+                current, pending = pending, None
+        at, chunk = current
+        assert step - at < prediction
+        actions.append(chunk[step - at])
+        made.append(at)
+    return actions, made
+
+
+@pytest.mark.parametrize("name", PRIORS)
+@pytest.mark.parametrize(("execute", "delay"), [(3, 0), (3, 1), (3, 3), (4, 2), (5, 1)])
+def test_a_robot_that_does_not_wait(name, execute, delay):
+    """Three sub-environments whose episodes end apart, and begin anew."""
+    prior, lengths = PRIORS[name], (7, 16, 22)
+    size = prior.prediction_length
+    env = TransformedEnv(
+        SerialEnv(len(lengths), [partial(CountingEnv, n) for n in lengths]),
+        policy_transforms(prior, observation_steps=1, execute=execute, delay=delay),
+    )
+    rollout = env.rollout(12, told(size), break_when_any_done=False)
+    actions, _, episode = executed_actions(rollout)
+    for row, length in enumerate(lengths):
+        expected, _ = lone_robot(
+            length,
+            size,
+            execute,
+            delay,
+            lambda step: [torch.tensor([step, step + i]) / 1000 for i in range(size)],
+        )
+        for number in range(int(episode[row].max())):  # but for the last, which may be cut
+            found = actions[row][episode[row] == number]
+            torch.testing.assert_close(found, torch.stack(expected))
+            # Each is the action for the step at which it was executed.
+            torch.testing.assert_close(found[:, 1] * 1000, torch.arange(float(length)))
+    # The environment itself was given the last action of every decision.
+    last = executed_chunk(rollout).gather(
+        -2, (rollout["next", "executed_steps"] - 1).unsqueeze(-1).expand(-1, -1, 1, ACTION_DIM)
+    )
+    seen = rollout["next", "observation"][..., 0, 2:]
+    torch.testing.assert_close(last.squeeze(-2), seen)
+
+
+def history(rollout, row, decision):
+    """All actions executed in the episode before a decision, control step by control step."""
+    done = rollout["next", "done"][row, :decision].flatten()
+    first = int(done.nonzero().max()) + 1 if done.any() else 0
+    chunk, steps = executed_chunk(rollout)[row], rollout["next", "executed_steps"][row]
+    parts = [chunk[d, : int(steps[d])] for d in range(first, decision)]
+    return torch.cat(parts) if parts else chunk[0, :0]
+
+
+@pytest.mark.parametrize(("execute", "delay"), [(3, 2), (4, 2), (5, 1)])
+def test_the_past_is_what_was_executed(execute, delay):
+    prior = PRIORS["past"]
+    env = TransformedEnv(
+        SerialEnv(2, [partial(CountingEnv, n) for n in (13, 40)]),
+        policy_transforms(prior, observation_steps=1, execute=execute, delay=delay),
+    )
+    rollout = env.rollout(9, told(6), break_when_any_done=False)
+    warm = 0
+    for row in range(2):
+        for decision in range(9):
+            before = history(rollout, row, decision)
+            is_warm = rollout["prior", "warm"][row, decision].all()
+            assert is_warm == (len(before) >= 6)
+            if is_warm:
+                warm += 1
+                assert torch.equal(rollout["prior", "loc"][row, decision], before[-6:])
+    assert warm > 6
+
+
+@pytest.mark.parametrize(("execute", "delay"), [(3, 2), (6, 6), (5, 1)])
+def test_the_preview_is_the_forecast_of_the_same_steps(execute, delay):
+    prior = PRIORS["preview"]
+    env = TransformedEnv(
+        CountingEnv(50), policy_transforms(prior, observation_steps=1, execute=execute, delay=delay)
+    )
+    rollout = env.rollout(8, told(12))
+    for decision in range(1, len(rollout)):
+        step = decision * execute
+        loc = rollout["prior", "loc"][decision, :6] * 1000
+        # Made by the decision before, for the six steps from here on.
+        torch.testing.assert_close(loc[:, 0], torch.full((6,), float(step - execute)))
+        torch.testing.assert_close(loc[:, 1], step + torch.arange(6.0))
+        # The leftover is the same forecast, and reaches as far as the chunk did.
+        leftover, valid = rollout["rtc", "leftover"][decision], rollout["rtc", "valid"][decision]
+        assert valid.flatten().tolist() == [i < 12 - execute for i in range(12)]
+        assert torch.equal(leftover[:6], rollout["prior", "loc"][decision, :6])
+        assert not leftover[12 - execute :].any()
+
+
+def late(length):
+    transforms = policy_transforms(PRIORS["past"], observation_steps=1, execute=4, delay=2)
+    return TransformedEnv(CountingEnv(length), transforms)
+
+
+@pytest.mark.parametrize("batched", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
+def test_inside_of_batched_environments(batched):
+    lengths = (7, 16)
+    env = batched(2, [partial(late, n) for n in lengths])
+    try:
+        rollout = env.rollout(10, told(6), break_when_any_done=False)
+    finally:
+        env.close(raise_if_closed=False)
+    actions, _, episode = executed_actions(rollout)
+    for row, length in enumerate(lengths):
+        alone = executed_actions(late(length).rollout(10, told(6)))[0]
+        for number in range(int(episode[row].max())):
+            torch.testing.assert_close(actions[row][episode[row] == number], alone)
+        # And the simulators were given these.
+        last = (rollout["next", "executed_steps"][row] - 1).unsqueeze(-1).expand(-1, 1, ACTION_DIM)
+        given = executed_chunk(rollout)[row].gather(-2, last).squeeze(-2)
+        torch.testing.assert_close(given, rollout["next", "observation"][row, :, 0, 2:])
+
+
+def test_only_the_rows_of_a_partial_step_change():
+    env = TransformedEnv(
+        SerialEnv(2, partial(CountingEnv, 20)),
+        policy_transforms(PRIORS["past"], observation_steps=1, execute=4, delay=2),
+    )
+    policy = told(6)
+    data = env.step_mdp(env.step(policy(env.reset())))
+    data.set("_step", torch.tensor([True, False]))
+    after = env.step(policy(data))["next"]
+    for key in ("leftover", "valid", "delay"):
+        before, now = data["rtc", key], after["rtc", key]
+        assert torch.equal(before[1], now[1]), key
+    assert not torch.equal(data["rtc", "leftover"][0], after["rtc", "leftover"][0])
+    # A reset of the other row leaves the first one as it is.
+    fresh = env.reset(
+        env.step_mdp(env.step(policy(data))).set("_reset", torch.tensor([[False], [True]]))
+    )
+    assert fresh["rtc", "delay"].tolist() == [[2], [0]]
+    assert fresh["rtc", "valid"].any((1, 2)).tolist() == [True, False]
+
+
+def test_specs_and_jumps_where_chunks_take_effect():
+    env = TransformedEnv(
+        CountingEnv(20), policy_transforms(PRIORS["past"], observation_steps=1, execute=4, delay=2)
+    )
+    check_env_specs(env)
+    rollout = env.rollout(10, told(6))
+    decision = executed_actions(rollout)[1].tolist()
+    assert decision == [0] * 6 + [1] * 4 + [2] * 4 + [3] * 4 + [4] * 2
+    # Only there the actions jump: made at another step. Inside, the steps they are for follow each other.
+    found = smoothness(rollout)
+    assert found.inner_jump == pytest.approx(0.001, rel=1e-3)
+    assert found.boundary_jump == pytest.approx((0.004**2 + 0.001**2) ** 0.5, rel=1e-3)
+    assert found.boundaries == 4
+    # The mean is compared with what the policy predicts, and carried on from what was executed.
+    made = [rollout["vla_action", "chunk"][d] for d in range(5)]
+    played = executed_chunk(rollout)
+    loc, squares = torch.cat([played[0, :4], played[1, :4]])[2:], []
+    for d in (2, 3, 4):
+        squares.append((made[d] - loc).square())
+        loc = torch.cat([loc, played[d, :4]])[4:]
+    expected = torch.cat(squares).mean().sqrt()
+    assert mean_revision(rollout, PRIORS["past"]) == pytest.approx(float(expected), rel=1e-5)
+
+
+class Judged(CountingEnv):
+    def __init__(self, length):
+        super().__init__(length)
+        flag = self.full_done_spec["done"].clone()
+        self.observation_spec["success"] = flag
+
+    def _reset(self, tensordict=None, **kwargs):
+        return super()._reset().set("success", torch.zeros(1, dtype=torch.bool))
+
+    def _step(self, tensordict):
+        return super()._step(tensordict).set("success", torch.ones(1, dtype=torch.bool))
+
+
+def test_episodes_keep_what_was_executed():
+    torch.manual_seed(0)
+    prior = PRIORS["past"]
+    network = VelocityMLP(ACTION_DIM, 4, 6, observation_steps=1, hidden_dim=8)
+    actor = WarmPriorActor(network, prior, nfe=2, guidance=RealTimeChunking())
+    env = TransformedEnv(
+        Judged(17), policy_transforms(prior, observation_steps=1, execute=4, delay=2)
+    )
+    episode = play_episode(actor, env, seed=3)
+    decisions = episode.decisions
+    assert episode.steps == 17 and decisions["next", "executed_steps"].sum() == 17
+    assert decisions["rtc", "delay"].flatten().tolist() == [0, 2, 2, 2, 2]
+    played = executed_chunk(decisions)
+    for d in range(1, len(decisions)):
+        left, valid = shift_chunk(played[d - 1], decisions["next", "executed_steps"][d - 1])
+        assert torch.equal(left, decisions["rtc", "leftover"][d]) and valid.sum() == 2
+        assert torch.equal(played[d, :2], played[d - 1, 4:])
+
+
+def test_numbers_that_do_not_go_together():
+    with pytest.raises(ValueError, match=r"delay of 4.*3 actions.*0 <= delay <= execute"):
+        InferenceDelay(4, execute=3)
+    with pytest.raises(ValueError, match="need 0 <= delay"):
+        InferenceDelay(-1, execute=3)
+    with pytest.raises(ValueError, match=r"6 actions do not reach 5.*delay of 2.*at most 4"):
+        TransformedEnv(
+            CountingEnv(9), policy_transforms(PRIORS["past"], execute=5, delay=2)
+        ).reset()
+    with pytest.raises(ValueError, match=r"delay of 4.*2 actions"):
+        policy_transforms(PRIORS["past"], delay=4)
+    alone = TransformedEnv(CountingEnv(9), InferenceDelay(1, execute=2))
+    with pytest.raises(KeyError, match="append it after ChunkStep"):
+        alone.reset()
+    whole = TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], delay=2))
+    data = told(6)(whole.reset())
+    with pytest.raises(KeyError, match=r"leftover.*delay.*hand over"):
+        whole.step(data.exclude("rtc"))
+    with pytest.raises(ValueError, match=r"expects a chunk \[\*B, 6, d_a\]"):
+        whole.step(whole.reset())
+    wrong = TransformedEnv(
+        CountingEnv(9),
+        Compose(ChunkStep(6), ActionHistory(PRIORS["past"]), InferenceDelay(1, execute=4)),
+    )
+    with pytest.raises(RuntimeError, match=r"executed 6 actions.*execute=4"):
+        wrong.rollout(2)
+
+
+def test_a_delay_alone_chooses_how_many_are_executed():
+    env = TransformedEnv(
+        CountingEnv(30), policy_transforms(PRIORS["past"], observation_steps=1, delay=2)
+    )
+    assert env.rollout(3, told(6))["next", "executed_steps"].flatten().tolist() == [4, 4, 4]
+    env = TransformedEnv(
+        CountingEnv(30), policy_transforms(PRIORS["preview"], observation_steps=1, delay=2)
+    )
+    assert env.rollout(3, told(12))["next", "executed_steps"].flatten().tolist() == [6, 6, 6]

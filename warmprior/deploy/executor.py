@@ -1,0 +1,304 @@
+"""One action per control step, while the next chunk is computed beside."""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import TimeoutError as NotDone
+from itertools import chain
+from types import TracebackType
+from typing import Self
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+
+from warmprior import keys
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_whole_numbers
+from warmprior.modules.normalize import Normalizer
+from warmprior.modules.prior import Prior
+from warmprior.modules.real_time_chunking import with_leftover
+from warmprior.transforms.delay import check_delay, shift_chunk
+from warmprior.transforms.mean_observation import mean_observation
+
+__all__ = ["AsyncExecutor"]
+
+
+class AsyncExecutor:
+    """Runs a policy beside a control loop: the next chunk is computed while this one is executed.
+
+    Every ``execute`` control steps a decision is begun with the observation of that step, in a thread of its
+    own. Until its chunk is there the robot goes on with the one before; the new one then takes effect at
+    the position of the step that has been reached. How many steps that took is counted, and the largest of
+    the last decisions' is what the policy is told of the next (``("rtc", "delay")``, with what is left of the
+    chunk, for :class:`~warmprior.RealTimeChunking`). The prior's mean is made of what was executed. All of
+    it is what :class:`~warmprior.InferenceDelay` does in simulation: with ``latency`` given, the actions are
+    the same.
+
+    Only the first step of an episode waits for its chunk. Later ones wait at most ``timeout`` seconds, where
+    no action is left; :meth:`act` then raises ``TimeoutError``, and may be called again, with the robot held
+    meanwhile.
+
+    Args:
+        actor: a :class:`~warmprior.WarmPriorActor`, or any module that reads ``"observation"``, the mean
+            under ``"prior"`` and what it needs under ``"rtc"`` (see :mod:`warmprior.keys`), and writes a
+            chunk ``[P, d_a]``; set to evaluation mode. It is called without batch dimensions, one call at a
+            time.
+
+    Keyword Args:
+        prior: of the policy; that of a :class:`~warmprior.WarmPriorActor` by default.
+        execute: control steps from one decision to the next; by default all ``H``, or as many as a chunk
+            allows with ``delay``.
+        delay: control steps that decisions are expected to take until some were measured.
+        window: number of last decisions whose largest delay is expected of the next.
+        observation_steps: ``To``.
+        normalizer: between raw and normalised units, such as the actor's own; by default observations are
+            given, and actions handed out, as the policy has them.
+        timeout: seconds to wait for a late chunk once no action is left; ``None`` for as long as it takes.
+        latency: simulate: chunks are computed in the calling thread, and take effect so many control steps
+            later.
+        pool: where to compute; by default in one thread, which :meth:`close` ends.
+        action_dim: ``d_a``; that of the actor's network by default.
+        chunk_key: where the policy writes its chunk; a :class:`~warmprior.WarmPriorActor`'s own by default.
+
+    Raises:
+        ValueError: for numbers that do not go together, or what the actor does not tell and is not given.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import PastPrior, RealTimeChunking, VelocityMLP, WarmPriorActor
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8), guidance=RealTimeChunking())
+        >>> with AsyncExecutor(actor, execute=6, latency=2) as executor:
+        ...     actions = [executor.act(torch.zeros(3)) for _ in range(21)]
+        >>> actions[0].shape, executor.delays
+        (torch.Size([2]), (2, 2, 2))
+    """
+
+    def __init__(
+        self,
+        actor: TensorDictModuleBase,
+        *,
+        prior: Prior | None = None,
+        execute: int | None = None,
+        delay: int = 1,
+        window: int = 10,
+        observation_steps: int = 2,
+        normalizer: Normalizer | None = None,
+        timeout: float | None = 0.0,
+        latency: int | None = None,
+        pool: Executor | None = None,
+        action_dim: int | None = None,
+        chunk_key: NestedKey | None = None,
+    ) -> None:
+        if isinstance(actor, WarmPriorActor):
+            prior = actor.prior if prior is None else prior
+            chunk_key = actor.chunk_key if chunk_key is None else chunk_key
+            if action_dim is None:
+                action_dim = getattr(actor.network, "action_dim", None)
+        if prior is None or action_dim is None:
+            raise ValueError(f"{type(actor).__name__} does not tell: give prior and action_dim")
+        if latency is not None:
+            if pool is not None:
+                raise ValueError(
+                    "a simulated latency computes in the calling thread: leave out pool"
+                )
+            delay = latency
+        check_whole_numbers(window=window, observation_steps=observation_steps)
+        length = prior.prediction_length
+        if execute is None:
+            execute = min(prior.chunk_length, length - delay)
+        check_delay(delay, execute, length)
+        if not 1 <= execute <= prior.chunk_length:
+            raise ValueError(
+                f"need 1 <= execute <= {prior.chunk_length}, the prior's chunk length, got {execute}"
+            )
+        self.prior, self.execute, self.timeout, self.latency = prior, execute, timeout, latency
+        self.actor = actor.eval()
+        self._chunk_key = keys.CHUNK if chunk_key is None else chunk_key
+        self._shape = (length, action_dim)
+        self._device = next(
+            (value.device for value in chain(actor.parameters(), actor.buffers())),
+            torch.device("cpu"),
+        )
+        self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
+        self._conditioned = mean_observation(prior)
+        self._owned = None
+        if pool is None and latency is None:
+            self._owned = pool = ThreadPoolExecutor(1, thread_name_prefix="warmprior-policy")
+        self._pool = pool
+        self._expected = delay
+        self._delays: deque[int] = deque(maxlen=window)
+        self._frames: deque[Tensor | TensorDictBase] = deque(maxlen=observation_steps)
+        self._closed = False
+        self.reset()
+
+    @property
+    def delays(self) -> tuple[int, ...]:
+        """Control steps that the last decisions took; those of first decisions are not counted."""
+        return tuple(self._delays)
+
+    @property
+    def expected_delay(self) -> int:
+        """What the next decision is told: the largest of :attr:`delays`, or ``delay`` without any."""
+        return max(self._delays, default=self._expected)
+
+    def reset(self) -> None:
+        """Begin another episode: nothing was executed, nothing is left, nothing is under way."""
+        pending: Future[Tensor] | None = getattr(self, "_pending", None)
+        if pending is not None:
+            pending.cancel()
+        self._pending: Future[Tensor] | None = None
+        self._frames.clear()
+        self._loc = torch.zeros(self._shape)
+        self._warm = torch.zeros(self._shape[0], 1, dtype=torch.bool)
+        self._elapsed = torch.zeros(1, dtype=torch.int64)
+        # The chunk as it is executed from the last decision on, and how much of it there is.
+        self._chunk, self._left, self._executed = torch.zeros(self._shape), 0, 0
+
+    def act(self, observation: Tensor | TensorDictBase) -> Tensor:
+        """The action of this control step.
+
+        Args:
+            observation: of this step, ``[d_o]``, or a tensordict ``[]`` of several entries.
+
+        Returns:
+            ``[d_a]``, on the CPU.
+
+        Raises:
+            TimeoutError: if no action is left, and the next chunk is not there in time.
+            RuntimeError: after :meth:`close`.
+            Exception: whatever the policy raised in its thread; at every call until :meth:`reset`.
+        """
+        if self._closed:
+            raise RuntimeError("the executor is closed")
+        self._see(observation)
+        self._collect()
+        if self._pending is None and self._executed >= min(self.execute, self._left):
+            self._decide()
+            self._collect()
+        if self._executed >= self._usable:
+            self._wait()
+        action = self._chunk[self._executed]
+        self._executed += 1
+        if self._normalizer is None:
+            return action.clone()
+        return self._normalizer.denormalize(TensorDict({keys.ACTION: action}))[keys.ACTION]
+
+    @property
+    def _usable(self) -> int:
+        """Actions that can be executed before another chunk is needed."""
+        # Means are defined for at most H executed actions per decision.
+        return self._left if self._pending is None else min(self._left, self.prior.chunk_length)
+
+    def _see(self, observation: Tensor | TensorDictBase) -> None:
+        if self._normalizer is not None:
+            data = TensorDict({keys.OBSERVATION: observation})
+            observation = self._normalizer.normalize(data)[keys.OBSERVATION]
+        observation = observation.clone()  # drivers may write the next one into the same memory
+        self._frames.append(observation)
+        while len(self._frames) < (self._frames.maxlen or 0):
+            self._frames.append(observation)
+
+    def _decide(self) -> None:
+        """Begin a decision; what is left of the chunk is at the positions of the new one from here on."""
+        steps = torch.tensor([self._executed])
+        if self._left:
+            self._elapsed = self._elapsed + steps
+            means = self.prior.next_mean(self._loc, self._chunk, steps, self._elapsed)
+            self._loc, self._warm = (value.cpu() for value in means)
+        left = self._left - self._executed
+        self._chunk, valid = shift_chunk(self._chunk, steps)
+        valid &= torch.arange(len(valid)).unsqueeze(-1) < left
+        self._left, self._executed = left, 0
+        frames = torch.stack(list(self._frames))
+        if isinstance(frames, TensorDictBase):
+            frames.batch_size = []  # the steps belong to the entries
+        data = TensorDict(
+            {
+                keys.OBSERVATION: frames,
+                "prior": {"loc": self._loc, "warm": self._warm, "elapsed": self._elapsed},
+                "rtc": {
+                    "leftover": self._chunk,
+                    "valid": valid,
+                    "delay": torch.tensor([min(self.expected_delay, left)]),
+                },
+            }
+        ).clone()
+        if self._pool is None:
+            self._pending = Future()
+            try:
+                self._pending.set_result(self._compute(data))
+            except Exception as error:  # as a thread would keep it
+                self._pending.set_exception(error)
+        else:
+            self._pending = self._pool.submit(self._compute, data)
+
+    @torch.no_grad()
+    def _compute(self, data: TensorDictBase) -> Tensor:
+        """The policy's chunk, in whichever thread."""
+        for transform in self._conditioned:
+            data = transform(data)
+        chunk = self.actor(data.to(self._device)).get(self._chunk_key)
+        if chunk is None or tuple(chunk.shape) != self._shape:
+            found = "nothing" if chunk is None else f"shape {tuple(chunk.shape)}"
+            raise ValueError(
+                f"expected a chunk [P, d_a] = {self._shape} at {self._chunk_key}, found {found}"
+            )
+        if not chunk.isfinite().all():
+            raise FloatingPointError("the policy's chunk holds NaN or infinity")
+        return chunk.to(self._chunk)
+
+    def _collect(self) -> None:
+        """Let the chunk under way take effect, if it is there."""
+        if self._pending is None or not self._pending.done():
+            return
+        first = self._left == 0 and not self._elapsed
+        if self.latency is not None and not first and self._executed < self.latency:
+            return
+        chunk = self._pending.result()
+        self._chunk = with_leftover(chunk, self._chunk, torch.tensor([self._executed]))
+        self._left, self._pending = self._shape[0], None
+        if not first:
+            self._delays.append(self._executed)
+
+    def _wait(self) -> None:
+        """Wait for the chunk under way: without it there is no action."""
+        first = not self._elapsed
+        if self._pending is not None:
+            try:
+                self._pending.exception(None if first else self.timeout)
+            except NotDone as late:
+                raise TimeoutError(
+                    f"the next chunk is not there after {self._executed} control steps and {self.timeout} s: "
+                    f"all {self._executed} actions that the last one held for them are executed. Hold the "
+                    "robot and call again, execute fewer actions per decision, predict longer chunks, or "
+                    "make the policy faster"
+                ) from late
+        self._collect()
+
+    def close(self, *, wait: bool = True) -> None:
+        """End the thread; a pool that was given is left as it is.
+
+        Args:
+            wait: for a decision under way to end.
+        """
+        self._closed = True
+        if self._pending is not None:
+            self._pending.cancel()
+        if self._owned is not None:
+            self._owned.shutdown(wait=wait, cancel_futures=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

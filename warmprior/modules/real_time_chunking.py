@@ -1,0 +1,255 @@
+"""Real-Time Chunking: a flow that is guided towards the rest of the chunk that is being executed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
+
+__all__ = ["SCHEDULES", "RealTimeChunking", "with_leftover"]
+
+Velocity = Callable[[Tensor, Tensor], Tensor]
+
+SCHEDULES: dict[str, Callable[[Tensor], Tensor]] = {
+    "exp": lambda linear: linear * torch.expm1(linear) / (math.e - 1),
+    "linear": lambda linear: linear,
+    "ones": torch.ones_like,
+    "zeros": lambda linear: (linear >= 1).to(linear),
+}
+"""How the weight of a position falls behind the delay, by name, from one that falls linearly."""
+
+Schedule = Literal["exp", "linear", "ones", "zeros"]
+
+
+def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
+    """A chunk as it is executed when it takes effect late: until then the old one's rest is.
+
+    Args:
+        chunk: the prediction, ``[*B, P, d_a]``.
+        leftover: what the chunk before holds for the same control steps, ``[*B, P, d_a]``.
+        delay: control steps until ``chunk`` takes effect, int64 ``[*B, 1]``.
+
+    Examples:
+        >>> import torch
+        >>> chunk, leftover = torch.zeros(1, 4, 1), torch.ones(1, 4, 1)
+        >>> with_leftover(chunk, leftover, torch.tensor([[2]])).flatten().tolist()
+        [1.0, 1.0, 0.0, 0.0]
+    """
+    late = torch.arange(chunk.shape[-2], device=chunk.device) < delay
+    return torch.where(late.unsqueeze(-1), leftover.to(chunk.dtype), chunk)
+
+
+@dataclass(frozen=True)
+class RealTimeChunking:
+    r"""Guidance of `Real-Time Chunking <https://arxiv.org/abs/2506.07339>`_, for any source.
+
+    While a chunk is computed, the one before goes on being executed for ``d`` control steps (the delay),
+    and the new one should continue it. Velocities are corrected towards the leftover :math:`Y` of the old
+    chunk, with :math:`\hat a = a_t + (1-t)\,v(t, a_t)` and :math:`J = \partial \hat a / \partial a_t`:
+
+    .. math::
+        v' = v + \min\!\big(g(t), \beta\big)\; J^\top W (Y - \hat a), \qquad
+        g(t) = \frac{\sigma^2}{S^2} \frac{1-t}{t} + \frac{t}{1-t}.
+
+    :math:`g` is exact for a source :math:`N(\mu, \sigma^2)` and Gaussian data of standard deviation
+    :math:`S` (docs/real_time_chunking.md derives it); :math:`\mu` drops out. :math:`\sigma = S = 1` is the
+    published weight, :math:`\frac{1-t}{t} \cdot \frac{t^2 + (1-t)^2}{(1-t)^2}`. It supposes a flow along
+    straight lines (:class:`~warmprior.LinearInterpolant`).
+
+    :math:`W` is 1 on the positions before the delay, which are executed as they are in the old chunk, falls
+    behind it by ``schedule``, and is 0 from ``horizon`` on.
+
+    Args:
+        horizon: first position without guidance, LeRobot's ``execution_horizon`` and the official code's
+            ``prefix_attention_horizon``; ``None``, the default, for all that is left of the old chunk, as in
+            the official studies. It never reaches further than that.
+        schedule: ``"exp"`` (the official default), ``"linear"`` (LeRobot's), ``"ones"`` or ``"zeros"``.
+        max_guidance_weight: :math:`\beta`; 5 in the official code, 10 in LeRobot.
+        jacobian: ``False`` takes the identity for :math:`J`, as LeRobot 0.6 does: no gradients, 0.6 of the
+            time, and another method, which is not exact where the formula is.
+        sigma: what to take for the source's standard deviation; its own by default. 1 is the published
+            weight whatever the source.
+        data_std: :math:`S`, how far actions spread where the observation is known, in normalised units. A
+            scale of the data in the weight is also what POTR (arXiv 2605.24433) names :math:`\sigma_d`.
+        trust_region: bound of the correction's part that is perpendicular to the velocity, as a share of
+            the velocity's norm; ``None`` for none. POTR bounds that part too; this form is ours.
+
+    Raises:
+        ValueError: for an unknown schedule, or a number that is not positive.
+
+    Examples:
+        >>> import torch
+        >>> rtc = RealTimeChunking(schedule="linear")
+        >>> weights = rtc.weights(torch.tensor(2), torch.tensor(6), 8)  # of 8 positions 6 are left
+        >>> (10 * weights).round().tolist()
+        [10.0, 10.0, 8.0, 6.0, 4.0, 2.0, 0.0, 0.0]
+        >>> rtc.guidance_weight(torch.tensor([0.0, 0.5, 0.75])).tolist()
+        [5.0, 2.0, 3.33...]
+    """
+
+    horizon: int | None = None
+    schedule: Schedule = "exp"
+    max_guidance_weight: float = 5.0
+    jacobian: bool = True
+    sigma: float | None = None
+    data_std: float = 1.0
+    trust_region: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.schedule not in SCHEDULES:
+            raise ValueError(
+                f"unknown schedule {self.schedule!r}; choose one of {', '.join(SCHEDULES)}"
+            )
+        if self.horizon is not None:
+            check_whole_numbers(horizon=self.horizon)
+        positive = ("max_guidance_weight", "data_std")
+        numbers = {name: getattr(self, name) for name in (*positive, "sigma", "trust_region")}
+        for name, value in numbers.items():
+            if value is None:
+                continue
+            check_finite_numbers(**{name: value})
+            if value < 0 or (value == 0 and name in positive):
+                least = "> 0" if name in positive else ">= 0"
+                raise ValueError(f"{name} must be {least}, got {value}")
+
+    def config(self) -> dict[str, Any]:
+        """The options, as JSON holds them."""
+        return asdict(self)
+
+    def check_delay(self, delay: int, left: int) -> None:
+        """Whether chunks can be guided that take effect so late.
+
+        Args:
+            delay: ``d``, control steps.
+            left: actions that are left of the old chunk when the new one is begun.
+
+        Raises:
+            ValueError: if the delay reaches behind the leftover or the horizon.
+        """
+        if not 0 <= delay <= left:
+            raise ValueError(
+                f"a delay of {delay} control steps needs as many actions of the old chunk, and {left} are "
+                "left of it: execute fewer actions per decision, or predict longer chunks"
+            )
+        if self.horizon is not None and self.horizon < delay:
+            raise ValueError(
+                f"the guidance ends at horizon={self.horizon}, before the delay of {delay} control steps "
+                f"does: need horizon >= delay, or None for all {left} actions that are left"
+            )
+
+    def weights(
+        self, delay: Tensor, left: Tensor, length: int, dtype: torch.dtype | None = None
+    ) -> Tensor:
+        """:math:`W`, by position.
+
+        Args:
+            delay: ``d``, int64 ``[*B]``.
+            left: number of positions that the leftover has, int64 ``[*B]``; the others weigh nothing.
+            length: ``P``.
+            dtype: of the weights; PyTorch's default one by default.
+
+        Returns:
+            ``[*B, P]``, between 0 and 1.
+        """
+        i = torch.arange(length, device=delay.device)
+        end = (left if self.horizon is None else left.clamp(max=self.horizon)).unsqueeze(-1)
+        start = torch.minimum(delay.unsqueeze(-1), end)
+        linear = (
+            (start - 1 - i).to(dtype or torch.get_default_dtype()) / (end - start + 1) + 1
+        ).clamp(0, 1)
+        return torch.where(i < end, SCHEDULES[self.schedule](linear), 0.0)
+
+    def guidance_weight(self, t: Tensor, sigma: Tensor | float = 1.0) -> Tensor:
+        r""":math:`\min(g(t), \beta)`.
+
+        Args:
+            t: times in [0, 1], ``[...]``.
+            sigma: standard deviation of the source, broadcastable to ``t``; see ``sigma`` above.
+        """
+        if self.sigma is not None:
+            sigma = self.sigma
+        tiny = torch.finfo(t.dtype).tiny
+        source = (sigma / self.data_std) ** 2 * ((1 - t) / t.clamp(min=tiny))
+        data = t / (1 - t).clamp(min=tiny)
+        return (source + data).clamp(max=self.max_guidance_weight)
+
+    def guided(
+        self,
+        velocity: Velocity,
+        leftover: Tensor,
+        valid: Tensor,
+        delay: Tensor,
+        sigma: Tensor | float = 1.0,
+    ) -> Velocity:
+        """A velocity that leads to chunks which continue the leftover.
+
+        It works under ``torch.no_grad()``, and what it gives is detached.
+
+        Args:
+            velocity: ``(t [B], a_t [B, P, d_a]) -> [B, P, d_a]``.
+            leftover: ``Y``, ``[B, P, d_a]``, at the positions of the new chunk.
+            valid: which positions it has, bool ``[B, P, 1]``: the first ones. Rows without any are not
+                guided.
+            delay: ``d``, int64 ``[B, 1]``.
+            sigma: standard deviation of the source, broadcastable to ``[B, P, d_a]``.
+
+        Returns:
+            A velocity of the same form; ``velocity`` itself if no row has a leftover.
+
+        Raises:
+            ValueError: if the shapes do not fit, or see :meth:`check_delay`.
+            RuntimeError: (when called) with the Jacobian, under ``torch.inference_mode()``.
+        """
+        rows, length = leftover.shape[:2]
+        if valid.shape != (rows, length, 1) or delay.shape != (rows, 1):
+            raise ValueError(
+                f"the leftover [B, P, d_a] has shape {tuple(leftover.shape)}: valid has to be [B, P, 1] and "
+                f"the delay [B, 1], got {tuple(valid.shape)} and {tuple(delay.shape)}"
+            )
+        left, delay = valid.sum((1, 2)), delay.squeeze(1)
+        if not left.any():
+            return velocity
+        for late, count in torch.stack([delay, left], 1)[left > 0].unique(dim=0).tolist():
+            self.check_delay(late, count)
+        weights = self.weights(delay, left, length, leftover.dtype).unsqueeze(-1)
+
+        def corrected(t: Tensor, a: Tensor) -> Tensor:
+            rest = (1 - t)[:, None, None]
+            if not self.jacobian:
+                v = velocity(t, a)
+                correction = weights * (leftover - (a + rest * v))
+            else:
+                if torch.is_inference_mode_enabled():
+                    raise RuntimeError(
+                        "RealTimeChunking needs gradients, which torch.inference_mode() rules out: use "
+                        "torch.no_grad(), or jacobian=False"
+                    )
+                with torch.enable_grad():
+                    point = a.detach().requires_grad_(True)
+                    v = velocity(t, point)
+                    clean = point + rest * v
+                    error = (weights * (leftover - clean)).detach()
+                    (correction,) = torch.autograd.grad(clean, point, error)
+            v = v.detach()
+            correction = self.guidance_weight(t[:, None, None], sigma) * correction
+            return v + self._within(correction, v)
+
+        return corrected
+
+    def _within(self, correction: Tensor, velocity: Tensor) -> Tensor:
+        """The correction, inside the trust region around the velocity's direction."""
+        if self.trust_region is None:
+            return correction
+        c, v = correction.flatten(1), velocity.flatten(1)
+        tiny = torch.finfo(c.dtype).tiny
+        along = (c * v).sum(1, keepdim=True) / v.square().sum(1, keepdim=True).clamp(min=tiny) * v
+        across = c - along
+        bound = self.trust_region * v.norm(dim=1, keepdim=True)
+        share = (bound / across.norm(dim=1, keepdim=True).clamp(min=tiny)).clamp(max=1.0)
+        return (along + share * across).view_as(correction)
