@@ -9,6 +9,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from warmprior.io.scheduling import scheduled_as_before
+
 WIDTHS = {"observation.environment_state": 10, "observation.state": 9, "action": 7}
 """Those of lift."""
 
@@ -58,7 +60,8 @@ def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, see
                 written[name].append(value)
             frame |= {name: scene(episode, step) for name in cameras}
             dataset.add_frame(frame | {"task": "lift"})
-        dataset.save_episode()
+        with scheduled_as_before():
+            dataset.save_episode()
     dataset.finalize()
     return {name: np.stack(values) for name, values in written.items()}
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import h5py
 import numpy as np
 import pytest
@@ -59,6 +61,11 @@ def converted(tmp_path_factory):
         kind: convert_robomimic(path, folder / kind, images=kind, progress=False)
         for kind in ("image", "video")
     }
+
+
+def test_a_process_is_scheduled_as_before(converted):
+    """The encoder of videos takes real-time priority where it may, which workers would inherit."""
+    assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 def equal(mine, theirs):

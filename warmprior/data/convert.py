@@ -30,6 +30,7 @@ from warmprior.data.lerobot_meta import DESCRIPTION
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
+from warmprior.io.scheduling import scheduled_as_before
 from warmprior.keys import ACTION, OBSERVATION, STATE
 
 __all__ = ["convert_robomimic"]
@@ -214,7 +215,7 @@ def _write(
         unit="demo",
         disable=not progress,
     )
-    with _quiet():
+    with _quiet(), scheduled_as_before():
         try:
             for start, stop in bar:
                 for row in range(start, stop):
