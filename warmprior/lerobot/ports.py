@@ -240,7 +240,10 @@ class OpenPiPort(FlowPort):
         def around(sample: Callable[..., Any]) -> Callable[..., Any]:
             def sampled(images: Any, *args: Any, **kwargs: Any) -> Tensor:
                 if kwargs.get("noise") is not None:
-                    raise ValueError("noise= is what the prior gives: leave it out")
+                    raise ValueError(
+                        "noise= is what the prior gives: leave it out, and put no second prior around a "
+                        "policy that has one (warm_smolvla, warm_pi05)"
+                    )
                 shape = torch.Size((images[0].shape[0], length, width))
                 kwargs["noise"] = source(shape, torch.float32, images[0].device)
                 actions = sample(images, *args, **kwargs)
