@@ -72,6 +72,15 @@ class FlowPort(ABC):
         """Sample a chunk for a batch of observations, without regard to any queue."""
         policy.predict_action_chunk(batch)
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Known ports are pickled and copied by name: what they are made of has none."""
+        known = next((name for name, port in PORTS.items() if port is self), None)
+        return super().__reduce_ex__(protocol) if known is None else (_known, (known,))
+
+
+def _known(name: str) -> FlowPort:
+    return PORTS[name]
+
 
 def check_steps(nfe: int | None) -> None:
     """Refuse a number of integration steps that is none.
