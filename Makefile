@@ -5,7 +5,11 @@ ARGS ?=
 EXTRAS := sim,vision,lerobot,vla,docs,dev
 PLUGIN := plugins/lerobot_policy_warmprior
 
-.PHONY: install benchmark throughput test test-slow lint fuzz docs clean
+# GR00T N1.5 is in lerobot 0.5.1 alone, which needs an environment of its own.
+GROOT := .venv-groot
+GROOT_NEEDS := tests/lerobot/groot_n15.txt
+
+.PHONY: install benchmark throughput test test-slow test-groot-n15 lint fuzz docs clean
 
 install: .venv/installed
 
@@ -30,6 +34,17 @@ test: install
 test-slow: install
 	$(BIN)/python -m pytest -m slow $(ARGS)
 
+$(GROOT)/installed: pyproject.toml constraints.txt $(GROOT_NEEDS)
+	$(PYTHON) -m venv $(GROOT)
+	$(GROOT)/bin/python -m pip install --quiet --upgrade pip
+	awk -F== 'NR == FNR { if (NF > 1) own[$$1]; next } !($$1 in own)' $(GROOT_NEEDS) constraints.txt > $(GROOT)/constraints.txt
+	$(GROOT)/bin/python -m pip install --quiet --constraint $(GROOT)/constraints.txt --requirement $(GROOT_NEEDS) --editable .
+	$(GROOT)/bin/python -m pip install --quiet --no-deps lerobot==0.5.1
+	@touch $@
+
+test-groot-n15: $(GROOT)/installed
+	$(GROOT)/bin/python -m pytest tests/lerobot/test_ports.py tests/lerobot/test_groot_n15.py $(ARGS)
+
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -42,4 +57,4 @@ docs: install
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build
 
 clean:
-	rm -rf .venv docs/_build build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf .venv $(GROOT) docs/_build build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -19,6 +19,8 @@ def built():
     policies = {}
 
     def build(family, **options):
+        if family not in MAKERS:
+            pytest.skip(f"{family} needs another release of lerobot")
         if options:
             return MAKERS[family](**options)
         if family not in policies:

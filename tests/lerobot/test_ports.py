@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.lerobot.seen import at_times, watch
-from tests.lerobot.tiny import ACTION, LENGTH, MAKERS, STEPS, observations, width, windows
+from tests.lerobot.tiny import ACTION, LENGTH, MAKERS, N15, STEPS, observations, width, windows
 from warmprior import GaussianPrior, PastPrior
 from warmprior.lerobot import PORTS, WarmPriorAdapter, port_for
 
@@ -37,13 +37,13 @@ def training_window(family, size=3):
 
 
 def test_all_families_have_a_port():
-    assert set(PORTS) == set(FAMILIES)
+    assert set(PORTS["0.5.1" if N15 else "0.6"]) == set(FAMILIES)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_ports_go_to_other_processes(family):
     """As TorchRL's collectors in processes send the policy and what is around it."""
-    port = PORTS[family]
+    port = PORTS["0.5.1" if N15 else "0.6"][family]
     assert pickle.loads(pickle.dumps(port)) is port
     assert copy.deepcopy(port) is port
 
@@ -207,16 +207,36 @@ def test_a_policy_that_draws_otherwise_is_not_trained(policy):
         adapter_of("pi05", pi).loss(batch, forward=lambda inputs: (torch.zeros(()), {}))
 
 
-def test_what_is_not_supported(policy, monkeypatch):
-    class Other:
-        name = "act"
+class Other:
+    name = "act"
 
-    with pytest.raises(ValueError, match=r"Other is no flow policy .* smolvla"):
+
+class Pi0:
+    name, config = "pi0", None
+
+
+def test_what_is_not_supported(policy):
+    with pytest.raises(ValueError, match=r"Other of lerobot .* is not supported: .* smolvla"):
         port_for(Other())
     with pytest.raises(ValueError, match="adapt_to_pi_aloha"):
         port_for(policy("smolvla", adapt_to_pi_aloha=True))
     with pytest.raises(ValueError, match="objective='diffusion' is no flow"):
         WarmPriorAdapter(policy("multi_task_dit", objective="diffusion"), GaussianPrior(4))
-    monkeypatch.setattr("warmprior.lerobot.ports.version", lambda name: "0.7.0")
-    with pytest.raises(ImportError, match=r"lerobot 0\.7\.0 .* supported is 0\.6\.\*"):
-        port_for(policy("pi0"))
+
+
+@pytest.mark.parametrize("release", ["0.7.0", "0.60.0", "0.5.0", "0.5.10"])
+def test_releases_without_ports(release, monkeypatch):
+    monkeypatch.setattr("warmprior.lerobot.ports.version", lambda name: release)
+    with pytest.raises(ImportError, match=f"lerobot {release} .* 0.6: pi0, .*; 0.5.1: groot$"):
+        port_for(Pi0())
+
+
+def test_the_release_tells_the_port(monkeypatch):
+    monkeypatch.setattr("warmprior.lerobot.ports.version", lambda name: "0.6.12")
+    assert port_for(Pi0()) is PORTS["0.6"]["pi0"]
+    # Those of the older release may draw their noise elsewhere.
+    monkeypatch.setattr("warmprior.lerobot.ports.version", lambda name: "0.5.1")
+    with pytest.raises(
+        ValueError, match=r"Pi0 of lerobot 0\.5\.1 is not supported: .*; 0\.5\.1: groot$"
+    ):
+        port_for(Pi0())

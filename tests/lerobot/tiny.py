@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+from importlib.metadata import PackageNotFoundError, version
 from types import SimpleNamespace
 from typing import Any
 from unittest import mock
@@ -12,6 +13,25 @@ import torch
 
 STATE, ACTION, PADDED, LENGTH, STEPS = 6, 7, 12, 8, 4
 CAMERA = "observation.images.top"
+
+
+def installed() -> str | None:
+    try:
+        return version("lerobot")
+    except PackageNotFoundError:
+        return None
+
+
+N15 = installed() == "0.5.1"
+"""Whether the release is that of GR00T N1.5, where no other family is supported (``make test-groot-n15``)."""
+
+ATTENTION = {  # of the heads of GR00T
+    "positional_embeddings": None,
+    "num_attention_heads": 2,
+    "attention_head_dim": 16,
+    "dropout": 0.0,
+    "final_dropout": False,
+}
 
 
 def features(image: tuple[int, ...] | None = (3, 64, 64)) -> dict[str, Any]:
@@ -139,13 +159,6 @@ def make_groot(**options: Any) -> Any:
     from lerobot.policies.groot.groot_n1_7 import GR00TN17ActionHead, GR00TN17Config
     from transformers.feature_extraction_utils import BatchFeature
 
-    attention = {
-        "positional_embeddings": None,
-        "num_attention_heads": 2,
-        "attention_head_dim": 16,
-        "dropout": 0.0,
-        "final_dropout": False,
-    }
     sizes = GR00TN17Config(
         backbone_embedding_dim=32,
         max_state_dim=8,
@@ -158,13 +171,13 @@ def make_groot(**options: Any) -> Any:
         use_alternate_vl_dit=True,
         state_dropout_prob=0.0,
         diffusion_model_cfg={
-            **attention,
+            **ATTENTION,
             "num_layers": 4,
             "norm_type": "ada_norm",
             "output_dim": 32,
             "interleave_self_attention": True,
         },
-        vl_self_attention_cfg={**attention, "num_layers": 1},
+        vl_self_attention_cfg={**ATTENTION, "num_layers": 1},
     )
 
     class Model(torch.nn.Module):
@@ -206,6 +219,74 @@ def make_groot(**options: Any) -> Any:
         modeling_groot.GrootPolicy, "_create_groot_model", lambda self: Model()
     )
     with create:
+        return modeling_groot.GrootPolicy(GrootConfig(**chosen))
+
+
+def make_groot_n15(**options: Any) -> Any:
+    """The real model behind an embedding of tokens, in lerobot 0.5.1."""
+    from lerobot.policies.groot import groot_n1, modeling_groot
+    from lerobot.policies.groot.configuration_groot import GrootConfig
+    from transformers.feature_extraction_utils import BatchFeature
+
+    class Backbone(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.embedding = torch.nn.Embedding(64, 32)
+
+        def prepare_input(self, inputs: Any) -> Any:
+            return BatchFeature(data=inputs)
+
+        def forward(self, inputs: Any) -> Any:
+            tokens = inputs["eagle_input_ids"]
+            mask = torch.ones_like(tokens, dtype=torch.bool)
+            features = self.embedding(tokens)
+            return BatchFeature(
+                data={"backbone_features": features, "backbone_attention_mask": mask}
+            )
+
+    head = {
+        "diffusion_model_cfg": {
+            **ATTENTION,
+            "num_layers": 2,
+            "norm_type": "ada_norm",
+            "output_dim": 32,
+            "interleave_self_attention": True,
+            "cross_attention_dim": 32,
+        },
+        "vl_self_attention_cfg": {**ATTENTION, "num_layers": 1},
+        "input_embedding_dim": 32,
+        "backbone_embedding_dim": 32,
+        "hidden_size": 32,
+        "max_seq_len": 64,
+        "action_dim": PADDED,
+        "action_horizon": LENGTH,
+        "max_state_dim": 8,
+        "max_num_embodiments": 32,
+        "num_target_vision_tokens": 4,
+        "num_inference_timesteps": STEPS,
+    }
+    sizes = groot_n1.GR00TN15Config(
+        backbone_cfg={}, action_head_cfg=head, action_horizon=LENGTH, action_dim=PADDED
+    )
+    chosen = {
+        **features(),
+        "chunk_size": LENGTH,
+        "n_action_steps": LENGTH,
+        "max_state_dim": 8,
+        "max_action_dim": PADDED,
+        "use_bf16": False,
+        **options,
+    }
+    model = groot_n1.GR00TN15
+
+    def built(*args: Any, **kwargs: Any) -> Any:
+        return model(sizes, local_model_path="")
+
+    with (
+        mock.patch.object(groot_n1, "EagleBackbone", Backbone),
+        mock.patch.object(model, "from_pretrained", built),
+        contextlib.redirect_stdout(None),
+    ):
         return modeling_groot.GrootPolicy(GrootConfig(**chosen))
 
 
@@ -293,14 +374,18 @@ def make_xvla(**options: Any) -> Any:
     return XVLAPolicy(XVLAConfig(**chosen))
 
 
-MAKERS = {
-    "smolvla": make_smolvla,
-    "pi0": lambda **options: make_pi("pi0", **options),
-    "pi05": lambda **options: make_pi("pi05", **options),
-    "groot": make_groot,
-    "multi_task_dit": make_multi_task_dit,
-    "xvla": make_xvla,
-}
+MAKERS = (
+    {"groot": make_groot_n15}
+    if N15
+    else {
+        "smolvla": make_smolvla,
+        "pi0": lambda **options: make_pi("pi0", **options),
+        "pi05": lambda **options: make_pi("pi05", **options),
+        "groot": make_groot,
+        "multi_task_dit": make_multi_task_dit,
+        "xvla": make_xvla,
+    }
+)
 
 
 def width(family: str) -> int:
@@ -318,7 +403,7 @@ def observations(family: str, size: int, seed: int = 0) -> dict[str, torch.Tenso
     tokens = torch.randint(3, 60, (size, 5), generator=generator)
     if family == "groot":
         return {
-            "input_ids": tokens,
+            "eagle_input_ids" if N15 else "input_ids": tokens,
             "state": normal(size, 1, 8),
             "embodiment_id": torch.zeros(size, dtype=torch.long),
         }

@@ -3,12 +3,11 @@
 from warmprior.lerobot.actor import LeRobotActor, LeRobotFlow
 from warmprior.lerobot.adapter import WarmPriorAdapter, history_indices
 from warmprior.lerobot.memory import ActionMemory
-from warmprior.lerobot.ports import LEROBOT_VERSIONS, PORTS, FlowPort, port_for
+from warmprior.lerobot.ports import PORTS, FlowPort, port_for
 from warmprior.lerobot.relative import RelativeActions
 from warmprior.lerobot.source import ChunkSource, action_std
 
 __all__ = [
-    "LEROBOT_VERSIONS",
     "PORTS",
     "ActionMemory",
     "ChunkSource",

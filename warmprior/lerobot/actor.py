@@ -48,6 +48,8 @@ class LeRobotFlow(TensorDictModuleBase):
         KeyError: if an input key is missing.
     """
 
+    guidance = None
+
     def __init__(
         self,
         policy: Any,

@@ -41,10 +41,10 @@ def history_indices(chunk_length: int, length: int, lead: int = 0) -> list[int]:
 class WarmPriorAdapter:
     """Trains and runs an unmodified flow policy of LeRobot from a prior's source.
 
-    Supported are pi0, pi0.5, SmolVLA, GR00T N1.7, multi_task_dit (flow matching) and X-VLA. The policy stays
-    as it is: only the noise that its loss and its sampler would draw is replaced, exactly once each, or an
-    error says that it was not. Everything is in the model's own units, after LeRobot's preprocessor and
-    before its postprocessor.
+    Supported are pi0, pi0.5, SmolVLA, GR00T N1.7, multi_task_dit (flow matching) and X-VLA of lerobot 0.6,
+    and GR00T N1.5 of lerobot 0.5.1. The policy stays as it is: only the noise that its loss and its sampler
+    would draw is replaced, exactly once each, or an error says that it was not. Everything is in the model's
+    own units, after LeRobot's preprocessor and before its postprocessor.
 
     For training, the dataset gives ``H`` more actions in front of each chunk: set
     ``delta_timestamps["action"]`` to :func:`history_indices` over the frame rate. They ride in

@@ -15,10 +15,7 @@ from torch import Tensor
 
 from warmprior.lerobot.injection import Source, SourceInjection
 
-__all__ = ["LEROBOT_VERSIONS", "PORTS", "FlowPort", "check_steps", "port_for"]
-
-LEROBOT_VERSIONS = ("0.6",)
-"""Releases that the ports were written for and are tested with."""
+__all__ = ["PORTS", "FlowPort", "check_steps", "port_for"]
 
 Record = Callable[[Tensor], None]
 """Takes what a sampler returned, ``[B, T, >= d_a]``."""
@@ -43,9 +40,13 @@ class FlowPort(ABC):
         """Positions of the chunk that lie before the current step."""
         return 0
 
+    def normalization(self, policy: Any) -> str | None:
+        """How the preprocessor normalises actions, by LeRobot's name: ``"MEAN_STD"``, ``"MIN_MAX"``."""
+        return getattr(policy.config.normalization_mapping.get("ACTION"), "value", None)
+
     @abstractmethod
     def check(self, policy: Any) -> None:
-        """Refuse options under which actions remembered are not those of the model's space.
+        """Refuse options under which the source would not be exact.
 
         Raises:
             ValueError: naming the option.
@@ -74,12 +75,15 @@ class FlowPort(ABC):
 
     def __reduce_ex__(self, protocol: Any) -> Any:
         """Known ports are pickled and copied by name: what they are made of has none."""
-        known = next((name for name, port in PORTS.items() if port is self), None)
-        return super().__reduce_ex__(protocol) if known is None else (_known, (known,))
+        for release, ports in PORTS.items():
+            for name, port in ports.items():
+                if port is self:
+                    return _known, (release, name)
+        return super().__reduce_ex__(protocol)
 
 
-def _known(name: str) -> FlowPort:
-    return PORTS[name]
+def _known(release: str, name: str) -> FlowPort:
+    return PORTS[release][name]
 
 
 def check_steps(nfe: int | None) -> None:
@@ -197,6 +201,33 @@ class DrawnPort(FlowPort):
             yield
 
 
+class GrootN15Port(DrawnPort):
+    """Of GR00T N1.5, which does otherwise than its configuration says."""
+
+    def normalization(self, policy: Any) -> str:
+        """Its preprocessor takes minima and maxima, whatever its ``normalization_mapping``."""
+        return "MIN_MAX"
+
+    @contextmanager
+    def sampling(
+        self, policy: Any, source: Source, record: Record, nfe: int | None = None
+    ) -> Iterator[None]:
+        """The draw in the sampler; ``select_action`` executes the first actions of a chunk."""
+
+        def around(predict: Callable[..., Tensor]) -> Callable[..., Tensor]:
+            def predicted(*args: Any, **kwargs: Any) -> Tensor:
+                # Its queue takes the whole chunk and keeps the last n_action_steps.
+                return predict(*args, **kwargs)[:, : policy.config.n_action_steps]
+
+            return predicted
+
+        with (
+            _replaced(policy, "predict_action_chunk", around),
+            super().sampling(policy, source, record, nfe),
+        ):
+            yield
+
+
 class OpenPiPort(FlowPort):
     """Of pi0, pi0.5 and SmolVLA, whose noise is an argument of the model (a compiled one included)."""
 
@@ -275,6 +306,16 @@ def _check_groot(policy: Any) -> None:
         )
 
 
+def _check_groot_n15(policy: Any) -> None:
+    copies = policy._groot_model.action_head.config.expand_batch
+    if copies not in (None, 1):
+        raise ValueError(
+            f"the action head repeats each batch {copies} times before it draws noise "
+            f"(expand_batch={copies}), and the history is not repeated with it: set it to None, and take "
+            "a larger batch"
+        )
+
+
 def _check_multi_task_dit(policy: Any) -> None:
     if policy.config.objective != "flow_matching":
         raise ValueError(
@@ -292,60 +333,78 @@ def _predict_multi_task_dit(policy: Any, batch: dict[str, Any]) -> None:
 
 _openpi = OpenPiPort()
 
-PORTS: dict[str, FlowPort] = {
-    "pi0": _openpi,
-    "pi05": _openpi,
-    "smolvla": _openpi,
-    "groot": DrawnPort(
-        "action_horizon",
-        lambda policy: policy._groot_model.config.max_action_dim,
-        lambda policy: (policy._groot_model.action_head, "get_action_with_features"),
-        lambda policy: (policy._groot_model.action_head, "num_inference_timesteps"),
-        model_config=lambda policy: policy._groot_model.config,
-        predicted=lambda output: output["action_pred"],
-        check=_check_groot,
-    ),
-    "multi_task_dit": DrawnPort(
-        "horizon",
-        lambda policy: policy.config.action_feature.shape[0],
-        lambda policy: (policy.objective, "conditional_sample"),
-        lambda policy: (policy.objective.config, "num_integration_steps"),
-        lead=lambda policy: policy.config.n_obs_steps - 1,
-        check=_check_multi_task_dit,
-        predict=_predict_multi_task_dit,
-    ),
-    "xvla": DrawnPort(
-        "chunk_size",
-        lambda policy: policy.model.dim_action,
-        lambda policy: (policy.model, "generate_actions"),
-        lambda policy: (policy.config, "num_denoising_steps"),
-    ),
+PORTS: dict[str, dict[str, FlowPort]] = {
+    "0.6": {
+        "pi0": _openpi,
+        "pi05": _openpi,
+        "smolvla": _openpi,
+        "groot": DrawnPort(
+            "action_horizon",
+            lambda policy: policy._groot_model.config.max_action_dim,
+            lambda policy: (policy._groot_model.action_head, "get_action_with_features"),
+            lambda policy: (policy._groot_model.action_head, "num_inference_timesteps"),
+            model_config=lambda policy: policy._groot_model.config,
+            predicted=lambda output: output["action_pred"],
+            check=_check_groot,
+        ),
+        "multi_task_dit": DrawnPort(
+            "horizon",
+            lambda policy: policy.config.action_feature.shape[0],
+            lambda policy: (policy.objective, "conditional_sample"),
+            lambda policy: (policy.objective.config, "num_integration_steps"),
+            lead=lambda policy: policy.config.n_obs_steps - 1,
+            check=_check_multi_task_dit,
+            predict=_predict_multi_task_dit,
+        ),
+        "xvla": DrawnPort(
+            "chunk_size",
+            lambda policy: policy.model.dim_action,
+            lambda policy: (policy.model, "generate_actions"),
+            lambda policy: (policy.config, "num_denoising_steps"),
+        ),
+    },
+    "0.5.1": {
+        "groot": GrootN15Port(
+            "action_horizon",
+            lambda policy: policy._groot_model.action_head.config.action_dim,
+            lambda policy: (policy._groot_model.action_head, "get_action"),
+            lambda policy: (policy._groot_model.action_head, "num_inference_timesteps"),
+            model_config=lambda policy: policy._groot_model.action_head.config,
+            predicted=lambda output: output["action_pred"],
+            check=_check_groot_n15,
+        ),
+    },
 }
-"""By the name that LeRobot knows the family by."""
+"""By the release of LeRobot (``"0.6"`` is all of 0.6), and in it by LeRobot's name of the family.
+
+``"groot"`` is GR00T N1.7 in 0.6 and N1.5 in 0.5.1, whose other families may draw their noise elsewhere.
+"""
 
 
 def port_for(policy: Any) -> FlowPort:
-    """The port of a policy's family.
+    """The port of a policy's family in the release of lerobot that is installed.
 
     Args:
         policy: of LeRobot, or of a class that inherits from one of its.
 
     Raises:
         ValueError: if there is none, or the policy has options that it does not support.
-        ImportError: if another release of lerobot is installed.
+        ImportError: if there is none for this release.
     """
     installed = version("lerobot")
-    if not installed.startswith(tuple(f"{known}." for known in LEROBOT_VERSIONS)):
-        supported = ", ".join(f"{known}.*" for known in LEROBOT_VERSIONS)
+    ports = next((PORTS[known] for known in PORTS if f"{installed}.".startswith(f"{known}.")), None)
+    supported = "; ".join(f"{release}: {', '.join(known)}" for release, known in PORTS.items())
+    if ports is None:
         raise ImportError(
             f"lerobot {installed} is installed, and its policies may draw their noise elsewhere: "
-            f"supported is {supported}"
+            f"supported are, by release, {supported}"
         )
     names = [getattr(kind, "name", None) for kind in type(policy).__mro__]
-    port = next((PORTS[name] for name in names if name in PORTS), None)
+    port = next((ports[name] for name in names if name in ports), None)
     if port is None:
         raise ValueError(
-            f"{type(policy).__name__} is no flow policy that is known: supported are {', '.join(PORTS)}"
+            f"{type(policy).__name__} of lerobot {installed} is not supported: supported are, by release, "
+            f"{supported}"
         )
     port.check(policy)
     return port

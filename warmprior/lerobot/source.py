@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from warmprior.lerobot.ports import port_for
 from warmprior.modules.prior import Prior
 
 __all__ = ["ChunkSource", "SigmaUnit", "action_std"]
@@ -168,14 +169,14 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
     """Standard deviation of a dataset's actions in the units of a policy, ``[d_a]``.
 
     Args:
-        policy: of LeRobot; its ``normalization_mapping`` tells the units.
+        policy: of LeRobot; its port tells the units.
         stats: of the dataset (``dataset.meta.stats``).
 
     Raises:
         ValueError: if the statistics that the policy's units need are missing, a dimension never varies
-            between its bounds, or the policy normalises actions elsewhere.
+            between its bounds, or the policy normalises actions elsewhere, or has no port.
     """
-    mode = getattr(policy.config.normalization_mapping.get("ACTION"), "value", None)
+    mode = port_for(policy).normalization(policy)
     own = (stats or {}).get("action", {})
     needs = {
         "MEAN_STD": ("std",),
