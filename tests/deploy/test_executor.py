@@ -294,6 +294,18 @@ def test_a_reset_forgets_what_is_under_way():
         assert not last["rtc", "valid"].any() and int(last["rtc", "delay"]) == 0
 
 
+def test_a_loop_in_inference_mode_has_guided_chunks():
+    """The thread is not in that mode, and gradients need tensors that were not made in it."""
+    found = []
+    for mode in (torch.inference_mode, torch.no_grad):
+        guided = actor(PastPrior(6), guidance=RealTimeChunking())
+        with AsyncExecutor(guided, execute=4, timeout=None) as executor, mode():
+            found.append(executor.act(torch.zeros(OBSERVATION_DIM)))
+            for _ in range(12):
+                executor.act(torch.zeros(OBSERVATION_DIM))
+    assert torch.equal(*found)
+
+
 def test_chunks_that_no_robot_should_get():
     class Wrong(Told):
         def forward(self, data):
@@ -311,7 +323,9 @@ def test_chunks_that_no_robot_should_get():
     [
         ({"execute": 6, "delay": 3}, r"8 actions do not reach 6.*delay of 3.*at most 5"),
         ({"execute": 3, "delay": 4}, r"0 <= delay <= execute"),
-        ({"latency": 5}, r"0 <= delay <= execute"),
+        ({"latency": 5}, r"delay of 5.*too long for predictions of 8 actions.*at most 4"),
+        ({"latency": 9}, r"delay of 9.*at most 4"),
+        ({"latency": 1.5}, "whole number of control steps"),
         ({"execute": 0, "delay": 0}, r"need 1 <= execute <= 8"),
         ({"window": 0}, "window must be a whole number"),
         ({"latency": 1, "pool": FakeClock([])}, "leave out pool"),

@@ -310,6 +310,43 @@ def test_batches_that_do_not_fit(policy):
         adapter.predict_action_chunk(observations("pi05", 2), noise=torch.zeros(2, LENGTH, 12))
 
 
+def test_masks_that_do_not_fit(policy):
+    """One of the chunk alone would declare the history valid wherever the target is."""
+    adapter = WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH))
+    batch = windows("pi05", 2, LENGTH)
+    short = {**batch, "action_is_pad": batch["action_is_pad"][:, LENGTH:]}
+    with pytest.raises(ValueError, match=r"action_is_pad has shape .*, expected \(2, 16\)"):
+        adapter.loss(short)
+    groot = windows("groot", 2, LENGTH)
+    groot["action_history_is_pad"] = groot["action_history_is_pad"][:, 1:]
+    with pytest.raises(ValueError, match=r"action_history_is_pad .* \(2, 7\), expected \(2, 8\)"):
+        WarmPriorAdapter(policy("groot"), PastPrior(LENGTH)).loss(groot)
+    with pytest.raises(ValueError, match="noise= is what the prior gives"):
+        WarmPriorAdapter(policy("smolvla"), PastPrior(LENGTH)).loss(
+            windows("smolvla", 2, LENGTH), noise=torch.zeros(2, LENGTH, 12)
+        )
+    adapter.predict_action_chunk(observations("pi05", 2))
+    for mask in ([[True], [False]], [True]):
+        with pytest.raises(ValueError, match=r"mask of environments .* expected \(2,\)"):
+            adapter.reset(torch.tensor(mask))
+
+
+def test_actions_that_never_vary_have_no_unit(policy):
+    zeros, ones = torch.zeros(ACTION), torch.ones(ACTION)
+    still = {"std": ones, "q01": zeros, "q99": torch.cat([zeros[:1], ones[1:]])}
+    with pytest.raises(ValueError, match=r"dimensions \[0\] have std \[1.0\] between q01 \[0.0\]"):
+        action_std(policy("pi05"), {"action": still})
+    constant = {"std": zeros, "min": ones, "max": ones}
+    with pytest.raises(ValueError, match=r"dimensions \[0, 1, 2, 3, 4, 5, 6\] have std"):
+        action_std(policy("multi_task_dit"), {"action": constant})
+    for given, unit, told in (
+        (ones / 0, "std", "finite numbers > 0"),
+        (ones, "model", "no effect with sigma_unit='model'"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit=unit, action_std=given)
+
+
 def test_the_standard_source_is_lerobots(policy):
     """With nothing ever warm, what is left is the policy with its own noise."""
     made = policy("smolvla")

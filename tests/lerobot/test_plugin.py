@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 import os
@@ -23,6 +24,7 @@ from tests.lerobot.tiny import (
     tiny_smolvlm,
     windows,
 )
+from warmprior import RealTimeChunking
 
 pytest.importorskip("lerobot")
 pytest.importorskip("lerobot_policy_warmprior")
@@ -108,6 +110,22 @@ def test_losses_and_chunks_start_from_the_prior(found, name):
     with watch(family, policy) as seen:
         policy.predict_action_chunk(dict(start))
     assert not torch.equal(seen.x[0][..., :ACTION], sources[2])
+
+
+@pytest.mark.parametrize(
+    ("name", "given"), [("warm_smolvla", (None, None, "none")), ("warm_pi05", ("none",))]
+)
+def test_options_of_the_loss_count_by_position_too(found, name, given):
+    policy = warm(found, name).train()
+    batch = windows(name.removeprefix("warm_"), 2, LENGTH)
+    losses = []
+    for args, kwargs in ((given, {}), ((), {"reduction": "none"})):
+        torch.manual_seed(0)
+        losses.append(policy(dict(batch), *args, **kwargs)[0])
+    assert losses[0].shape == (2,) and torch.equal(*losses)
+    if name == "warm_smolvla":
+        with pytest.raises(ValueError, match="noise= is what the prior gives"):
+            policy(dict(batch), torch.zeros(2, LENGTH, 12))
 
 
 def test_sigma_in_units_of_the_dataset_is_kept(found, tmp_path):
@@ -251,6 +269,25 @@ def test_the_flow_policys_loss_is_algorithm_1(found):
         policy.forward({k: v for k, v in batch.items() if k != "action_is_pad"})
 
 
+def test_a_copied_flow_policy_trains_its_own_weights(found):
+    policy = flow_policy(found)
+    policy.forward(flow_batch(8))
+    replaced = flow_policy(found)
+    replaced.forward(flow_batch(8))
+    replaced.load_state_dict(policy.state_dict(), assign=True)
+    for other in (copy.deepcopy(policy), replaced):
+        other.forward(flow_batch(8))[0].backward()
+        assert all(weight.grad is not None for weight in other.parameters())
+
+
+def test_only_the_extremes_bound_a_flow_policys_actions(found):
+    from lerobot.configs.types import NormalizationMode
+
+    assert flow_policy(found).actor.ode.clip == 1.0
+    units = {"STATE": NormalizationMode.MEAN_STD, "ACTION": NormalizationMode.MEAN_STD}
+    assert flow_policy(found, normalization_mapping=units).actor.ode.clip is None
+
+
 def test_the_flow_policy_remembers(found):
     policy = flow_policy(found, prior="past,sigma=0.0").eval()
     sources = []
@@ -260,6 +297,8 @@ def test_the_flow_policy_remembers(found):
         "observation.state": torch.randn(2, 3),
         "observation.environment_state": torch.randn(2, 2),
     }
+    with pytest.raises(RuntimeError, match="no observation was seen"):
+        policy.predict_action_chunk(dict(batch))
     actions = torch.stack([policy.select_action(dict(batch)) for _ in range(9)], 1)
     assert len(sources) == 3
     assert torch.equal(sources[1], actions[:, :4]) and torch.equal(sources[2], actions[:, 4:8])
@@ -334,6 +373,12 @@ def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
     saved_policy(tmp_path / "unbounded", clip=None)
     with pytest.raises(ValueError, match=r"the bound clip=1\.0"):
         export_policy(tmp_path / "unbounded", tmp_path / "none")
+    for i, option in enumerate(
+        ({"solver": "midpoint", "nfe": 4}, {"grid": "dense-jump"}, {"guidance": RealTimeChunking()})
+    ):
+        saved_policy(tmp_path / f"sampler{i}", **option)
+        with pytest.raises(ValueError, match="Euler's method in uniform steps, without guidance"):
+            export_policy(tmp_path / f"sampler{i}", tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 

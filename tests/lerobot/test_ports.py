@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import pytest
 import torch
 
@@ -35,6 +38,14 @@ def training_window(family, size=3):
 
 def test_all_families_have_a_port():
     assert set(PORTS["0.5.1" if N15 else "0.6"]) == set(FAMILIES)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_ports_go_to_other_processes(family):
+    """As TorchRL's collectors in processes send the policy and what is around it."""
+    port = PORTS["0.5.1" if N15 else "0.6"][family]
+    assert pickle.loads(pickle.dumps(port)) is port
+    assert copy.deepcopy(port) is port
 
 
 @pytest.mark.parametrize("family", FAMILIES)

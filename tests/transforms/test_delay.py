@@ -250,14 +250,16 @@ def test_episodes_keep_what_was_executed():
 def test_numbers_that_do_not_go_together():
     with pytest.raises(ValueError, match=r"delay of 4.*3 actions.*0 <= delay <= execute"):
         InferenceDelay(4, execute=3)
-    with pytest.raises(ValueError, match="need 0 <= delay"):
-        InferenceDelay(-1, execute=3)
+    for delay in (-1, 1.5, True):
+        with pytest.raises(ValueError, match="whole number of control steps, at least 0"):
+            InferenceDelay(delay, execute=3)
     with pytest.raises(ValueError, match=r"6 actions do not reach 5.*delay of 2.*at most 4"):
         TransformedEnv(
             CountingEnv(9), policy_transforms(PRIORS["past"], execute=5, delay=2)
         ).reset()
-    with pytest.raises(ValueError, match=r"delay of 4.*2 actions"):
-        policy_transforms(PRIORS["past"], delay=4)
+    for delay in (4, 7):
+        with pytest.raises(ValueError, match=rf"delay of {delay}.*too long for.* 6 .*at most 3"):
+            policy_transforms(PRIORS["past"], delay=delay)
     alone = TransformedEnv(CountingEnv(9), InferenceDelay(1, execute=2))
     with pytest.raises(KeyError, match="append it after ChunkStep"):
         alone.reset()

@@ -227,7 +227,7 @@ class AsyncExecutor:
                     "delay": torch.tensor([min(self.expected_delay, left)]),
                 },
             }
-        ).clone()
+        )
         if self._pool is None:
             self._pending = Future()
             try:
@@ -240,6 +240,8 @@ class AsyncExecutor:
     @torch.no_grad()
     def _compute(self, data: TensorDictBase) -> Tensor:
         """The policy's chunk, in whichever thread."""
+        # Tensors of its own: those of a loop under torch.inference_mode() have no gradients for guidance.
+        data = data.clone()
         for transform in self._conditioned:
             data = transform(data)
         chunk = self.actor(data.to(self._device)).get(self._chunk_key)

@@ -136,10 +136,11 @@ class WarmPriorAdapter:
 
         Raises:
             KeyError: if ``"action"`` or its mask is missing.
-            ValueError: if the window has another length.
+            ValueError: if the window or its mask has another length, or noise is given.
         """
-        window = self._window(batch)
-        history, valid, target, is_pad = window
+        if kwargs.get("noise") is not None:
+            raise ValueError("noise= is what the prior gives: leave it out")
+        history, valid, target, is_pad = self._window(batch)
         a0, target = self.source.learn(history, valid, target, self.generator)
         inputs = dict(batch)
         for name in (HISTORY, HISTORY_IS_PAD):
@@ -270,6 +271,15 @@ class WarmPriorAdapter:
                 f"current step and T={length} of the chunk. Take the steps of history_indices({history}, "
                 f"{length}, {self.source.lead}) from the dataset"
             )
+        for name, mask, values in (
+            ("action_is_pad", is_pad, actions),
+            (HISTORY_IS_PAD if HISTORY in batch else "action_is_pad", past_is_pad, past),
+        ):
+            if mask.shape != values.shape[:2]:
+                raise ValueError(
+                    f"{name} has shape {tuple(mask.shape)}, expected {tuple(values.shape[:2])}: it tells of "
+                    "every action of the window, those of the history included, whether it is padding"
+                )
         return past, ~past_is_pad, actions[:, -length:], is_pad[:, -length:]
 
     def _source(self, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -300,5 +310,9 @@ def _std(
     if unit not in ("model", "std"):
         raise ValueError(f"sigma_unit must be 'model' or 'std', got {unit!r}")
     if unit == "model":
+        if given is not None:
+            raise ValueError(
+                "action_std has no effect with sigma_unit='model': give sigma_unit='std'"
+            )
         return None
     return action_std(policy, stats) if given is None else torch.as_tensor(given)

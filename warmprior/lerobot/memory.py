@@ -136,11 +136,19 @@ class ActionMemory:
 
         Args:
             mask: of environments, bool ``[B]``; all by default.
+
+        Raises:
+            ValueError: if the mask has another shape.
         """
         if mask is None:
             self._chunk = None
         elif self._chunk is not None:
             rows = torch.as_tensor(mask, dtype=torch.bool, device=self._new.device)
+            if rows.shape != self._new.shape:
+                raise ValueError(
+                    f"the mask of environments has shape {tuple(rows.shape)}, expected "
+                    f"{tuple(self._new.shape)}: one bool per environment"
+                )
             # The rest of the chunk goes on being executed, now as the first actions of an episode.
             last = self._chunk.shape[1] - 1
             steps = torch.arange(last + 1, device=rows.device) + self._executed

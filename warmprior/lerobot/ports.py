@@ -73,6 +73,18 @@ class FlowPort(ABC):
         """Sample a chunk for a batch of observations, without regard to any queue."""
         policy.predict_action_chunk(batch)
 
+    def __reduce_ex__(self, protocol: Any) -> Any:
+        """Known ports are pickled and copied by name: what they are made of has none."""
+        for release, ports in PORTS.items():
+            for name, port in ports.items():
+                if port is self:
+                    return _known, (release, name)
+        return super().__reduce_ex__(protocol)
+
+
+def _known(release: str, name: str) -> FlowPort:
+    return PORTS[release][name]
+
 
 def check_steps(nfe: int | None) -> None:
     """Refuse a number of integration steps that is none.
@@ -268,7 +280,10 @@ class OpenPiPort(FlowPort):
         def around(sample: Callable[..., Any]) -> Callable[..., Any]:
             def sampled(images: Any, *args: Any, **kwargs: Any) -> Tensor:
                 if kwargs.get("noise") is not None:
-                    raise ValueError("noise= is what the prior gives: leave it out")
+                    raise ValueError(
+                        "noise= is what the prior gives: leave it out, and put no second prior around a "
+                        "policy that has one (warm_smolvla, warm_pi05)"
+                    )
                 shape = torch.Size((images[0].shape[0], length, width))
                 kwargs["noise"] = source(shape, torch.float32, images[0].device)
                 actions = sample(images, *args, **kwargs)

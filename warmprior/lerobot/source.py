@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
@@ -75,9 +76,11 @@ class ChunkSource:
             )
         if not prior.is_flow:
             raise ValueError(told + "it is trained at t = 0 alone, and LeRobot trains at all times")
-        if std is not None and (tuple(std.shape) != (action_dim,) or not (std > 0).all()):
+        if std is not None and not (
+            tuple(std.shape) == (action_dim,) and (std > 0).all() and std.isfinite().all()
+        ):
             raise ValueError(
-                f"the standard deviation of the actions must be {action_dim} numbers > 0, one per "
+                f"the standard deviation of the actions must be {action_dim} finite numbers > 0, one per "
                 f"dimension, got {std.tolist()}"
             )
         self.prior = prior
@@ -170,8 +173,8 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
         stats: of the dataset (``dataset.meta.stats``).
 
     Raises:
-        ValueError: if the statistics that the policy's units need are missing, or the policy normalises
-            actions elsewhere, or has no port.
+        ValueError: if the statistics that the policy's units need are missing, a dimension never varies
+            between its bounds, or the policy normalises actions elsewhere, or has no port.
     """
     mode = port_for(policy).normalization(policy)
     own = (stats or {}).get("action", {})
@@ -196,4 +199,12 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
     if mode == "MEAN_STD":
         return torch.ones_like(std)
     low, high = bounds
-    return 2 * std / (high - low)
+    unit = 2 * std / (high - low)
+    still = [i for i, value in enumerate(unit.tolist()) if not 0 < value < math.inf]
+    if still:
+        raise ValueError(
+            f"sigma_unit='std' needs actions that vary: dimensions {still} have std "
+            f"{std[still].tolist()} between {needs[mode][1]} {low[still].tolist()} and {needs[mode][2]} "
+            f"{high[still].tolist()}. Give action_std in the model's units, or use sigma_unit='model'"
+        )
+    return unit

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Integral
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
@@ -24,9 +26,18 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
         length: ``P``, how many a chunk has, if it is known.
 
     Raises:
-        ValueError: if not ``0 <= delay <= execute``, or ``execute + delay`` exceeds ``length``.
+        ValueError: if ``delay`` is no whole number, not ``0 <= delay <= execute``, or ``execute + delay``
+            exceeds ``length``.
     """
-    if not 0 <= delay <= execute:
+    if isinstance(delay, bool) or not isinstance(delay, Integral) or delay < 0:
+        raise ValueError(f"a delay is a whole number of control steps, at least 0, got {delay!r}")
+    if length is not None and 2 * delay > length:
+        raise ValueError(
+            f"a delay of {delay} control steps is too long for predictions of {length} actions, of which "
+            f"as many are executed, and as many more until the next ones take effect: at most {length // 2}. "
+            "Predict longer chunks, or make the policy faster"
+        )
+    if delay > execute:
         raise ValueError(
             f"a delay of {delay} control steps does not go with {execute} actions per decision: need "
             "0 <= delay <= execute, or the next decision is due before the last one took effect"

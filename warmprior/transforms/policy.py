@@ -9,7 +9,7 @@ from warmprior import keys
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
-from warmprior.transforms.delay import InferenceDelay
+from warmprior.transforms.delay import InferenceDelay, check_delay
 from warmprior.transforms.history import ActionHistory
 from warmprior.transforms.mean_observation import mean_observation
 from warmprior.transforms.stack import ObservationStack
@@ -75,6 +75,7 @@ def policy_transforms(
     if delay is not None:
         if execute is None:
             execute = min(prior.chunk_length, prior.prediction_length - delay)
+        check_delay(delay, execute, prior.prediction_length)
         late = [InferenceDelay(delay, execute=execute, chunk_key=chunk_key)]
     per_step = [transform.clone() for transform in (actions, images) if transform is not None]
     per_step += [] if normalizer is None else normalizer.env_transforms()

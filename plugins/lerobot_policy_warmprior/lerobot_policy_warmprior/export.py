@@ -47,8 +47,8 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
 
     Raises:
         FileExistsError: if ``out`` exists.
-        ValueError: if the policy has images, absolute actions, no normaliser, or a prior that a policy of
-            LeRobot cannot have.
+        ValueError: if the policy has images, absolute actions, no normaliser, another sampler than
+            Euler's in uniform steps, or a prior that a policy of LeRobot cannot have.
     """
     out = Path(out)
     if out.exists():
@@ -64,6 +64,13 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
         raise ValueError(
             f"{folder}: the policy needs a normaliser, and the bound clip=1.0 on its actions (it has "
             f"{actor.ode.clip}), which are those of LeRobot's policy"
+        )
+    if actor.ode.solver != "euler" or actor.ode.grid != "uniform" or actor.ode.guidance is not None:
+        raise ValueError(
+            f"{folder}: warm_flow integrates by Euler's method in uniform steps, without guidance, and the "
+            f"policy has solver={actor.ode.solver!r}, grid={actor.ode.grid!r}, "
+            f"guidance={actor.ode.guidance}: change it first, as by actor.replace(solver='euler', "
+            "grid='uniform', guidance=None), and save it"
         )
     prior, network, normalizer = actor.prior, actor.network, actor.normalizer
     spec = next((t for t in TASKS.values() if t.env_name == environment_name(actor)), None)

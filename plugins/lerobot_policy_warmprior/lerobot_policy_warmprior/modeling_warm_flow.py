@@ -7,6 +7,7 @@ from collections import deque
 from typing import Any
 
 import torch
+from lerobot.configs.types import NormalizationMode
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.policies.utils import populate_queues
 from tensordict import TensorDict
@@ -68,10 +69,12 @@ class WarmFlowPolicy(PreTrainedPolicy):
                 num_heads=config.num_heads,
                 dropout=config.dropout,
             )
-        # What the data span is [-1, 1]; nothing beyond it is executed, nor remembered.
-        self.actor = WarmPriorActor(network, prior, nfe=config.nfe, clip=1.0)
+        # What the data span is [-1, 1]; nothing beyond it is executed, nor remembered. In other units than
+        # those of the extremes it is not known.
+        spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX
+        self.actor = WarmPriorActor(network, prior, nfe=config.nfe, clip=1.0 if spans else None)
         # Of the same weights, so that it is no part of the module and is not saved again.
-        self.__dict__["_loss"] = None
+        self.__dict__["_made"] = None
         self.reset()
 
     def get_optim_params(self) -> Any:
@@ -120,15 +123,36 @@ class WarmFlowPolicy(PreTrainedPolicy):
             },
             [len(target)],
         )
-        if self._loss is None:
-            self.__dict__["_loss"] = FlowMatchingLoss(self.actor)
-        loss = self._loss(data)["loss_flow_matching"]
+        loss = self._loss()(data)["loss_flow_matching"]
         return loss, {"flow_matching": loss.item()}
+
+    def _loss(self) -> FlowMatchingLoss:
+        """The loss of the weights that the policy has now."""
+        made = self.__dict__["_made"]
+        mine = {id(weight) for weight in self.actor.network.parameters()}
+        # The loss of a copied policy, or of one whose weights were replaced, trains others.
+        if made is None or {id(weight) for weight in made.parameters()} != mine:
+            made = self.__dict__["_made"] = FlowMatchingLoss(self.actor)
+        return made
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """A new chunk from the last observations, ``[B, P, d_a]``, normalised."""
+        """A new chunk from the last observations, ``[B, P, d_a]``, normalised.
+
+        Args:
+            batch: not read; the observations are those that :meth:`select_action` was given, as in LeRobot's
+                other policies of several observations.
+            kwargs: likewise.
+
+        Raises:
+            RuntimeError: if it was given none in this episode.
+        """
         self.eval()
+        if not all(self._queues[name] for name in self.config.observed):
+            raise RuntimeError(
+                "no observation was seen in this episode: warm_flow takes the last ones from select_action, "
+                "call that first"
+            )
         if self._memory.waits:  # asked for chunks alone
             self._memory.executed(self.config.n_action_steps)
         seen = {name: torch.stack(list(self._queues[name]), dim=1) for name in self.config.observed}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from dataclasses import dataclass
 from typing import Any
 
@@ -60,7 +61,7 @@ class WarmPolicyMixin:
         super().__init__(config, *args, **kwargs)
         if config.sigma_unit == "std" and config.action_std is None:
             config.action_std = action_std(self, dataset_stats).tolist()
-        std = None if config.action_std is None else torch.tensor(config.action_std)
+        std = torch.tensor(config.action_std) if config.sigma_unit == "std" else None
         prior = config.make_prior()
         # Not a submodule: it refers back to the policy.
         self.__dict__["_adapter"] = WarmPriorAdapter(
@@ -69,7 +70,9 @@ class WarmPolicyMixin:
 
     def forward(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> Any:
         """The policy's own loss, from the prior's source."""
-        return self._adapter.loss(batch, super().forward, **kwargs)
+        forward = super().forward
+        told = inspect.signature(forward).bind(batch, *args, **kwargs).arguments
+        return self._adapter.loss(told.pop("batch"), forward, **told)
 
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The next action of every environment."""
