@@ -273,6 +273,7 @@ def test_relative_actions_follow_the_state(built):
         (Prior.make("regression", 8), "trained at t = 0 alone"),
         (Prior.make("history", 8), "see its mean"),
         (Prior.make("forecast", 8), "as one vector"),
+        (Prior.make("reflow", 8), "needs a trained policy of gaussian"),
     ],
 )
 def test_priors_that_do_not_fit(policy, prior, told):
@@ -355,6 +356,21 @@ def test_the_standard_source_is_lerobots(policy):
     with watch("smolvla", made) as seen:
         chunk = adapter.predict_action_chunk(dict(batch))
     assert torch.equal(chunk, made.predict_action_chunk(dict(batch), noise=seen.x[0]))
+
+
+def test_a_decision_that_failed_does_not_count(built):
+    """Its source is drawn again around the same mean."""
+    made = built("pi05", n_action_steps=4)
+    adapter = WarmPriorAdapter(made, PreviewPrior(4, sigma=0.0), generator=generator())
+    batch = observations("pi05", 2)
+    chunk = adapter.predict_action_chunk(dict(batch))
+    vars(made.model)["embed_prefix"] = lambda *args: 1 / 0  # once the source is drawn
+    with pytest.raises(ZeroDivisionError):
+        adapter.predict_action_chunk(dict(batch))
+    del vars(made.model)["embed_prefix"]
+    with watch("pi05", made) as seen:
+        adapter.predict_action_chunk(dict(batch))
+    assert torch.equal(seen.x[0][:, :4, :ACTION], chunk[:, 4:8])
 
 
 def test_the_steps_of_windows():

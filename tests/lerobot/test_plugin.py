@@ -12,10 +12,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import (
     ACTION,
+    CAMERA,
     LENGTH,
     make_pi,
     make_smolvla,
@@ -25,6 +27,7 @@ from tests.lerobot.tiny import (
     windows,
 )
 from warmprior import RealTimeChunking
+from warmprior.lerobot import LeRobotActor, WarmPriorAdapter
 
 pytest.importorskip("lerobot")
 pytest.importorskip("lerobot_policy_warmprior")
@@ -81,6 +84,36 @@ def test_a_base_checkpoint_becomes_a_warm_policy(found, name, built, tmp_path):
         again = found[name].from_pretrained(tmp_path / "warm")
     assert again.config.prior == "past,sigma=0.0"
     assert all(map(torch.equal, again.state_dict().values(), policy.state_dict().values()))
+
+
+@pytest.mark.parametrize("name", ["warm_smolvla", "warm_pi05"])
+def test_a_warm_policy_acts_in_torchrl(found, name):
+    family = name.removeprefix("warm_")
+    policy = warm(found, name, prior="past,sigma=0.0").eval()
+    prior = policy.warm_adapter.prior
+    seen_by = observations(family, 2)
+    actor = LeRobotActor(
+        policy,
+        prior,
+        names={"state": "observation.state", "top": CAMERA},
+        preprocess=lambda batch: {**seen_by, **batch},
+    )
+    loc = torch.randn(2, LENGTH, ACTION)
+    data = TensorDict(
+        {
+            "observation": {
+                "state": seen_by["observation.state"][:, None],
+                "top": seen_by[CAMERA][:, None],
+            },
+            "prior": {"loc": loc, "warm": torch.ones(2, LENGTH, 1, dtype=torch.bool)},
+        },
+        [2],
+    )
+    with watch(family, policy) as seen:
+        chunk = actor(data)["vla_action", "chunk"]
+    assert torch.equal(seen.x[0][..., :ACTION], loc) and chunk.shape == loc.shape
+    with pytest.raises(ValueError, match=r"starts from .* by itself"):
+        WarmPriorAdapter(policy, prior)
 
 
 @pytest.mark.parametrize("name", ["warm_smolvla", "warm_pi05"])
@@ -297,15 +330,14 @@ def test_the_flow_policy_remembers(found):
         "observation.state": torch.randn(2, 3),
         "observation.environment_state": torch.randn(2, 2),
     }
-    with pytest.raises(RuntimeError, match="no observation was seen"):
-        policy.predict_action_chunk(dict(batch))
     actions = torch.stack([policy.select_action(dict(batch)) for _ in range(9)], 1)
     assert len(sources) == 3
     assert torch.equal(sources[1], actions[:, :4]) and torch.equal(sources[2], actions[:, 4:8])
     assert actions.abs().max() <= 1
     policy.reset()
-    policy.select_action(dict(batch))
+    chunks = [policy.predict_action_chunk(dict(batch)) for _ in range(2)]
     assert not torch.equal(sources[3], actions[:, 4:8])
+    assert torch.equal(sources[4], chunks[0])
 
 
 def test_flow_policies_that_lerobot_could_not_train(found):

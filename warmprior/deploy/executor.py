@@ -147,7 +147,10 @@ class AsyncExecutor:
         return max(self._delays, default=self._expected)
 
     def reset(self) -> None:
-        """Begin another episode: nothing was executed, nothing is left, nothing is under way."""
+        """Begin another episode: nothing was executed, nothing is left, nothing is under way.
+
+        A decision that a thread has begun runs to its end unheard, and takes its draws from the generator.
+        """
         pending: Future[Tensor] | None = getattr(self, "_pending", None)
         if pending is not None:
             pending.cancel()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from typing import Any
 
 import torch
@@ -120,7 +121,12 @@ class LeRobotFlow(TensorDictModuleBase):
         def draw(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
             return whole.to(dtype=dtype, device=device)
 
-        with self._port.sampling(self.policy, draw, chunks.append, nfe):
+        # A policy of the plugin has a source of its own, which this one takes the place of.
+        own = getattr(self.policy, "warm_adapter", None)
+        with (
+            nullcontext() if own is None else own.aside(),
+            self._port.sampling(self.policy, draw, chunks.append, nfe),
+        ):
             self._port.predict(self.policy, inputs)
         chunk = chunks[0][:, self.source.positions, : self.source.action_dim]
         return tensordict.set(self.out_keys[0], chunk.to(noise).reshape(noise.shape))

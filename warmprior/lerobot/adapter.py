@@ -91,6 +91,11 @@ class WarmPriorAdapter:
         generator: torch.Generator | None = None,
     ) -> None:
         self.port = port_for(policy)
+        if getattr(policy, "warm_adapter", None) is not None:
+            raise ValueError(
+                f"{type(policy).__name__} starts from {policy.warm_adapter.prior} by itself: use its own "
+                "methods, or policy.warm_adapter"
+            )
         self.policy, self.prior, self.generator = policy, prior, generator
         self.source = ChunkSource(
             prior,
@@ -115,7 +120,9 @@ class WarmPriorAdapter:
         check_steps(nfe)
         self._relative = relative
         self._memory = ActionMemory(prior, self.source.action_dim)
+        # Raw states at the decision that is remembered, and at the one under way.
         self._state: Tensor | None = None
+        self._now: Tensor | None = None
         self._sampling = False
 
     def loss(
@@ -236,13 +243,21 @@ class WarmPriorAdapter:
         self._memory.forget(mask)
 
     @contextmanager
-    def _from_source(self) -> Iterator[None]:
-        self._sampling = True
+    def aside(self) -> Iterator[None]:
+        """Within, a policy of the plugin, which goes through its adapter, samples as its base class does."""
+        before, self._sampling = self._sampling, True
         try:
-            with self.port.sampling(self.policy, self._source, self._record, self.nfe):
-                yield
+            yield
         finally:
-            self._sampling = False
+            self._sampling = before
+
+    @contextmanager
+    def _from_source(self) -> Iterator[None]:
+        with (
+            self.aside(),
+            self.port.sampling(self.policy, self._source, self._record, self.nfe),
+        ):
+            yield
 
     def _window(self, batch: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         missing = [name for name in ("action", "action_is_pad") if name not in batch]
@@ -287,7 +302,7 @@ class WarmPriorAdapter:
         move = None
         if self._relative is not None:
             relative, before, now = self._relative, self._state, self._relative.state()
-            self._state = now
+            self._now = now
 
             def move(loc: Tensor) -> Tensor:
                 assert before is not None, "there was a decision, and it had a state"
@@ -298,6 +313,7 @@ class WarmPriorAdapter:
         return self.source.place(a0, self.generator).to(dtype)
 
     def _record(self, actions: Tensor) -> None:
+        self._state = self._now
         self._memory.record(actions[:, self.source.positions, : self.source.action_dim])
 
 

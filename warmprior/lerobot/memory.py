@@ -41,6 +41,8 @@ class ActionMemory:
         self.action_dim = action_dim
         # None between episodes; the others are of the same decision.
         self._chunk: Tensor | None = None
+        # Of the decision under way, which counts only once it has a chunk: a sampler may fail.
+        self._decision = torch.empty(0), torch.empty(0)
         self._loc = self._elapsed = self._executed = self._new = torch.empty(0)
 
     def decide(
@@ -76,9 +78,7 @@ class ActionMemory:
             loc, warm = self.prior.next_mean(self._loc, self._chunk, self._executed, elapsed)
             warm = warm & ~self._new[:, None, None]
             loc = loc if move is None else move(loc)
-        self._loc, self._elapsed, self._chunk = loc, elapsed, torch.zeros_like(loc)
-        self._executed = torch.zeros_like(elapsed)
-        self._new = torch.zeros_like(elapsed[:, 0], dtype=torch.bool)
+        self._decision = loc, elapsed
         return loc, warm
 
     def record(self, chunk: Tensor) -> None:
@@ -87,7 +87,10 @@ class ActionMemory:
         Args:
             chunk: ``[B, P, d_a]``.
         """
+        self._loc, self._elapsed = self._decision
         self._chunk = chunk.detach().to(self._loc, copy=True)
+        self._executed = torch.zeros_like(self._elapsed)
+        self._new = torch.zeros_like(self._elapsed[:, 0], dtype=torch.bool)
 
     def step(self) -> None:
         """One more action of the chunk is executed."""

@@ -68,6 +68,8 @@ class ChunkSource:
         told = f"{prior} cannot be the source of a policy of LeRobot: "
         if prior.needs_vector:
             raise ValueError(told + "it needs the observation as one vector")
+        if prior.teacher is not None:
+            raise ValueError(told + f"it needs a trained policy of {prior.teacher}")
         if prior.conditions_network:
             raise ValueError(told + "the network would have to see its mean")
         if prior.start_time > 0:

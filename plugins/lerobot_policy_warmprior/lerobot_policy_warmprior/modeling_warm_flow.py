@@ -53,7 +53,14 @@ class WarmFlowPolicy(PreTrainedPolicy):
         width = sum(config.input_features[name].shape[0] for name in config.observed)
         sizes = (config.action_feature.shape[0], width, prior.prediction_length, config.n_obs_steps)
         if config.network:
-            network = VelocityNetwork.from_config(json.loads(config.network))
+            try:
+                described = json.loads(config.network)
+            except json.JSONDecodeError as error:
+                raise ValueError(
+                    "--policy.network is the JSON of VelocityNetwork.config(), got "
+                    f"{config.network!r} ({error})"
+                ) from error
+            network = VelocityNetwork.from_config(described)
             names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
             built = tuple(getattr(network, name) for name in names)
             if built != sizes:
@@ -137,24 +144,34 @@ class WarmFlowPolicy(PreTrainedPolicy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """A new chunk from the last observations, ``[B, P, d_a]``, normalised.
+        """A new chunk, ``[B, P, d_a]``, normalised.
 
         Args:
-            batch: not read; the observations are those that :meth:`select_action` was given, as in LeRobot's
-                other policies of several observations.
-            kwargs: likewise.
-
-        Raises:
-            RuntimeError: if it was given none in this episode.
+            batch: the present observations ``[B, d]``; those before are remembered, since :meth:`reset`.
+            kwargs: nothing of it is needed.
         """
-        self.eval()
-        if not all(self._queues[name] for name in self.config.observed):
-            raise RuntimeError(
-                "no observation was seen in this episode: warm_flow takes the last ones from select_action, "
-                "call that first"
-            )
+        self._remember(batch)
         if self._memory.waits:  # asked for chunks alone
             self._memory.executed(self.config.n_action_steps)
+        return self._chunk()
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
+        """The next action of every environment, ``[B, d_a]``, normalised."""
+        self._remember(batch)
+        if not self._queues["action"]:
+            self._queues["action"].extend(
+                self._chunk().transpose(0, 1)[: self.config.n_action_steps]
+            )
+        self._memory.step()
+        return self._queues["action"].popleft()
+
+    def _remember(self, batch: dict[str, Tensor]) -> None:
+        seen = {name: batch[name] for name in self.config.observed}
+        self._queues = populate_queues(self._queues, seen)
+
+    def _chunk(self) -> Tensor:
+        self.eval()
         seen = {name: torch.stack(list(self._queues[name]), dim=1) for name in self.config.observed}
         observation = self._observation(seen)
         loc, warm = self._memory.decide(len(observation), observation.device)
@@ -164,17 +181,6 @@ class WarmFlowPolicy(PreTrainedPolicy):
         chunk = self.actor(data)[keys.CHUNK]
         self._memory.record(chunk)
         return chunk
-
-    @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """The next action of every environment, ``[B, d_a]``, normalised."""
-        batch = {name: batch[name] for name in self.config.observed}
-        self._queues = populate_queues(self._queues, batch)
-        if not self._queues["action"]:
-            chunk = self.predict_action_chunk(batch)
-            self._queues["action"].extend(chunk.transpose(0, 1)[: self.config.n_action_steps])
-        self._memory.step()
-        return self._queues["action"].popleft()
 
     def _observation(self, batch: dict[str, Tensor]) -> Tensor:
         """``[B, To, d_o]``."""

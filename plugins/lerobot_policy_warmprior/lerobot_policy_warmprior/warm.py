@@ -57,14 +57,14 @@ class WarmPolicyMixin:
                 "use_relative_actions=true needs the robot's state at both decisions: use "
                 "warmprior.lerobot.WarmPriorAdapter with RelativeActions around the policy"
             )
-        self.__dict__["_adapter"] = None  # the policy's own constructor resets
+        self.__dict__["warm_adapter"] = None  # the policy's own constructor resets
         super().__init__(config, *args, **kwargs)
         if config.sigma_unit == "std" and config.action_std is None:
             config.action_std = action_std(self, dataset_stats).tolist()
         std = torch.tensor(config.action_std) if config.sigma_unit == "std" else None
         prior = config.make_prior()
         # Not a submodule: it refers back to the policy.
-        self.__dict__["_adapter"] = WarmPriorAdapter(
+        self.__dict__["warm_adapter"] = WarmPriorAdapter(
             self, prior, sigma_unit=config.sigma_unit, action_std=std
         )
 
@@ -72,21 +72,21 @@ class WarmPolicyMixin:
         """The policy's own loss, from the prior's source."""
         forward = super().forward
         told = inspect.signature(forward).bind(batch, *args, **kwargs).arguments
-        return self._adapter.loss(told.pop("batch"), forward, **told)
+        return self.warm_adapter.loss(told.pop("batch"), forward, **told)
 
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The next action of every environment."""
-        return self._adapter.select_action(batch, super().select_action, **kwargs)
+        return self.warm_adapter.select_action(batch, super().select_action, **kwargs)
 
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """A new chunk; ``executed_steps=`` tells how much of the last one was executed."""
         executed = kwargs.pop("executed_steps", None)
-        return self._adapter.predict_action_chunk(
+        return self.warm_adapter.predict_action_chunk(
             batch, executed, super().predict_action_chunk, **kwargs
         )
 
     def reset(self) -> None:
         """New episodes in all environments."""
         super().reset()
-        if self._adapter is not None:
-            self._adapter.forget()
+        if self.warm_adapter is not None:
+            self.warm_adapter.forget()
