@@ -172,6 +172,18 @@ def test_the_cache_is_asked_first(copy, tmp_path, monkeypatch):
     assert "agentview16fast" in cached.name
 
 
+def test_one_quality_goes_for_all_cameras_of_a_file(recorded, tmp_path):
+    first = render(recorded, CAMERAS[:1], out=tmp_path / "first.hdf5")
+    with pytest.raises(ValueError, match=r"agentview were rendered fast.*add --fast, or .*all"):
+        render(first, CAMERAS[1:], out=tmp_path / "mixed.hdf5", fast=False)
+    assert not (tmp_path / "mixed.hdf5").exists()
+    both = render(first, CAMERAS[1:], out=tmp_path / "both.hdf5")
+    with h5py.File(both) as file:
+        assert json.loads(file["data"].attrs["rendering"])["cameras"] == list(CAMERAS)
+    anew = render(both, CAMERAS, out=tmp_path / "anew.hdf5", fast=False)
+    compare_images(anew, IMAGES, fast=False)
+
+
 def without_states(file):
     del file["data/demo_0/states"]
 
