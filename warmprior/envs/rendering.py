@@ -66,10 +66,12 @@ def require_rendering() -> str:
     """The backend that renders here.
 
     Raises:
+        ImportError: if MuJoCo is missing.
         RuntimeError: if none does; the message names the packages to install.
     """
     backend = rendering_backend()
     if backend is None:
+        require("mujoco", "sim")  # without which no backend could be tried
         raise RuntimeError(
             "cannot render: neither EGL nor OSMesa works here. On Debian or Ubuntu install one of "
             "them: apt-get install libegl1 (with libegl-mesa0) or apt-get install libosmesa6"
