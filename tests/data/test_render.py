@@ -193,10 +193,15 @@ def of_another_environment(file):
     file["data/demo_0/states"] = np.zeros((STEPS, 45))
 
 
+def not_a_number(file):
+    file["data/demo_0/states"][2, 5] = np.nan
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (without_states, r"data/demo_0 has no states to render"),
+        (not_a_number, r"data/demo_0/states has NaN or infinity in row 2"),
         (of_another_environment, r"states has shape \(4, 45\).*Lift has \(4, 32\)"),
     ],
 )
@@ -221,6 +226,11 @@ def test_states_that_cannot_be_rendered_are_refused(copy, change, said):
 def test_bad_options(copy, options, said):
     with pytest.raises(ValueError, match=said):
         render(copy, **{"out": copy, **options})
+
+
+def test_images_too_large_for_opengl_are_told(copy):
+    with pytest.raises(ValueError, match="cannot render images of 20000 x 20000 pixels here"):
+        render(copy, CAMERAS[:1], out=copy, size=20_000)
 
 
 def replaced(path, value, key=f"data/demo_1/obs/{IMAGES[0]}"):

@@ -78,7 +78,7 @@ def render_demonstrations(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        DatasetError: if it holds no states, or those of another simulator.
+        DatasetError: if it holds no states, those of another simulator, or some that are not finite.
         ValueError: if there is no such camera, an option is out of range, or images of other cameras in the
             file were rendered in the other quality.
         RuntimeError: if nothing here can render.
@@ -190,7 +190,14 @@ class _Illustrator:
                     f"{self.index.env_args['env_name']} has {expected}: its robots or objects are others here"
                 )
             with reading(file, f"data/{demo}/states"):
-                return states[:, 1 : 1 + model.nq]
+                found = states[:, 1 : 1 + model.nq]
+        usable = np.isfinite(found).all(-1)
+        if not usable.all():  # MuJoCo would show something all the same
+            raise DatasetError(
+                f"{path}: data/{demo}/states has NaN or infinity in row {int(np.argmin(usable))}: record it "
+                "again, or leave the demo out"
+            )
+        return found
 
     def check(self) -> None:
         """Render one image of every camera."""
