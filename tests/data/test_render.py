@@ -172,6 +172,18 @@ def test_the_cache_is_asked_first(copy, tmp_path, monkeypatch):
     assert "agentview16fast" in cached.name
 
 
+def test_one_quality_goes_for_all_cameras_of_a_file(recorded, tmp_path):
+    first = render(recorded, CAMERAS[:1], out=tmp_path / "first.hdf5")
+    with pytest.raises(ValueError, match=r"agentview were rendered fast.*add --fast, or .*all"):
+        render(first, CAMERAS[1:], out=tmp_path / "mixed.hdf5", fast=False)
+    assert not (tmp_path / "mixed.hdf5").exists()
+    both = render(first, CAMERAS[1:], out=tmp_path / "both.hdf5")
+    with h5py.File(both) as file:
+        assert json.loads(file["data"].attrs["rendering"])["cameras"] == list(CAMERAS)
+    anew = render(both, CAMERAS, out=tmp_path / "anew.hdf5", fast=False)
+    compare_images(anew, IMAGES, fast=False)
+
+
 def without_states(file):
     del file["data/demo_0/states"]
 
@@ -181,10 +193,15 @@ def of_another_environment(file):
     file["data/demo_0/states"] = np.zeros((STEPS, 45))
 
 
+def not_a_number(file):
+    file["data/demo_0/states"][2, 5] = np.nan
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (without_states, r"data/demo_0 has no states to render"),
+        (not_a_number, r"data/demo_0/states has NaN or infinity in row 2"),
         (of_another_environment, r"states has shape \(4, 45\).*Lift has \(4, 32\)"),
     ],
 )
@@ -209,6 +226,11 @@ def test_states_that_cannot_be_rendered_are_refused(copy, change, said):
 def test_bad_options(copy, options, said):
     with pytest.raises(ValueError, match=said):
         render(copy, **{"out": copy, **options})
+
+
+def test_images_too_large_for_opengl_are_told(copy):
+    with pytest.raises(ValueError, match="cannot render images of 20000 x 20000 pixels here"):
+        render(copy, CAMERAS[:1], out=copy, size=20_000)
 
 
 def replaced(path, value, key=f"data/demo_1/obs/{IMAGES[0]}"):

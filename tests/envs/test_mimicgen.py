@@ -93,6 +93,12 @@ def test_missing_package_says_what_to_install(path, monkeypatch):
         RobosuiteEnv("coffee_d0")
 
 
+def test_a_clone_that_is_not_installed_is_no_other_package(path):
+    write_mimicgen(path / "mimicgen")  # its root has the name as well
+    with pytest.raises(ImportError, match=r"need NVlabs' package.*run: git clone"):
+        RobosuiteEnv("coffee_d0")
+
+
 @pytest.mark.parametrize("kind", ["package", "module"])
 def test_another_package_of_the_name_is_refused_without_running_it(path, kind):
     code = "raise SystemExit('its code ran')"

@@ -25,6 +25,7 @@ from warmprior.envs import RobosuiteEnv, RobosuiteWrapper, rendering_backend
 from warmprior.envs import rendering as rendering_module
 from warmprior.envs.simulator import make_simulator, task_env_args
 from warmprior.envs.tasks import TASKS
+from warmprior.io import extras
 
 make_lift = partial(RobosuiteEnv, "lift", horizon=15)
 
@@ -314,3 +315,7 @@ def test_says_how_to_get_a_renderer(monkeypatch):
     monkeypatch.setattr(rendering_module, "rendering_backend", lambda: None)
     with pytest.raises(RuntimeError, match=r"libegl1.*libosmesa6"):
         make_lift().render_frame()
+    # A process that tries a backend fails without MuJoCo, too.
+    monkeypatch.setattr(extras.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=r"mujoco is not installed; run: pip install 'warmprior"):
+        rendering_module.require_rendering()

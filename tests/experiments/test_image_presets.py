@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from warmprior.envs import rendering
 from warmprior.experiments import (
     PRESETS,
     DataOptions,
@@ -66,3 +67,9 @@ def test_asked_for_elsewhere_missing_weights_are_an_error_before_any_work(offlin
     with pytest.raises(OSError, match="cannot be had"):
         replace(PRESETS["quick"], data=IMAGE).check()
     replace(PRESETS["quick"], data=IMAGE, network=NetworkOptions(encoder="resnet18")).check()
+
+
+def test_without_a_renderer_images_are_refused_as_an_option(monkeypatch):
+    monkeypatch.setattr(rendering, "rendering_backend", lambda: None)
+    with pytest.raises(ValueError, match=r"--obs image needs .*libegl1.*libosmesa6"):
+        IMAGE.check()

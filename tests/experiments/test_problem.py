@@ -14,9 +14,10 @@ from warmprior.data import DatasetError, generate_demonstrations
 from warmprior.data.hdf5 import read_index
 from warmprior.envs import rendering_backend
 from warmprior.experiments import NetworkOptions, Recipe, RunOptions, Store, robosuite_problem
-from warmprior.experiments.recipe import DataOptions
+from warmprior.experiments.recipe import DataOptions, HeldOutOptions
 from warmprior.experiments.record import record, restore
 from warmprior.io.files import file_digest
+from warmprior.modules import Normalizer
 from warmprior.training import TrainingConfig
 from warmprior.transforms import AbsoluteActions
 
@@ -111,6 +112,27 @@ def test_part_of_a_file_is_its_first_demonstrations(path, tmp_path):
     assert torch.allclose(mine, all_of_it[:30], atol=1e-6)
     with pytest.raises(DatasetError, match="there are 2 demonstrations, fewer than the 3"):
         robosuite_problem(path, options=DataOptions(demonstrations=(3,)))
+
+
+def test_another_task_is_refused_before_anything_is_rendered(path, monkeypatch):
+    from warmprior.data import render
+    from warmprior.experiments import problem, recipe
+
+    monkeypatch.setattr(render, "render_demonstrations", lambda *_, **__: pytest.fail("rendered"))
+    monkeypatch.setattr(recipe, "require_rendering", lambda: "egl")
+    asked = DataOptions(task=("stack",), dataset=path, obs="image")
+    with pytest.raises(ValueError, match="holds demonstrations of lift, not of stack"):
+        problem.find_problems(asked)
+    facts = {"task": "stack", "style": "ph", "source": "file", "demonstrations": 2, "sha256": ""}
+    facts["images"] = {"cameras": ["agentview"], "size": 16, "fast_rendering": True}
+    with pytest.raises(ValueError, match=r"of lift, but these .* are for stack"):
+        problem.observe(
+            HeldOutOptions(validation=path),
+            facts,
+            Normalizer({}, {}),
+            chunk_length=4,
+            observation_steps=2,
+        )
 
 
 @pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -289,11 +291,35 @@ def test_imagenets_weights_that_cannot_be_had(monkeypatch):
 
     monkeypatch.setattr(ResNet18_Weights, "get_state_dict", offline)
     with pytest.raises(
-        OSError, match=r"cannot be had \(no route to host\): connect once, put resnet18"
+        OSError, match=r"cannot be had \(no route to host\): connect once, put an intact"
     ):
         load_imagenet(encoder_of(backbone="resnet18"))
     with pytest.raises(ValueError, match="not for 'small'"):
         load_imagenet(encoder_of())
+
+
+class Planted:
+    """Runs when it is unpickled."""
+
+    def __reduce__(self):
+        return (os.mkdir, (Planted.folder,))
+
+
+@pytest.mark.parametrize("stored", [b"", b"<html>", b"PK\x03\x04" + bytes(99), Planted()])
+def test_stored_weights_that_are_damaged_or_hold_code(tmp_path, monkeypatch, stored):
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    path = tmp_path / "hub" / "checkpoints" / "resnet18-f37072fd.pth"
+    path.parent.mkdir(parents=True)
+    if isinstance(stored, bytes):
+        path.write_bytes(stored)
+    else:
+        Planted.folder = str(tmp_path / "ran")
+        torch.save({"conv1.weight": stored}, path)
+    with pytest.raises(
+        OSError, match=r"cannot be had \(.*\): connect once, put an intact resnet18"
+    ):
+        load_imagenet(encoder_of(backbone="resnet18"))
+    assert not (tmp_path / "ran").exists()
 
 
 def test_half_precision_networks_take_images_as_they_are():

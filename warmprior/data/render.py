@@ -55,9 +55,9 @@ def render_demonstrations(
     """Add images to a robomimic file, rendered from the states that it holds.
 
     The result is a copy of the file in robomimic's layout, with ``obs/<camera>_image`` uint8
-    ``[N, size, size, 3]``, upright and compressed, in every demo, without ``next_obs``. It appears under its
-    name when it is complete. Finished demos lie in a folder next to it until then: an interrupted call
-    continues from them. The images do not depend on the number of workers.
+    ``[N, size, size, 3]``, upright and compressed, in every demo, without ``next_obs``. Images of other
+    cameras stay. It appears under its name when it is complete. Finished demos lie in a folder next to it
+    until then: an interrupted call continues from them. The images do not depend on the number of workers.
 
     Args:
         path: a robomimic HDF5 file with states.
@@ -78,8 +78,9 @@ def render_demonstrations(
 
     Raises:
         FileNotFoundError: if there is no such file.
-        DatasetError: if it holds no states, or those of another simulator.
-        ValueError: if there is no such camera, or an option is out of range.
+        DatasetError: if it holds no states, those of another simulator, or some that are not finite.
+        ValueError: if there is no such camera, an option is out of range, or images of other cameras in the
+            file were rendered in the other quality.
         RuntimeError: if nothing here can render.
         OSError: if the disk is full; what is finished stays.
 
@@ -97,6 +98,7 @@ def render_demonstrations(
     for name, value in {"size": size, "workers": workers}.items():
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1, got {value}")
+    kept = _rendered_before(path, index, cameras, fast)
     chosen = [] if demos is None else [demos]
     identity = digest_of(*renderer_versions(), file_digest(path), cameras, size, fast, *chosen)[:8]
     if out is None:
@@ -132,7 +134,7 @@ def render_demonstrations(
                 pool.submit(_Render(demo))
             while pool.running:
                 bar.update(len(pool.wait()))
-        write_atomic(out, lambda temporary: _write(temporary, illustrator))
+        write_atomic(out, lambda temporary: _write(temporary, illustrator, kept))
         for demo in index.demos:
             illustrator.part(demo).unlink()
     parts.rmdir()
@@ -188,7 +190,14 @@ class _Illustrator:
                     f"{self.index.env_args['env_name']} has {expected}: its robots or objects are others here"
                 )
             with reading(file, f"data/{demo}/states"):
-                return states[:, 1 : 1 + model.nq]
+                found = states[:, 1 : 1 + model.nq]
+        usable = np.isfinite(found).all(-1)
+        if not usable.all():  # MuJoCo would show something all the same
+            raise DatasetError(
+                f"{path}: data/{demo}/states has NaN or infinity in row {int(np.argmin(usable))}: record it "
+                "again, or leave the demo out"
+            )
+        return found
 
     def check(self) -> None:
         """Render one image of every camera."""
@@ -256,7 +265,31 @@ class _Compare:
         illustrator.compare(self.state, self.images, self.name, self.advice)
 
 
-def _write(path: Path, illustrator: _Illustrator) -> None:
+def _rendering(file: Any) -> dict[str, Any] | None:
+    """How the images of an open file were rendered, where it says so."""
+    written = file["data"].attrs.get("rendering")
+    return None if written is None else json.loads(written)
+
+
+def _rendered_before(
+    path: Path, index: DatasetIndex, cameras: Sequence[str], fast: bool
+) -> list[str]:
+    """Other cameras whose images are known to be of the quality that is asked for: one goes for a file."""
+    with open_robomimic(path) as file:
+        before = _rendering(file)
+    if before is None:
+        return []
+    kept = [c for c in index.cameras if c in before["cameras"] and c not in cameras]
+    if kept and bool(before["fast"]) != fast:
+        raise ValueError(
+            f"{path}: its images of {', '.join(kept)} were rendered {'in full quality' if fast else 'fast'}, "
+            f"and one quality goes for all: {'leave out' if fast else 'add'} --fast, or render all cameras "
+            f"(--cameras {' '.join([*kept, *cameras])})"
+        )
+    return kept
+
+
+def _write(path: Path, illustrator: _Illustrator, kept: Sequence[str]) -> None:
     """The file with the images of the demos, and with its masks if all of them are in it."""
     h5py, size, index = require("h5py", "sim"), illustrator.size, illustrator.index
     with open_robomimic(index.path) as source, h5py.File(path, "w") as file:
@@ -265,7 +298,7 @@ def _write(path: Path, illustrator: _Illustrator) -> None:
         data.attrs["total"] = sum(index.lengths)
         data.attrs["env_args"] = json.dumps(_with_cameras(index.env_args, illustrator), indent=4)
         data.attrs["rendering"] = json.dumps(
-            {"size": size, "cameras": illustrator.cameras, "fast": illustrator.fast}
+            {"size": size, "cameras": [*kept, *illustrator.cameras], "fast": illustrator.fast}
         )
         for demo in index.demos:
             data.create_group(demo).attrs.update(source["data"][demo].attrs)
@@ -308,7 +341,7 @@ def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) ->
     index = read_index(path, image_keys=image_keys)
     first = f"data/{index.demos[0]}"
     with open_robomimic(path) as file:
-        written = file["data"].attrs.get("rendering")
+        rendering = _rendering(file)
         states = member(file, f"{first}/states", "dataset")
         state = None if states is None else states[0]
         images = {key: file[f"{first}/obs/{key}"][0] for key in image_keys}
@@ -316,7 +349,7 @@ def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) ->
         index,
         images,
         state=state,
-        rendering=None if written is None else json.loads(written),
+        rendering=rendering,
         fast=fast,
         advice=f"render these anew (python -m warmprior render {path})",
     )

@@ -42,15 +42,16 @@ def find_mimicgen() -> Path:
         'mimicgen'
     """
     spec = find_spec("mimicgen")
-    if spec is None:
+    folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
+    for folder in folders:
+        if all((folder / "envs" / "robosuite" / f"{task}.py").is_file() for task in _TASKS):
+            return folder
+    # A bare folder of the name, such as the clone beside which Python runs, is no package.
+    if spec is None or spec.origin is None:
         raise ImportError(
             "MimicGen's tasks need NVlabs' package, which is not on the package index (what has its "
             f"name there is another project); run: {_INSTALL}"
         )
-    folders = [Path(folder) for folder in spec.submodule_search_locations or ()]
-    for folder in folders:
-        if all((folder / "envs" / "robosuite" / f"{task}.py").is_file() for task in _TASKS):
-            return folder
     raise ImportError(
         f"the package mimicgen in {', '.join(map(str, folders)) or spec.origin} is not NVlabs': it has no "
         "envs/robosuite with stack, coffee and threading, and was not imported. The package index has "

@@ -66,10 +66,12 @@ def require_rendering() -> str:
     """The backend that renders here.
 
     Raises:
+        ImportError: if MuJoCo is missing.
         RuntimeError: if none does; the message names the packages to install.
     """
     backend = rendering_backend()
     if backend is None:
+        require("mujoco", "sim")  # without which no backend could be tried
         raise RuntimeError(
             "cannot render: neither EGL nor OSMesa works here. On Debian or Ubuntu install one of "
             "them: apt-get install libegl1 (with libegl-mesa0) or apt-get install libosmesa6"
@@ -92,6 +94,7 @@ class CameraRenderer:
             images differ by 1 to 2 of 255 on average.
 
     Raises:
+        ValueError: if images of this size are too large for OpenGL.
         RuntimeError: if no OpenGL backend works, or the process was forked from one that has rendered.
 
     Examples:
@@ -124,6 +127,10 @@ class CameraRenderer:
         quality.offsamples = 0 if fast else before[2]
         try:
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
+        except mujoco.FatalError as error:
+            raise ValueError(
+                f"OpenGL cannot render images of {width} x {height} pixels here: {error}"
+            ) from error
         finally:
             sizes.offwidth, sizes.offheight, quality.offsamples = before
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)

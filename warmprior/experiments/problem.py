@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from warmprior.data import download_mimicgen, download_robomimic, generate_demonstrations
+from warmprior.data.index import DatasetIndex
 from warmprior.data.opening import Demonstrations, open_demonstrations
 from warmprior.data.render import renderer_versions
 from warmprior.data.replay import DemonstrationReplay
@@ -137,8 +138,8 @@ def robosuite_problem(
     Raises:
         DatasetError: if the file cannot be read or has fewer demonstrations, or images are to be rendered
             and it has no states.
-        ValueError: if it has no pose deltas to make absolute poses of, there is no such camera, or its
-            environment is unknown.
+        ValueError: if it has no pose deltas to make absolute poses of, there is no such camera, its
+            environment is unknown, or a file is of another task than the one that is named.
         ImportError: if its simulator is MimicGen's, and its package is missing.
     """
     options = DataOptions() if options is None else options
@@ -153,8 +154,14 @@ def robosuite_problem(
         raise ValueError(
             f"{path} does not say which environment it was recorded in: name it with --task"
         )
+    # Not after hours of rendering, or of training.
+    if source == "file" and options.task not in ((), (task_of(index),)):
+        raise ValueError(
+            f"{path} holds demonstrations of {task_of(index)}, not of {options.task[0]}: leave --task out or "
+            "correct it"
+        )
     if is_mimicgen(index.env_args["env_name"]):
-        find_mimicgen()  # not after hours of training
+        find_mimicgen()
     dataset, images = _read(found, options, demos)
     description = environment_description(
         dataset.recorded_env_args, style, observation_steps, actions, images
@@ -251,7 +258,7 @@ def navigation_problem() -> Problem:
     )
 
 
-def task_of(dataset: DemonstrationReplay) -> str:
+def task_of(dataset: DemonstrationReplay | DatasetIndex) -> str:
     """Short name of a dataset's task, or the environment's where it is none of ours."""
     task = dataset.task
     return str(dataset.env_args["env_name"]).lower() if task is None else task.name
@@ -269,18 +276,14 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
     """
     options.check()
     if options.dataset is not None:
-        found = robosuite_problem(
-            options.dataset,
-            options.data[0],
-            observation_steps=observation_steps,
-            options=options,
-        )
-        if options.task not in ((), (found.task,)):
-            raise ValueError(
-                f"{options.dataset} holds demonstrations of {found.task}, not of {options.task[0]}: leave "
-                "--task out or correct it"
+        return [
+            robosuite_problem(
+                options.dataset,
+                options.data[0],
+                observation_steps=observation_steps,
+                options=options,
             )
-        return [found]
+        ]
     if not options.download:
         counts = ", ".join(f"{options.count(style)} {style}" for style in options.data)
         print(
@@ -354,6 +357,11 @@ def observe(
         n = max(20, int(-(-options.observations // usable)))
         found = _open(generate_demonstrations(task, style, n, HELD_OUT_SEED), None)
         told = f"{n} newly generated demonstrations"
+    theirs = task_of(found.index())
+    if theirs != task:  # before images are rendered
+        raise ValueError(
+            f"--validation {found.name} holds demonstrations of {theirs}, but these policies are for {task}"
+        )
     images = facts.get("images")
     seen: dict[str, Any] = {}
     if images is not None:
@@ -364,11 +372,6 @@ def observe(
             "fast_rendering": images["fast_rendering"],
         }
     dataset, _ = _read(found, DataOptions(actions=facts.get("actions", "delta"), **seen))
-    if task_of(dataset) != task:
-        raise ValueError(
-            f"--validation {found.name} holds demonstrations of {task_of(dataset)}, but these policies are "
-            f"for {task}"
-        )
     # A copy: the data are normalised on the CPU, the policy may live elsewhere.
     normalizer = copy.deepcopy(normalizer).to("cpu")
     shared = SharedObservations(

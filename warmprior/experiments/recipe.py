@@ -135,7 +135,10 @@ class DataOptions:
         if self.force_download and not self.download:
             raise ValueError("--force-download belongs to --download")
         if self.obs == "image":
-            require_rendering()
+            try:
+                require_rendering()
+            except RuntimeError as error:
+                raise ValueError(f"--obs image needs the simulator's images: {error}") from error
             if self.actions == "absolute":
                 raise ValueError("--obs image goes with --actions delta, as in the paper")
             if len(set(self.cameras)) < len(self.cameras):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from http.client import HTTPException
+from pickle import UnpicklingError
 from typing import Any, Literal
 
 import torch
@@ -206,16 +208,19 @@ def imagenet_weights() -> dict[str, Tensor]:
     """ImageNet's weights of ResNet-18, which torchvision downloads once.
 
     Raises:
-        OSError: if they are neither stored here nor can be downloaded.
+        OSError: if they are neither stored here nor can be downloaded, or what is stored is damaged.
         ImportError: if torchvision is missing.
     """
     torchvision: Any = require("torchvision.models", "vision")
     weights = torchvision.ResNet18_Weights.IMAGENET1K_V1
     try:
-        return weights.get_state_dict(progress=False, check_hash=True)
-    except OSError as error:
+        # Tensors alone: a file of theirs can hold code, too, which would run.
+        return weights.get_state_dict(progress=False, check_hash=True, weights_only=True)
+    # A download that breaks off or is another file, and a stored file that is cut, empty or no weights.
+    except (OSError, HTTPException, RuntimeError, UnpicklingError, EOFError) as error:
+        reason = str(error).partition("\n")[0].rstrip(". ") or type(error).__name__
         raise OSError(
-            f"ImageNet's weights of ResNet-18 cannot be had ({error}): connect once, put "
+            f"ImageNet's weights of ResNet-18 cannot be had ({reason}): connect once, put an intact "
             f"{weights.url.rpartition('/')[2]} into {torch.hub.get_dir()}/checkpoints, or start from random "
             "weights (--encoder resnet18)"
         ) from error

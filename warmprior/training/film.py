@@ -134,8 +134,10 @@ def record_filmstrip(
 
     Raises:
         RuntimeError: if nothing on this machine can render; the message names the packages to install.
-        ValueError: if the policy keeps no description of its environment.
+        ValueError: if the policy keeps no description of its environment, or the size of a video is odd.
     """
+    if video is not None:
+        _check_size(size)
     with _played(actor, seed, nfe, policy_seed, options) as played:
         steps = np.unique(np.linspace(0, len(played.states) - 1, frames).round().astype(int))
         pictures = [played.frame(step, size) for step in steps]
@@ -188,11 +190,18 @@ def record_video(
     Raises:
         ImportError: if PyAV is missing.
         RuntimeError: if nothing on this machine can render; the message names the packages to install.
-        ValueError: if the policy keeps no description of its environment.
+        ValueError: if the policy keeps no description of its environment, or the size is odd.
     """
+    _check_size(size)
     with _played(actor, seed, nfe, policy_seed, options) as played:
         played.write(path, size, _rate(actor))
     return played.success
+
+
+def _check_size(size: int) -> None:
+    """Before the episode is played: the encoder takes pixels two by two."""
+    if size < 2 or size % 2:
+        raise ValueError(f"the side of a video must be an even number of pixels, got {size}")
 
 
 def _rate(actor: WarmPriorActor) -> int:
