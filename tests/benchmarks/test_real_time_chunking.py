@@ -83,7 +83,10 @@ def test_it_continues_with_the_rows_that_are_missing(script, tmp_path):
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"delay": 5}, r"--delay 5 with --execute 3 and gaussian.*too long for predictions of 8 actions.*at most 4"),
+        (
+            {"delay": 5},
+            r"--delay 5 with --execute 3 and gaussian.*too long for predictions of 8 actions.*at most 4",
+        ),
         (
             {"delay": 2, "execute": 7},
             r"--delay 2 with --execute 7 and gaussian, which predicts 8.*at most 6",
