@@ -226,16 +226,7 @@ def _understanding(what: str) -> Iterator[None]:
 class DemonstrationReplay(TensorDictReplayBuffer):
     """Demonstrations, as one immutable TorchRL replay buffer; formats are subclasses of it.
 
-    The whole selection becomes a flat, contiguous :class:`~tensordict.TensorDict` of ``N`` steps, in
-    the order of the demos' numbers:
-
-    - ``"observation"`` ``[N, d_o]`` float32, the observation keys side by side; with images nested,
-      ``("observation", "state")`` ``[N, d_s]`` and each as uint8 ``[N, 3, size, size]``;
-    - ``"action"`` ``[N, d_a]`` float32, as recorded (not normalised);
-    - ``("next", "reward")`` ``[N, 1]`` float32;
-    - ``("next", "done")``, ``("next", "terminated")``, ``("next", "truncated")`` ``[N, 1]`` bool: done
-      on the last step of each demo, terminated there if its reward is positive, else truncated;
-    - ``"episode"`` ``[N]`` int64, counted from 0, and ``"frame"`` ``[N]`` int64, the row itself.
+    The entries are those that :class:`RobomimicExperienceReplay` tells, whatever the format.
 
     Args:
         index: what to read.

@@ -13,6 +13,7 @@ from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.modules.real_time_chunking import with_leftover
+from warmprior.transforms.chunk_keys import chunk_spec, executed_steps
 
 __all__ = ["InferenceDelay", "check_delay", "executed_chunk", "shift_chunk"]
 
@@ -169,11 +170,7 @@ class InferenceDelay(Transform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         # The chunk here is the executed one: TorchRL hands over the input that the inverses gave.
-        executed = next_tensordict.get(self.executed_key)
-        if executed is None:
-            raise KeyError(
-                f"InferenceDelay found no {self.executed_key!r} after the step: append it after ChunkStep"
-            )
+        executed = executed_steps(next_tensordict, self.executed_key, "InferenceDelay")
         if (executed > self.execute).any():
             raise RuntimeError(
                 f"a decision executed {int(executed.max())} actions, and InferenceDelay was told "
@@ -211,12 +208,7 @@ class InferenceDelay(Transform):
         return tensordict
 
     def _check_chunk(self, action_spec: TensorSpec) -> TensorSpec:
-        if self.chunk_key not in action_spec.keys(True, True):
-            raise KeyError(
-                f"InferenceDelay found no {self.chunk_key} among the actions "
-                f"{list(action_spec.keys(True, True))}: append it after ChunkStep"
-            )
-        chunk = action_spec[self.chunk_key]
+        chunk = chunk_spec(action_spec, self.chunk_key, "InferenceDelay")
         check_delay(self.delay, self.execute, chunk.shape[-2])
         # Kept because resets are frequent and TorchRL rebuilds specs on every access.
         self._chunk = chunk

@@ -13,6 +13,7 @@ from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.modules.prior import Prior
+from warmprior.transforms.chunk_keys import chunk_spec, executed_steps
 
 __all__ = ["ActionHistory"]
 
@@ -84,12 +85,7 @@ class ActionHistory(Transform):
         self._chunk: TensorSpec | None = None
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        executed = next_tensordict.get(self.executed_key)
-        if executed is None:
-            raise KeyError(
-                f"ActionHistory found no {self.executed_key!r} after the step: append it after "
-                "ChunkStep"
-            )
+        executed = executed_steps(next_tensordict, self.executed_key, "ActionHistory")
         before = tensordict.get(self.loc_key)
         elapsed = tensordict.get(self.elapsed_key) + executed
         loc, warm = self.prior.next_mean(before, tensordict.get(self.chunk_key), executed, elapsed)
@@ -121,12 +117,7 @@ class ActionHistory(Transform):
         return tensordict
 
     def _check_chunk(self, action_spec: TensorSpec) -> TensorSpec:
-        if self.chunk_key not in action_spec.keys(True, True):
-            raise KeyError(
-                f"ActionHistory found no {self.chunk_key} among the actions "
-                f"{list(action_spec.keys(True, True))}: append it after ChunkStep"
-            )
-        chunk = action_spec[self.chunk_key]
+        chunk = chunk_spec(action_spec, self.chunk_key, "ActionHistory")
         length = chunk.shape[-2]
         if length != self.prior.prediction_length:
             raise ValueError(
