@@ -28,11 +28,14 @@ benchmark: install
 throughput: install
 	$(BIN)/python benchmarks/throughput.py $(ARGS)
 
+# Files side by side, one per core: tests of one file share what they have trained.
+PYTEST := $(BIN)/python -m pytest -n logical --dist loadfile
+
 test: install
-	$(BIN)/python -m pytest $(ARGS)
+	$(PYTEST) $(ARGS)
 
 test-slow: install
-	$(BIN)/python -m pytest -m slow $(ARGS)
+	$(PYTEST) -m slow $(ARGS)
 
 $(GROOT)/installed: pyproject.toml constraints.txt $(GROOT_NEEDS)
 	$(PYTHON) -m venv $(GROOT)
