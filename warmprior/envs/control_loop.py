@@ -15,11 +15,22 @@ import numpy as np
 
 from warmprior.envs.osc import Arm, check_supported, compiled_torques
 from warmprior.envs.simulator import isolated_numpy_seed
+from warmprior.envs.tasks import low_dim_keys
 from warmprior.io.extras import require
 
 __all__ = ["ControlLoop", "StepLoop"]
 
 Observations = dict[str, np.ndarray]
+
+OBJECT_POSES = {
+    "Lift",
+    "NutAssemblySquare",
+    "PickPlaceCan",
+    "Stack",
+    "ToolHang",
+    "TwoArmTransport",
+}
+"""Environments whose ``"object"`` observation follows from positions alone."""
 
 
 class StepLoop:
@@ -189,6 +200,11 @@ class ControlLoop(StepLoop):
         self._mujoco = require("mujoco", "sim")
         self._torques = compiled_torques()
         super().__init__(env, keys)
+        poses = low_dim_keys(len(env.robots))
+        #: Whether :meth:`look_back` gives all observations.
+        self.looks_back = type(env).__name__ in OBJECT_POSES and not {
+            *self._names.values()
+        }.difference(poses)
 
     def _bind(self) -> None:
         super()._bind()
@@ -204,6 +220,11 @@ class ControlLoop(StepLoop):
 
     def step(self, action: np.ndarray) -> tuple[Observations, bool]:
         """Advance one control step; see :meth:`StepLoop.step`."""
+        success = self.advance(action)
+        return self._observations_here(), success
+
+    def advance(self, action: np.ndarray) -> bool:
+        """Advance one control step without observing; whether the task is solved."""
         env, mujoco, model, data = self.env, self._mujoco, self._model, self._data
         if len(action) != env.action_dim:
             raise ValueError(f"expected an action of width {env.action_dim}, got {len(action)}")
@@ -234,8 +255,29 @@ class ControlLoop(StepLoop):
             mujoco.mj_step2(model, data)
         env.timestep += 1
         env.cur_time += env.control_timestep
-        success = bool(env._check_success())
+        return bool(env._check_success())
+
+    def _observations_here(self) -> Observations:
         # Poses belong to the last substep's start until the kinematics are brought up to date.
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        return self.observations(refresh=True), success
+        self._mujoco.mj_kinematics(self._model, self._data)
+        self._mujoco.mj_comPos(self._model, self._data)
+        return self.observations(refresh=True)
+
+    def look_back(self, states: Sequence[np.ndarray]) -> list[Observations]:
+        """What the last steps' :meth:`step` would have observed, where it was left out (:meth:`advance`).
+
+        Only for observations that are poses: others are of contacts and velocities that are gone.
+
+        Args:
+            states: :meth:`state` after the last steps, one after the other; the last one is the current one.
+                The first one's observations may be wrong: sensors of objects relative to the gripper read
+                poses that were cached a step before.
+
+        Returns:
+            Observations, one per state.
+        """
+        data, found = self._data, []
+        for state in states:
+            data.qpos[:], data.qvel[:] = np.split(state[1:], [self._model.nq])
+            found.append(self._observations_here())
+        return found

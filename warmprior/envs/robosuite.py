@@ -28,6 +28,11 @@ __all__ = ["RobosuiteEnv", "RobosuiteWrapper"]
 
 _LOOPS = {"lean": ControlLoop, "robosuite": StepLoop}
 
+_FLAGS = keys.SUCCESS, "terminated", "truncated", "done"
+
+_Flags = tuple[bool, bool, bool, bool]
+"""Of a control step, in the order of the above."""
+
 
 class RobosuiteWrapper(_EnvWrapper):
     """Wraps a robosuite environment.
@@ -209,6 +214,10 @@ class RobosuiteWrapper(_EnvWrapper):
         if self.low_dim_keys is None:
             self.low_dim_keys = default_keys(len(env.robots))
         self._loop = _LOOPS[self.control_loop](env, self.low_dim_keys)
+        self._late: ControlLoop | None = None  # the loop, where it may observe afterwards
+        if isinstance(self._loop, ControlLoop) and self._loop.looks_back:
+            others = self.from_pixels or self.sim_state or self.eef_pose
+            self._late = None if others else self._loop
         self._renderers = EnvRenderers(env, fast=self.fast_rendering)
         if self.from_pixels:
             require_rendering()
@@ -241,54 +250,97 @@ class RobosuiteWrapper(_EnvWrapper):
         if seed is not None:
             self._seed, self._episode = seed, 0
 
-    def _read(
-        self,
-        observations: Mapping[str, np.ndarray],
-        success: bool,
-        truncated: bool = False,
-    ) -> TensorDict:
-        # This runs at every control step beside two milliseconds of physics: two arrays are filled and
-        # split, instead of one small tensor made per entry.
-        flat = np.concatenate(
-            [*(observations[key] for key in self.low_dim_keys or ()), (success,)],
-            dtype=np.float32,
-            casting="same_kind",
-        )
-        terminated = success and self.terminate_on_success
-        flags = np.array([[success], [terminated], [truncated], [terminated or truncated]])
-        floats, bools = torch.from_numpy(flat), torch.from_numpy(flags).unbind(0)
-        out = {
-            keys.OBSERVATION: floats[:-1],
-            "reward": floats[-1:],
-            **dict(zip(("success", "terminated", "truncated", "done"), bools, strict=True)),
+    def _measure(self, observations: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        # This runs between control steps of physics, which leave nothing of other code in the caches.
+        state = [observations[key] for key in self.low_dim_keys or ()]
+        found: dict[str, Any] = {
+            keys.OBSERVATION: np.concatenate(state, dtype=np.float32, casting="same_kind")
         }
         if self.from_pixels:
-            frames = {
-                camera: torch.from_numpy(self.render_frame(camera)) for camera in self.cameras
-            }
-            out["pixels"] = TensorDict(frames) if self.nested_pixels else frames[self.cameras[0]]
+            frames = {camera: self.render_frame(camera) for camera in self.cameras}
+            found["pixels"] = frames if self.nested_pixels else frames[self.cameras[0]]
         if self.sim_state:
-            out[keys.SIM_STATE] = torch.from_numpy(self._loop.state())
+            found[keys.SIM_STATE] = self._loop.state()
         if self.eef_pose:
             arms = range(len(self._env.robots))
             poses = [np.column_stack(self._loop.eef(arm)[::-1]) for arm in arms]
-            out[keys.EEF_POSE] = torch.from_numpy(np.stack(poses).astype(np.float32))
-        result = TensorDict(out, [])
-        return result if self.device is None else result.to(self.device)
+            found[keys.EEF_POSE] = np.stack(poses).astype(np.float32)
+        return found
+
+    def _count(self, success: bool) -> _Flags:
+        """Count a control step; what it means for the episode."""
+        self._elapsed += 1
+        terminated = success and self.terminate_on_success
+        out_of_time = self.horizon is not None and self._elapsed >= self.horizon
+        return success, terminated, out_of_time and not terminated, terminated or out_of_time
+
+    def _tell(
+        self, flags: Sequence[_Flags], measured: Sequence[dict[str, Any]]
+    ) -> list[TensorDictBase]:
+        """A result per step, of which the last ones tell what was measured."""
+        # Arrays are made tensors and split, instead of one small tensor per entry and step.
+        bits = np.array(flags)
+        booleans = iter(torch.from_numpy(bits.reshape(-1, 1)).unbind(0))
+        rewards = torch.from_numpy(bits[:, :1].astype(np.float32)).unbind(0)
+        entries: list[dict[str, Any]] = [
+            {"reward": reward, **{name: next(booleans) for name in _FLAGS}} for reward in rewards
+        ]
+        for entry, found in zip(entries[len(flags) - len(measured) :], measured, strict=True):
+            for key, value in found.items():
+                nested = isinstance(value, dict)
+                entry[key] = TensorDict(value) if nested else torch.from_numpy(value)
+        # Without the constructor's checks, which take longer than all of the above.
+        results = [TensorDict._new_unsafe(entry, batch_size=torch.Size([])) for entry in entries]
+        return results if self.device is None else [r.to(self.device) for r in results]
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         observations = self._loop.reset(self.episode_seed)
         self._episode += 1
         self._elapsed = 0
-        return self._read(observations, False).exclude("reward")
+        (result,) = self._tell([(False, False, False, False)], [self._measure(observations)])
+        return result.exclude("reward")
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict.get(keys.ACTION).detach().cpu().numpy()
-        observations, success = self._loop.step(action.astype(np.float64))
-        self._elapsed += 1
-        out_of_time = self.horizon is not None and self._elapsed >= self.horizon
-        solved = success and self.terminate_on_success
-        return self._read(observations, success, truncated=out_of_time and not solved)
+        (result,) = self.control_steps(tensordict.get(keys.ACTION)[None], 1)
+        return result
+
+    def control_steps(self, actions: torch.Tensor, keep: int) -> list[TensorDictBase]:
+        """Take control steps until the episode ends, with nothing but physics in between.
+
+        :class:`~warmprior.ChunkStep` executes chunks by it, where no transform has to look at every step.
+
+        Args:
+            actions: ``[n, d_a]``, ``n >= 1``, in the environment's units.
+            keep: of how many of the last steps to tell the observations; of the others only the reward,
+                ``"success"`` and the done flags.
+
+        Returns:
+            What each step led to, ``n`` or fewer.
+
+        Examples:
+            >>> _ = env.reset()  # doctest: +SKIP
+            >>> steps = env.control_steps(torch.zeros(8, 7), keep=1)  # doctest: +SKIP
+            >>> ["observation" in step for step in steps[-2:]]  # doctest: +SKIP
+            [False, True]
+        """
+        rows = actions.detach().cpu().double().unbind(0)
+        flags: list[_Flags] = []
+        states: list[np.ndarray] = []
+        measured: list[dict[str, Any]] = []
+        for action in rows:
+            if self._late is not None:
+                success = self._late.advance(action.numpy())
+                states.append(self._late.state())
+            else:
+                observations, success = self._loop.step(action.numpy())
+                measured.append(self._measure(observations))
+            flags.append(self._count(success))
+            if flags[-1][-1]:
+                break
+        if self._late is not None:
+            # One more than is told: see ControlLoop.look_back.
+            measured = [self._measure(o) for o in self._late.look_back(states[-keep - 1 :])]
+        return self._tell(flags, measured[-keep:])
 
 
 class RobosuiteEnv(RobosuiteWrapper):

@@ -10,6 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform, TransformedEnv
 
+from warmprior import keys
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.camera_images import CameraImages
 from warmprior.transforms.inner_step import InnerStep
@@ -35,12 +36,17 @@ class LateTransforms:
     fast simulator that takes longer than anything else here. The result is that of transforming every
     step, bit by bit.
 
+    An environment without batch dimensions may offer ``control_steps(actions, keep)``, as
+    :class:`~warmprior.envs.RobosuiteWrapper` does, which takes all steps in one go. It is used where actions
+    can be inverted at once, and is another factor of two.
+
     Args:
         step: the step of the environment, through its transforms.
         action_key: the environment's action, at the root.
+        brief: whether only reward and flags are read of the first steps: ``control_steps`` tells no more.
     """
 
-    def __init__(self, step: InnerStep, action_key: str) -> None:
+    def __init__(self, step: InnerStep, action_key: str, brief: bool) -> None:
         self._step = step
         self._transforms = step.transforms
         self._action_key = action_key
@@ -50,6 +56,9 @@ class LateTransforms:
         looking = (i for i, t in enumerate(self._transforms) if isinstance(t, AbsoluteActions))
         first = 1 + max(looking, default=-1)
         self._one_by_one, self._at_once = self._transforms[:first], self._transforms[first:]
+        self._control_steps: Callable[[Tensor, int], list[TensorDictBase]] | None = None
+        if brief and not self._one_by_one and not step.base.batch_size:
+            self._control_steps = getattr(step.base, "control_steps", None)
 
     @classmethod
     def of(
@@ -77,7 +86,8 @@ class LateTransforms:
             keys not in ([], [action_key]) for pair in inverse for keys in pair
         ):
             return None
-        return cls(step, action_key)
+        brief = {*base.reward_keys, *base.done_keys, keys.SUCCESS}
+        return cls(step, action_key, brief.issuperset(read))
 
     def __call__(
         self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
@@ -93,29 +103,41 @@ class LateTransforms:
         Returns:
             What all of them led to, ``first`` included; only the last one is transformed.
         """
-        results = [first]
-        batch, device = first.batch_size, first.device
-        for action in self._inverse(actions):
-            advance(current, results[-1], reward_key)
-            if current["done"].any():
-                break
-            # Without the constructor's checks: the entries come out of tensordicts of this batch size.
-            entries = current | {self._action_key: action}
-            inputs = TensorDict._new_unsafe(entries, batch_size=batch, device=device)
-            for transform in reversed(self._one_by_one):
-                inputs = transform._inv_call(inputs)
-            results.append(self._step.bare(inputs))
+        results, actions = [first], self._inverse(actions)
+        if self._control_steps is None:
+            results += self._steps(current, first, actions, reward_key)
+        elif len(actions) and not first.get("done").any():
+            results += self._control_steps(actions, self._reach)
         if len(results) > 1:
             results[-1] = self._transformed(first, results[1:])
         return results
 
-    def _inverse(self, actions: Tensor) -> tuple[Tensor, ...]:
+    def _steps(
+        self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
+    ) -> list[TensorDictBase]:
+        """One step after the other, untransformed."""
+        results: list[TensorDictBase] = []
+        for action in actions.unbind(0):
+            advance(current, results[-1] if results else first, reward_key)
+            if current["done"].any():
+                break
+            # Without the constructor's checks: the entries come out of tensordicts of this batch size.
+            entries = current | {self._action_key: action}
+            inputs = TensorDict._new_unsafe(
+                entries, batch_size=first.batch_size, device=first.device
+            )
+            for transform in reversed(self._one_by_one):
+                inputs = transform._inv_call(inputs)
+            results.append(self._step.bare(inputs))
+        return results
+
+    def _inverse(self, actions: Tensor) -> Tensor:
         # Elementwise: all of them at once, time first, so that what a transform has per row broadcasts.
         actions = actions.movedim(-2, 0)
         for transform in reversed(self._at_once):
             if transform.in_keys_inv:
                 actions = transform._inv_apply_transform(actions)
-        return actions.unbind(0)
+        return actions
 
     def _transformed(self, before: TensorDictBase, results: list[TensorDictBase]) -> TensorDictBase:
         # What lies further back than they reach has no influence, so that `before` may be older.
