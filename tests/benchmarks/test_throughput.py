@@ -14,6 +14,7 @@ pytest.importorskip("robosuite")
 SCRIPT = Path(__file__).parents[2] / "benchmarks" / "throughput.py"
 KEYS = {
     "windows_per_second",
+    "windows_over_torch",
     "lerobot_windows_over_getitem",
     "train_step_over_network",
     "preconditioning_over_network",

@@ -119,31 +119,33 @@ class ActionWindow(Transform):
                 f"ActionWindow needs the index of each sampled step under {self.frame_key!r}: store "
                 "torch.arange(N) there, or use window_replay_buffer"
             )
+        batch, chunk_length = tensordict.batch_size, self.prior.chunk_length
         frame = frame.reshape(-1, 1)
-        start, end = self.start[frame], self.end[frame]
+        start, end = _rows(self.start, frame), _rows(self.end, frame)
         index = frame + self.action_offsets
-        valid = (index >= start) & (index <= end)
-        action = self.action[index.clamp(start, end)]
-        chunk_length = self.prior.chunk_length
-        history_valid = valid[:, :chunk_length]
+        history_valid = index[:, :chunk_length] >= start
+        is_pad = index[:, chunk_length:] > end
+        action = _rows(self.action, index.clamp(start, end))
         target = action[:, chunk_length:]
         # Outside the episode the gather repeats its first action, which belongs to the target: zero it.
         history = action[:, :chunk_length] * history_valid.unsqueeze(-1)
         loc, warm = self.prior.training_mean(history, history_valid, target)
         warm = self.prior.withhold(warm, self.generator)
         recent = (frame + self.observation_offsets).clamp_min(start)
-        batch = tensordict.batch_size
-        # Selected and not indexed, from a plain tensor: for images that is thirty times as fast.
-        rows = recent.flatten()
         written = (
-            (key, self.get_buffer(name).as_subclass(Tensor).index_select(0, rows))
-            for name, key in self._observations.items()
+            (key, _rows(self.get_buffer(name), recent)) for name, key in self._observations.items()
         )
-        written = ((key, value.unflatten(0, recent.shape)) for key, value in written)
-        values = (target, ~valid[:, chunk_length:], loc, warm)
+        values = (target, is_pad, loc, warm)
         for key, value in (*written, *zip(self.out_keys[1:], values, strict=True)):
             tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
         return tensordict
+
+
+def _rows(values: Tensor, index: Tensor) -> Tensor:
+    """``values[index]``, along the first dimension."""
+    # Selected and not indexed, from a plain tensor: twice as fast, and for images thirty times.
+    found = values.as_subclass(Tensor).index_select(0, index.flatten())
+    return found.view(*index.shape, *values.shape[1:])
 
 
 def _checked(
