@@ -1,0 +1,94 @@
+"""The simulation against closed forms and brute force, and the script on a policy that plays the toy."""
+
+from __future__ import annotations
+
+import itertools
+import json
+
+import pytest
+
+pytest.importorskip("robosuite")
+
+import scaling
+import torch
+from _scaling_simulation import Played, apart, comparison, lockstep, served
+
+from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from warmprior.envs.description import environment_description
+from warmprior.envs.simulator import task_env_args
+from warmprior.experiments.condition import AT_ONCE
+from warmprior.experiments.contestant import Cell
+from warmprior.experiments.worker import Play
+
+
+def episode(*steps, decision=1.0):
+    return Played((decision,) * len(steps), steps)
+
+
+EQUAL = [episode(2.0, 2.0, 2.0)] * 12  # nine seconds each
+
+
+@pytest.mark.parametrize("cores", [1, 2, 3, 4, 6, 12])
+def test_equal_episodes(cores):
+    rounds = 12 // cores
+    assert apart(EQUAL, cores) == 9.0 * rounds
+    assert lockstep(EQUAL, cores, lambda n: 1.0) == 9.0 * rounds
+    assert lockstep(EQUAL, cores, float) == (3 * cores + 6.0) * rounds  # one after another
+
+
+def test_episodes_of_their_own_length():
+    episodes = [episode(1.0), episode(5.0), episode(1.0), episode(2.0, 2.0)]
+    assert apart(episodes, 1) == 2 + 6 + 2 + 6
+    # 0-2 first, 0-6 second; third 2-4, fourth 4-10
+    assert apart(episodes, 2) == 10.0
+    # Rows: steps 1, 1 and 5, 2, 2; of each round the longer, and a decision.
+    assert lockstep(episodes, 2, lambda n: 1.0) == (1 + 5) + (1 + 2) + (1 + 2)
+
+
+def test_one_process_decides():
+    # Two at once: both wait from 0 on, so that every decision serves both.
+    assert served([episode(2.0, 2.0)] * 2, 2, lambda n: 1.0) == 6.0
+    # It decides for what waits when it gets free: the first at 0 for both, then each as it comes.
+    uneven = [episode(1.0, 1.0), episode(1.5, 1.0)]
+    # 0-1 both; the first needs the next at 2, served 2-3, ends at 4; the second at 2.5, served 3-4, ends 5.
+    assert served(uneven, 2, lambda n: 1.0) == 5.0
+    assert served(EQUAL, 1, lambda n: 1.0) == apart(EQUAL, 1)
+
+
+def test_a_comparison():
+    def following(number):
+        return {Play(number, Cell(1, 1, AT_ONCE), seed): 1.0 for seed in range(10)}
+
+    assert comparison(3, 5.0, following, 1) == 3 * 15.0
+    found = [comparison(3, 5.0, following, cores) for cores in (1, 2, 4, 8, 100)]
+    assert found == sorted(found, reverse=True)
+    assert found[-1] == 6.0  # all trainings at once, then all episodes
+    for seconds, cores in zip(found, (1, 2, 4, 8, 100), strict=True):
+        assert seconds >= max(45.0 / cores, 6.0)
+
+
+def test_more_cores_never_take_longer_when_episodes_are_equal():
+    times = [apart(EQUAL, cores) for cores in range(1, 14)]
+    assert all(a >= b for a, b in itertools.pairwise(times))
+
+
+def test_the_script(tmp_path, capsys):
+    torch.manual_seed(0)
+    prior = PastPrior(8)
+    environment = environment_description(task_env_args("lift"), "ph", 2)
+    network = VelocityMLP(7, 19, 8, 2, hidden_dim=16)
+    WarmPriorActor(network, prior, environment=environment).save_pretrained(tmp_path / "policy")
+    out = tmp_path / "out"
+    argv = [str(tmp_path / "policy"), "--episodes", "2", "--repeats", "1", "--out", str(out)]
+    assert scaling.main([*argv, "--processes", "2", "--cores", "1", "16"]) == 0
+    results = json.loads((out / "scaling.json").read_text())
+    assert set(results["measured"]) == {"1", "2"}
+    assert results["simulated"]["1"]["apart"] == pytest.approx(1.0)
+    assert all(len(e["decisions"]) == len(e["steps"]) for e in results["recorded"])
+    assert (out / "scaling.png").stat().st_size > 10_000
+    assert "16 cores" in (out / "table.md").read_text()
+
+
+def test_no_policy(tmp_path, capsys):
+    assert scaling.main([str(tmp_path / "none")]) == 2
+    assert "none" in capsys.readouterr().err
