@@ -1,7 +1,11 @@
 """Sphinx configuration: ``sphinx-build -W -b html docs docs/_build``."""
 
+import re
+from functools import cache as _cache
 from importlib.metadata import version as _version
+from pathlib import Path as _Path
 
+from furo.navigation import get_navigation_tree
 from sphinx.util.inspect import signature as _signature
 from sphinx.util.inspect import stringify_signature
 
@@ -12,16 +16,22 @@ release = version = _version("warmprior")
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
     "sphinx.ext.napoleon",
     "sphinx.ext.doctest",
     "sphinx.ext.viewcode",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "sphinx-mathjax-offline",  # formulas need no internet
 ]
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "_templates"]
+templates_path = ["_templates"]
 html_theme = "furo"
 html_title = "warmprior"
 
-# The reference shows what each package lists in __all__, in that order, without what its classes
-# inherit: TorchRL documents its own methods.
+# A page per class and function of docs/reference/*.rst, without what classes inherit: TorchRL documents
+# its own methods.
+autosummary_generate = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
@@ -43,6 +53,51 @@ def _show_own_signature(app, what, name, obj, options, signature, return_annotat
     return signature, return_annotation
 
 
+@_cache
+def _documented():
+    """Public names by the full names under which the reference has them."""
+    pages = (_Path(__file__).parent / "reference").glob("*.rst")
+    found = (
+        re.findall(r"^(?:   ~|\.\. py:data:: )(warmprior[\w.]+)$", page.read_text(), re.M)
+        for page in pages
+    )
+    return {name.rsplit(".", 1)[1]: name for names in found for name in names}
+
+
+def _resolve_other_names(app, env, node, contnode):
+    """Link what is named as another module has it, such as ``warmprior.modules.Prior``, or by itself."""
+    parts = node["reftarget"].split(".")
+    known = [i for i, part in enumerate(parts) if part in _documented()]
+    if node.get("refdomain") != "py" or not known or (known[0] and parts[0] != "warmprior"):
+        return None
+    target = ".".join([_documented()[parts[known[0]]], *parts[known[0] + 1 :]])
+    domain = env.get_domain("py")
+    return domain.resolve_xref(
+        env, node["refdoc"], app.builder, node["reftype"], target, node, contnode
+    )
+
+
+def _fold_navigation(app, pagename, templatename, context, doctree):
+    """Unfold the branch of the page alone: with all of the reference on every page it would be most of it."""
+    if "furo_navigation_tree" in context:
+        tree = context["toctree"](collapse=True, titles_only=True, maxdepth=-1, includehidden=True)
+        context["furo_navigation_tree"] = get_navigation_tree(tree)
+
+
+def _keep_what_formulas_need(app, error):
+    """MathJax comes with inputs, outputs and voices that these pages do not use, 20 MB of them."""
+    folder = _Path(app.outdir) / "_static" / "mathjax"
+    kept = {folder / "tex-chtml.js", folder / "output" / "chtml" / "fonts"}
+    for path in sorted(folder.rglob("*"), reverse=True):
+        if path.is_file() and not kept & {path, *path.parents}:
+            path.unlink()
+        elif path.is_dir() and not any(path.iterdir()):
+            path.rmdir()
+
+
 def setup(app):
-    """Connect the handler above."""
+    """Connect the handlers above."""
     app.connect("autodoc-process-signature", _show_own_signature)
+    app.connect("missing-reference", _resolve_other_names)
+    app.connect("html-page-context", _fold_navigation, priority=900)
+    app.connect("build-finished", _keep_what_formulas_need, priority=900)
