@@ -6,16 +6,13 @@ import contextlib
 import dataclasses
 import os
 import signal
-import socket
-import sys
 
 import torch
-import torch.multiprocessing
 from torch import nn
 
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, training, weights
 from warmprior import PastPrior, PreconditionedNetwork, SourceMoments, VelocityMLP
-from warmprior.io.distributed import joined, rank
+from warmprior.io.distributed import rank
 from warmprior.io.workers import WorkerError
 from warmprior.modules import OTPrior
 
@@ -162,28 +159,3 @@ def refuses(folder):
         except ValueError as error:
             told.append(str(error))
     (folder / f"refused {rank()}").write_text("\n".join(told))
-
-
-def _run(number, processes, port, job, folder):
-    torch.set_num_threads(1)
-    os.environ |= {
-        "RANK": str(number),
-        "LOCAL_RANK": str(number),
-        "WORLD_SIZE": str(processes),
-        "LOCAL_WORLD_SIZE": str(processes),
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": str(port),
-    }
-    sys.stderr = open(os.devnull, "w")  # noqa: SIM115
-    with joined():
-        job(folder)
-
-
-def together(job, folder, processes=2, join=True):
-    """Let processes do a job, as ``torchrun`` would start them."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    return torch.multiprocessing.spawn(
-        _run, (processes, port, job, folder), nprocs=processes, join=join
-    )

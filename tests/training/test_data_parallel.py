@@ -7,6 +7,7 @@ import time
 import pytest
 import torch
 
+from tests.together import together
 from tests.training.cloning_parts import weights
 from tests.training.data_parallel_parts import (
     CASES,
@@ -15,7 +16,6 @@ from tests.training.data_parallel_parts import (
     dies,
     gradients,
     stopped_at,
-    together,
     trained,
     whole,
 )
