@@ -275,7 +275,9 @@ class BehaviourCloning:
             loss = self._loss(batch)
             self.optimizer.zero_grad()
             loss.backward()
-            whole = mean_over_processes(loss.detach())
+            whole = loss.detach()
+            if self.processes > 1:
+                mean_over_processes(whole)
         if self._unchecked:
             self._check_gradients()
         self.optimizer.step()
