@@ -306,12 +306,20 @@ class Comparison:
             By number, why a training failed. What fails in all processes alike does not stop the others.
         """
         failed: dict[int, str] = {}
-        for number, chosen in sorted(enumerate(everyone), key=lambda n: n[1].training.seed):
+        lost = set[Path]()
+
+        def place(entry: tuple[int, Contestant]) -> tuple[int, bool]:
+            return entry[1].training.seed, entry[1].prior.teacher is not None
+
+        for number, chosen in sorted(enumerate(everyone), key=place):
+            if chosen.prior.teacher is not None and chosen.teacher().folder in lost:
+                continue  # told with its teacher
             quiet = (lambda iteration: None) if rank() else None
             try:
                 chosen.store.train(chosen.prior, chosen.training, quiet)
             except (FloatingPointError, ValueError) as error:
                 failed[number] = str(error)
+                lost.add(chosen.folder)
                 print(f"FAILED {chosen}: {error}", flush=True)
         go_on_alone()
         return failed

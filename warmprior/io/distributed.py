@@ -94,8 +94,8 @@ def _wait() -> None:
 
 def _leave() -> None:
     global _waiting
-    if _waiting is not None:
-        _waiting = None
+    _waiting = None
+    if dist.is_initialized():
         dist.destroy_process_group()
 
 

@@ -143,7 +143,7 @@ class FlowMatchingLoss(LossModule):
         share: ``(rank, number)`` of processes that train together: this one evaluates the network at every
             ``number``-th window from ``rank`` on. All of them have to be given the same batch and equal
             generators: sources, couplings and times are those of the whole batch everywhere. The mean of
-            their losses, and of their gradients, is that of one process.
+            their losses, and of their gradients, is that of one process; unreduced errors are of the share.
         autocast: type that the network's matrix products compute in (:class:`torch.autocast`), such as
             ``torch.bfloat16``; that of its weights by default. The path and the errors keep the actions'.
 

@@ -63,6 +63,9 @@ TREND_BATCHES = 16
 HASHED_AT_ONCE = 2**26
 """Bytes of the data."""
 
+WINDOWS_SEED = 1_000_003
+"""Added to the seed of windows that have a generator of their own: other draws than those of the sources."""
+
 STATE_FORMAT = 4
 """Part of every state's identity; raised whenever the same options give other weights."""
 
@@ -173,7 +176,9 @@ class BehaviourCloning:
         prefetch = home.type != device.type if prefetch is None else prefetch
         # What is drawn ahead, or on another device, cannot be drawn by the generator of what follows.
         apart = prefetch or home.type != device.type
-        windows = torch.Generator(home).manual_seed(config.seed) if apart else self.generator
+        windows = self.generator
+        if apart:
+            windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
         observation_key, loc_key, warm_key = actor.in_keys[:3]
         renamed = {"loc_key": loc_key, "warm_key": warm_key, "chunk_key": actor.chunk_key}
         if actor.prior.conditions_network:  # what it reads is made of the data's observation
@@ -448,10 +453,9 @@ class BehaviourCloning:
     def _restore_windows(self, state: Tensor | None) -> None:
         if self._windows is None:
             return
-        if (
-            state is None
-        ):  # they were drawn by the generator of the rest: the data lay on the device
-            seed = self.config.seed + self.iteration
+        if state is None:
+            # They were drawn by the generator of the rest, for the data lay on the device.
+            seed = WINDOWS_SEED + self.config.seed + self.iteration
             state = torch.Generator(self._windows.device).manual_seed(seed).get_state()
         if self._prefetch is None:
             self._windows.set_state(state)

@@ -9,6 +9,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from warmprior.io.distributed import from_leader
+
 __all__ = ["Prefetch", "placed"]
 
 DEVICE_SHARE = 0.5
@@ -28,11 +30,15 @@ def placed(data: TensorDictBase, device: torch.device | str) -> TensorDictBase:
         device(type='cpu')
     """
     device = torch.device(device)
-    if device.type == "cuda":
+    if device.type != "cuda":
+        return data.to(device)
+
+    def fits() -> bool:
         free, _ = torch.cuda.mem_get_info(device)
-        if data.bytes() > DEVICE_SHARE * free:
-            return data
-    return data.to(device)
+        return data.bytes() <= DEVICE_SHARE * free
+
+    # The same for processes that train together: their windows are drawn by generators of one kind.
+    return data.to(device) if from_leader(fits) else data
 
 
 class Prefetch:
