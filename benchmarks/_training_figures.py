@@ -80,11 +80,12 @@ SCALED = {"paper": (paper_network, 1), "small": (small_network, 10)}
 """Networks, and training steps per round."""
 
 
-def _round(step: Callable[[], object], calls: int) -> float:
-    start = time.perf_counter()
+def _round(step: Callable[[], object], calls: int) -> torch.Tensor:
+    """Seconds, and seconds of processor time."""
+    start = time.perf_counter(), time.process_time()
     for _ in range(calls):
         step()
-    return time.perf_counter() - start
+    return torch.tensor([time.perf_counter() - start[0], time.process_time() - start[1]])
 
 
 def _scale(number: int, port: int, repeats: int, folder: str) -> None:
@@ -98,23 +99,30 @@ def _scale(number: int, port: int, repeats: int, folder: str) -> None:
             both, found = cloning(make(), Path(folder) / f"{name} {number}"), []
             for repeat in range(repeats + 1):
                 torch.distributed.barrier()
-                one = _round(alone[name].step, calls) if not rank() else 0.0
+                one = _round(alone[name].step, calls) if not rank() else torch.zeros(2)
                 torch.distributed.barrier()
                 two = _round(both.step, calls)
+                torch.distributed.all_reduce(two)
                 if repeat:  # the first round warms up
-                    found.append(one / (2 * two))
+                    found.append(one / two)
             if not rank():
-                (Path(folder) / f"{name}.txt").write_text(str(statistics.median(found)))
+                torch.save(torch.stack(found).median(0).values, Path(folder) / f"{name}.pt")
 
 
-def ddp_efficiency(clock: Any) -> dict[str, float]:
-    """Windows per second of two processes of a thread, over twice those of one, at the same whole batch."""
+def ddp_efficiency(clock: Any) -> dict[str, dict[str, float]]:
+    """Windows per second of two processes of a thread, over twice those of one, at the same whole batch.
+
+    By time, and by processor time, which tells what sharing a batch costs where other work takes the cores.
+    """
     with socket.socket() as free, tempfile.TemporaryDirectory() as folder:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
         free.close()
         torch.multiprocessing.spawn(_scale, (port, clock.repeats, folder), nprocs=2)
-        return {name: float((Path(folder) / f"{name}.txt").read_text()) for name in SCALED}
+        found = {name: torch.load(Path(folder) / f"{name}.pt").tolist() for name in SCALED}
+    return {
+        name: dict(zip(("time", "processor"), both, strict=True)) for name, both in found.items()
+    }
 
 
 def _gpu(name: str) -> bool:
