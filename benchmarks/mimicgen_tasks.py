@@ -49,7 +49,8 @@ def preset(asked: Recipe) -> Recipe:
 
 def main(argv: Sequence[str] | None = None) -> int:
     options = {"study": "mimicgen", "description": __doc__, "preset": preset}
-    return run_script(partial(study_success, FEW, argv, **options), "mimicgen_tasks.py")
+    script = partial(study_success, FEW, argv, **options)
+    return run_script(script, "mimicgen_tasks.py", together=True)
 
 
 if __name__ == "__main__":

@@ -147,7 +147,7 @@ def run(argv: Sequence[str] | None) -> None:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    return run_script(lambda: run(argv), "navigation1d.py")
+    return run_script(lambda: run(argv), "navigation1d.py", together=True)
 
 
 if __name__ == "__main__":

@@ -24,8 +24,9 @@ from typing import Any
 from unittest import mock
 
 import torch
+from _training_figures import D_A, D_O, PRIOR, TO, H, steps
 from tensordict import TensorDict, TensorDictBase
-from throughput import D_A, D_O, PRIOR, TO, Clock, H, steps
+from throughput import Clock
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm

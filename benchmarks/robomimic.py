@@ -4,6 +4,7 @@ python benchmarks/robomimic.py                                   # a first table
 python benchmarks/robomimic.py --task can stack --data ph mh --preset cpu
 python benchmarks/robomimic.py --obs image                       # lift from two cameras
 python benchmarks/robomimic.py --download --preset paper --device cuda --out runs/paper
+torchrun --nproc-per-node 2 benchmarks/robomimic.py --preset paper --device cuda    # on two GPUs
 python benchmarks/robomimic.py --resume --out runs/paper         # after an interruption
 """
 
@@ -19,7 +20,8 @@ from warmprior.io.script import run_script
 
 def main(argv: Sequence[str] | None = None) -> int:
     options = {"study": "robomimic", "description": __doc__, "preset": comparison_preset}
-    return run_script(partial(study_success, PRESETS, argv, **options), "robomimic.py")
+    script = partial(study_success, PRESETS, argv, **options)
+    return run_script(script, "robomimic.py", together=True)
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import torch
 from _scaling_simulation import Played, apart, comparison, lockstep, served
+from _training_figures import PRIOR, TO, small_network, steps
 from tensordict import TensorDict
-from throughput import PRIOR, TO, small_network, steps
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 

@@ -24,8 +24,21 @@ from pathlib import Path
 from typing import Any
 
 import _prior_space_figures as prior_space
+import _training_figures as training
 import numpy as np
 import torch
+from _training_figures import (
+    BATCH,
+    D_A,
+    D_O,
+    PRIOR,
+    TO,
+    H,
+    paper_network,
+    small_network,
+    step_of,
+    steps,
+)
 from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import TransformedEnv
@@ -35,8 +48,6 @@ from warmprior import (
     ChiTransformer,
     ImageEncoder,
     Normalizer,
-    PastPrior,
-    VelocityMLP,
     VisionNetwork,
     WarmPriorActor,
     policy_transforms,
@@ -48,10 +59,7 @@ from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.simulator import task_env_args
 from warmprior.experiments.results import facts_of_machine
-from warmprior.training import BehaviourCloning, TrainingConfig, precondition
-
-D_O, D_A, H, TO, BATCH = 23, 7, 8, 2, 256
-PRIOR = PastPrior(H)
+from warmprior.training import precondition
 
 
 class Clock:
@@ -83,20 +91,6 @@ class Clock:
         """Median of the rounds' time of ``thing`` over that of ``base``."""
         one, two = self.times(thing, base, **options)
         return statistics.median(a / b for a, b in zip(one, two, strict=True))
-
-
-def steps(episodes: int, length: int) -> TensorDict:
-    n = episodes * length
-    both = torch.rand(n, D_O + D_A, generator=torch.Generator().manual_seed(0)) * 2 - 1
-    observation, action = both.split((D_O, D_A), dim=-1)
-    episode = torch.arange(n) // length
-    data = TensorDict({"observation": observation, "action": action, "episode": episode}, [n])
-    return data.contiguous()
-
-
-def paper_network() -> ChiTransformer:
-    torch.manual_seed(0)
-    return ChiTransformer(D_A, D_O, PRIOR.prediction_length, TO)
 
 
 def windows_per_second(clock: Clock) -> float:
@@ -192,22 +186,6 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
     return ratio * 20 * BATCH / 64
 
 
-def train_step_over_network(clock: Clock) -> float:
-    network, bare = paper_network(), paper_network()
-    actor = WarmPriorActor(network, PRIOR)
-    with tempfile.TemporaryDirectory() as folder:
-        config = TrainingConfig(batch_size=BATCH)
-        training = BehaviourCloning(actor, steps(400, 200), config, folder, observation_steps=TO)
-        actor.train()
-    return clock.ratio(training.step, step_of(bare))
-
-
-def small_network() -> VelocityMLP:
-    """That of the quick preset."""
-    torch.manual_seed(0)
-    return VelocityMLP(D_A, D_O, PRIOR.prediction_length, TO, hidden_dim=384)
-
-
 class Unmodulated(nn.Module):
     """The small network in bare torch, with time as one more input instead of adaptive norms."""
 
@@ -230,20 +208,6 @@ class Unmodulated(nn.Module):
         for block in self.blocks:
             x = x + block(x)
         return self.head(x).view_as(a)
-
-
-def step_of(network: nn.Module) -> Callable[[], None]:
-    """A training step of a network alone, on random numbers."""
-    optimizer = torch.optim.AdamW(network.parameters(), fused=True)
-    t, a, o = torch.rand(BATCH), torch.randn(BATCH, H, D_A), torch.randn(BATCH, TO, D_O)
-
-    def step() -> None:
-        loss = network(t, a, o).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-
-    return step
 
 
 def preconditioning_over_network(clock: Clock) -> float:
@@ -401,7 +365,10 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "windows_per_second": (windows_per_second, ">= 150000"),
     "windows_over_torch": (windows_over_torch, ">= 0.6"),
     "lerobot_windows_over_getitem": (lerobot_windows_over_getitem, ">= 500"),
-    "train_step_over_network": (train_step_over_network, "<= 1.10"),
+    "train_step_over_network": (training.train_step_over_network, "<= 1.10"),
+    "ddp_efficiency": (training.ddp_efficiency, ""),
+    "cuda_train_step_over_network": (training.cuda_train_step_over_network, "<= 1.05"),
+    "cuda_latency": (training.cuda_latency, ""),
     "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
     "modulation_over_input": (modulation_over_input, "<= 1.20"),
     "actor_over_network": (actor_over_network, "<= 1.10"),

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 
 pytest.importorskip("robosuite")
 
@@ -17,6 +18,9 @@ KEYS = {
     "windows_over_torch",
     "lerobot_windows_over_getitem",
     "train_step_over_network",
+    "ddp_efficiency",
+    "cuda_train_step_over_network",
+    "cuda_latency",
     "preconditioning_over_network",
     "modulation_over_input",
     "actor_over_network",
@@ -52,6 +56,16 @@ def test_writes_every_key(throughput, tmp_path):
     assert results["env_over_robosuite"] is None
     assert {"python", "torch", "warmprior"} <= results["meta"]["versions"].keys()
     assert {"cpu", "torch_threads", "date"} <= results["meta"]["hardware"].keys()
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_what_needs_a_gpu_is_skipped_by_name(throughput, tmp_path, capsys):
+    names = ["cuda_train_step_over_network", "cuda_latency"]
+    throughput.main(["--only", *names, "--repeats", "1", "--out", str(tmp_path)])
+    results = json.loads((tmp_path / "throughput.json").read_text())
+    told = capsys.readouterr()
+    for name in names:
+        assert results[name] is None and f"{name}: skipped, needs a GPU" in told.out + told.err
 
 
 def test_images(throughput, tmp_path):
@@ -92,5 +106,6 @@ def test_every_figure_can_be_measured(throughput, tmp_path):
     throughput.main(["--repeats", "1", "--out", str(tmp_path)])
     results = json.loads((tmp_path / "throughput.json").read_text())
     missing = {name for name, value in results.items() if value is None}
-    assert missing <= {"lerobot_windows_over_getitem"}
+    on_gpus = {"cuda_train_step_over_network", "cuda_latency"}
+    assert missing <= {"lerobot_windows_over_getitem", *on_gpus}
     assert results["actor_over_network"].keys() == {"1", "3", "9"}

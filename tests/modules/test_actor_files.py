@@ -279,3 +279,23 @@ def test_a_key_that_is_none(tmp_path, key):
     change_config(tmp_path, "actor", warm_key=key)
     with pytest.raises(ValueError, match=r"config\.json .*warm_key must be a key"):
         WarmPriorActor.from_pretrained(tmp_path)
+
+
+def test_a_network_compiled_in_place_acts_and_is_saved_as_before(tmp_path):
+    torch.manual_seed(0)
+    actor = WarmPriorActor(VelocityMLP(2, 3, 4, hidden_dim=8), PastPrior(4)).eval()
+    mean = {"loc": torch.randn(1, 4, 2), "warm": torch.ones(1, 4, 1, dtype=torch.bool)}
+    data = TensorDict({"observation": torch.randn(1, 2, 3), "prior": mean}, [1])
+
+    def chunk(policy):
+        generator = torch.Generator().manual_seed(1)
+        return policy(data.clone(), nfe=3, generator=generator)["vla_action", "chunk"]
+
+    with torch.no_grad():
+        before = chunk(actor)
+        calls = []
+        actor.network.compile(backend=lambda graph, inputs: calls.append(1) or graph.forward)
+        torch.testing.assert_close(chunk(actor), before)
+    assert calls
+    actor.save_pretrained(tmp_path)
+    assert torch.equal(chunk(WarmPriorActor.from_pretrained(tmp_path)).detach(), before)

@@ -17,6 +17,7 @@ import tyro
 
 from warmprior.experiments.recipe import Recipe
 from warmprior.experiments.record import differences, record, refuse_ignored, restore
+from warmprior.io.distributed import from_leader, rank
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
 from warmprior.io.script import PartialFailure
 
@@ -75,7 +76,7 @@ def parse[R: Recipe](
     if not asked.data.generated:  # those of presets are numbers to generate
         base = replace(base, data=replace(base.data, demonstrations=()))
     recipe = read(base)
-    out = _output_folder(recipe, study)
+    out = from_leader(lambda: _output_folder(recipe, study))
     if recipe.run.resume:
         base = _stored(type(recipe), out, study)
         recipe = read(base)
@@ -150,6 +151,9 @@ def started(recipe: Recipe, study: str) -> Iterator[Path]:
         OSError: if it cannot be written to, or another process works in it.
     """
     out = recipe.run.directory
+    if rank():  # the first process is in it, for all
+        yield out
+        return
     check_writable(out)
     with exclusive(out):
         tree = {"study": study, **record(recipe, changeable=True)}

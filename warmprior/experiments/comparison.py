@@ -21,6 +21,7 @@ from warmprior.experiments.results import Results, Row, facts_of_machine
 from warmprior.experiments.schedule import Schedule
 from warmprior.experiments.store import Losses, Store
 from warmprior.experiments.worker import Attempt, Failure, Measure, Play, Train, Worker
+from warmprior.io.distributed import go_on_alone, leader_first, rank, world_size
 from warmprior.io.files import check_writable
 from warmprior.io.script import PartialFailure
 from warmprior.io.workers import WorkerPool, available_cores
@@ -67,7 +68,8 @@ class Comparison:
             prior.allowed_nfes(self.nfes)
         check_writable(self.directory)
         if stores is None:
-            problems = find_problems(recipe.data, recipe.network.observation_steps)
+            with leader_first():  # the others find what it has generated, rendered or downloaded
+                problems = find_problems(recipe.data, recipe.network.observation_steps)
             stores = [Store.of(recipe, problem) for problem in problems]
         self.stores = list(stores)
         self.contestants = self._contestants()
@@ -248,13 +250,15 @@ class Comparison:
 
     def _compute(self, *, play: bool) -> None:
         """Train, and measure and play what the missing rows need."""
-        self.results.save()
+        if not rank():
+            self.results.save()
+        everyone = [*self.contestants, *self._missing_teachers()]
+        together = self._train_together(everyone) if world_size() > 1 else {}
         outcomes = Outcomes(self.contestants, self.recipe)
         following = {}
         if play:
             following = {n: outcomes.missing(n, self.results) for n in range(len(self.contestants))}
         jobs = [job for those in following.values() for job in those]
-        everyone = [*self.contestants, *self._missing_teachers()]
         workers = min(self.num_workers, len(everyone) + len(jobs))
         schedule = self._schedule(everyone, following, workers)
         worker = Worker(everyone, self.recipe.evaluation)
@@ -265,6 +269,8 @@ class Comparison:
             ComparisonProgress(iterations, episodes) as progress,
             WorkerPool(workers, worker) as pool,
         ):
+            for number, reason in together.items():
+                failed |= {n: f"{everyone[n]}: {reason}" for n in schedule.failed(Train(number))}
             while True:
                 while pool.idle and (job := schedule.next()) is not None:
                     pool.submit(Attempt(job))
@@ -292,6 +298,31 @@ class Comparison:
         if all(n in failed for n in range(len(self.contestants))):
             raise PartialFailure("; ".join(self.failures))
         self.contestants = [c for n, c in enumerate(self.contestants) if n not in failed]
+
+    def _train_together(self, everyone: Sequence[Contestant]) -> dict[int, str]:
+        """Train what is missing by all processes, one policy after another; the first one alone goes on.
+
+        Returns:
+            By number, why a training failed. What fails in all processes alike does not stop the others.
+        """
+        failed: dict[int, str] = {}
+        lost = set[Path]()
+
+        def place(entry: tuple[int, Contestant]) -> tuple[int, bool]:
+            return entry[1].training.seed, entry[1].prior.teacher is not None
+
+        for number, chosen in sorted(enumerate(everyone), key=place):
+            if chosen.prior.teacher is not None and chosen.teacher().folder in lost:
+                continue  # told with its teacher
+            quiet = (lambda iteration: None) if rank() else None
+            try:
+                chosen.store.train(chosen.prior, chosen.training, quiet)
+            except (FloatingPointError, ValueError) as error:
+                failed[number] = str(error)
+                lost.add(chosen.folder)
+                print(f"FAILED {chosen}: {error}", flush=True)
+        go_on_alone()
+        return failed
 
     def _schedule(
         self,

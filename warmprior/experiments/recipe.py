@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-import torch
 import tyro
 
 from warmprior.data.opening import check_place, name_of_place
@@ -15,6 +14,7 @@ from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
 from warmprior.experiments.condition import AT_ONCE, Condition
+from warmprior.io.distributed import check_batch, check_device
 from warmprior.io.extras import require
 from warmprior.io.options import LATER
 from warmprior.modules import (
@@ -362,7 +362,7 @@ class RunOptions:
         out: output folder (default: a numbered one under runs/).
         resume: continue in --out, or in the latest default folder, with the options stored there.
         envs: worker processes that train and play, with the same results (default: one per core).
-        device: of networks and data, such as cuda.
+        device: of networks and data, such as cuda; one per process under torchrun.
         compile: torch.compile the network in training.
         logger: TorchRL logger of the training curves.
     """
@@ -377,12 +377,7 @@ class RunOptions:
 
     def __post_init__(self) -> None:
         check_counts(self, "envs")
-        try:
-            # Computed and read: there are devices that can only be named, such as meta.
-            torch.ones(1, device=self.device).add(1).item()
-        except (RuntimeError, AssertionError, NotImplementedError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"--device {self.device} does not work here: {reason}") from error
+        check_device(self.device)
 
     @property
     def directory(self) -> Path:
@@ -471,6 +466,7 @@ class Recipe:
                 "--weighting standardised needs --precondition: add --weighting velocity to "
                 "--no-precondition"
             )
+        check_batch(self.training.batch_size)
         self.check_observations()
         priors, played = self.sources.priors(), set[int]()
         for prior in priors:

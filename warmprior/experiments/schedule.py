@@ -75,7 +75,7 @@ class Schedule:
         self._ready.extend(self._following.get(number, ()))
 
     def failed(self, job: Job) -> list[int]:
-        """A job failed: nothing more is done for its policy, nor for those that learn from it.
+        """A job failed, or is not begun: nothing more is done for its policy and those that learn from it.
 
         Args:
             job: the one that failed.
@@ -83,7 +83,7 @@ class Schedule:
         Returns:
             The numbers of these policies, its own first; each is told once.
         """
-        if isinstance(job, Train):
+        if isinstance(job, Train) and job not in self._to_train:
             self._end_training(job.number)
         pupils = [pupil for pupil, teacher in self._teachers.items() if teacher == job.number]
         new = [number for number in (job.number, *pupils) if number not in self._failed]

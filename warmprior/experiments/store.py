@@ -19,6 +19,7 @@ from torchrl.record.loggers import get_logger
 
 from warmprior.experiments.problem import Problem
 from warmprior.experiments.recipe import NetworkOptions, Recipe, RunOptions, check_images
+from warmprior.io.distributed import leader_first, mean_over_processes, rank, world_size
 from warmprior.io.files import check_writable, digest_of, read_json, write_atomic
 from warmprior.io.options import identity_of
 from warmprior.modules.actor import WarmPriorActor
@@ -38,6 +39,7 @@ from warmprior.training.checkpoint import (
     restoring,
     save_state,
 )
+from warmprior.training.placement import placed
 from warmprior.training.prior_learning import learn_prior
 from warmprior.training.threads import torch_threads
 from warmprior.training.training_config import TrainingConfig
@@ -147,7 +149,8 @@ class Store:
         if isinstance(prior, nn.Module):  # it learns: every policy has its own
             prior = Prior.from_config(prior.config())
         if isinstance(prior, LearnedPrior):
-            self._learn(prior, training)
+            with leader_first():
+                self._learn(prior, training)
         if prior.teacher is not None:
             prior = prior if isinstance(prior, nn.Module) else copy.copy(prior)
             prior.learn_from(self.policy(self.teacher(prior), training))
@@ -206,6 +209,8 @@ class Store:
         """Train a policy; continue or reuse the stored one of the same options.
 
         On a CPU it is trained by one thread, wherever: another number would give other weights.
+        Processes that have :func:`~warmprior.io.distributed.joined` train it together, each with a thread or
+        a GPU of its own.
 
         Args:
             prior: its source distribution.
@@ -222,7 +227,7 @@ class Store:
         if folder not in self._losses:
             if prior.teacher is not None:
                 self.train(self.teacher(prior), training, progress)
-            logger = self._logger(folder.name)
+            logger = None if rank() else self._logger(folder.name)
             started, known = time.process_time(), policy_path(folder, training.iterations).is_dir()
             on_cpu = torch.device(self.run.device).type == "cpu"
             with (
@@ -232,7 +237,7 @@ class Store:
             ):
                 cloning = BehaviourCloning(
                     self.new_actor(prior, training),
-                    self.problem.data.to(self.run.device),
+                    placed(self.problem.data, self.run.device),
                     training,
                     folder,
                     observation_steps=self.network.observation_steps,
@@ -242,8 +247,9 @@ class Store:
                 told = f"train {prior.describe()}, seed {training.seed}"
                 whole = cloning.iteration == 0
                 cloning.run(told if progress is None else None, progress)
-            if whole and not known:
-                seconds = time.process_time() - started
+            used = torch.tensor(time.process_time() - started, dtype=torch.float64)
+            seconds = world_size() * mean_over_processes(used).item()
+            if whole and not known and not rank():
                 text = json.dumps({"seconds": seconds}) + "\n"
                 write_atomic(folder / TIME, lambda path: path.write_text(text))
             self.note_trained(prior, training, cloning.losses)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from typing import Any
 
 import torch
 
+from warmprior.io.distributed import joined, launched, rank
 from warmprior.io.workers import WorkerError
 
 __all__ = ["ERRORS", "PartialFailure", "run_script"]
@@ -31,7 +34,11 @@ ERRORS = (
 
 
 def run_script(
-    script: Callable[[], object], name: str, *, errors: tuple[type[BaseException], ...] = ERRORS
+    script: Callable[[], object],
+    name: str,
+    *,
+    errors: tuple[type[BaseException], ...] = ERRORS,
+    together: bool = False,
 ) -> int:
     """Run a script.
 
@@ -41,6 +48,7 @@ def run_script(
 
     Keyword Args:
         errors: what to report without a traceback.
+        together: several processes that ``torchrun`` starts may run it, of which the first prints.
 
     Returns:
         The exit code: 0, 2 after an error, 130 after Ctrl-C.
@@ -58,7 +66,10 @@ def run_script(
 
     before = signal.signal(signal.SIGINT, interrupt)
     try:
-        script()
+        if launched() and not together:
+            raise ValueError("it trains with one process; start it without torchrun")
+        with joined(), _printing():
+            script()
     except BaseException as error:
         if interrupted:  # whatever the libraries in between have made of it
             print(f"\n{name}: interrupted; --resume continues", file=sys.stderr)
@@ -66,8 +77,19 @@ def run_script(
         if not isinstance(error, errors):
             raise
         told = error.args[0] if isinstance(error, KeyError) and error.args else error
-        print(f"{name}: error: {told}", file=sys.stderr)
+        teller = f"{name} (process {os.environ['RANK']})" if launched() else name
+        print(f"{teller}: error: {told}", file=sys.stderr, flush=True)
         return 2
     finally:
         signal.signal(signal.SIGINT, before)
     return 0
+
+
+@contextmanager
+def _printing() -> Iterator[None]:
+    """Let the first of several processes print, and no other."""
+    if not rank():
+        yield
+        return
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere):
+        yield

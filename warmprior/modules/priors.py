@@ -115,7 +115,7 @@ class PreviewPrior(Prior):
     def _first_half(self, forecast: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
         loc, warm = _all_cold(like)
         loc[..., : self.chunk_length, :] = forecast
-        warm[..., : self.chunk_length, :] = True
+        warm[..., : self.chunk_length, :].fill_(True)
         return loc, warm
 
     def training_mean(

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, cast, get_args
 
 import torch
@@ -138,6 +140,12 @@ class FlowMatchingLoss(LossModule):
             ``"sum"`` (Algorithm 1's squared norm, summed over the batch) or ``"none"``
             (``[*B, P, d_a]``, zero where padded).
         generator: source of randomness of ``t`` and :math:`a_0`; the actor sampler's by default.
+        share: ``(rank, number)`` of processes that train together: this one evaluates the network at every
+            ``number``-th window from ``rank`` on. All of them have to be given the same batch and equal
+            generators: sources, couplings and times are those of the whole batch everywhere. The mean of
+            their losses, and of their gradients, is that of one process; unreduced errors are of the share.
+        autocast: type that the network's matrix products compute in (:class:`torch.autocast`), such as
+            ``torch.bfloat16``; that of its weights by default. The path and the errors keep the actions'.
 
     .. note::
         Keys read (all renameable by :meth:`set_keys`): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool
@@ -146,10 +154,11 @@ class FlowMatchingLoss(LossModule):
         moved to the network's, where the generator has to be.
 
     Raises:
-        ValueError: for an unknown ``reduction``, ``times``, ``objective`` or ``weighting``, or a negative
-            weight; for standardised errors of a network that is not preconditioned; for a curved path with an
-            option or a prior that needs the straight one; for an option that needs a flow with a prior whose
-            field is none; or for another path than the network is preconditioned for.
+        ValueError: for an unknown ``reduction``, ``times``, ``objective`` or ``weighting``, a negative
+            weight, or a ``share`` that is none; for standardised errors of a network that is not
+            preconditioned; for a curved path with an option or a prior that needs the straight one; for an
+            option that needs a flow with a prior whose field is none; or for another path than the network is
+            preconditioned for.
 
     Examples:
         >>> import torch
@@ -196,12 +205,16 @@ class FlowMatchingLoss(LossModule):
         interpolant: Interpolant | None = None,
         reduction: str = "mean",
         generator: torch.Generator | None = None,
+        share: tuple[int, int] = (0, 1),
+        autocast: torch.dtype | None = None,
     ) -> None:
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
         super().__init__()
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
+        if not 0 <= share[0] < share[1]:
+            raise ValueError(f"share must be (rank, number) with 0 <= rank < number, got {share}")
         self.convert_to_functional(actor_network.network, "velocity_network")
         self.prior = actor_network.prior
         check_objective(
@@ -239,7 +252,7 @@ class FlowMatchingLoss(LossModule):
                 )
             if objective != "velocity" or self_distillation:
                 raise ValueError(f"a velocity predicts the sample {told}")
-        self.reduction = reduction
+        self.reduction, self.share, self.autocast = reduction, share, autocast
         self.generator = actor_network.sampler.generator if generator is None else generator
         observation, loc, warm = actor_network.in_keys[:3]
         self.set_keys(observation=observation, loc=loc, warm=warm, chunk=actor_network.chunk_key)
@@ -305,6 +318,21 @@ class FlowMatchingLoss(LossModule):
         if self.prior.is_flow:
             t = self.times(batch, self.generator, a1.dtype, a1.device)
         observation = network_observation(observation, batch)
+        pad = tensordict.get(k.pad_mask, None)
+        if pad is not None:
+            pad = pad.to(device)
+        number, mine = batch.numel(), slice(self.share[0], None, self.share[1])
+        distilled = max(1, round(DISTILLED_SHARE * number))
+        counts = [_counted(pad, number, a1)]
+        if self.self_distillation:
+            part = None if pad is None else pad.reshape(-1, pad.shape[-1])[:distilled]
+            counts.append(_counted(part, distilled, a1))
+        if self.share[1] > 1:
+            # Every so many-th and not a block: of the first windows, which are distilled, all get a part.
+            a0, a1 = (a.reshape(-1, *a.shape[-2:])[mine] for a in (a0, a1))
+            t, observation = t.reshape(-1)[mine], observation[mine]
+            pad = None if pad is None else pad.reshape(-1, pad.shape[-1])[mine]
+            distilled = len(range(distilled)[mine])
         errors: list[Tensor] = []
         interrupt: KeyboardInterrupt | None = None
         with self.velocity_network_params.to_module(
@@ -313,34 +341,52 @@ class FlowMatchingLoss(LossModule):
             try:
                 errors.append(self._velocity_error(a0, a1, t, observation))
                 if self.self_distillation:
-                    errors.append(self._jump_error(a0, a1, observation))
+                    errors.append(self._jump_error(a0, a1, observation, distilled))
             except KeyboardInterrupt as key:
                 interrupt = key  # leaving the context with it would make a RuntimeError of it
         if interrupt is not None:
             raise interrupt
-        pad = tensordict.get(k.pad_mask, None)
-        if pad is not None:
-            pad = pad.to(device)
-        losses = [self._reduced(errors[0], pad)]
-        for error in errors[1:]:
+        losses = [self._reduced(errors[0], pad, counts[0])]
+        for error, count in zip(errors[1:], counts[1:], strict=True):
             part = None if pad is None else pad.reshape(-1, pad.shape[-1])[: len(error)]
-            losses.append(self.self_distillation * self._reduced(error, part))
+            losses.append(self.self_distillation * self._reduced(error, part, count))
         return TensorDict(dict(zip(self.out_keys, losses, strict=True)), batch_size=[])
+
+    def _field(
+        self, network: nn.Module, observation: Tensor | TensorDictBase, like: Tensor
+    ) -> Callable[[Tensor, Tensor], Tensor]:
+        """A network's velocity at observations, see :func:`velocity_field`, in the type to compute in."""
+        if self.autocast is None:
+            return velocity_field(network, observation)
+        # A context of its own each time: what the teacher casts without gradients must not be taken for the
+        # weights that are trained.
+        compute = partial(torch.autocast, like.device.type, self.autocast)
+        with compute():
+            field = velocity_field(network, observation)
+
+        def velocity(t: Tensor, a: Tensor) -> Tensor:
+            with compute():
+                return field(t, a)
+
+        return velocity
 
     def _velocity_error(
         self, a0: Tensor, a1: Tensor, t: Tensor, observation: Tensor | TensorDictBase
     ) -> Tensor:
         """Error at times ``t`` ``[*B]`` of the path, ``[*B, P, d_a]``."""
         a_t, velocity = self.interpolant(a0, a1, t)
-        field = velocity_field(self.velocity_network, observation)
+        field = self._field(self.velocity_network, observation, a_t)
         predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:]))
         return self._distance(predicted.reshape(a1.shape), velocity, t)
 
-    def _jump_error(self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase) -> Tensor:
+    def _jump_error(
+        self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase, n: int
+    ) -> Tensor:
         """Error of the single step from the start to the end, of the first windows, ``[n, P, d_a]``."""
-        a0, a1 = (a.detach().reshape(-1, *a.shape[-2:]) for a in (a0, a1))
-        n = max(1, round(DISTILLED_SHARE * len(a0)))
-        a0, a1, observation = a0[:n], a1[:n], observation[:n]
+        a0, a1 = (a.detach().reshape(-1, *a.shape[-2:])[:n] for a in (a0, a1))
+        if not n:  # more processes than distilled windows
+            return a0
+        observation = observation[:n]
         begin = self.prior.start_time
         near = begin + (1.0 - begin) / TEACHER_STEPS
         start, _ = self.interpolant(a0, a1, a0.new_full((n,), begin))
@@ -348,13 +394,13 @@ class FlowMatchingLoss(LossModule):
             point, _ = self.interpolant(a0, a1, a0.new_full((n,), near))
             teacher = self.velocity_network if self.teacher is None else self.teacher
             end = integrate(
-                velocity_field(teacher, observation),
+                self._field(teacher, observation, point),
                 point,
                 nfe=TEACHER_STEPS - 1,
                 start_time=near,
             )
         t = a0.new_full((n,), begin)
-        jump = velocity_field(self.velocity_network, observation)(t, start)
+        jump = self._field(self.velocity_network, observation, start)(t, start)
         return self._distance(jump, (end - start) / (1.0 - begin), t)
 
     def _distance(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
@@ -365,15 +411,20 @@ class FlowMatchingLoss(LossModule):
             error = error / unit.view_as(error)
         return (1 - t)[..., None, None] * error.abs() if self.objective == "l1" else error.square()
 
-    def _reduced(self, error: Tensor, pad: Tensor | None) -> Tensor:
-        """Errors ``[*B, P, d_a]`` where they count."""
+    def _reduced(self, error: Tensor, pad: Tensor | None, count: Tensor | int) -> Tensor:
+        """Errors ``[*B, P, d_a]`` where they count, of ``count`` coordinates that all processes have."""
         if pad is not None:
             error = error.masked_fill(pad.unsqueeze(-1), 0.0)
         if self.reduction == "none":
             return error
         loss = error.sum()
         if self.reduction == "mean":
-            count = error.numel() if pad is None else (~pad).sum() * error.shape[-1]
-            # A batch that is padding only has no error, and must not become NaN.
-            loss = loss / torch.as_tensor(count, device=loss.device).clamp_min(1)
-        return loss
+            loss = loss / count
+        return loss if self.share[1] == 1 else self.share[1] * loss
+
+
+def _counted(pad: Tensor | None, number: int, a1: Tensor) -> Tensor | int:
+    """Coordinates of the windows that count, at least 1: padding alone has no error, and no NaN."""
+    if pad is None:
+        return max(1, number * a1.shape[-2:].numel())
+    return ((~pad).sum() * a1.shape[-1]).clamp_min(1)

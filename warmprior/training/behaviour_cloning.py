@@ -6,15 +6,25 @@ import hashlib
 import json
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
 import torch
 from tensordict import TensorDictBase
-from torch import nn
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
 from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
+from warmprior.io.distributed import (
+    check_batch,
+    from_leader,
+    mean_over_processes,
+    process_group,
+    rank,
+    world_size,
+)
 from warmprior.io.files import exclusive
 from warmprior.io.options import identity_of
 from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
@@ -41,6 +51,7 @@ from warmprior.training.checkpoint import (
     snapshot_optimizer,
 )
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.placement import Prefetch
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer, without_images
 
@@ -51,6 +62,9 @@ TREND_BATCHES = 16
 
 HASHED_AT_ONCE = 2**26
 """Bytes of the data."""
+
+WINDOWS_SEED = 1_000_003
+"""Added to the seed of windows that have a generator of their own: other draws than those of the sources."""
 
 STATE_FORMAT = 4
 """Part of every state's identity; raised whenever the same options give other weights."""
@@ -102,9 +116,16 @@ class BehaviourCloning:
     training on a folder with a state continues it; on CPU the result is bitwise that of an
     uninterrupted run with the same number of threads.
 
+    Processes that have :func:`~warmprior.io.distributed.joined` train together: each constructs the same
+    training, runs it and computes its share of every batch, and PyTorch's DDP averages the gradients. The
+    weights are those of one process up to rounding, whatever the number of processes, which may change from
+    one start to the next; only what a network draws itself (dropout, crops of images) is drawn anew. The
+    first process alone writes.
+
     Args:
         actor: the policy; its network is trained in place.
-        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`.
+        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`; on the network's device,
+            or on the CPU where they do not fit there.
         config: the recipe.
         directory: the folder.
 
@@ -112,13 +133,15 @@ class BehaviourCloning:
         observation_steps: ``To``.
         logger: a TorchRL logger for the loss, the learning rate and the speed.
         resume: continue from the folder's state if there is one; otherwise start over.
-        compile: compile the velocity network with :func:`torch.compile`.
+        compile: compile the velocity network with :func:`torch.compile`; on a GPU, as CUDA graphs.
+        prefetch: gather batches ahead in a thread, drawn by a generator of their own; by default where data
+            on the CPU train a network that is not.
 
     Raises:
-        ValueError: if the folder's state is damaged or belongs to another recipe, prior, network or
-            dataset, the policy could not be loaded again (:meth:`WarmPriorActor.check_saveable`), or its
-            prior conditions the network and it reads another key than :class:`~warmprior.MeanObservation`
-            writes.
+        ValueError: if a batch has fewer windows than there are processes, the folder's
+            state is damaged or belongs to another recipe, prior, network or dataset, the policy could not be
+            loaded again (:meth:`WarmPriorActor.check_saveable`), or its prior conditions the network and it
+            reads another key than :class:`~warmprior.MeanObservation` writes.
         TypeError: if the policy cannot be saved.
     """
 
@@ -133,8 +156,10 @@ class BehaviourCloning:
         logger: Logger | None = None,
         resume: bool = True,
         compile: bool = False,
+        prefetch: bool | None = None,
     ) -> None:
         actor.check_saveable()  # before hours are spent on what would be lost
+        check_batch(config.batch_size)
         if config.batch_size < actor.prior.least_batch:
             raise ValueError(
                 f"{actor.prior.name} needs batches of at least {actor.prior.least_batch}, got "
@@ -144,8 +169,16 @@ class BehaviourCloning:
         self.config = config
         self.directory = Path(directory)
         self.logger = logger
-        device = data.device or torch.device("cpu")
+        self.rank, self.processes = rank(), world_size()
+        home = data.device or torch.device("cpu")
+        device = next((p.device for p in actor.network.parameters()), home)
         self.generator = torch.Generator(device).manual_seed(config.seed)
+        prefetch = home.type != device.type if prefetch is None else prefetch
+        # What is drawn ahead, or on another device, cannot be drawn by the generator of what follows.
+        apart = prefetch or home.type != device.type
+        windows = self.generator
+        if apart:
+            windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
         observation_key, loc_key, warm_key = actor.in_keys[:3]
         renamed = {"loc_key": loc_key, "warm_key": warm_key, "chunk_key": actor.chunk_key}
         if actor.prior.conditions_network:  # what it reads is made of the data's observation
@@ -161,8 +194,12 @@ class BehaviourCloning:
             actor.prior,
             batch_size=config.batch_size,
             observation_steps=observation_steps,
-            generator=self.generator,
+            generator=windows,
             **renamed,
+        )
+        self._windows = windows if apart else None
+        self._prefetch = (
+            Prefetch(self.replay_buffer.sample, windows, device=device) if prefetch else None
         )
         #: The network, and the prior where it learns as well.
         self.trained = nn.ModuleDict({"network": actor.network})
@@ -177,6 +214,8 @@ class BehaviourCloning:
             self_distillation=config.self_distillation,
             teacher=cast(Any, self.ema.module)["network"],
             generator=self.generator,
+            share=(self.rank, self.processes),
+            autocast=torch.bfloat16 if config.precision == "bf16" else None,
         )
         self.optimizer = make_optimizer(
             actor.network,
@@ -201,11 +240,19 @@ class BehaviourCloning:
             "format": STATE_FORMAT,
         }
         torch.manual_seed(config.seed)
+        self._differ()
         self._resume = resume
         self._restored: float | None = None  # when the state that was restored had been written
         self._restore()
+        self._graphs = compile and device.type == "cuda"
         if compile:
-            self.loss_module.velocity_network.compile()
+            mode = "reduce-overhead" if self._graphs else None
+            self.loss_module.velocity_network.compile(mode=mode)
+        self._loss: nn.Module = _Loss(self.loss_module, self.trained)
+        self._unchecked = self.processes > 1
+        if self.processes > 1:
+            with process_group():
+                self._loss = DistributedDataParallel(self._loss, broadcast_buffers=False)
 
     @property
     def state_path(self) -> Path:
@@ -220,17 +267,39 @@ class BehaviourCloning:
         """One gradient step: sample, loss, backward, optimiser, schedule, averaging.
 
         Returns:
-            The loss, a detached scalar.
+            The loss, a detached scalar; of all processes together.
+
+        Raises:
+            ValueError: if several processes train a network with a weight that has no part in its output.
+            WorkerError: if another process ended.
         """
-        losses = self.loss_module(self.replay_buffer.sample())
-        loss = torch.stack([losses[key] for key in self.loss_module.out_keys]).sum()
-        self.optimizer.zero_grad()
-        loss.backward()
+        if self._graphs:  # what the graphs of the last step have left may be overwritten
+            torch.compiler.cudagraph_mark_step_begin()
+        batch = self.replay_buffer.sample() if self._prefetch is None else self._prefetch()
+        with process_group():
+            loss = self._loss(batch)
+            self.optimizer.zero_grad()
+            loss.backward()
+            whole = loss.detach()
+            if self.processes > 1:
+                mean_over_processes(whole)
+        if self._unchecked:
+            self._check_gradients()
         self.optimizer.step()
         self.schedule.step()
         self.ema.update_parameters(self.trained)
         self.iteration += 1
-        return loss.detach()
+        return whole
+
+    def _check_gradients(self) -> None:
+        # DDP waits for all of them, and complains in the step after, in words of its own.
+        for name, parameter in self.trained.named_parameters():
+            if parameter.requires_grad and parameter.grad is None:
+                raise ValueError(
+                    f"{name} has no part in the loss, so that several processes cannot train it together: "
+                    "freeze it with requires_grad_(False), or train with one process"
+                )
+        self._unchecked = False
 
     def run(
         self,
@@ -248,17 +317,31 @@ class BehaviourCloning:
                 kept policies stay.
             BlockingIOError: if another process trains in the folder.
         """
-        if self.iteration == self.config.iterations and self._is_kept():
+        if from_leader(lambda: self.iteration == self.config.iterations and self._is_kept()):
             return
-        with exclusive(self.directory):
+        with exclusive(self.directory) if not self.rank else nullcontext():
+            from_leader(lambda: None)  # it has the lock
             self._restore()  # what another process did since this object was built
-            self._run(description, progress)
+            try:
+                self._check_together()
+                self._run(description, progress)
+            finally:
+                if self._prefetch is not None:
+                    self._prefetch.close()
+
+    def _check_together(self) -> None:
+        iteration = from_leader(lambda: self.iteration)
+        if iteration != self.iteration:
+            raise OSError(
+                f"the processes read different states at {self.state_path}, of iterations {iteration} and "
+                f"{self.iteration}: give --out a folder that all machines share"
+            )
 
     def _run(self, description: str | None, progress: Callable[[int], object] | None) -> None:
         config = self.config
         keep = set(config.checkpoint_iterations)
-        if self.iteration in keep and not self._is_kept():
-            self._averaged_actor().save_pretrained(self.policy_path(self.iteration))
+        if self.iteration in keep and not self.rank and not self._is_kept():
+            self._keep()
         save_every = config.save_every or max(1, config.iterations // config.checkpoints // 10)
         self.actor.train()
         bar = tqdm(
@@ -285,10 +368,14 @@ class BehaviourCloning:
                 if logs:
                     self._log(torch.stack(self._running).mean().item(), bar)
                     self._running.clear()
-                if i in keep:
-                    self._averaged_actor().save_pretrained(self.policy_path(i))
-                if saves:
+                if i in keep and not self.rank:
+                    self._keep()
+                if saves and not self.rank:
                     self._save()
+
+    def _keep(self) -> None:
+        """Keep the policy of this iteration."""
+        self._averaged_actor().save_pretrained(self.policy_path(self.iteration))
 
     def _is_kept(self) -> bool:
         """Whether the policy of this iteration is on disk and whole."""
@@ -316,7 +403,7 @@ class BehaviourCloning:
     def _log(self, loss: float, bar: Any) -> None:
         self.losses.append((self.iteration, loss))
         bar.set_postfix(loss=f"{loss:.4f}", refresh=False)
-        if self.logger is not None:
+        if self.logger is not None and not self.rank:
             iteration, moment = self._logged
             self._logged = self.iteration, time.monotonic()
             values = {
@@ -341,7 +428,7 @@ class BehaviourCloning:
             **named("trained", module_tensors(self.trained)),
             **named("ema", module_tensors(self.ema)),
             **named("optimizer", snapshot_optimizer(self.optimizer)),
-            **named("rng", rng_tensors(self.generator)),
+            **named("rng", rng_tensors(self.generator) | self._windows_state()),
             "running": torch.stack(self._running) if self._running else torch.empty(0),
         }
         schedule = self.schedule.state_dict()
@@ -355,6 +442,30 @@ class BehaviourCloning:
         }
         save_state(self.state_path, tensors, facts)
         self._restored = self.state_path.stat().st_mtime
+
+    def _windows_state(self) -> dict[str, Tensor]:
+        """Random state of the windows, where they are not drawn by the generator of the rest."""
+        if self._windows is None:
+            return {}
+        state = self._prefetch.state() if self._prefetch else self._windows.get_state()
+        return {"windows": state}
+
+    def _restore_windows(self, state: Tensor | None) -> None:
+        if self._windows is None:
+            return
+        if state is None:
+            # They were drawn by the generator of the rest, for the data lay on the device.
+            seed = WINDOWS_SEED + self.config.seed + self.iteration
+            state = torch.Generator(self._windows.device).manual_seed(seed).get_state()
+        if self._prefetch is None:
+            self._windows.set_state(state)
+        else:
+            self._prefetch.restore(state)
+
+    def _differ(self) -> None:
+        """Draw apart from the other processes what networks draw: dropout and crops, each of its windows."""
+        if self.rank:
+            torch.manual_seed(int(torch.randint(2**62, ())) + self.rank)
 
     def _restore(self) -> None:
         """Continue from the folder's state, if there is one that is not continued already."""
@@ -397,8 +508,29 @@ class BehaviourCloning:
         for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
             group["lr"] = rate
         self._running = list(tensors["running"].to(self.generator.device))
-        restore_rng(self.generator, select("rng", tensors))
         self.iteration, self.losses = iteration, losses
+        restore_rng(self.generator, select("rng", tensors))
+        self._restore_windows(tensors.get("rng/windows"))
+        self._differ()
+
+
+class _Loss(nn.Module):
+    """The sum of the losses of a batch, as a module of what is trained.
+
+    DDP averages the gradients of its module's parameters. Those of the loss module are the same, but named
+    and nested as TorchRL's functional modules need it.
+    """
+
+    loss_module: FlowMatchingLoss
+
+    def __init__(self, loss_module: FlowMatchingLoss, trained: nn.Module) -> None:
+        super().__init__()
+        self.trained = trained
+        self.__dict__["loss_module"] = loss_module
+
+    def forward(self, batch: TensorDictBase) -> Tensor:
+        losses = self.loss_module(batch)
+        return torch.stack([losses[key] for key in self.loss_module.out_keys]).sum()
 
 
 def _learning(prior: Prior) -> list[nn.Parameter]:

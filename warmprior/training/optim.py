@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from typing import Any, cast
 
-from torch import nn
+import torch
+from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -93,6 +95,22 @@ def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
     """
     if not 0.0 <= rate < 1.0:
         raise ValueError(f"the EMA rate must be in [0, 1), got {rate}")
-    averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(rate))
+    averaged = _Average(network, multi_avg_fn=get_ema_multi_avg_fn(rate))
     averaged.module.eval()
     return averaged.requires_grad_(False)
+
+
+class _Average(AveragedModel):
+    """An average whose update does not wait for the device: PyTorch's copies the count there every time."""
+
+    @torch.no_grad()
+    def update_parameters(self, model: nn.Module) -> None:
+        mine: list[Tensor] = list(self.module.parameters())
+        theirs: list[Tensor] = list(model.parameters())
+        if self.n_averaged.item():  # it stays on the CPU
+            cast(Any, self.multi_avg_fn)(mine, theirs, self.n_averaged)
+        else:
+            torch._foreach_copy_(mine, theirs)
+        for averaged, buffer in zip(self.module.buffers(), model.buffers(), strict=True):
+            averaged.copy_(buffer)
+        self.n_averaged += 1

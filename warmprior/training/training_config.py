@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Literal, get_args
 
 from warmprior.io.options import LATER
 from warmprior.modules.prior import Prior
 from warmprior.objectives.flow_matching import Objective, Weighting, check_objective
 from warmprior.objectives.times import TimesName
 
-__all__ = ["TrainingConfig"]
+__all__ = ["Precision", "TrainingConfig"]
+
+Precision = Literal["float32", "bf16"]
 
 
 @dataclass(frozen=True)
@@ -19,7 +22,7 @@ class TrainingConfig:
 
     Attributes:
         iterations: gradient steps.
-        batch_size: windows per step.
+        batch_size: windows per step, of all processes together.
         learning_rate: peak of the schedule.
         weight_decay: AdamW's decay of matrix weights.
         betas: AdamW's decay rates.
@@ -35,6 +38,7 @@ class TrainingConfig:
         weighting: of the loss: errors as they are, or in units of what preconditioning leaves, so that every
             time counts alike.
         self_distillation: weight of learning in one step where the flow of averaged weights ends.
+        precision: of the network's matrix products in training; weights, averages and optimiser are float32.
 
     Raises:
         ValueError: for a number out of its range, naming it.
@@ -56,6 +60,7 @@ class TrainingConfig:
     objective: Objective = field(default="velocity", metadata=LATER)
     weighting: Weighting = field(default="velocity", metadata=LATER)
     self_distillation: float = field(default=0.0, metadata=LATER)
+    precision: Precision = field(default="float32", metadata=LATER)
 
     def __post_init__(self) -> None:
         counts = ("iterations", "batch_size", "checkpoints", "log_every", "save_every")
@@ -67,6 +72,9 @@ class TrainingConfig:
             value = getattr(self, name)
             if not (math.isfinite(value) and (value > 0 or (value == 0 and low == ">="))):
                 raise ValueError(f"{name} must be a finite number {low} 0, got {value}")
+        if self.precision not in get_args(Precision):
+            known = ", ".join(get_args(Precision))
+            raise ValueError(f"precision must be one of {known}, got {self.precision!r}")
         shares = {"betas": self.betas, "warmup_ratio": (self.warmup_ratio,)}
         for name, values in (shares | {"ema_rate": (self.ema_rate,)}).items():
             if not all(0.0 <= value < 1.0 for value in values):

@@ -1,0 +1,84 @@
+"""A comparison whose policies several processes train together, and the first one plays."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from tests.experiments.comparison_parts import comparison, rows_of, weights
+from tests.together import together
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior.experiments import Store
+from warmprior.io.distributed import rank, world_size
+
+PRIORS = (GaussianPrior(4), PastPrior(4), PreviewPrior(4))
+
+
+class FailingStore(Store):
+    """The policies of one source diverge, and it is told who trained."""
+
+    def train(self, prior, training, progress=None):
+        with (self.directory / f"trained by {world_size()}").open("a") as file:
+            file.write(f"{prior.name} {rank()}\n")
+        if prior.name == "preview":
+            raise FloatingPointError("the loss became nan")
+        return super().train(prior, training, progress)
+
+
+def run(folder):
+    (folder / "policies").mkdir(exist_ok=True)
+    made = comparison(folder, 1, priors=PRIORS, kind=FailingStore, seeds=1, episodes=2)
+    made.run()
+    assert rank() == 0 and world_size() == 1  # the others have ended
+    (folder / "failures").write_text(json.dumps(made.failures))
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    one, two = (tmp_path_factory.mktemp(name) for name in ("one", "two"))
+    run(one)
+    together(run, two)
+    return one, two
+
+
+def test_policies_are_those_of_one_process(folders):
+    one, two = (weights(folder) for folder in folders)
+    assert one.keys() == two.keys() and one
+    for name, value in one.items():
+        torch.testing.assert_close(two[name], value, rtol=0, atol=1e-5, msg=name)
+
+
+def test_all_trained_and_one_played(folders):
+    """The rows have the same facts, episodes and order; what is measured may differ by rounding."""
+    one, two = (rows_of(folder) for folder in folders)
+    assert [row["prior"] for row in two] == [row["prior"] for row in one]
+    assert {row["prior"] for row in two} == {"gaussian", "past"}
+    for mine, theirs in zip(one, two, strict=True):
+        assert mine.keys() == theirs.keys() and len(mine["outcomes"]) == 2
+        for key, value in mine.items():
+            assert theirs[key] == (
+                pytest.approx(value, rel=1e-3) if isinstance(value, float) else value
+            ), key
+    trained = sorted((folders[1] / "policies" / "trained by 2").read_text().splitlines())
+    assert trained == sorted(f"{prior.name} {r}" for prior in PRIORS for r in range(2))
+
+
+def test_a_training_that_fails_in_all_does_not_stop_the_others(folders):
+    one, two = (json.loads((folder / "failures").read_text()) for folder in folders)
+    assert one == two and len(two) == 1 and "the loss became nan" in two[0]
+    # Nor is it tried again by the first process alone.
+    assert "preview" not in (folders[1] / "policies" / "trained by 1").read_text()
+
+
+def test_it_can_be_resumed_without_torchrun(folders):
+    made = comparison(
+        folders[1], 1, priors=PRIORS[:2], kind=FailingStore, seeds=1, episodes=2, resume=False
+    )
+    before = weights(folders[1])
+    for contestant in made.contestants:
+        assert contestant.path.is_dir()
+        contestant.store.train(contestant.prior, contestant.training, lambda iteration: None)
+    after = weights(folders[1])
+    assert all(torch.equal(after[name], value) for name, value in before.items())

@@ -1,0 +1,89 @@
+"""Who is who among processes, and which devices and scripts they are refused."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+import torch.distributed as dist
+
+from warmprior.experiments import RunOptions
+from warmprior.io import distributed
+from warmprior.io.distributed import check_device, launched, process_group, rank, world_size
+from warmprior.io.script import run_script
+from warmprior.io.workers import WorkerError
+
+
+@pytest.fixture
+def under_torchrun(monkeypatch):
+    names = {"RANK": 1, "LOCAL_RANK": 1, "WORLD_SIZE": 3, "LOCAL_WORLD_SIZE": 3, "MASTER_ADDR": "x"}
+    for name, value in names.items():
+        monkeypatch.setenv(name, str(value))
+
+
+@pytest.fixture
+def two_gpus(monkeypatch):
+    """As far as names go; a tensor on one of them fails."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+
+
+def test_alone(monkeypatch):
+    assert not launched() and (rank(), world_size()) == (0, 1)
+    monkeypatch.setenv("WORLD_SIZE", "4")  # as a cluster's scheduler may leave it, without the rest
+    assert not launched()
+
+
+def test_torchrun_with_one_process_is_none(under_torchrun, monkeypatch):
+    assert launched()
+    monkeypatch.setenv("WORLD_SIZE", "1")
+    assert not launched()
+
+
+def test_other_scripts_are_not_run_twice(under_torchrun, capsys):
+    def never():
+        raise AssertionError("it was run")
+
+    assert run_script(never, "prior_space_rl.py") == 2
+    told = capsys.readouterr().err
+    assert "process 1" in told and "trains with one process; start it without torchrun" in told
+
+
+@pytest.mark.parametrize(
+    ("device", "told"),
+    [
+        ("cuda:7", "--device cuda:7 does not work here: there is cuda:0, cuda:1"),
+        ("meta", "--device meta does not work here"),
+        ("nothing", "--device nothing does not work here"),
+    ],
+)
+def test_a_device_that_is_not_there(two_gpus, device, told):
+    with pytest.raises(ValueError, match=told):
+        check_device(device)
+    with pytest.raises(ValueError, match=told):
+        RunOptions(device=device)
+
+
+def test_several_processes_share_no_gpu(under_torchrun, two_gpus):
+    with pytest.raises(ValueError, match="3 processes on a machine with 2 CUDA device"):
+        check_device("cuda")
+    with pytest.raises(ValueError, match=r"every process takes a GPU of its own: --device cuda$"):
+        check_device("cuda:1")
+    check_device("cpu")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("[../third_party/gloo/transport/tcp/pair.cc:534] Connection closed by peer"),
+        dist.DistNetworkError("the server is gone"),
+    ],
+)
+def test_errors_of_a_group_are_told_as_what_they_are(error):
+    with pytest.raises(WorkerError, match="start all of them again with --resume"), process_group():
+        raise error
+
+
+def test_other_errors_pass():
+    with pytest.raises(RuntimeError, match="shapes do not fit"), process_group():
+        raise RuntimeError("shapes do not fit")
+    assert distributed.STEP < distributed.PATIENCE

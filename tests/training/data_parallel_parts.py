@@ -1,0 +1,161 @@
+"""What each of several processes does in the tests of data parallel training."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import signal
+
+import torch
+from torch import nn
+
+from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, training, weights
+from warmprior import PastPrior, PreconditionedNetwork, SourceMoments, VelocityMLP
+from warmprior.io.distributed import rank
+from warmprior.io.workers import WorkerError
+from warmprior.modules import OTPrior
+
+STEPS = dataclasses.replace(
+    CONFIG, iterations=20, batch_size=15, learning_rate=1e-3, save_every=5, checkpoints=1
+)
+
+
+class LearningPrior(nn.Module, PastPrior):
+    """It learns how far to trust the past, with the flow."""
+
+    name = "learning-past"
+
+    def __init__(self, chunk_length: int) -> None:
+        nn.Module.__init__(self)
+        PastPrior.__init__(self, chunk_length)
+        self.trust = nn.Parameter(torch.ones(2))
+
+    def distribution(self, loc, warm, observation=None):
+        return super().distribution(self.trust * loc, warm)
+
+
+class IdleMLP(VelocityMLP):
+    """With a weight that it does not use."""
+
+    def __init__(self, *sizes, **options) -> None:
+        super().__init__(*sizes, **options)
+        self.idle = nn.Parameter(torch.zeros(3))
+
+
+def standardised():
+    one = torch.ones(4, 2)
+    return PreconditionedNetwork(mlp(), moments=SourceMoments(0 * one, 0 * one, one, one, 0 * one))
+
+
+CASES = {
+    "plain": ({}, lambda: actor_for(PastPrior(4), mlp())),
+    "withheld": ({}, lambda: actor_for(PastPrior(4, cold_probability=0.5), mlp())),
+    "coupled": ({}, lambda: actor_for(OTPrior(4), mlp())),
+    "learning prior": ({}, lambda: actor_for(LearningPrior(4), mlp())),
+    "distilled, standardised": (
+        {"self_distillation": 0.5, "weighting": "standardised"},
+        lambda: actor_for(PastPrior(4), standardised()),
+    ),
+    "bf16": ({"precision": "bf16"}, lambda: actor_for(PastPrior(4), mlp())),
+}
+"""Options and policies; none draws anything itself. 15 windows are no multiple of two processes."""
+
+
+def short_episodes():
+    """Where a chunk of four is padded more often than not."""
+    return dataset().set("episode", torch.arange(120) // 5)
+
+
+def cloning(folder, case, **changes):
+    options, make = CASES[case]
+    config = dataclasses.replace(STEPS, **options, **changes)
+    return training(folder, config, actor=make(), data=short_episodes())
+
+
+def gradients(folder, case):
+    """Of the first step, with the loss and the points at which the network was evaluated."""
+    points = []
+    part = cloning(folder / "first" / f"{case} {rank()}", case)
+    part.loss_module.velocity_network.register_forward_pre_hook(
+        lambda network, inputs: points.append(inputs[1].detach().clone())
+    )
+    loss = part.step()
+    return loss, {n: p.grad.clone() for n, p in part.trained.named_parameters()}, points
+
+
+def trained(folder, case, **changes):
+    part = cloning(folder / case, case, **changes)
+    part.run(None)
+    if not rank():
+        torch.save((weights(part), part.losses), folder / f"{case}.pt")
+
+
+def whole(folder):
+    """Everything that ends well, in one go: processes start slowly."""
+    torch.save({case: gradients(folder, case) for case in CASES}, folder / f"first {rank()}.pt")
+    for case in CASES:
+        trained(folder, case)
+    stopped_at(folder / "two then one", 12)
+    trained(folder / "one then two", "plain")
+    diverges(folder)
+    refuses(folder)
+
+
+def stopped_at(folder, iteration):
+    """End in the middle, as if killed after a step."""
+    part = cloning(folder / "plain", "plain")
+    step = part.step
+
+    def stopping():
+        if part.iteration == iteration:
+            raise KeyboardInterrupt
+        return step()
+
+    part.step = stopping
+    with contextlib.suppress(KeyboardInterrupt):
+        part.run(None)
+
+
+def dies(folder):
+    """The second process is killed at the twelfth step; tells what the first one meets."""
+    part = cloning(folder / "plain", "plain")
+    step = part.step
+
+    def dying():
+        if part.iteration == 12 and rank():
+            os.kill(os.getpid(), signal.SIGKILL)
+        return step()
+
+    part.step = dying
+    try:
+        part.run(None)
+    except WorkerError as error:
+        (folder / "told").write_text(str(error))
+
+
+def diverges(folder):
+    """Windows of the second process alone lead to NaN."""
+    part = cloning(folder / "diverges", "plain")
+    if rank():
+        times = part.loss_module.times
+        part.loss_module.times = lambda *args: times(*args) * float("nan")
+    try:
+        part.run(None)
+    except FloatingPointError as error:
+        (folder / f"diverged {rank()}").write_text(str(error))
+
+
+def refuses(folder):
+    """What several processes cannot train."""
+    told = []
+    idle = actor_for(PastPrior(4), IdleMLP(2, 3, 4, hidden_dim=8))
+    for start in (
+        lambda: cloning(folder / "small", "plain", batch_size=1),
+        lambda: training(folder / "idle", STEPS, actor=idle).run(None),
+    ):
+        try:
+            start()
+        except ValueError as error:
+            told.append(str(error))
+    (folder / f"refused {rank()}").write_text("\n".join(told))

@@ -1,0 +1,92 @@
+"""Training whose matrix products are bfloat16, and everything else float32."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+from torch import nn
+
+from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, same, training, weights
+from warmprior import FlowMatchingLoss, PastPrior, WarmPriorActor, window_replay_buffer
+from warmprior.io.options import identity_of
+from warmprior.training import TrainingConfig, precondition
+from warmprior.training.checkpoint import load_state
+
+BF16 = dataclasses.replace(CONFIG, precision="bf16")
+
+
+def preconditioned():
+    prior = PastPrior(4)
+    return actor_for(prior, precondition(mlp(), dataset(), prior))
+
+
+@pytest.mark.parametrize("make", [actor_for, preconditioned])
+@pytest.mark.parametrize("options", [{}, {"self_distillation": 1.0}])
+def test_products_are_bf16_and_the_loss_is_close(make, options):
+    losses, types = [], []
+    for autocast in (None, torch.bfloat16):
+        actor = make().eval()  # without dropout, which would draw other masks
+        layers = [m for m in actor.network.modules() if isinstance(m, nn.Linear)]
+        generator = torch.Generator().manual_seed(0)
+        loss = FlowMatchingLoss(actor, generator=generator, autocast=autocast, **options)
+        seen = set()
+        for layer in loss.velocity_network.modules():
+            if isinstance(layer, nn.Linear):
+                layer.register_forward_hook(lambda m, i, out, seen=seen: seen.add(out.dtype))
+        torch.manual_seed(0)
+        batch = window_replay_buffer(
+            dataset(), actor.prior, batch_size=64, generator=torch.Generator().manual_seed(1)
+        ).sample()
+        value = sum(loss(batch).values())
+        value.backward()
+        assert value.dtype == torch.float32 and layers
+        assert all(p.grad.dtype == torch.float32 for p in actor.network.parameters())
+        assert any(p.grad.abs().max() > 0 for p in actor.network.parameters())
+        losses.append(value.item())
+        types.append(seen)
+    assert types == [{torch.float32}, {torch.bfloat16}]
+    assert losses[0] != losses[1] and losses[1] == pytest.approx(losses[0], rel=2e-2)
+
+
+def test_gradients_after_the_teacher_are_those_of_the_trained_weights():
+    """Weights that were cast without gradients would get none."""
+    actor = preconditioned()
+    loss = FlowMatchingLoss(actor, self_distillation=1.0, autocast=torch.bfloat16)
+    batch = window_replay_buffer(dataset(), actor.prior, batch_size=16).sample()
+    loss(batch)["loss_self_distillation"].backward()
+    assert all(p.grad is not None for p in actor.network.parameters())
+
+
+def test_states_and_policies_are_float32_and_resume_is_exact(tmp_path):
+    whole = training(tmp_path / "whole", BF16)
+    whole.run(None)
+    part = training(tmp_path / "part", BF16)
+    for _ in range(14):
+        part.step()
+    part._save()
+    again = training(tmp_path / "part", BF16)
+    assert again.iteration == 14
+    again.run(None)
+    assert same(weights(again), weights(whole))
+    tensors, _ = load_state(whole.state_path)
+    assert {v.dtype for n, v in tensors.items() if "trained" in n or "exp_avg" in n} == {
+        torch.float32
+    }
+    policy = WarmPriorActor.from_pretrained(whole.policy_path(40))
+    assert {p.dtype for p in policy.parameters()} == {torch.float32}
+    plain = training(tmp_path / "plain")
+    plain.run(None)
+    assert not same(weights(plain), weights(whole))
+
+
+def test_it_is_part_of_what_was_trained(tmp_path):
+    training(tmp_path, BF16).run(None)
+    with pytest.raises(ValueError, match="belongs to another config"):
+        training(tmp_path)
+    assert "precision" not in identity_of(
+        TrainingConfig()
+    )  # what was trained before is found again
+    with pytest.raises(ValueError, match="precision must be one of float32, bf16, got 'fp8'"):
+        TrainingConfig(precision="fp8")

@@ -1,0 +1,242 @@
+"""Processes that train together, as ``torchrun`` starts them: who is who, and who waits for whom."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from warmprior.io.workers import WorkerError, stop_forking
+
+__all__ = [
+    "check_batch",
+    "check_device",
+    "from_leader",
+    "go_on_alone",
+    "joined",
+    "launched",
+    "leader_first",
+    "mean_over_processes",
+    "process_group",
+    "rank",
+    "world_size",
+]
+
+STEP = timedelta(minutes=10)
+"""How long the others may take to arrive where gradients are averaged."""
+
+PATIENCE = timedelta(days=2)
+"""How long the first process may take to generate, render or learn what the others wait for."""
+
+_waiting: dist.ProcessGroup | None = None
+"""The group in which processes wait for each other; always of the CPU."""
+
+
+def launched() -> bool:
+    """Whether ``torchrun`` started this process as one of several."""
+    names = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR")
+    return all(name in os.environ for name in names) and int(os.environ["WORLD_SIZE"]) > 1
+
+
+def world_size() -> int:
+    """How many processes train together: 1 unless this one has :func:`joined` others."""
+    return dist.get_world_size() if dist.is_initialized() else 1
+
+
+def rank() -> int:
+    """The number of this process among them. The first, 0, is the one that writes and prints."""
+    return dist.get_rank() if dist.is_initialized() else 0
+
+
+@contextmanager
+def joined() -> Iterator[None]:
+    """Join the processes that ``torchrun`` started, if it did, and leave them at the end.
+
+    Gradients on a CPU are averaged by gloo, those on GPUs by NCCL. Workers that are started from here on are
+    started afresh: the threads of a group do not survive a fork.
+
+    Raises:
+        WorkerError: if another process ended, or did not arrive within ten minutes.
+
+    Examples:
+        >>> with joined():  # started without torchrun
+        ...     world_size(), rank()
+        (1, 0)
+    """
+    global _waiting
+    if not launched():
+        yield
+        return
+    local, devices = int(os.environ["LOCAL_RANK"]), torch.cuda.device_count()
+    if local < devices:
+        torch.cuda.set_device(local)  # "cuda" is this one from here on
+    stop_forking()
+    with process_group():
+        dist.init_process_group("cpu:gloo,cuda:nccl" if devices else "gloo", timeout=STEP)
+        _waiting = dist.new_group(backend="gloo", timeout=PATIENCE)
+    try:
+        yield
+    finally:
+        _leave()
+
+
+def _wait() -> None:
+    """For all others."""
+    with process_group():
+        dist.barrier(_waiting)
+
+
+def _leave() -> None:
+    global _waiting
+    _waiting = None
+    if dist.is_initialized():
+        dist.destroy_process_group()
+
+
+@contextmanager
+def process_group() -> Iterator[None]:
+    """Tell the errors of a group whose other processes are gone as what they are.
+
+    Raises:
+        WorkerError: instead of them.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        if not isinstance(error, dist.DistError) and "gloo" not in str(error).lower():
+            raise
+        raise WorkerError(
+            "another of the processes that train together has ended, or does not answer: see its own error. "
+            "What is finished and the last state are kept; start all of them again with --resume"
+        ) from error
+
+
+@contextmanager
+def leader_first() -> Iterator[None]:
+    """Let the first process do something before the others, which find it done.
+
+    Raises:
+        WorkerError: if the first process ended meanwhile.
+    """
+    if rank():
+        _wait()
+    yield
+    if world_size() > 1 and not rank():
+        _wait()
+
+
+def from_leader[T](make: Callable[[], T]) -> T:
+    """What the first process makes of something that the others must not, or might not, make alike.
+
+    Args:
+        make: called by the first process; its result has to be picklable.
+
+    Raises:
+        SystemExit: in the others, if it fails in the first, which tells why.
+        WorkerError: if the first process ended meanwhile.
+
+    Examples:
+        >>> from_leader(lambda: 3)
+        3
+    """
+    if world_size() == 1:
+        return make()
+    told: list[Any] = [None, False]
+    try:
+        if not rank():
+            told = [make(), True]
+    finally:
+        with process_group():
+            dist.broadcast_object_list(told, 0, _waiting)
+    if not told[1]:
+        raise SystemExit(2)
+    return told[0]
+
+
+def go_on_alone() -> None:
+    """Let the first process go on as if it had been started alone, and the others end.
+
+    Raises:
+        SystemExit: in the others, with success.
+    """
+    if world_size() == 1:
+        return
+    ends = bool(rank())
+    _wait()
+    _leave()
+    if ends:
+        raise SystemExit(0)
+
+
+def mean_over_processes(value: Tensor) -> Tensor:
+    """The mean of what every process has, in place.
+
+    Args:
+        value: of one shape everywhere.
+
+    Examples:
+        >>> mean_over_processes(torch.tensor(3.0))
+        tensor(3.)
+    """
+    if world_size() > 1:
+        dist.all_reduce(value)
+        value /= world_size()
+    return value
+
+
+def check_batch(size: int) -> None:
+    """Whether every process gets a window.
+
+    Args:
+        size: windows per step, of all processes.
+
+    Raises:
+        ValueError: if there are more processes.
+    """
+    if size < world_size():
+        raise ValueError(
+            f"--batch-size {size} has fewer windows than there are processes, {world_size()}: start fewer, "
+            "or choose a larger batch"
+        )
+
+
+def check_device(device: str) -> None:
+    """Whether every process here has a device of a name, and it computes.
+
+    Args:
+        device: such as ``"cuda"``; of several processes each then takes one of its own.
+
+    Raises:
+        ValueError: naming ``--device`` and what there is instead.
+
+    Examples:
+        >>> check_device("cpu")
+    """
+    try:
+        kind, index = torch.device(device).type, torch.device(device).index
+        if kind == "cuda" and torch.cuda.is_available():
+            devices = torch.cuda.device_count()
+            local = int(os.environ["LOCAL_WORLD_SIZE"]) if launched() else 1
+            if launched() and index is not None:
+                raise ValueError(
+                    f"--device {device}: under torchrun every process takes a GPU of its own: --device cuda"
+                )
+            if local > devices:
+                raise ValueError(
+                    f"--device {device}: {local} processes on a machine with {devices} CUDA device(s): start "
+                    f"torchrun with --nproc-per-node {devices}"
+                )
+            if index is not None and index >= devices:
+                known = ", ".join(f"cuda:{i}" for i in range(devices))
+                raise ValueError(f"--device {device} does not work here: there is {known}")
+        # Computed and read: there are devices that can only be named, such as meta.
+        torch.ones(1, device=device).add(1).item()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"--device {device} does not work here: {reason}") from error
