@@ -18,6 +18,7 @@ import tyro
 from warmprior.experiments.recipe import Recipe
 from warmprior.experiments.record import differences, record, refuse_ignored, restore
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
+from warmprior.io.ray_pool import check_ray
 from warmprior.io.script import PartialFailure
 
 __all__ = ["numbered_folder", "parse", "started", "write_report"]
@@ -90,6 +91,8 @@ def parse[R: Recipe](
     name = recipe.run.logger
     if name in ("tensorboard", "wandb") and find_spec(name) is None:
         raise ImportError(f"--logger {name} needs the package {name}: pip install it")
+    if recipe.run.engine == "ray":
+        check_ray(recipe.run.ray_address)
     recipe.check()
     return replace(recipe, run=replace(recipe.run, out=out))
 

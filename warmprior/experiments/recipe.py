@@ -365,6 +365,8 @@ class RunOptions:
         device: of networks and data, such as cuda.
         compile: torch.compile the network in training.
         logger: TorchRL logger of the training curves.
+        engine: who computes, with the same results: processes of this machine, or Ray, on one or many.
+        ray_address: HOST:PORT of a Ray cluster's head (default: $RAY_ADDRESS, or this machine alone).
     """
 
     preset: str = "quick"
@@ -374,15 +376,23 @@ class RunOptions:
     device: str = "cpu"
     compile: bool = False
     logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"
+    engine: Literal["local", "ray"] = "local"
+    ray_address: str | None = None
 
     def __post_init__(self) -> None:
         check_counts(self, "envs")
+        if self.ray_address is not None and self.engine != "ray":
+            raise ValueError("--ray-address belongs to --engine ray")
         try:
             # Computed and read: there are devices that can only be named, such as meta.
             torch.ones(1, device=self.device).add(1).item()
         except (RuntimeError, AssertionError, NotImplementedError) as error:
             reason = str(error).splitlines()[0]
             raise ValueError(f"--device {self.device} does not work here: {reason}") from error
+        if self.engine == "ray" and torch.device(self.device).index is not None:
+            raise ValueError(
+                f"--device {self.device}: Ray chooses which GPU a training gets; name none with --engine ray"
+            )
 
     @property
     def directory(self) -> Path:
