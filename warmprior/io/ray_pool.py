@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import platform
+import re
 import socket
+import subprocess
 import sys
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,8 +25,11 @@ from warmprior.io.workers import Failure, WorkerError, available_cores, stop_for
 
 __all__ = ["RayPool", "check_ray", "check_versions"]
 
-PATIENCE = 5.0
+PATIENCE = 15.0
 """Seconds in which a cluster has to answer."""
+
+CONNECT = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
+"""What a process does to find out whether there is a cluster."""
 
 NODE_PATIENCE = 60.0
 """Seconds in which each of its machines has to start a process and import the library."""
@@ -42,26 +47,41 @@ def check_ray(address: str | None = None) -> str | None:
     Raises:
         ImportError: if Ray is not installed.
         ValueError: if this is no address of a head.
-        ConnectionError: if nothing answers there.
+        ConnectionError: if nothing answers there, or the cluster has another Ray or Python.
     """
     require("ray", "ray")
     address = address or os.environ.get("RAY_ADDRESS") or "local"
-    if address in ("local", "auto"):
-        return None if address == "local" else address
+    if address == "local":
+        return None
     host, _, port = address.rpartition(":")
-    if not host or not port.isdecimal() or "/" in address:
+    if address != "auto" and not (host and port.isdecimal() and "/" not in host):
         raise ValueError(
             f"--ray-address {address} is not the address of a cluster's head, HOST:PORT (6379 by default); "
             "start from one of its machines, not through ray://"
         )
     try:
-        socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
+        if address != "auto":  # nobody listens: that is told at once
+            socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
+        # In a process of its own: Ray itself goes on trying for minutes, and cannot be interrupted.
+        command = [sys.executable, "-c", CONNECT, address]
+        done = subprocess.run(command, stderr=subprocess.PIPE, timeout=PATIENCE, check=False)
+        if done.returncode == 0:
+            return address
+        reason = reason_of(done.stderr)
+    except subprocess.TimeoutExpired as late:
+        reason = f"it does not answer within {PATIENCE:g} seconds. {reason_of(late.stderr or b'')}"
     except (OSError, OverflowError) as error:
-        raise ConnectionError(
-            f"--ray-address {address}: nothing answers there ({error}). Start the cluster with ray start "
-            f"--head --port={port}, or leave out --ray-address and RAY_ADDRESS for this machine alone"
-        ) from error
-    return address
+        reason = str(error)
+    raise ConnectionError(
+        f"--ray-address {address} is no cluster to work on: {reason.strip(' .')}. Start one with ray start "
+        "--head (RAY_AUTH_MODE=token if it asks for a token), or leave out --ray-address and RAY_ADDRESS for "
+        "this machine alone"
+    )
+
+
+def reason_of(told: bytes) -> str:
+    """The message at the end of what a Python process, or Ray, wrote before it ended."""
+    return re.split(r"^[\w.]+(?:Error|Exception): |^\[.*?\] ", told.decode(), flags=re.M)[-1].strip()
 
 
 def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str) -> None:
@@ -269,11 +289,7 @@ class RayPool[State]:
         if address is None:
             cores = self._limit or available_cores()
             options = {"address": "local", "num_cpus": cores, "include_dashboard": False}
-        try:
-            self._ray.init(**options, logging_level="ERROR")
-        except (RuntimeError, ValueError) as error:  # of another version, or none of Ray at all
-            self._disconnect()
-            raise ConnectionError(f"--ray-address {address}: {error}") from error
+        self._ray.init(**options, logging_level="ERROR")
 
     def _disconnect(self) -> None:
         if self._owned:
