@@ -109,7 +109,9 @@ def test_machines_that_could_not_do_the_work_are_refused(ray_address, tmp_path, 
 
 def test_what_is_no_cluster_is_refused_within_seconds(monkeypatch):
     started = time.monotonic()
-    with pytest.raises(ConnectionError, match=r"127\.0\.0\.1:1 is no cluster.*refused.*ray start --head"):
+    with pytest.raises(
+        ConnectionError, match=r"127\.0\.0\.1:1 is no cluster.*refused.*ray start --head"
+    ):
         check_ray("127.0.0.1:1")
     for told in ("localhost", "ray://head:10001"):
         with pytest.raises(ValueError, match="HOST:PORT"):
@@ -117,7 +119,7 @@ def test_what_is_no_cluster_is_refused_within_seconds(monkeypatch):
     assert time.monotonic() - started < 5
     monkeypatch.setattr(ray_pool, "PATIENCE", 3.0)
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:%d" % silent.getsockname()[1])
+        monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{silent.getsockname()[1]}")
         with pytest.raises(ConnectionError, match="does not answer within 3 seconds"):
             check_ray()
     monkeypatch.delenv("RAY_ADDRESS")

@@ -92,7 +92,7 @@ class Comparison:
             "data": [problem.identity for problem in problems],
         }
         meta = {
-            **facts_of_machine(workers=self.num_workers, device=recipe.run.device, torch_threads=1),
+            **facts_of_machine(**self._hardware, device=recipe.run.device, torch_threads=1),
             "problems": [{"task": p.task, "style": p.style, **p.facts} for p in problems],
             "policies": [
                 c.facts() | {"prior": c.prior.config(), "folder": c.folder.name}
@@ -133,6 +133,13 @@ class Comparison:
     def num_workers(self) -> int:
         """Worker processes: as asked for, or one per core that this process may use."""
         return self.recipe.run.envs or available_cores()
+
+    @property
+    def _hardware(self) -> dict[str, Any]:
+        """What computes, where it is known before the work."""
+        if self._on_ray:
+            return {"engine": "ray", "workers": self.recipe.run.envs}
+        return {"workers": self.num_workers}
 
     @property
     def _on_ray(self) -> bool:

@@ -23,8 +23,8 @@ __all__ = ["FileTracker", "MemoryTracker"]
 REPORT_EVERY = 1.0
 """Seconds between two reports of a job: each writes a file, perhaps over a network."""
 
-LOCK_PATIENCE = 60.0
-"""Seconds in which a folder becomes free whose process died with its machine or its driver."""
+LOCK_POLL, LOCK_PATIENCE = 1.0, 60.0
+"""Seconds between two looks at a folder in use, and in which that of a dead process becomes free."""
 
 
 class MemoryTracker:
@@ -123,4 +123,4 @@ def _once_free(train: Callable[[], Any]) -> Any:
         except BlockingIOError:
             if time.monotonic() > end:
                 raise
-            time.sleep(1.0)
+            time.sleep(LOCK_POLL)

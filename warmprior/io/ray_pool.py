@@ -81,7 +81,9 @@ def check_ray(address: str | None = None) -> str | None:
 
 def reason_of(told: bytes) -> str:
     """The message at the end of what a Python process, or Ray, wrote before it ended."""
-    return re.split(r"^[\w.]+(?:Error|Exception): |^\[.*?\] ", told.decode(), flags=re.M)[-1].strip()
+    return re.split(r"^[\w.]+(?:Error|Exception): |^\[.*?\] ", told.decode(), flags=re.M)[
+        -1
+    ].strip()
 
 
 def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str) -> None:
@@ -226,7 +228,7 @@ class RayPool[State]:
             job: picklable, and repeatable.
         """
         task = self._ray.remote(_run).options(
-            name=str(job), num_cpus=1, num_gpus=self._gpus(job), max_retries=self._retries
+            num_cpus=1, num_gpus=self._gpus(job), max_retries=self._retries
         )
         self._running[task.remote(self._setup, job)] = job
 
