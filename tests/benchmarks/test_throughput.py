@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -27,6 +28,7 @@ KEYS = {
     "encoder_share",
     "prior_space_decoding",
     "prior_space_collection_over_env",
+    "ray_overhead_per_cell",
     "meta",
 }
 
@@ -51,6 +53,14 @@ def test_writes_every_key(throughput, tmp_path):
     assert results["env_over_robosuite"] is None
     assert {"python", "torch", "warmprior"} <= results["meta"]["versions"].keys()
     assert {"cpu", "torch_threads", "date"} <= results["meta"]["hardware"].keys()
+
+
+def test_figures_of_ray_are_skipped_by_name_without_it(throughput, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    name = "ray_overhead_per_cell"
+    throughput.main(["--only", name, "--repeats", "1", "--out", str(tmp_path)])
+    assert json.loads((tmp_path / "throughput.json").read_text())[name] is None
+    assert f"{name}: skipped, needs warmprior[ray]" in capsys.readouterr().out
 
 
 def test_images(throughput, tmp_path):

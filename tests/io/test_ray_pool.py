@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import socket
@@ -22,12 +23,15 @@ from warmprior.io.workers import Failure, WorkerError
 pytest.importorskip("ray")
 
 
-class State:
-    """Counts, in a file, how often it is made."""
+OWN_CODE = """
+import os, time
 
+class State:
+    # Tells, in a file, that it was made.
     def __init__(self, folder):
         self.folder = folder
         (folder / f"made-{os.getpid()}-{time.monotonic_ns()}").touch()
+"""
 
 
 def facts(number, state):
@@ -63,9 +67,13 @@ def gathered(pool, jobs):
 
 
 @apart
-def test_jobs_give_results_or_failures_and_end_with_the_context(ray_address, tmp_path):
+def test_jobs_give_results_or_failures_and_end_with_the_context(ray_address, tmp_path, monkeypatch):
     torch.set_float32_matmul_precision("high")
-    pool = RayPool(partial(State, tmp_path), address=ray_address, folders=[tmp_path], retries=1)
+    # Found by this process alone, until its workers are told where.
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "users_own_module.py").write_text(OWN_CODE)
+    make_state = partial(importlib.import_module("users_own_module").State, tmp_path)
+    pool = RayPool(make_state, address=ray_address, folders=[tmp_path], retries=1)
     with pytest.raises(KeyboardInterrupt), pool:
         assert pool.num_workers == pool.idle == 2 and pool.wait(0) == []
         jobs = [partial(facts, number) for number in range(6)]
