@@ -23,7 +23,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import write_atomic
 from warmprior.io.workers import Failure, WorkerError, available_cores, stop_forking
 
-__all__ = ["RayPool", "check_ray", "check_versions"]
+__all__ = ["RayPool", "check_ray", "check_versions", "ray_cluster"]
 
 PATIENCE = 15.0
 """Seconds in which a cluster has to answer."""
@@ -164,8 +164,8 @@ class RayPool[State]:
     :class:`~warmprior.io.workers.Failure`: what one raised, or that its process died more often than it is
     started again. Jobs must be repeatable for that.
 
-    Entering the context connects, or starts a cluster of this machine; a connection that this process has
-    already is taken, and left as it is. Leaving it with an error, such as Ctrl-C, ends all jobs.
+    Entering the context connects, or starts a cluster, see :func:`ray_cluster`, also for what is raised
+    then. Leaving it with an error, such as Ctrl-C, ends all jobs.
 
     Args:
         make_state: makes what jobs work on, once in each process; sent to a machine once.
@@ -179,10 +179,6 @@ class RayPool[State]:
 
     Raises:
         ImportError: if Ray is not installed.
-        ConnectionError: on entering, if there is no such cluster, or its Ray or Python is another.
-        WorkerError: on entering, if a machine has other versions or cannot start the library.
-        OSError: on entering, if a machine does not see a folder.
-        ValueError: on entering, if this is no address.
     """
 
     def __init__(
@@ -265,61 +261,16 @@ class RayPool[State]:
             return Failure(str(error).splitlines()[0])
 
     def __enter__(self) -> Self:
-        self._owned = not self._ray.is_initialized()
-        if self._owned:
-            self._connect()
-        try:
-            mine = versions()
-            with _tokens(self._folders) as tokens:
-                for node in self._nodes():
-                    self._check_node(node, tokens, mine)
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(ray_cluster(self._address, self._limit, self._folders))
             self._setup = _Setup(
                 tuple(map(os.path.abspath, sys.path)),
-                mine,
+                versions(),
                 torch.get_float32_matmul_precision(),
                 self._ray.put(self._make_state),
             )
-        except BaseException:
-            self._disconnect()
-            raise
+            self._connection = stack.pop_all()
         return self
-
-    def _connect(self) -> None:
-        stop_forking()  # its connections do not survive one
-        address = check_ray(self._address)
-        options: dict[str, Any] = {"address": address}
-        if address is None:
-            cores = self._limit or available_cores()
-            options = {"address": "local", "num_cpus": cores, "include_dashboard": False}
-        self._ray.init(**options, logging_level="ERROR")
-
-    def _disconnect(self) -> None:
-        if self._owned:
-            self._ray.shutdown()
-
-    def _nodes(self) -> list[dict[str, Any]]:
-        """The machines that may get jobs."""
-        return [n for n in self._ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
-
-    def _check_node(
-        self, node: Mapping[str, Any], tokens: Mapping[str, str], mine: Mapping[str, str]
-    ) -> None:
-        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-        name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
-        there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-        task = self._ray.remote(_look).options(num_cpus=0, scheduling_strategy=there)
-        try:
-            theirs, unseen = self._ray.get(task.remote(tokens), timeout=NODE_PATIENCE)
-        except self._ray.exceptions.RayError as error:
-            cause = getattr(error, "cause", None) or error
-            raise WorkerError(f"{name} cannot start this library: {cause}") from error
-        check_versions(mine, theirs, name)
-        if unseen:
-            raise OSError(
-                f"{name} does not see what is written to {Path(unseen[0]).parent} here: choose an --out that "
-                "all machines share, at the same path"
-            )
 
     def __exit__(
         self,
@@ -331,7 +282,67 @@ class RayPool[State]:
             with contextlib.suppress(self._ray.exceptions.RayError):
                 self._ray.cancel(task, force=True)
         self._running.clear()
-        self._disconnect()
+        self._connection.close()
+
+
+@contextlib.contextmanager
+def ray_cluster(
+    address: str | None = None, num_cpus: int | None = None, folders: Sequence[Path] = ()
+) -> Iterator[Any]:
+    """A connection to a Ray cluster whose machines can do this library's work.
+
+    One that this process has already is taken, and left as it is.
+
+    Args:
+        address: see :func:`check_ray`; a cluster of this machine is started by default, and ended.
+        num_cpus: of the cluster that is started; one per core by default.
+        folders: that all machines have to share.
+
+    Yields:
+        The module ``ray``.
+
+    Raises:
+        ImportError: if Ray is not installed.
+        ValueError: if this is no address.
+        ConnectionError: if there is no such cluster, or its Ray or Python is another.
+        WorkerError: if a machine has other versions or cannot start the library.
+        OSError: if a machine does not see a folder.
+    """
+    ray = require("ray", "ray")
+    with contextlib.ExitStack() as stack:
+        if not ray.is_initialized():
+            address = check_ray(address)
+            options: dict[str, Any] = {"address": address}
+            if address is None:
+                cores = num_cpus or available_cores()
+                options = {"address": "local", "num_cpus": cores, "include_dashboard": False}
+            stop_forking()  # a connection does not survive it
+            stack.callback(ray.shutdown)
+            ray.init(**options, logging_level="ERROR")
+        with _tokens(folders) as tokens:
+            for node in ray.nodes():
+                if node["Alive"] and node["Resources"].get("CPU", 0) >= 1:  # it may get jobs
+                    _check_node(ray, node, tokens)
+        yield ray
+
+
+def _check_node(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> None:
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
+    there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+    task = ray.remote(_look).options(num_cpus=0, scheduling_strategy=there)
+    try:
+        theirs, unseen = ray.get(task.remote(tokens), timeout=NODE_PATIENCE)
+    except ray.exceptions.RayError as error:
+        cause = getattr(error, "cause", None) or error
+        raise WorkerError(f"{name} cannot start this library: {cause}") from error
+    check_versions(versions(), theirs, name)
+    if unseen:
+        raise OSError(
+            f"{name} does not see what is written to {Path(unseen[0]).parent} here: choose an --out that "
+            "all machines share, at the same path"
+        )
 
 
 @contextlib.contextmanager
