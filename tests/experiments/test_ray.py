@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -52,12 +53,13 @@ class Failing(DriftEnv):
 
 @apart
 def test_rows_are_those_of_the_local_engine_though_a_process_dies_and_a_cell_fails(
-    undisturbed, tmp_path, ray_address
+    undisturbed, tmp_path, ray_address, monkeypatch
 ):
     (tmp_path / "log").mkdir()
+    monkeypatch.chdir(tmp_path)  # that of the cluster is another
     options = {"engine": "ray", "ray_address": ray_address, "priors": PRIORS[1:2], "seeds": 1}
     sound = drift_problem(MortalOnce(tmp_path / "log"))
-    compared = comparison(tmp_path, None, problem=sound, **options)
+    compared = comparison(Path(), None, problem=sound, **options)
     (store,) = compared.stores
     broken = replace(drift_problem(Failing()), task="broken")
     stores = [store, Store(broken, store.network, store.directory, store.logs, store.run)]

@@ -340,9 +340,7 @@ class Comparison:
             address=run.ray_address,
             limit=run.envs,
             folders=sorted({self.directory, *(store.directory for store in self.stores)}),
-            gpus=lambda attempt: int(
-                bool(self.trainings_at_once) and isinstance(attempt.job, Train)
-            ),
+            gpus=lambda attempt: (self.trainings_at_once or 0) * isinstance(attempt.job, Train),
         )
 
     def _schedule(
