@@ -233,6 +233,8 @@ def run(argv: Sequence[str] | None) -> None:
                 out / f"{algorithm}-{slug(source)}-seed{seed}",
                 evaluation_seed=EVALUATION_SEED,
                 description=agent,
+                collectors=recipe.agents.collectors,
+                ray_address=recipe.run.ray_address,
             )
             try:
                 with torch_threads(recipe.agents.threads):

@@ -59,6 +59,9 @@ from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.simulator import task_env_args
 from warmprior.experiments.results import facts_of_machine
+from warmprior.io.files import read_json, write_atomic
+from warmprior.io.ray_pool import RayPool
+from warmprior.io.workers import Pool, WorkerPool
 from warmprior.training import precondition
 
 
@@ -361,6 +364,32 @@ def load_memory_over_data(clock: Clock) -> float:
     return float(done.stdout)
 
 
+def empty_cell(number: int, folder: Path) -> int:
+    """What a cell costs beside its episodes: a job, and the file that tells its result."""
+    path = folder / f"{number}.json"
+    write_atomic(path, lambda temporary: temporary.write_text("{}"))
+    return len(read_json(path))
+
+
+def ray_overhead_per_cell(clock: Clock) -> dict[str, float] | None:
+    """Seconds per empty cell, one after another, by a local worker process and by one on Ray."""
+    if not importlib.util.find_spec("ray"):
+        tqdm.write("ray_overhead_per_cell: skipped, needs warmprior[ray]")
+        return None
+
+    def play(pool: Pool[Path]) -> None:
+        for number in range(100):
+            pool.submit(partial(empty_cell, number))
+            pool.wait()
+
+    with tempfile.TemporaryDirectory() as name, WorkerPool(1, Path(name)) as local:
+        play(local)  # forks, which is not possible beside Ray
+        with RayPool(partial(Path, name), limit=1) as ray:
+            rounds = clock.times(lambda: play(local), lambda: play(ray))
+    names = ("local", "ray")
+    return {name: statistics.median(r) / 100 for name, r in zip(names, rounds, strict=True)}
+
+
 FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "windows_per_second": (windows_per_second, ">= 150000"),
     "windows_over_torch": (windows_over_torch, ">= 0.6"),
@@ -380,6 +409,7 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "encoder_share": (encoder_share, ""),
     "prior_space_decoding": (prior_space.decoding, ""),
     "prior_space_collection_over_env": (prior_space.collection_over_env, ""),
+    "ray_overhead_per_cell": (ray_overhead_per_cell, ""),
 }
 
 

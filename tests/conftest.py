@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import hypothesis
 import pytest
 import torch
@@ -22,3 +27,31 @@ def renders_apart():
     before = start_method()
     yield
     assert start_method() == before, "let what renders run in tests.processes.apart"
+
+
+CLUSTER = """
+import ray
+options = dict(num_cpus=2, include_dashboard=False, logging_level="ERROR")
+cluster = ray.init(address="local", _node_ip_address="127.0.0.1", **options)
+print("address", cluster.address_info["gcs_address"], flush=True)
+input()
+"""
+
+
+@pytest.fixture(scope="session")
+def ray_address():
+    """A Ray cluster of two cores. Whoever connects to it cannot fork afterwards, and has to do it apart."""
+    pytest.importorskip("ray")
+    root = str(Path(__file__).parents[1])
+    process = subprocess.Popen(
+        [sys.executable, "-c", CLUSTER],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=root,
+        env={**os.environ, "PYTHONPATH": root, "RAY_AUTH_MODE": "disabled"},
+    )
+    with process:
+        told = (line.split() for line in process.stdout)
+        yield next(words[1] for words in told if words[:1] == ["address"])
+        process.stdin.write("\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import sys
 import time
 from pathlib import Path
 
@@ -32,6 +33,7 @@ KEYS = {
     "encoder_share",
     "prior_space_decoding",
     "prior_space_collection_over_env",
+    "ray_overhead_per_cell",
     "meta",
 }
 
@@ -66,6 +68,14 @@ def test_what_needs_a_gpu_is_skipped_by_name(throughput, tmp_path, capsys):
     told = capsys.readouterr()
     for name in names:
         assert results[name] is None and f"{name}: skipped, needs a GPU" in told.out + told.err
+
+
+def test_figures_of_ray_are_skipped_by_name_without_it(throughput, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    name = "ray_overhead_per_cell"
+    throughput.main(["--only", name, "--repeats", "1", "--out", str(tmp_path)])
+    assert json.loads((tmp_path / "throughput.json").read_text())[name] is None
+    assert f"{name}: skipped, needs warmprior[ray]" in capsys.readouterr().out
 
 
 def test_images(throughput, tmp_path):

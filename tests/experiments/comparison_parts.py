@@ -124,6 +124,8 @@ def comparison(
     precondition=True,
     play_on=False,
     grid="uniform",
+    engine="local",
+    ray_address=None,
 ):
     recipe = Recipe(
         network=NetworkOptions(hidden_dim=16, precondition=precondition),
@@ -131,7 +133,14 @@ def comparison(
         evaluation=EvaluationOptions(
             seeds=seeds, episodes=episodes, nfe=(3, 1), play_on=play_on, grid=grid
         ),
-        run=RunOptions(out=folder / "out", resume=resume, envs=envs, logger=logger),
+        run=RunOptions(
+            out=folder / "out",
+            resume=resume,
+            envs=envs,
+            logger=logger,
+            engine=engine,
+            ray_address=ray_address,
+        ),
     )
     store = kind(
         problem or drift_problem(),

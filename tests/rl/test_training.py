@@ -7,8 +7,8 @@ import torch
 
 from tests.rl.training_parts import (
     ALGORITHMS,
-    LENGTHS,
     H,
+    check_transitions,
     make_actor,
     make_config,
     make_env,
@@ -37,21 +37,6 @@ class Recorded(PriorSpaceTraining):
         self.saves[self.steps] = (state, torch.get_rng_state(), len(self.buffer), len(self.curve))
 
 
-def hand_rollout(decisions):
-    """Start, executed steps, reward sum and end of every decision, environment by environment."""
-    time, result = [0, 0], []
-    for _ in range(decisions):
-        for i, length in enumerate(LENGTHS):
-            executed = min(H, length - time[i])
-            rewards = range(
-                time[i] + 1, time[i] + executed + 1
-            )  # CountingEnv pays the step's number
-            ended = time[i] + executed == length
-            result.append((i, time[i], executed, sum(rewards), ended))
-            time[i] = 0 if ended else time[i] + executed
-    return result
-
-
 @pytest.mark.parametrize(
     ("offset", "truncate", "bootstrap"),
     [(1.0, True, False), (0.0, True, True), (0.25, False, True)],
@@ -64,36 +49,9 @@ def test_transitions_are_those_of_a_rollout_by_hand(tmp_path, offset, truncate, 
         bootstrap_timeouts=bootstrap,
     )
     training.run()
+    check_transitions(training, offset=offset, time_outs=bootstrap and truncate)
     stored = training.buffer[:]
-    expected = hand_rollout(len(stored) // 2)
-    assert len(stored) == len(expected)
-    latest: dict[int, tuple[bool, torch.Tensor]] = {}
-    for row, (i, start, executed, reward, ended) in zip(stored, expected, strict=True):
-        following = row["next"]
-        assert row["observation"][0, 0] == start
-        # The last state of the episode, not the first of the next one.
-        assert following["observation"][0, 0] == start + executed
-        assert following["observation"][0, 1] == row["observation"][0, 1]
-        last_action = row["vla_action", "chunk"][executed - 1]
-        torch.testing.assert_close(following["observation"][0, 2:], last_action)
-        assert following["executed_steps"] == executed
-        assert following["reward"] == pytest.approx(reward - offset * executed)
-        assert following["done"] == ended
-        # DSRL takes time-outs for terminations.
-        assert following["terminated"] == (ended and not (bootstrap and truncate))
-        # The mean of WP-Past is what was executed last.
-        if executed == H:
-            assert torch.equal(following["prior", "anchor"], row["vla_action", "chunk"])
-        if i in latest:
-            was_last, anchor = latest[i]
-            assert torch.equal(anchor, row["prior", "anchor"]) != was_last
-        latest[i] = (ended, following["prior", "anchor"])
-    # What was decoded is what the residual says.
-    decoded = training.decoder(stored.select("observation", "prior"))["vla_action", "chunk"]
-    torch.testing.assert_close(decoded, stored["vla_action", "chunk"])
     assert stored["prior", "delta"].abs().max() <= training.decoder.delta == 0.5
-    # All control steps are counted, those of the warm-up too.
-    assert training.steps == sum(executed for _, _, executed, _, _ in expected)
     assert 90 <= training.steps < 90 + 2 * H
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
+import pytest
 import torch
 from torchrl.data import Categorical
 from torchrl.envs import SerialEnv, TransformedEnv
@@ -79,7 +80,64 @@ def make_config(**options):
     return PriorSpaceConfig(**values | options)
 
 
-def make_training(directory, actor=None, env=None, training_class=PriorSpaceTraining, **options):
+def hand_rollout(decisions, lengths):
+    """Start, executed steps, reward sum and end of every decision, environment by environment."""
+    time, result = [0] * len(lengths), []
+    for _ in range(decisions):
+        for i, length in enumerate(lengths):
+            executed = min(H, length - time[i])
+            rewards = range(
+                time[i] + 1, time[i] + executed + 1
+            )  # CountingEnv pays the step's number
+            ended = time[i] + executed == length
+            result.append((i, time[i], executed, sum(rewards), ended))
+            time[i] = 0 if ended else time[i] + executed
+    return result
+
+
+def check_transitions(training, *, lengths=LENGTHS, offset=1.0, time_outs=False):
+    """What a training stored is what its environments do.
+
+    Args:
+        training: of WP-Past.
+        lengths: of the episodes of its environments.
+        offset: of rewards.
+        time_outs: whether episodes end by time-outs that are told from terminations.
+    """
+    stored = training.buffer[:]
+    expected = hand_rollout(len(stored) // len(lengths), lengths)
+    assert len(stored) == len(expected)
+    latest: dict[int, tuple[bool, torch.Tensor]] = {}
+    for row, (i, start, executed, reward, ended) in zip(stored, expected, strict=True):
+        following = row["next"]
+        assert row["observation"][0, 0] == start
+        # The last state of the episode, not the first of the next one.
+        assert following["observation"][0, 0] == start + executed
+        assert following["observation"][0, 1] == row["observation"][0, 1]
+        last_action = row["vla_action", "chunk"][executed - 1]
+        torch.testing.assert_close(following["observation"][0, 2:], last_action)
+        assert following["executed_steps"] == executed
+        assert float(following["reward"]) == pytest.approx(reward - offset * executed)
+        assert following["done"] == ended
+        # DSRL takes time-outs for terminations.
+        assert following["terminated"] == (ended and not time_outs)
+        # The mean of WP-Past is what was executed last.
+        if executed == H:
+            assert torch.equal(following["prior", "anchor"], row["vla_action", "chunk"])
+        if i in latest:
+            was_last, anchor = latest[i]
+            assert torch.equal(anchor, row["prior", "anchor"]) != was_last
+        latest[i] = (ended, following["prior", "anchor"])
+    # What was decoded is what the residual says.
+    decoded = training.decoder(stored.select("observation", "prior"))["vla_action", "chunk"]
+    torch.testing.assert_close(decoded, stored["vla_action", "chunk"])
+    # All control steps are counted, those of the warm-up too.
+    assert training.steps == sum(executed for _, _, executed, _, _ in expected)
+
+
+def make_training(
+    directory, actor=None, env=None, training_class=PriorSpaceTraining, collection=None, **options
+):
     env = {} if env is None else env
     return training_class(
         make_actor() if actor is None else actor,
@@ -87,4 +145,5 @@ def make_training(directory, actor=None, env=None, training_class=PriorSpaceTrai
         make_config(**options),
         directory,
         evaluation_seed=EVALUATION_SEED,
+        **({} if collection is None else collection),
     )

@@ -19,6 +19,7 @@ from warmprior.experiments.recipe import Recipe
 from warmprior.experiments.record import differences, record, refuse_ignored, restore
 from warmprior.io.distributed import from_leader, rank
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
+from warmprior.io.ray_pool import check_ray
 from warmprior.io.script import PartialFailure
 
 __all__ = ["numbered_folder", "parse", "started", "write_report"]
@@ -91,6 +92,8 @@ def parse[R: Recipe](
     name = recipe.run.logger
     if name in ("tensorboard", "wandb") and find_spec(name) is None:
         raise ImportError(f"--logger {name} needs the package {name}: pip install it")
+    if recipe.run.engine == "ray":
+        check_ray(recipe.run.ray_address)
     recipe.check()
     return replace(recipe, run=replace(recipe.run, out=out))
 

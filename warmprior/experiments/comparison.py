@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,22 @@ from warmprior.experiments.record import record
 from warmprior.experiments.results import Results, Row, facts_of_machine
 from warmprior.experiments.schedule import Schedule
 from warmprior.experiments.store import Losses, Store
-from warmprior.experiments.worker import Attempt, Failure, Measure, Play, Train, Worker
+from warmprior.experiments.trackers import FileTracker, MemoryTracker
+from warmprior.experiments.worker import (
+    Attempt,
+    Job,
+    Measure,
+    Play,
+    PlayCell,
+    Tracker,
+    Train,
+    Worker,
+)
 from warmprior.io.distributed import go_on_alone, leader_first, rank, world_size
 from warmprior.io.files import check_writable
+from warmprior.io.ray_pool import RayPool
 from warmprior.io.script import PartialFailure
-from warmprior.io.workers import WorkerPool, available_cores
+from warmprior.io.workers import Failure, Pool, WorkerPool, available_cores
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 
@@ -82,7 +94,7 @@ class Comparison:
             "data": [problem.identity for problem in problems],
         }
         meta = {
-            **facts_of_machine(workers=self.num_workers, device=recipe.run.device, torch_threads=1),
+            **facts_of_machine(**self._hardware, device=recipe.run.device, torch_threads=1),
             "problems": [{"task": p.task, "style": p.style, **p.facts} for p in problems],
             "policies": [
                 c.facts() | {"prior": c.prior.config(), "folder": c.folder.name}
@@ -123,6 +135,17 @@ class Comparison:
     def num_workers(self) -> int:
         """Worker processes: as asked for, or one per core that this process may use."""
         return self.recipe.run.envs or available_cores()
+
+    @property
+    def _hardware(self) -> dict[str, Any]:
+        """What computes, where it is known before the work."""
+        if self._on_ray:
+            return {"engine": "ray", "workers": self.recipe.run.envs}
+        return {"workers": self.num_workers}
+
+    @property
+    def _on_ray(self) -> bool:
+        return self.recipe.run.engine == "ray"
 
     @property
     def trainings_at_once(self) -> int | None:
@@ -214,7 +237,7 @@ class Comparison:
         return tuple(row.facts.get(name) for name in self.contestants[0].facts())
 
     def run(self) -> Results:
-        """Train what is missing and play what is missing, in worker processes.
+        """Train what is missing and play what is missing, in worker processes or on a Ray cluster.
 
         A policy is played as soon as it is trained and a worker is free. The rows and their order are the
         same for any number of workers. A policy whose training, measures or episodes fail does not stop the
@@ -225,7 +248,9 @@ class Comparison:
 
         Raises:
             PartialFailure: if no policy is left.
-            WorkerError: if a worker process dies, a ``RuntimeError``.
+            WorkerError: if a worker process dies, a ``RuntimeError``; on a cluster that fails its job alone.
+            ConnectionError: if there is no such cluster. What it asks of machines, and raises, is told by
+                :class:`~warmprior.io.ray_pool.RayPool`.
         """
         self._compute(play=True)
         return self.results
@@ -254,33 +279,36 @@ class Comparison:
             self.results.save()
         everyone = [*self.contestants, *self._missing_teachers()]
         together = self._train_together(everyone) if world_size() > 1 else {}
-        outcomes = Outcomes(self.contestants, self.recipe)
+        outcomes = Outcomes(self.contestants, self.recipe, whole_cells=self._on_ray)
         following = {}
         if play:
             following = {n: outcomes.missing(n, self.results) for n in range(len(self.contestants))}
         jobs = [job for those in following.values() for job in those]
-        workers = min(self.num_workers, len(everyone) + len(jobs))
-        schedule = self._schedule(everyone, following, workers)
-        worker = Worker(everyone, self.recipe.evaluation)
+        tracker = self._tracker(everyone)
         failed: dict[int, str] = {}
+        running = set[Job]()
         iterations = sum(c.training.iterations for c in everyone)
-        episodes = sum(isinstance(job, Play) for job in jobs)
+        episodes = sum(_amount(job, everyone) for job in jobs if not isinstance(job, Measure))
         with (
             ComparisonProgress(iterations, episodes) as progress,
-            WorkerPool(workers, worker) as pool,
+            self._pool(everyone, len(jobs), tracker) as pool,
         ):
+            schedule = self._schedule(everyone, following, pool)
             for number, reason in together.items():
                 failed |= {n: f"{everyone[n]}: {reason}" for n in schedule.failed(Train(number))}
             while True:
                 while pool.idle and (job := schedule.next()) is not None:
                     pool.submit(Attempt(job))
+                    running.add(job)
                 if not pool.running:
                     break
                 for attempt, result in pool.wait(0.5):
                     job, chosen = attempt.job, everyone[attempt.job.number]
+                    running.remove(job)
+                    progress.moved(job, _amount(job, everyone))
                     if isinstance(result, Failure):
                         for n in schedule.failed(job):
-                            failed[n] = f"{everyone[n]}: {result.reason}"
+                            failed[n] = f"{everyone[n]}{_told_cell(job)}: {result.reason}"
                             progress.say(f"FAILED {failed[n]}")
                     elif isinstance(job, Train):
                         schedule.trained(job.number)
@@ -288,13 +316,14 @@ class Comparison:
                         self.results.save()
                         progress.say(f"trained {chosen}, {chosen.training.iterations} iterations")
                     else:
-                        if isinstance(job, Play):
-                            progress.played()
                         for row in outcomes.add(job, result):
                             self.results.add(row, order=self._place)
                             progress.say(_told(chosen, row))
-                progress.trained(sum(worker.iterations))
+                for job in running:
+                    progress.moved(job, tracker.count(job))
         self.failures = [failed[number] for number in sorted(failed)]
+        if isinstance(tracker, FileTracker) and not failed:
+            tracker.remove()
         if all(n in failed for n in range(len(self.contestants))):
             raise PartialFailure("; ".join(self.failures))
         self.contestants = [c for n, c in enumerate(self.contestants) if n not in failed]
@@ -324,14 +353,42 @@ class Comparison:
         go_on_alone()
         return failed
 
+    def _tracker(self, everyone: Sequence[Contestant]) -> MemoryTracker | FileTracker:
+        if self._on_ray:
+            return FileTracker(self.directory / "cells", everyone, self.recipe.evaluation)
+        return MemoryTracker(len(everyone))
+
+    def _pool(
+        self, everyone: Sequence[Contestant], num_jobs: int, tracker: Tracker
+    ) -> Pool[Worker]:
+        """Who computes."""
+        make_worker = partial(Worker, everyone, self.recipe.evaluation, tracker)
+        if not self._on_ray:
+            return WorkerPool(min(self.num_workers, len(everyone) + num_jobs), make_worker())
+        run = self.recipe.run
+        return RayPool(
+            make_worker,
+            address=run.ray_address,
+            limit=run.envs,
+            folders=sorted({self.directory, *(store.directory for store in self.stores)}),
+            gpus=lambda attempt: (self.trainings_at_once or 0) * isinstance(attempt.job, Train),
+        )
+
     def _schedule(
         self,
         everyone: Sequence[Contestant],
-        following: Mapping[int, Sequence[Measure | Play]],
-        workers: int,
+        following: Mapping[int, Sequence[Measure | Play | PlayCell]],
+        pool: Pool[Worker],
     ) -> Schedule:
         """One training seed after another, teachers before their pupils."""
         numbers = {c.folder: n for n, c in enumerate(everyone)}
+        at_once = self.trainings_at_once
+        if at_once is not None and isinstance(pool, RayPool):
+            at_once *= pool.num_gpus
+            if not at_once:
+                raise ValueError(
+                    f"--device {self.recipe.run.device}: no machine of the Ray cluster has a GPU"
+                )
         return Schedule(
             sorted(numbers.values(), key=lambda n: everyone[n].training.seed),
             following,
@@ -340,8 +397,8 @@ class Comparison:
                 for n, c in enumerate(everyone)
                 if c.prior.teacher is not None
             },
-            workers=workers,
-            trainings_at_once=self.trainings_at_once,
+            workers=pool.num_workers,
+            trainings_at_once=at_once,
         )
 
     def _place(self, row: Row) -> tuple[int, int, int, int, str]:
@@ -349,6 +406,17 @@ class Comparison:
         number = self._order.get(self._policy(row), len(self._order))
         condition = row.get("delay") or 0, row.get("guidance") or ""
         return number, row.get("checkpoint") or 0, -(row.get("nfe") or 0), *condition
+
+
+def _amount(job: Job, everyone: Sequence[Contestant]) -> int:
+    """Gradient steps, or episodes, of a job."""
+    if isinstance(job, Train):
+        return everyone[job.number].training.iterations
+    return len(job.episode_seeds) if isinstance(job, PlayCell) else 1
+
+
+def _told_cell(job: Job) -> str:
+    return f", {job.cell}" if isinstance(job, Play | PlayCell) else ""
 
 
 def _told(chosen: Contestant, row: Row) -> str:

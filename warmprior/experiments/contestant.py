@@ -35,6 +35,9 @@ class Cell:
         """What rows tell of it."""
         return {"checkpoint": self.checkpoint, "nfe": self.nfe, **self.condition.facts()}
 
+    def __str__(self) -> str:
+        return ", ".join(f"{name} {value}" for name, value in self.facts().items())
+
 
 @dataclass(frozen=True, eq=False)
 class Contestant:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
 
 from warmprior.diagnostics.flow import encoded_windows
-from warmprior.diagnostics.mean_error import MeanError, mean_error
+from warmprior.diagnostics.mean_error import mean_error
 from warmprior.diagnostics.shared_observations import SharedObservations
-from warmprior.diagnostics.source_leak import SourceLeak, source_leak
+from warmprior.diagnostics.source_leak import source_leak
 from warmprior.experiments.straightness import flow_measures
 from warmprior.modules.actor import WarmPriorActor
 
@@ -21,34 +20,8 @@ MEASURED_WINDOWS = 512
 """Observations of the training data on which source leak and flow of every policy are measured."""
 
 
-@dataclass(frozen=True)
-class Measures:
-    """What is measured of a policy on its training data.
-
-    Attributes:
-        leaks: its source leak by NFE; empty where no two episodes have steps to compare.
-        means: the error of its mean by NFE.
-        flow: of its flow and source; these hold at any NFE.
-    """
-
-    leaks: dict[int, SourceLeak]
-    means: dict[int, MeanError]
-    flow: dict[str, float]
-
-    def at(self, nfe: int) -> dict[str, float | None]:
-        """By name, as a row of this NFE tells it.
-
-        Args:
-            nfe: one that was measured.
-        """
-        leak, mean = self.leaks.get(nfe), self.means[nfe]
-        return {
-            "mean_error": mean.target,
-            "mean_revision_data": mean.revision,
-            "source_leak": None if leak is None else leak.leak,
-            "inner_step_ratio": None if leak is None else leak.inner_step_ratio,
-            **self.flow,
-        }
+Measures = dict[int, dict[str, float | None]]
+"""What is measured of a policy, by NFE and name, as rows tell it."""
 
 
 def measure(
@@ -69,6 +42,10 @@ def measure(
     Keyword Args:
         chunk_length: ``H``.
         observation_steps: ``To``.
+
+    Returns:
+        By NFE: the error of the policy's mean, its source leak (``None`` where no two episodes have steps
+        to compare), and what holds at any NFE, of its flow and source.
     """
     shared = SharedObservations(data.to("cpu"), chunk_length, observation_steps=observation_steps)
     drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
@@ -81,4 +58,16 @@ def measure(
     met = shared.met(policy, generator=generator)
     allowed = policy.prior.allowed_nfes(nfes)
     means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
-    return Measures(leaks, means, flow_measures(policy, met, generator=generator))
+    flow = flow_measures(policy, met, generator=generator)
+
+    def told(nfe: int) -> dict[str, float | None]:
+        leak, mean = leaks.get(nfe), means[nfe]
+        return {
+            "mean_error": mean.target,
+            "mean_revision_data": mean.revision,
+            "source_leak": None if leak is None else leak.leak,
+            "inner_step_ratio": None if leak is None else leak.inner_step_ratio,
+            **flow,
+        }
+
+    return {nfe: told(nfe) for nfe in allowed}

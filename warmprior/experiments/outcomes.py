@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import torch
-
-from warmprior.diagnostics.mean_error import mean_revision
-from warmprior.diagnostics.smoothness import smoothness
 from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.experiments.cell_outcome import CellOutcome
 from warmprior.experiments.contestant import Cell, Contestant
 from warmprior.experiments.measures import Measures
 from warmprior.experiments.recipe import Recipe
 from warmprior.experiments.results import Results, Row, played
-from warmprior.experiments.worker import Measure, Play
-from warmprior.modules.prior import Prior
+from warmprior.experiments.worker import Measure, Play, PlayCell
 from warmprior.training.evaluation import Episode
 
 __all__ = ["Outcomes"]
@@ -29,16 +25,23 @@ class Outcomes:
     Args:
         contestants: the policies that jobs name by number.
         recipe: how they are played.
+
+    Keyword Args:
+        whole_cells: whether a job plays all episodes of a cell, or one of them.
     """
 
-    def __init__(self, contestants: Sequence[Contestant], recipe: Recipe) -> None:
+    def __init__(
+        self, contestants: Sequence[Contestant], recipe: Recipe, *, whole_cells: bool = False
+    ) -> None:
+        self._whole_cells = whole_cells
         self._contestants, self._options = contestants, recipe.evaluation
         nfes = self._options.nfes
         self._cells = [c.cells(nfes, recipe.conditions(c.prior)) for c in contestants]
         self._episodes: dict[tuple[int, Cell], list[Episode]] = {}
+        self._played: dict[tuple[int, Cell], CellOutcome] = {}
         self._measures: dict[int, Measures] = {}
 
-    def missing(self, number: int, results: Results) -> list[Measure | Play]:
+    def missing(self, number: int, results: Results) -> list[Measure | Play | PlayCell]:
         """The jobs that the rows of a policy need.
 
         Args:
@@ -53,53 +56,43 @@ class Outcomes:
         ]
         is_last = any(cell.checkpoint == chosen.training.iterations for cell in cells)
         seeds = range(EVALUATION_SEED, EVALUATION_SEED + self._options.episodes)
-        return [
-            *([Measure(number)] if is_last else []),
-            *(Play(number, cell, seed) for cell in cells for seed in seeds),
-        ]
+        measures = [Measure(number)] if is_last else []
+        if self._whole_cells:
+            return [*measures, *(PlayCell(number, cell, seeds) for cell in cells)]
+        return [*measures, *(Play(number, cell, seed) for cell in cells for seed in seeds)]
 
-    def add(self, job: Measure | Play, outcome: Any) -> list[Row]:
+    def add(self, job: Measure | Play | PlayCell, outcome: Any) -> list[Row]:
         """Take note of what a job gave.
 
         Args:
             job: which.
-            outcome: of the job: :class:`Measures` or an :class:`~warmprior.training.Episode`.
+            outcome: what it gave.
 
         Returns:
             The rows of its policy that lacked nothing else; each is given once.
         """
+        number = job.number
         if isinstance(job, Measure):
-            self._measures[job.number] = outcome
+            self._measures[number] = outcome
+        elif isinstance(job, PlayCell):
+            self._played[number, job.cell] = outcome
         else:
-            self._episodes.setdefault((job.number, job.cell), []).append(outcome)
-        return self._complete(job.number)
+            episodes = self._episodes.setdefault((number, job.cell), [])
+            episodes.append(outcome)
+            if len(episodes) == self._options.episodes:
+                prior = self._contestants[number].prior
+                self._played[number, job.cell] = CellOutcome.of(episodes, prior)
+                del self._episodes[number, job.cell]
+        return self._complete(number)
 
     def _complete(self, number: int) -> list[Row]:
         chosen, rows = self._contestants[number], []
         for cell in self._cells[number]:
             is_last = cell.checkpoint == chosen.training.iterations
-            count = len(self._episodes.get((number, cell), ()))
-            if count < self._options.episodes or (is_last and number not in self._measures):
+            if (number, cell) not in self._played or (is_last and number not in self._measures):
                 continue
-            # Sums depend on the order: that of the seeds, not that in which the episodes ended.
-            played_out = self._episodes.pop((number, cell))
-            episodes = sorted(played_out, key=lambda episode: episode.seed)
-            measured = self._measures[number].at(cell.nfe) if is_last else {}
-            motion, facts = _motion(episodes, chosen.prior), chosen.facts() | cell.facts()
-            rows.append(played(facts, [e.success for e in episodes], **motion, **measured))
+            outcome = self._played.pop((number, cell))
+            measured = self._measures[number][cell.nfe] if is_last else {}
+            facts = chosen.facts() | cell.facts()
+            rows.append(played(facts, outcome.successes, **outcome.motion, **measured))
         return rows
-
-
-def _motion(episodes: Sequence[Episode], prior: Prior) -> dict[str, float | None]:
-    """How long episodes took, how smooth they were, and how far decisions were from their mean."""
-    rollout = torch.cat([episode.decisions for episode in episodes])
-    # Episodes of a single decision have no boundary between chunks.
-    smooth = None
-    if any(len(episode.decisions) > 1 for episode in episodes):
-        smooth = smoothness(rollout)
-    return {
-        "mean_steps": sum(episode.steps for episode in episodes) / len(episodes),
-        "boundary_jump": None if smooth is None else smooth.boundary_jump,
-        "inner_jump": None if smooth is None else smooth.inner_jump,
-        "mean_revision": mean_revision(rollout, prior),
-    }

@@ -25,6 +25,7 @@ from warmprior.experiments.recipe import (
 )
 from warmprior.experiments.record import refuse_ignored
 from warmprior.experiments.store import finished_problem
+from warmprior.io.options import LATER
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.rl import PriorAnchor, PriorSpaceConfig
@@ -68,6 +69,8 @@ class GroupOptions:
         base_delta: half the agent's box around zero, where --rl.delta is not given (default: 1.5).
         num_envs: parallel environments of an agent.
         threads: of an agent's training; more than one only wait for each other in small networks.
+        collectors: Ray actors that collect, with num-envs environments each, with --engine ray (default:
+            none, the training itself collects).
     """
 
     algorithm: tuple[Literal["dsrl-na", "dsrl-sac"], ...] = ("dsrl-na",)
@@ -75,9 +78,11 @@ class GroupOptions:
     base_delta: float | None = None
     num_envs: int = 4
     threads: int | None = None
+    collectors: int | None = field(default=None, metadata=LATER)
 
     def __post_init__(self) -> None:
         check_counts(self, "horizon", "num_envs", "threads")
+        check_counts(self, "collectors", most=10)  # their seeds are apart from others' by that much
 
 
 @dataclass(frozen=True)
@@ -110,6 +115,8 @@ class PriorSpaceRecipe(Recipe):
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         self.check_single(problem=True, chunk=True, sigma=True, nfe=True)
+        if self.agents.collectors is not None and self.run.engine != "ray":
+            raise ValueError("--collectors belongs to --engine ray")
         base = prior_space_preset(self)
         if self.policies.run is not None:
             told = "--run brings its policies and their data"

@@ -8,6 +8,8 @@ from typing import Self
 
 from tqdm import tqdm
 
+from warmprior.experiments.worker import Job, Measure, Train
+
 __all__ = ["ComparisonProgress"]
 
 
@@ -20,6 +22,7 @@ class ComparisonProgress:
     """
 
     def __init__(self, iterations: int, episodes: int) -> None:
+        self._counts: dict[Job, int] = {}
         # Without a terminal, None shows no bar: two of them would fill a log with control characters.
         self._training, self._playing = (
             tqdm(
@@ -41,13 +44,12 @@ class ComparisonProgress:
         tqdm.write(line)
         sys.stdout.flush()  # a pipe is to show it at once
 
-    def trained(self, iterations: int) -> None:
-        """Move the bar of the trainings to as many gradient steps."""
-        self._training.update(iterations - self._training.n)
-
-    def played(self) -> None:
-        """Count an episode."""
-        self._playing.update()
+    def moved(self, job: Job, count: int) -> None:
+        """A job has come to ``count`` gradient steps, or episodes; one that starts anew moves back."""
+        if not isinstance(job, Measure):
+            bar = self._training if isinstance(job, Train) else self._playing
+            bar.update(count - self._counts.get(job, 0))
+            self._counts[job] = count
 
     def __enter__(self) -> Self:
         return self

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import torch
 import tyro
 
 from warmprior.data.opening import check_place, name_of_place
@@ -14,7 +15,7 @@ from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
 from warmprior.experiments.condition import AT_ONCE, Condition
-from warmprior.io.distributed import check_batch, check_device
+from warmprior.io.distributed import check_batch, check_device, launched
 from warmprior.io.extras import require
 from warmprior.io.options import LATER
 from warmprior.modules import (
@@ -365,6 +366,8 @@ class RunOptions:
         device: of networks and data, such as cuda; one per process under torchrun.
         compile: torch.compile the network in training.
         logger: TorchRL logger of the training curves.
+        engine: who computes, with the same results: processes of this machine, or Ray, on one or many.
+        ray_address: HOST:PORT of a Ray cluster's head (default: $RAY_ADDRESS, or this machine alone).
     """
 
     preset: str = "quick"
@@ -374,10 +377,20 @@ class RunOptions:
     device: str = "cpu"
     compile: bool = False
     logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"
+    engine: Literal["local", "ray"] = "local"
+    ray_address: str | None = None
 
     def __post_init__(self) -> None:
         check_counts(self, "envs")
         check_device(self.device)
+        if self.ray_address is not None and self.engine != "ray":
+            raise ValueError("--ray-address belongs to --engine ray")
+        if self.engine == "ray" and launched():
+            raise ValueError("--engine ray distributes the work itself: start it without torchrun")
+        if self.engine == "ray" and torch.device(self.device).index is not None:
+            raise ValueError(
+                f"--device {self.device}: Ray chooses which GPU a training gets; name none with --engine ray"
+            )
 
     @property
     def directory(self) -> Path:

@@ -13,7 +13,7 @@ from warmprior.io.options import identity_of, variations
 
 __all__ = ["differences", "record", "refuse_ignored", "restore", "variation_notes"]
 
-OF_A_START = {"run": ("out", "resume"), "data": ("force_download",)}
+OF_A_START = {"run": ("out", "resume", "engine", "ray_address"), "data": ("force_download",)}
 """Options, by part, of one start of a run: they are not stored."""
 
 CHANGEABLE = {"run": ("envs", "logger")}

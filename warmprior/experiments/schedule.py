@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 
-from warmprior.experiments.worker import Job, Measure, Play, Train
+from warmprior.experiments.worker import Job, Measure, Play, PlayCell, Train
 
 __all__ = ["Schedule"]
 
@@ -37,7 +37,7 @@ class Schedule:
     def __init__(
         self,
         order: Sequence[int],
-        following: Mapping[int, Sequence[Measure | Play]],
+        following: Mapping[int, Sequence[Measure | Play | PlayCell]],
         *,
         teachers: Mapping[int, int],
         workers: int,
@@ -46,7 +46,7 @@ class Schedule:
         self._following, self._teachers = following, teachers
         self._workers = workers
         self._at_once = trainings_at_once or len(order)
-        self._to_train, self._ready = deque(map(Train, order)), deque[Measure | Play]()
+        self._to_train, self._ready = deque(map(Train, order)), deque[Measure | Play | PlayCell]()
         self._training = 0
         self._tried = set[int]()  # whose training ended, well or not
         self._failed = set[int]()

@@ -82,6 +82,8 @@ class Store:
     _losses: dict[Path, Losses] = field(default_factory=dict, init=False)
 
     def __post_init__(self) -> None:
+        # Workers on other machines have other working directories.
+        self.directory, self.logs = self.directory.absolute(), self.logs.absolute()
         check_writable(self.directory)
 
     @classmethod

@@ -2,25 +2,27 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, Protocol
 
 import torch
 from torchrl.envs import EnvBase, TransformedEnv
 
+from warmprior.experiments.cell_outcome import CellOutcome
 from warmprior.experiments.condition import Condition
 from warmprior.experiments.contestant import Cell, Contestant
 from warmprior.experiments.measures import Measures, measure
 from warmprior.experiments.recipe import EvaluationOptions
 from warmprior.experiments.store import Losses, Store
 from warmprior.io.script import ERRORS
+from warmprior.io.workers import Failure
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.evaluation import Episode, play_episode
 
-__all__ = ["Attempt", "Failure", "Job", "Measure", "Play", "Train", "Worker"]
+__all__ = ["Attempt", "Job", "Measure", "Play", "PlayCell", "Tracker", "Train", "Worker"]
 
 
 @dataclass(frozen=True)
@@ -72,14 +74,43 @@ class Play:
         return worker.play(self)
 
 
-Job = Train | Measure | Play
-
-
 @dataclass(frozen=True)
-class Failure:
-    """Why a job came to nothing."""
+class PlayCell:
+    """Play all episodes of a cell, one after another.
 
-    reason: str
+    Attributes:
+        number: of the policy.
+        cell: how it is played.
+        episode_seeds: of the episodes.
+    """
+
+    number: int
+    cell: Cell
+    episode_seeds: range
+
+    def __call__(self, worker: Worker) -> CellOutcome:
+        """What they tell together."""
+        episodes = []
+        for seed in self.episode_seeds:
+            episodes.append(worker.play(Play(self.number, self.cell, seed)))
+            worker.tracker.report(self, len(episodes))
+        return CellOutcome.of(episodes, worker.contestants[self.number].prior)
+
+
+Job = Train | Measure | Play | PlayCell
+
+
+class Tracker(Protocol):
+    """How far jobs are, told by those who do them to those who wait for them."""
+
+    def report(self, job: Job, count: int) -> None:
+        """A job has come to ``count`` gradient steps, or episodes."""
+
+    def count(self, job: Job) -> int:
+        """How far it is."""
+
+    def result(self, job: Job, compute: Callable[[], Any]) -> Any:
+        """What a job gives; computed if that is not known from an earlier attempt."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +122,7 @@ class Attempt:
     def __call__(self, worker: Worker) -> Any:
         """What the job gives, or a :class:`Failure`."""
         try:
-            return self.job(worker)
+            return worker.tracker.result(self.job, partial(self.job, worker))
         except Exception as error:
             if not isinstance(error, ERRORS):
                 traceback.print_exc()  # nothing that a user can mend
@@ -107,26 +138,20 @@ class Worker:
     Args:
         contestants: the policies that jobs name by number.
         options: how they are played.
-
-    Attributes:
-        iterations: of each training so far, shared with the process that shows them.
+        tracker: is told how far jobs are.
     """
 
-    def __init__(self, contestants: Sequence[Contestant], options: EvaluationOptions) -> None:
-        self.contestants, self.options = contestants, options
-        # Without a lock, which a killed worker might hold for ever: each entry has a single writer.
-        self.iterations = multiprocessing.RawArray("q", len(contestants))
+    def __init__(
+        self, contestants: Sequence[Contestant], options: EvaluationOptions, tracker: Tracker
+    ) -> None:
+        self.contestants, self.options, self.tracker = contestants, options, tracker
         self._store: Store | None = None
         self._simulator: EnvBase | None = None
         self._playing: tuple[int, int, Condition] | None = None
 
     def train(self, number: int) -> Losses:
         """Train a policy, see :meth:`Store.train`."""
-
-        def report(iteration: int) -> None:
-            self.iterations[number] = iteration
-
-        chosen = self.contestants[number]
+        chosen, report = self.contestants[number], partial(self.tracker.report, Train(number))
         losses = chosen.store.train(chosen.prior, chosen.training, report)
         if torch.cuda.is_initialized():
             torch.cuda.empty_cache()  # for the next training, which may be another worker's

@@ -12,13 +12,16 @@ import warnings
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import torch
 from tqdm import tqdm
 
 __all__ = [
+    "Failure",
+    "Pool",
     "WorkerError",
     "WorkerPool",
     "available_cores",
@@ -31,7 +34,7 @@ _forks = True
 
 
 class WorkerError(RuntimeError):
-    """A worker process died."""
+    """A worker process died, or cannot do the work."""
 
 
 def worker_died(worker: str, advice: str) -> WorkerError:
@@ -79,6 +82,48 @@ def end_with_parent() -> None:
         os._exit(1)  # nobody is left to be told, and the environment may be in the middle of a step
 
     threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a job came to nothing, as a result among others.
+
+    Attributes:
+        reason: in words.
+    """
+
+    reason: str
+
+
+class Pool[State](Protocol):
+    """What takes jobs: worker processes (:class:`WorkerPool`), or many machines (:class:`RayPool`)."""
+
+    @property
+    def num_workers(self) -> int:
+        """How many jobs run at once at most."""
+
+    @property
+    def running(self) -> int:
+        """Number of jobs submitted whose results :meth:`wait` has not given."""
+
+    @property
+    def idle(self) -> int:
+        """Number of jobs that would start at once."""
+
+    def submit(self, job: Callable[[State], Any]) -> None:
+        """Let a worker call ``job(state)``."""
+
+    def wait(self, timeout: float | None = None) -> list[tuple[Any, Any]]:
+        """Wait until a job ends; ``[(job, result), ...]`` of those that have."""
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
 
 
 class WorkerPool[State]:

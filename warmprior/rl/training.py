@@ -23,6 +23,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent
 from warmprior.rl.checks import check_finite
 from warmprior.rl.config import PriorSpaceConfig
+from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
 from warmprior.rl.replay_segments import ReplaySegments
 from warmprior.training.checkpoint import check_identity, load_state, save_state
 from warmprior.training.evaluation import Episode, evaluate, watched
@@ -47,6 +48,10 @@ class PriorSpaceTraining:
     Keyword Args:
         evaluation_seed: simulator seed of the first evaluation episode.
         description: of the progress bar; no bar if ``None``.
+        collectors: how many actors of a Ray cluster collect, with environments of ``make_env`` each, see
+            :func:`~warmprior.rl.ray_collection.ray_rounds`; by default this process does. With another
+            number the agent meets other episodes.
+        ray_address: of the cluster.
 
     Attributes:
         decoder: the frozen policy as a decoder.
@@ -67,8 +72,11 @@ class PriorSpaceTraining:
         *,
         evaluation_seed: int,
         description: str | None = None,
+        collectors: int | None = None,
+        ray_address: str | None = None,
     ) -> None:
         self.actor, self.make_env, self.config = actor, make_env, config
+        self.collectors, self.ray_address = collectors, ray_address
         self.directory = Path(directory)
         self.evaluation_seed, self.description = evaluation_seed, description
         torch.manual_seed(config.seed)
@@ -108,21 +116,24 @@ class PriorSpaceTraining:
                 executes less than ``H`` actions of a chunk.
             FloatingPointError: if a loss, a parameter or what the environment gives becomes NaN or
                 infinite; the last save stays.
-            WorkerError: if a worker process of an environment dies, a ``RuntimeError``.
+            WorkerError: if a worker process of an environment, or a collector, dies, a ``RuntimeError``.
         """
         config = self.config
         if self.steps >= config.environment_steps:
             return self.curve
-        with self._environments() as (evaluation_env, env), self._bar() as bar:
-            self.decoder.check_env(env)
-            if keys.ANCHOR not in env.observation_spec.keys(True, True):
+        with (
+            self._environment(0) as evaluation_env,
+            self._rounds(evaluation_env.batch_size.numel()) as rounds,
+            self._bar() as bar,
+        ):
+            self.decoder.check_env(evaluation_env)
+            if keys.ANCHOR not in evaluation_env.observation_spec.keys(True, True):
                 raise KeyError(f"the environment writes no {keys.ANCHOR}: append PriorAnchor")
             if not self.curve:
                 self._evaluate(evaluation_env, {"base": self.actor})
                 self._save()
-            data = env.reset()
             while self.steps < config.environment_steps:
-                data, executed = self._collect(env, data)
+                executed = next(rounds)
                 before, self.steps = self.steps, self.steps + executed
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
@@ -137,18 +148,45 @@ class PriorSpaceTraining:
         return self.curve
 
     @contextmanager
-    def _environments(self) -> Iterator[tuple[EnvBase, EnvBase]]:
-        """For evaluation and for training; closed in the end, and the death of a worker is an error."""
-        evaluation_env = self.make_env(0)
-        try:
-            env = self.make_env(self._seed())
-        except BaseException:
-            evaluation_env.close(raise_if_closed=False)
-            raise
-        with watched(evaluation_env), watched(env):
-            yield evaluation_env, env
-        for each in (evaluation_env, env):
-            each.close(raise_if_closed=False)
+    def _environment(self, seed: int) -> Iterator[EnvBase]:
+        """Closed in the end, and the death of a worker is an error."""
+        env = self.make_env(seed)
+        with watched(env):
+            yield env
+        env.close(raise_if_closed=False)
+
+    @contextmanager
+    def _rounds(self, num_envs: int) -> Iterator[Iterator[int]]:
+        """Decisions of all environments, kept for learning, and how many control steps each round took."""
+        if self.collectors is None:
+            with self._environment(self._seed()) as env:
+                yield self._collected(env)
+            return
+        policy = WarmUpSwitch(self.agent.warmup, self.agent.policy)
+        with ray_rounds(
+            policy,
+            self.make_env,
+            collectors=self.collectors,
+            num_envs=num_envs,
+            seed=self._seed(),
+            address=self.ray_address,
+        ) as rounds:
+            yield self._received(rounds, policy)
+
+    def _collected(self, env: EnvBase) -> Iterator[int]:
+        data = env.reset()
+        while True:
+            data, executed = self._collect(env, data)
+            yield executed
+
+    def _received(self, rounds: Iterator[TensorDictBase], policy: WarmUpSwitch) -> Iterator[int]:
+        while True:
+            policy.learning.fill_(self._learns)
+            yield self._keep(next(rounds))
+
+    @property
+    def _learns(self) -> bool:
+        return self.steps >= self.config.warmup_steps
 
     def _bar(self) -> Any:
         return tqdm(
@@ -171,20 +209,23 @@ class PriorSpaceTraining:
 
     @torch.no_grad()
     def _collect(self, env: EnvBase, data: TensorDictBase) -> tuple[TensorDictBase, int]:
-        warming = self.steps < self.config.warmup_steps
-        policy = self.agent.warmup if warming else self.agent.policy
+        policy = self.agent.policy if self._learns else self.agent.warmup
         with set_exploration_type(ExplorationType.RANDOM):
             data = policy(data.to(self.device)).to(env.device or torch.device("cpu"))
         # Before a simulator sees them.
         self._check_finite(data.select(keys.DELTA, keys.CHUNK))
         data, following = env.step_and_maybe_reset(data)
+        return following, self._keep(data)
+
+    def _keep(self, data: TensorDictBase) -> int:
+        """Add decisions to what is learnt from; the number of their control steps."""
         transitions = self._transitions(data)
         # Before they are saved: they would end every later training on them.
         self._check_finite(transitions)
         self._check_executed(transitions["next"])
         self.buffer.extend(transitions)
         self.segments.append(transitions)
-        return following, int(data["next", keys.EXECUTED].sum())
+        return int(data["next", keys.EXECUTED].sum())
 
     def _check_finite(self, data: TensorDictBase) -> None:
         cause = "the policy or the training has diverged, or the environment is at fault"

@@ -1,0 +1,96 @@
+"""Collection by actors of a Ray cluster: the same kind of transitions, and learning from them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+pytest.importorskip("ray")
+
+from tests.processes import apart
+from tests.rl.training_parts import (
+    LENGTHS,
+    H,
+    check_transitions,
+    make_actor,
+    make_env,
+    make_training,
+)
+from warmprior import PastPrior
+from warmprior.io.workers import WorkerError
+from warmprior.rl import PriorSpaceConfig
+from warmprior.rl.agent import PriorSpaceAgent
+from warmprior.rl.ray_collection import WarmUpSwitch
+
+
+def test_a_buffer_says_which_policy_acts():
+    agent = PriorSpaceAgent(make_actor(), PriorSpaceConfig(nfe=2, hidden_dim=8, num_layers=1))
+    switch = WarmUpSwitch(agent.warmup, agent.policy)
+    assert switch.state_dict()["learning"].item() is False
+    data = make_env(0).reset()
+    for learning, policy in ((False, agent.warmup), (True, agent.policy)):
+        switch.learning.fill_(learning)
+        found = []
+        for act in (switch, policy):
+            torch.manual_seed(3)
+            found.append(act(data.clone())["vla_action", "chunk"])
+        assert torch.equal(*found)
+
+
+@apart
+def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp_path):
+    actor = make_actor(PastPrior(H, sigma=0.01))
+    training = make_training(
+        tmp_path,
+        actor,
+        {"prior": actor.prior},
+        warmup_steps=40,
+        collection={"collectors": 2, "ray_address": ray_address},
+    )
+    fresh = {name: value.clone() for name, value in training.agent.state().items()}
+    training.run()
+    lengths = LENGTHS * 2
+    check_transitions(training, lengths=lengths)
+    assert 90 <= training.steps < 90 + len(lengths) * H
+    # The warm-up's residuals are the prior's, and then the agent's: the actors were told.
+    drawn = training.buffer[:]["prior", "delta"]
+    executed = training.buffer[:]["next", "executed_steps"].reshape(-1, len(lengths)).sum(1)
+    warm = len(lengths) * int((executed.cumsum(0) - executed < 40).sum())
+    assert drawn[:warm].std() == pytest.approx(0.01, rel=0.15) and drawn[warm:].std() > 0.1
+    # No two actors draw alike.
+    rounds = drawn.unflatten(0, (-1, 2, 2))
+    assert not torch.isclose(rounds[:, 0], rounds[:, 1]).all(-1).any()
+    state = training.agent.state()
+    assert not all(torch.equal(fresh[name], state[name]) for name in fresh)
+    again = make_training(tmp_path, actor, {"prior": actor.prior}, warmup_steps=40)
+    assert again.steps == training.steps and again.curve == training.curve
+
+
+@pytest.mark.slow
+@apart
+def test_the_same_number_of_actors_collects_the_same(ray_address, tmp_path):
+    found = []
+    for name in ("one", "two"):
+        collection = {"collectors": 2, "ray_address": ray_address}
+        training = make_training(tmp_path / name, collection=collection)
+        curve = training.run()
+        found.append((training.buffer[:], curve))
+    (one, curve), (two, again) = found
+    assert (one == two).all() and curve == again
+
+
+def broken(data):
+    raise RuntimeError("the motors are off")
+
+
+@pytest.mark.slow
+@apart
+def test_an_environment_that_fails_in_an_actor_ends_the_training(ray_address, tmp_path):
+    collection = {"collectors": 1, "ray_address": ray_address}
+    training = make_training(tmp_path, env={"hook": broken}, collection=collection)
+    with pytest.raises(WorkerError, match=r"a Ray collector failed.*the motors are off"):
+        training.run()
+    with pytest.raises(ValueError, match="--collectors 3 need a CPU each, and the cluster has 2"):
+        make_training(
+            tmp_path / "more", collection={"collectors": 3, "ray_address": ray_address}
+        ).run()

@@ -1,0 +1,359 @@
+"""Jobs on many machines, through Ray."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import re
+import socket
+import subprocess
+import sys
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import torch
+
+from warmprior.io.extras import require
+from warmprior.io.files import write_atomic
+from warmprior.io.workers import Failure, WorkerError, available_cores, stop_forking
+
+__all__ = ["RayPool", "check_ray", "check_versions", "ray_cluster"]
+
+PATIENCE = 15.0
+"""Seconds in which a cluster has to answer."""
+
+CONNECT = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
+"""What a process does to find out whether there is a cluster."""
+
+NODE_PATIENCE = 60.0
+"""Seconds in which each of its machines has to start a process and import the library."""
+
+
+def check_ray(address: str | None = None) -> str | None:
+    """Refuse a cluster that cannot be reached, before any work.
+
+    Args:
+        address: ``HOST:PORT`` of its head, or ``auto``; by default ``$RAY_ADDRESS``.
+
+    Returns:
+        The address, or ``None`` for a cluster of this machine alone, which has yet to be started.
+
+    Raises:
+        ImportError: if Ray is not installed.
+        ValueError: if this is no address of a head.
+        ConnectionError: if nothing answers there, or the cluster has another Ray or Python.
+    """
+    require("ray", "ray")
+    address = address or os.environ.get("RAY_ADDRESS") or "local"
+    if address == "local":
+        return None
+    host, _, port = address.rpartition(":")
+    if address != "auto" and not (host and port.isdecimal() and "/" not in host):
+        raise ValueError(
+            f"--ray-address {address} is not the address of a cluster's head, HOST:PORT (6379 by default); "
+            "start from one of its machines, not through ray://"
+        )
+    try:
+        if address != "auto":  # nobody listens: that is told at once
+            socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
+        # In a process of its own: Ray itself goes on trying for minutes, and cannot be interrupted.
+        command = [sys.executable, "-c", CONNECT, address]
+        done = subprocess.run(command, stderr=subprocess.PIPE, timeout=PATIENCE, check=False)
+        if done.returncode == 0:
+            return address
+        reason = reason_of(done.stderr)
+    except subprocess.TimeoutExpired as late:
+        reason = f"it does not answer within {PATIENCE:g} seconds. {reason_of(late.stderr or b'')}"
+    except (OSError, OverflowError) as error:
+        reason = str(error)
+    raise ConnectionError(
+        f"--ray-address {address} is no cluster to work on: {reason.strip(' .')}. Start one with ray start "
+        "--head (RAY_AUTH_MODE=token if it asks for a token), or leave out --ray-address and RAY_ADDRESS for "
+        "this machine alone"
+    )
+
+
+def reason_of(told: bytes) -> str:
+    """The message at the end of what a Python process, or Ray, wrote before it ended."""
+    return re.split(r"^[\w.]+(?:Error|Exception): |^\[.*?\] ", told.decode(), flags=re.M)[
+        -1
+    ].strip()
+
+
+def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str) -> None:
+    """Refuse a machine with other versions: it might compute something else.
+
+    Args:
+        mine: of the driver, by package.
+        theirs: of the machine.
+        node: its name.
+
+    Raises:
+        WorkerError: naming the machine and both versions, a ``RuntimeError``.
+
+    Examples:
+        >>> check_versions({"torch": "2.11.0"}, {"torch": "2.10.0"}, "node-7")
+        Traceback (most recent call last):
+            ...
+        warmprior.io.workers.WorkerError: node-7 has torch 2.10.0, and this process 2.11.0: ...
+    """
+    for name, here in mine.items():
+        there = theirs.get(name, "none")
+        if there != here:
+            raise WorkerError(
+                f"{node} has {name} {there}, and this process {here}: install the same everywhere"
+            )
+
+
+def versions() -> dict[str, str]:
+    """Of what has to be the same on all machines."""
+    packages = ("warmprior", "torch", "torchrl", "tensordict")
+    return {"Python": platform.python_version(), **{name: version(name) for name in packages}}
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """What a process on any machine needs before it takes jobs."""
+
+    path: tuple[str, ...]
+    versions: Mapping[str, str]
+    matmul_precision: str
+    state: Any  # reference to what makes it
+
+
+_current: tuple[str, Any] | None = None
+"""Of this process: of which pool it is a worker, and the state that it works on."""
+
+
+def _run(setup: _Setup, job: Callable[[Any], Any]) -> Any:
+    """In a worker process: call a job with the state, which is built once per process."""
+    global _current
+    name = setup.state.hex()
+    if _current is None or _current[0] != name:
+        _current = None  # of an earlier run
+        check_versions(setup.versions, versions(), platform.node())  # it may have joined late
+        sys.path.extend(place for place in setup.path if place not in sys.path)
+        torch.set_num_threads(1)
+        torch.set_float32_matmul_precision(setup.matmul_precision)
+        _current = name, require("ray", "ray").get(setup.state)()
+    return job(_current[1])
+
+
+def _look(tokens: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
+    """On a machine: its versions, and the files of ``tokens`` that it does not see as they were written."""
+
+    def seen(path: str) -> str | None:
+        try:
+            return Path(path).read_text()
+        except OSError:
+            return None
+
+    return versions(), [path for path, token in tokens.items() if seen(path) != token]
+
+
+class RayPool[State]:
+    """Machines of a Ray cluster that compute, with one thread, a job per core at a time.
+
+    The interface is that of :class:`~warmprior.io.workers.WorkerPool`, but jobs may end with a
+    :class:`~warmprior.io.workers.Failure`: what one raised, or that its process died more often than it is
+    started again. Jobs must be repeatable for that.
+
+    Entering the context connects, or starts a cluster, see :func:`ray_cluster`, also for what is raised
+    then. Leaving it with an error, such as Ctrl-C, ends all jobs.
+
+    Args:
+        make_state: makes what jobs work on, once in each process; sent to a machine once.
+
+    Keyword Args:
+        address: of the cluster, see :func:`check_ray`.
+        limit: how many jobs run at once at most; one per core of the cluster by default.
+        folders: that all machines have to share.
+        gpus: how many GPUs a job needs; by default none.
+        retries: how often a job is started again whose process died.
+
+    Raises:
+        ImportError: if Ray is not installed.
+    """
+
+    def __init__(
+        self,
+        make_state: Callable[[], State],
+        *,
+        address: str | None = None,
+        limit: int | None = None,
+        folders: Sequence[Path] = (),
+        gpus: Callable[[Any], float] = lambda job: 0.0,
+        retries: int = 3,
+    ) -> None:
+        self._ray = require("ray", "ray")
+        self._make_state, self._address, self._limit = make_state, address, limit
+        self._folders, self._gpus, self._retries = folders, gpus, retries
+        self._running: dict[Any, Callable[[State], Any]] = {}
+
+    @property
+    def num_workers(self) -> int:
+        """How many jobs run at once at most: machines may join and leave."""
+        cores = int(self._ray.cluster_resources().get("CPU", 0))
+        return max(1, min(cores, self._limit or cores))
+
+    @property
+    def num_gpus(self) -> int:
+        """How many GPUs the cluster has."""
+        return int(self._ray.cluster_resources().get("GPU", 0))
+
+    @property
+    def running(self) -> int:
+        """Number of jobs submitted whose results :meth:`wait` has not given."""
+        return len(self._running)
+
+    @property
+    def idle(self) -> int:
+        """Number of jobs that would start at once, if nobody else uses the cluster."""
+        return max(0, self.num_workers - self.running)
+
+    def submit(self, job: Callable[[State], Any]) -> None:
+        """Let a machine call ``job(state)``.
+
+        Args:
+            job: picklable, and repeatable.
+        """
+        task = self._ray.remote(_run).options(
+            num_cpus=1, num_gpus=self._gpus(job), max_retries=self._retries
+        )
+        self._running[task.remote(self._setup, job)] = job
+
+    def wait(self, timeout: float | None = None) -> list[tuple[Any, Any]]:
+        """Wait until a job ends.
+
+        Args:
+            timeout: in seconds; without limit by default.
+
+        Returns:
+            ``[(job, result), ...]`` of the jobs that ended, a :class:`Failure` for those that did not end
+            well; none after ``timeout``.
+        """
+        if not self._running:
+            return []
+        running = list(self._running)
+        if self._ray.wait(running, timeout=timeout)[0]:
+            done, _ = self._ray.wait(running, num_returns=len(running), timeout=0)
+            return [(self._running.pop(task), self._result(task)) for task in done]
+        return []
+
+    def _result(self, task: Any) -> Any:
+        errors = self._ray.exceptions
+        try:
+            return self._ray.get(task)
+        except errors.RayTaskError as error:
+            return Failure(str(error.cause))
+        except (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError) as error:
+            return Failure(
+                f"its process was killed {self._retries + 1} times, perhaps for lack of memory "
+                f"({str(error).splitlines()[0]})"
+            )
+        except errors.RayError as error:
+            return Failure(str(error).splitlines()[0])
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(ray_cluster(self._address, self._limit, self._folders))
+            self._setup = _Setup(
+                tuple(map(os.path.abspath, sys.path)),
+                versions(),
+                torch.get_float32_matmul_precision(),
+                self._ray.put(self._make_state),
+            )
+            self._connection = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        for task in self._running:
+            with contextlib.suppress(self._ray.exceptions.RayError):
+                self._ray.cancel(task, force=True)
+        self._running.clear()
+        self._connection.close()
+
+
+@contextlib.contextmanager
+def ray_cluster(
+    address: str | None = None, num_cpus: int | None = None, folders: Sequence[Path] = ()
+) -> Iterator[Any]:
+    """A connection to a Ray cluster whose machines can do this library's work.
+
+    One that this process has already is taken, and left as it is.
+
+    Args:
+        address: see :func:`check_ray`; a cluster of this machine is started by default, and ended.
+        num_cpus: of the cluster that is started; one per core by default.
+        folders: that all machines have to share.
+
+    Yields:
+        The module ``ray``.
+
+    Raises:
+        ImportError: if Ray is not installed.
+        ValueError: if this is no address.
+        ConnectionError: if there is no such cluster, or its Ray or Python is another.
+        WorkerError: if a machine has other versions or cannot start the library.
+        OSError: if a machine does not see a folder.
+    """
+    ray = require("ray", "ray")
+    with contextlib.ExitStack() as stack:
+        if not ray.is_initialized():
+            address = check_ray(address)
+            options: dict[str, Any] = {"address": address}
+            if address is None:
+                cores = num_cpus or available_cores()
+                options = {"address": "local", "num_cpus": cores, "include_dashboard": False}
+            stop_forking()  # a connection does not survive it
+            stack.callback(ray.shutdown)
+            ray.init(**options, logging_level="ERROR")
+        with _tokens(folders) as tokens:
+            for node in ray.nodes():
+                if node["Alive"] and node["Resources"].get("CPU", 0) >= 1:  # it may get jobs
+                    _check_node(ray, node, tokens)
+        yield ray
+
+
+def _check_node(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> None:
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
+    there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+    task = ray.remote(_look).options(num_cpus=0, scheduling_strategy=there)
+    try:
+        theirs, unseen = ray.get(task.remote(tokens), timeout=NODE_PATIENCE)
+    except ray.exceptions.RayError as error:
+        cause = getattr(error, "cause", None) or error
+        raise WorkerError(f"{name} cannot start this library: {cause}") from error
+    check_versions(versions(), theirs, name)
+    if unseen:
+        raise OSError(
+            f"{name} does not see what is written to {Path(unseen[0]).parent} here: choose an --out that "
+            "all machines share, at the same path"
+        )
+
+
+@contextlib.contextmanager
+def _tokens(folders: Sequence[Path]) -> Iterator[dict[str, str]]:
+    """A new file in each folder, and its content."""
+    token = uuid.uuid4().hex
+    paths = [folder.absolute() / f".shared-{token}" for folder in folders]
+    try:
+        for path in paths:
+            write_atomic(path, lambda temporary: temporary.write_text(token))
+        yield {str(path): token for path in paths}
+    finally:
+        for path in paths:
+            path.unlink(missing_ok=True)

@@ -1,0 +1,150 @@
+"""Transitions from many machines, through TorchRL's own collector on Ray."""
+
+from __future__ import annotations
+
+import copy
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType
+
+from warmprior import keys
+from warmprior.io.ray_pool import ray_cluster
+from warmprior.io.workers import WorkerError, stop_forking
+
+__all__ = ["WarmUpSwitch", "ray_rounds"]
+
+EPISODES_APART = 10_000
+"""Between the seeds of two collectors."""
+
+
+class WarmUpSwitch(TensorDictModuleBase):
+    """One of two policies, as a buffer among the weights says: whoever receives these does the same.
+
+    Args:
+        warmup: acts until ``learning`` is set.
+        policy: acts then.
+
+    Attributes:
+        learning: bool ``[]``.
+    """
+
+    def __init__(self, warmup: TensorDictModuleBase, policy: TensorDictModuleBase) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = policy.in_keys, [keys.DELTA, keys.CHUNK]
+        self.warmup, self.policy = warmup, policy
+        self.learning: torch.Tensor
+        self.register_buffer("learning", torch.zeros((), dtype=torch.bool))
+
+    def forward(self, data: TensorDictBase) -> TensorDictBase:
+        """Write a residual and its chunk."""
+        decided = (self.policy if self.learning else self.warmup)(data.copy())
+        return data.update(decided.select(*self.out_keys))
+
+
+def _actor_class() -> type:
+    """What an actor is: TorchRL's collector, in which Ray finds its way."""
+    from torchrl.collectors import Collector
+
+    class Actor(Collector):
+        def __repr__(self) -> str:  # Ray writes it before every line that an actor prints
+            return "collector"
+
+        def __bool__(
+            self,
+        ) -> bool:  # its length is infinite: Ray asks, and would lose an error on that
+            return True
+
+    return Actor
+
+
+def _make_env(make_env: Callable[[int], EnvBase], seed: int, path: list[str]) -> EnvBase:
+    """In an actor: its environment, and its draws, from a seed."""
+    stop_forking()
+    sys.path.extend(place for place in path if place not in sys.path)
+    torch.set_num_threads(1)
+    torch.manual_seed(seed)
+    return make_env(seed)
+
+
+@contextmanager
+def ray_rounds(
+    policy: WarmUpSwitch,
+    make_env: Callable[[int], EnvBase],
+    *,
+    collectors: int,
+    num_envs: int,
+    seed: int,
+    address: str | None = None,
+) -> Iterator[Iterator[TensorDictBase]]:
+    """Rounds of decisions, one of each environment of each of several actors, on a CPU each.
+
+    Before every round all actors receive the weights that ``policy`` has then, and all wait for the
+    slowest. Actor ``i`` draws from ``seed + 10_000 * i``: the same arguments give the same decisions, on
+    however many machines, but others than :class:`~warmprior.rl.PriorSpaceTraining` collects by itself.
+
+    Args:
+        policy: what acts; a copy on the CPU does.
+        make_env: ``make_env(seed) -> EnvBase``, ``[num_envs]``.
+
+    Keyword Args:
+        collectors: how many actors.
+        num_envs: environments of each.
+        seed: of all that is drawn.
+        address: of the cluster, see :func:`~warmprior.io.ray_pool.check_ray`.
+
+    Yields:
+        An iterator over rounds, ``[collectors, num_envs, 1]``.
+
+    Raises:
+        ValueError: if the cluster has fewer CPUs than there are to be actors.
+        WorkerError: if an actor dies, or an environment in it fails, a ``RuntimeError``.
+    """
+    with ray_cluster(address, collectors) as ray:
+        from torchrl.collectors.distributed import RayCollector
+
+        cores = int(ray.cluster_resources().get("CPU", 0))
+        if cores < collectors:
+            raise ValueError(
+                f"--collectors {collectors} need a CPU each, and the cluster has {cores}"
+            )
+        makers: list[Any] = [
+            partial(_make_env, make_env, seed + EPISODES_APART * i, list(sys.path))
+            for i in range(collectors)
+        ]
+        collector = None
+        try:
+            collector = RayCollector(
+                makers,
+                copy.deepcopy(policy).to("cpu"),
+                collector_class=_actor_class(),
+                collector_kwargs={"auto_register_policy_transforms": False},
+                frames_per_batch=collectors * num_envs,
+                total_frames=sys.maxsize,
+                exploration_type=ExplorationType.RANDOM,
+                remote_configs={"num_cpus": 1, "num_gpus": 0},
+                device="cpu",
+                sync=True,
+            )
+            yield _rounds(collector, policy)
+        except ray.exceptions.RayError as error:
+            cause = getattr(error, "cause", None) or error
+            raise WorkerError(f"a Ray collector failed: {str(cause).splitlines()[0]}") from error
+        finally:
+            if collector is not None:
+                collector.shutdown()
+
+
+def _rounds(collector: Any, policy: WarmUpSwitch) -> Iterator[TensorDictBase]:
+    rounds = None
+    while True:
+        collector.update_policy_weights_(TensorDict.from_module(policy).data.to("cpu"))
+        rounds = iter(collector) if rounds is None else rounds
+        yield next(rounds)
