@@ -92,6 +92,7 @@ for axis, prior in zip(axes, priors[1:], strict=True):
         x = navigation_positions()[start : start + 4]
         axis.plot(x, loc[: len(x)], ".-", color=prior.color, label="mean" if start == 8 else None)
     axis.set(title=f"{prior.label}: {error:.3f} from the next chunk", xlabel="position")
+    axis.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
 axes[0].set_ylabel("height (action)")
 axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 plt.show()

@@ -186,9 +186,10 @@ def play(actor, camera=True):
 
 
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.4))
-axes[0].plot(torch.tensor(losses).view(-1, 10).mean(1), label="with images")
-axes[0].plot(torch.tensor(blind_losses).view(-1, 10).mean(1), label="images blanked")
-axes[0].set(title="Training", xlabel="iterations / 10", ylabel="flow-matching loss")
+for told, curve in (("with images", losses), ("images blanked", blind_losses)):
+    means = torch.tensor(curve).view(-1, 10).mean(1)
+    axes[0].plot(torch.arange(len(means)) * 10 + 5, means, label=told)
+axes[0].set(title="Training", xlabel="iterations", ylabel="flow-matching loss")
 axes[0].set_ylim(bottom=0)
 axes[0].legend()
 for axis, name, played in (
@@ -204,3 +205,23 @@ for axis, name, played in (
     axis.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1), xlabel="x")
 axes[1].set_ylabel("y")
 plt.show()
+
+# %%
+# Each star is a part, in the color of the path to it; a dot is a decision, of four actions each.
+# What to notice: with images the paths lead to their parts, and their slight overshoot is that of
+# four actions decided at once. The blind policy has learnt what is true of all demonstrations, to
+# go up, and no more.
+#
+# Robots
+# ------
+# On a simulated robot the same parts are put together by the benchmark:
+#
+# .. code-block:: console
+#
+#    python benchmarks/robomimic.py --obs image
+#
+# Lift from two cameras of 48 x 48 pixels, 100 scripted demonstrations, 3,000 iterations of batch
+# 64, one seed: policies from the Gaussian source, WP-Past and WP-Preview solve 25 of 25 episodes, at
+# NFE 3 and at NFE 1, and an untrained one solves none (15 minutes on two cores;
+# :doc:`all conditions </evidence>`). :doc:`/images` tells how demonstrations get their images, and
+# what larger encoders take.
