@@ -65,12 +65,12 @@ sphinx_gallery_conf = {
 }
 
 
-def _without_zip(app, docname, source):
-    """Leave one link below a tutorial, to its script."""
+def _one_download(app, docname, source):
+    """Leave one link to a tutorial's script, the one below it."""
     if docname.startswith("auto_tutorials/"):
-        source[0] = source[0].partition(
-            "    .. container:: sphx-glr-download sphx-glr-download-zip"
-        )[0]
+        above = r"\.\. only:: html\n\n    \.\. note::\n        :class: sphx-glr-download-link-note.*?(?=^\S)"
+        below = r"    \.\. container:: sphx-glr-download sphx-glr-download-zip.*"
+        source[0] = re.sub(f"{above}|{below}", "", source[0], flags=re.M | re.S)
 
 
 def _show_own_signature(app, what, name, obj, options, signature, return_annotation):
@@ -124,7 +124,7 @@ def _keep_what_formulas_need(app, error):
 
 def setup(app):
     """Connect the handlers above."""
-    app.connect("source-read", _without_zip)
+    app.connect("source-read", _one_download)
     app.connect("autodoc-process-signature", _show_own_signature)
     app.connect("missing-reference", _resolve_other_names)
     app.connect("html-page-context", _fold_navigation, priority=900)

@@ -27,7 +27,11 @@ from warmprior import (
     policy_transforms,
     window_replay_buffer,
 )
-from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
+from warmprior.diagnostics import (
+    SharedObservations,
+    executed_actions,
+    flow_paths,
+)
 from warmprior.envs import (
     NavigationEnv,
     navigation_demonstrations,
@@ -51,9 +55,13 @@ def draw_task(axis):
     """Obstacles, and the demonstrations as dotted lines."""
     x = navigation_positions()
     for centre in (-0.45, 0.45):
-        axis.fill_between([centre - 0.12, centre + 0.12], -0.45, 0.45, color="0.8")
+        axis.fill_between(
+            [centre - 0.12, centre + 0.12], -0.45, 0.45, color="0.8"
+        )
     axis.plot(x, navigation_heights().T, color="0.5", lw=0.8, ls=":")
-    axis.set(xlabel="position (observation)", xlim=(-1, 1), ylim=(-1.15, 1.15))
+    axis.set(
+        xlabel="position (observation)", xlim=(-1, 1), ylim=(-1.15, 1.15)
+    )
 
 
 demos = navigation_demonstrations()
@@ -61,9 +69,15 @@ print(demos)
 
 figure, axis = plt.subplots(figsize=(5, 2.6))
 draw_task(axis)
-axis.plot(navigation_positions(), navigation_heights()[:3].T, color="tab:blue")
-axis.plot(navigation_positions(), navigation_heights()[3:].T, color="tab:orange")
-axis.set(ylabel="height (action)", title="Six demonstrations around two obstacles")
+axis.plot(
+    navigation_positions(), navigation_heights()[:3].T, color="tab:blue"
+)
+axis.plot(
+    navigation_positions(), navigation_heights()[3:].T, color="tab:orange"
+)
+axis.set(
+    ylabel="height (action)", title="Six demonstrations around two obstacles"
+)
 plt.show()
 
 # %%
@@ -88,7 +102,9 @@ plt.show()
 def train(prior, iterations=1000):
     """Behaviour cloning by flow matching."""
     torch.manual_seed(0)
-    windows = window_replay_buffer(demos, prior, batch_size=256, observation_steps=1)
+    windows = window_replay_buffer(
+        demos, prior, batch_size=256, observation_steps=1
+    )
     network = VelocityMLP(
         action_dim=1,
         observation_dim=demos["observation"].shape[-1],
@@ -96,11 +112,15 @@ def train(prior, iterations=1000):
         observation_steps=1,
         hidden_dim=64,
     )
-    network = PreconditionedNetwork(network, moments=SourceMoments.fit(windows, prior))
+    network = PreconditionedNetwork(
+        network, moments=SourceMoments.fit(windows, prior)
+    )
     actor = WarmPriorActor(network, prior, nfe=9)
     loss_module = FlowMatchingLoss(actor)
     optimizer = torch.optim.AdamW(network.parameters(), lr=4e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+        optimizer, iterations
+    )
     for _ in range(iterations):
         optimizer.zero_grad()
         loss_module(windows.sample())["loss_flow_matching"].backward()
@@ -111,7 +131,9 @@ def train(prior, iterations=1000):
 
 actors = {
     "Gaussian source": train(GaussianPrior(chunk_length=4)),
-    "WP-Past": train(PastPrior(chunk_length=4, sigma=0.1, cold_probability=0.1)),
+    "WP-Past": train(
+        PastPrior(chunk_length=4, sigma=0.1, cold_probability=0.1)
+    ),
 }
 
 # %%
@@ -137,9 +159,17 @@ for axis, (name, actor) in zip(axes, actors.items(), strict=True):
     heights = executed_actions(rollout)[0].squeeze(-1)
     metrics = navigation_metrics(heights, chunk_length=4)
     draw_task(axis)
-    axis.plot(navigation_positions(), heights[1:25].T, color="tab:blue", lw=0.6, alpha=0.5)
+    axis.plot(
+        navigation_positions(),
+        heights[1:25].T,
+        color="tab:blue",
+        lw=0.6,
+        alpha=0.5,
+    )
     axis.plot(navigation_positions(), heights[0], color="black", lw=1.4)
-    axis.plot(navigation_positions()[::4], heights[0, ::4], "o", color="black", ms=3)
+    axis.plot(
+        navigation_positions()[::4], heights[0, ::4], "o", color="black", ms=3
+    )
     axis.set_title(
         f"{name}: changes sides at {metrics.switch_rate:.0%} of decisions,\n"
         f"{metrics.collision_rate:.0%} of 256 episodes collide"
@@ -167,8 +197,11 @@ figure, axes = plt.subplots(1, 2, figsize=(9, 3.1), sharey=True)
 for axis, (name, actor) in zip(axes, actors.items(), strict=True):
     window = shared.windows(actor.prior)[shared.frames == step]
     generator = torch.Generator().manual_seed(0)
-    paths = flow_paths(actor, window.expand(60).contiguous(), n_steps=50, generator=generator)
-    height = paths[:, :, 0, 0]  # [source samples, times, position in the chunk, action dimension]
+    paths = flow_paths(
+        actor, window.expand(60).contiguous(), n_steps=50, generator=generator
+    )
+    # [source samples, times, position in the chunk, action dimension]
+    height = paths[:, :, 0, 0]
     for line in height:
         axis.plot(
             torch.linspace(0, 1, 51),

@@ -57,8 +57,10 @@ class Momentum(Prior):
         return loc, warm
 
     def next_mean(self, loc, chunk, executed_steps, elapsed_steps):
-        last = chunk.gather(-2, self.positions(executed_steps - 1, chunk, 1))
-        before = chunk.gather(-2, self.positions((executed_steps - 2).clamp_min(0), chunk, 1))
+        steps = (executed_steps - 2).clamp_min(0), executed_steps - 1
+        before, last = (
+            chunk.gather(-2, self.positions(step, chunk, 1)) for step in steps
+        )
         loc = self._line(before, last)
         return loc, torch.ones_like(loc[..., :1], dtype=torch.bool)
 
@@ -85,13 +87,28 @@ shared = SharedObservations(demos, chunk_length=4)
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.0), sharey=True)
 for axis, prior in zip(axes, priors[1:], strict=True):
     windows = shared.windows(prior)
-    error = (windows["prior", "loc"] - windows["vla_action", "chunk"]).square().mean().sqrt()
-    axis.plot(navigation_positions(), demos["action"][:64], color="0.6", label="demonstration")
+    error = windows["prior", "loc"] - windows["vla_action", "chunk"]
+    error = error.square().mean().sqrt()
+    axis.plot(
+        navigation_positions(),
+        demos["action"][:64],
+        color="0.6",
+        label="demonstration",
+    )
     for start in range(8, 64, 8):
         loc = windows["prior", "loc"][shared.frames == start].flatten()
         x = navigation_positions()[start : start + 4]
-        axis.plot(x, loc[: len(x)], ".-", color=prior.color, label="mean" if start == 8 else None)
-    axis.set(title=f"{prior.label}: {error:.3f} from the next chunk", xlabel="position")
+        axis.plot(
+            x,
+            loc[: len(x)],
+            ".-",
+            color=prior.color,
+            label="mean" if start == 8 else None,
+        )
+    axis.set(
+        title=f"{prior.label}: {error:.3f} from the next chunk",
+        xlabel="position",
+    )
     axis.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
 axes[0].set_ylabel("height (action)")
 axes[1].legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
@@ -114,7 +131,9 @@ recipe = NAVIGATION_PRESETS["quick"]
 recipe = replace(
     recipe,
     network=replace(recipe.network, hidden_dim=64),
-    training=replace(recipe.training, iterations=1000, learning_rate=4e-3, save_every=1000),
+    training=replace(
+        recipe.training, iterations=1000, learning_rate=4e-3, save_every=1000
+    ),
     run=RunOptions(out=Path(folder.name) / "run", envs=1, logger="none"),
 )
 problem = navigation_problem()
@@ -123,7 +142,9 @@ priors = [
     PastPrior(4, sigma=0.1, cold_probability=0.1),
     Momentum(4, sigma=0.1, cold_probability=0.1),
 ]
-comparison = Comparison(recipe, "navigation1d", stores=[Store.of(recipe, problem)], priors=priors)
+comparison = Comparison(
+    recipe, "navigation1d", stores=[Store.of(recipe, problem)], priors=priors
+)
 comparison.train()
 
 rows = []
@@ -141,7 +162,15 @@ columns = {
     "collisions, history shifted": mean_cell("shifted_collision_rate", ".3f"),
 }
 label = source_labels(rows)
-print(table(rows, lambda row: f"{label(row)}, NFE {row['nfe']}", None, columns, head="policy"))
+print(
+    table(
+        rows,
+        lambda row: f"{label(row)}, NFE {row['nfe']}",
+        None,
+        columns,
+        head="policy",
+    )
+)
 
 # %%
 # What to notice: both warm sources keep their side at nine network evaluations per chunk (NFE 9).
@@ -153,12 +182,26 @@ print(table(rows, lambda row: f"{label(row)}, NFE {row['nfe']}", None, columns, 
 
 figure, axes = plt.subplots(1, 3, figsize=(10, 2.8), sharey=True)
 for axis, contestant in zip(axes, comparison.contestants, strict=True):
-    played = play_navigation(comparison.player(contestant), seed=0, nfe=1, rollouts=40)
+    played = play_navigation(
+        comparison.player(contestant), seed=0, nfe=1, rollouts=40
+    )
     heights = executed_actions(played)[0].squeeze(-1)
     for centre in (-0.45, 0.45):
-        axis.fill_between([centre - 0.12, centre + 0.12], -0.45, 0.45, color="0.8")
-    axis.plot(navigation_positions(), heights.T, color=contestant.prior.color, lw=0.7, alpha=0.6)
-    axis.set(title=f"{contestant.prior.label}, NFE 1", xlabel="position", xlim=(-1, 1))
+        axis.fill_between(
+            [centre - 0.12, centre + 0.12], -0.45, 0.45, color="0.8"
+        )
+    axis.plot(
+        navigation_positions(),
+        heights.T,
+        color=contestant.prior.color,
+        lw=0.7,
+        alpha=0.6,
+    )
+    axis.set(
+        title=f"{contestant.prior.label}, NFE 1",
+        xlabel="position",
+        xlim=(-1, 1),
+    )
 axes[0].set_ylabel("height (action)")
 plt.show()
 

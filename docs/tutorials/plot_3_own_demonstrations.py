@@ -34,7 +34,12 @@ from warmprior import (
     policy_transforms,
 )
 from warmprior.data import LeRobotExperienceReplay, RobomimicExperienceReplay
-from warmprior.training import BehaviourCloning, TrainingConfig, evaluate, precondition
+from warmprior.training import (
+    BehaviourCloning,
+    TrainingConfig,
+    evaluate,
+    precondition,
+)
 
 torch.manual_seed(0)
 folder = tempfile.TemporaryDirectory()
@@ -55,8 +60,8 @@ def demonstrator(observation):
     if abs(angle) < 0.4:
         torque = -9.0 * angle - 2.0 * speed
     else:
-        missing = 15.0 - (0.5 * speed**2 + 15.0 * cosine)  # energy, of what upright rest has
-        torque = 0.5 * missing * speed
+        energy = 0.5 * speed**2 + 15.0 * cosine  # 15 at rest, upright
+        torque = 0.5 * (15.0 - energy) * speed
     return np.clip([torque], -2.0, 2.0).astype(np.float32)
 
 
@@ -69,8 +74,10 @@ def record(env, seed):
         action = demonstrator(observation)
         episode["state"].append(observation)
         episode["actions"].append(action)
-        disturbed = action + disturbance.normal(0.0, 1.0, 1).astype(np.float32)
-        observation, reward, terminated, truncated, _ = env.step(disturbed)
+        noise = disturbance.normal(0.0, 1.0, 1).astype(np.float32)
+        observation, reward, terminated, truncated, _ = env.step(
+            action + noise
+        )
         episode["rewards"].append(reward)
         over = terminated or truncated
     return {name: np.array(values) for name, values in episode.items()}
@@ -89,14 +96,18 @@ print(len(episodes), "episodes of", len(episodes[0]["actions"]), "steps")
 
 with h5py.File(root / "swing_up.hdf5", "w") as file:
     data = file.create_group("data")
-    data.attrs["env_args"] = json.dumps({"env_name": "Pendulum-v1", "env_kwargs": {}})
+    data.attrs["env_args"] = json.dumps(
+        {"env_name": "Pendulum-v1", "env_kwargs": {}}
+    )
     for i, episode in enumerate(episodes):
         demo = data.create_group(f"demo_{i}")
         demo["actions"] = episode["actions"]
         demo["rewards"] = episode["rewards"]
         demo["obs/state"] = episode["state"]
 
-replay = RobomimicExperienceReplay(root / "swing_up.hdf5", observation_keys=["state"])
+replay = RobomimicExperienceReplay(
+    root / "swing_up.hdf5", observation_keys=["state"]
+)
 demos = replay.data
 print(demos.select("observation", "action", "episode"))
 
@@ -110,19 +121,30 @@ print(demos.select("observation", "action", "episode"))
 # own:
 
 features = {
-    "observation.state": {"dtype": "float32", "shape": (3,), "names": ["cos", "sin", "speed"]},
+    "observation.state": {
+        "dtype": "float32",
+        "shape": (3,),
+        "names": ["cos", "sin", "speed"],
+    },
     "action": {"dtype": "float32", "shape": (1,), "names": ["torque"]},
 }
-dataset = LeRobotDataset.create("me/swing_up", fps=20, features=features, root=root / "lerobot")
+dataset = LeRobotDataset.create(
+    "me/swing_up", fps=20, features=features, root=root / "lerobot"
+)
 for episode in episodes[:5]:
-    for state, action in zip(episode["state"], episode["actions"], strict=True):
-        dataset.add_frame({"observation.state": state, "action": action, "task": "swing up"})
+    for state, action in zip(
+        episode["state"], episode["actions"], strict=True
+    ):
+        dataset.add_frame(
+            {"observation.state": state, "action": action, "task": "swing up"}
+        )
     dataset.save_episode()
 dataset.finalize()
 
 same = LeRobotExperienceReplay(root / "lerobot").data
 first = demos[: len(same)]
-print({key: bool((same[key] == first[key]).all()) for key in ("observation", "action", "episode")})
+for key in ("observation", "action", "episode"):
+    print(key, "is the same:", bool((same[key] == first[key]).all()))
 
 # %%
 # Both readers give the same tensors (here of five episodes, to save time). From here on it does not
@@ -143,13 +165,21 @@ def train(prior, iterations=1000):
     torch.manual_seed(0)
     network = VelocityMLP(1, 3, prior.prediction_length, hidden_dim=64)
     network = precondition(network, normalized, prior)
-    actor = WarmPriorActor(network, prior, nfe=1, clip=1.0, normalizer=normalizer)
+    actor = WarmPriorActor(
+        network, prior, nfe=1, clip=1.0, normalizer=normalizer
+    )
     config = TrainingConfig(
-        iterations=iterations, batch_size=256, learning_rate=2e-3, warmup_ratio=0.05, checkpoints=1
+        iterations=iterations,
+        batch_size=256,
+        learning_rate=2e-3,
+        warmup_ratio=0.05,
+        checkpoints=1,
     )
     training = BehaviourCloning(actor, normalized, config, root / prior.name)
     training.run(description=None)  # no progress bar
-    return WarmPriorActor.from_pretrained(root / prior.name / f"policy_{iterations:06d}")
+    return WarmPriorActor.from_pretrained(
+        root / prior.name / f"policy_{iterations:06d}"
+    )
 
 
 policies = {
@@ -177,7 +207,9 @@ class StandsAtTheEnd(Transform):
     def _told(self, tensordict):
         observation = tensordict["observation"]
         self.seen.append(observation.clone())
-        return tensordict.set("success", tensordict["truncated"] & (observation[..., :1] > 0.98))
+        return tensordict.set(
+            "success", tensordict["truncated"] & (observation[..., :1] > 0.98)
+        )
 
     def _step(self, tensordict, next_tensordict):
         return self._told(next_tensordict)
@@ -186,14 +218,18 @@ class StandsAtTheEnd(Transform):
         return self._told(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec):
-        observation_spec["success"] = Categorical(2, shape=(1,), dtype=torch.bool)
+        observation_spec["success"] = Categorical(
+            2, shape=(1,), dtype=torch.bool
+        )
         return observation_spec
 
 
 def play(policy, episodes=20):
     """How many episodes end upright, and all observations ``[episodes, 201, 3]``."""
     judge = StandsAtTheEnd()
-    transforms = Compose(judge, policy_transforms(policy.prior, normalizer=normalizer))
+    transforms = Compose(
+        judge, policy_transforms(policy.prior, normalizer=normalizer)
+    )
     env = TransformedEnv(GymEnv("Pendulum-v1"), transforms)
     judge.seen.clear()
     played = evaluate(policy, env, episodes=episodes, first_seed=1_000)
@@ -211,10 +247,14 @@ shown |= {name: play(policy) for name, policy in policies.items()}
 for axis, (name, (solved, seen)) in zip(axes, shown.items(), strict=True):
     for episode in seen[:20]:
         degrees = angle(episode)
-        degrees[1:][degrees.diff().abs() > 180] = torch.nan  # no line where the angle wraps around
+        degrees[1:][degrees.diff().abs() > 180] = (
+            torch.nan
+        )  # no line where the angle wraps around
         axis.plot(torch.arange(len(degrees)) / 20, degrees, lw=0.8, alpha=0.7)
     told = "" if solved is None else f": {solved} of 20 end upright"
-    axis.set(title=name + told, xlabel="seconds", yticks=[-180, -90, 0, 90, 180])
+    axis.set(
+        title=name + told, xlabel="seconds", yticks=[-180, -90, 0, 90, 180]
+    )
 axes[0].set_ylabel("angle in degrees (0 is upright)")
 plt.show()
 
@@ -243,7 +283,14 @@ class Film:
     def _repr_html_(self):
         file, (first, *others) = io.BytesIO(), self.pictures
         duration = round(1000 / self.rate)
-        first.save(file, "WEBP", save_all=True, append_images=others, duration=duration, loop=0)
+        first.save(
+            file,
+            "WEBP",
+            save_all=True,
+            append_images=others,
+            duration=duration,
+            loop=0,
+        )
         data = base64.b64encode(file.getvalue()).decode()
         return f'<img alt="film of an episode" src="data:image/webp;base64,{data}">'
 
@@ -254,12 +301,16 @@ def picture(observation, size=200):
     canvas, middle = ImageDraw.Draw(image), size / 2
     tip = (middle - 0.4 * size * sine, middle - 0.4 * size * cosine)
     canvas.line([(middle, middle), tip], fill="#1f77b4", width=10)
-    canvas.ellipse([middle - 5, middle - 5, middle + 5, middle + 5], fill="black")
+    canvas.ellipse(
+        [middle - 5, middle - 5, middle + 5, middle + 5], fill="black"
+    )
     return image
 
 
 _, seen = shown["WP-Past"]
-hardest = int(angle(seen[:, 0]).abs().argmax())  # it starts nearest to hanging down
+hardest = int(
+    angle(seen[:, 0]).abs().argmax()
+)  # it starts nearest to hanging down
 Film([picture(observation) for observation in seen[hardest, ::2]], rate=10)
 
 # %%

@@ -35,13 +35,21 @@ shared = SharedObservations(demos, chunk_length=4)
 def train(prior, iterations=800, look=lambda iteration, actor: None):
     """As in tutorial 1; ``look`` is called after every iteration."""
     torch.manual_seed(0)
-    windows = window_replay_buffer(demos, prior, batch_size=256, observation_steps=1)
-    network = VelocityMLP(1, 9, prior.prediction_length, observation_steps=1, hidden_dim=64)
-    network = PreconditionedNetwork(network, moments=SourceMoments.fit(windows, prior))
+    windows = window_replay_buffer(
+        demos, prior, batch_size=256, observation_steps=1
+    )
+    network = VelocityMLP(
+        1, 9, prior.prediction_length, observation_steps=1, hidden_dim=64
+    )
+    network = PreconditionedNetwork(
+        network, moments=SourceMoments.fit(windows, prior)
+    )
     actor = WarmPriorActor(network, prior, nfe=9)
     loss_module = FlowMatchingLoss(actor)
     optimizer = torch.optim.AdamW(network.parameters(), lr=4e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+        optimizer, iterations
+    )
     for iteration in range(1, iterations + 1):
         optimizer.zero_grad()
         loss_module(windows.sample())["loss_flow_matching"].backward()
@@ -64,7 +72,9 @@ def look(iteration, actor):
     """For the last section: how much of the source's noise reaches the actions meanwhile."""
     if iteration in (10, 20, 50, 100, 200, 400, 800):
         windows = shared.windows(actor.prior)
-        leaks[iteration] = source_leak(actor, windows, nfes=(1, 9), episodes=shared.episodes)
+        leaks[iteration] = source_leak(
+            actor, windows, nfes=(1, 9), episodes=shared.episodes
+        )
 
 
 actors = {
@@ -82,11 +92,17 @@ actors = {
 nfes = [1, 2, 3, 5, 9]
 figure, axis = plt.subplots(figsize=(6, 3.2))
 for name, actor in actors.items():
-    played = [judge_navigation(actor, seed=0, nfe=nfe, rollouts=256) for nfe in nfes]
+    played = [
+        judge_navigation(actor, seed=0, nfe=nfe, rollouts=256) for nfe in nfes
+    ]
     collisions = [row["collision_rate"] for row in played]
     print(f"{name:16}", [round(rate, 2) for rate in collisions])
     axis.plot(nfes, collisions, "o-", color=actor.prior.color, label=name)
-axis.set(xscale="log", xlabel="network evaluations per chunk (NFE)", ylabel="episodes that collide")
+axis.set(
+    xscale="log",
+    xlabel="network evaluations per chunk (NFE)",
+    ylabel="episodes that collide",
+)
 axis.set(ylim=(-0.03, 1.03))
 axis.set_xticks(nfes, nfes)
 axis.minorticks_off()
@@ -107,14 +123,23 @@ plt.show()
 step = 16
 figure, axes = plt.subplots(1, 3, figsize=(10, 2.8), sharey=True)
 for axis, (name, actor) in zip(axes, actors.items(), strict=True):
-    window = shared.windows(actor.prior)[shared.frames == step].expand(200).contiguous()
+    window = shared.windows(actor.prior)[shared.frames == step]
+    window = window.expand(200).contiguous()
     axis.axhspan(-0.45, 0.45, color="0.9")
     for place, nfe in enumerate((1, 2, 9)):
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
-            chunk = actor(window.clone(), nfe=nfe, generator=generator)["vla_action", "chunk"]
+            acted = actor(window.clone(), nfe=nfe, generator=generator)
+        chunk = acted["vla_action", "chunk"]
         spread = 0.6 * (torch.rand(200, generator=generator) - 0.5)
-        axis.plot(place + spread, chunk[:, 0, 0], ".", ms=3, alpha=0.5, color=actor.prior.color)
+        axis.plot(
+            place + spread,
+            chunk[:, 0, 0],
+            ".",
+            ms=3,
+            alpha=0.5,
+            color=actor.prior.color,
+        )
     axis.set_xticks(range(3), ["NFE 1", "NFE 2", "NFE 9"])
     axis.set_title(name)
 axes[0].set_ylabel("height (first action)")

@@ -44,7 +44,8 @@ def draw(gripper, part):
     line = torch.linspace(-1.2, 1.2, SIZE)
     images = torch.full((len(gripper), 3, SIZE, SIZE), 235, dtype=torch.uint8)
     for place, color in ((part, (40, 160, 60)), (gripper, (210, 50, 40))):
-        x, y = (line - place[:, :1]).square(), (line.flip(0) - place[:, 1:]).square()
+        x = (line - place[:, :1]).square()
+        y = (line.flip(0) - place[:, 1:]).square()
         covered = x[:, None, :] + y[:, :, None] < 0.16**2
         for channel, value in enumerate(color):
             images[:, channel][covered] = value
@@ -83,14 +84,19 @@ class ReachEnv(EnvBase):
 
     def _reset(self, tensordict, **kwargs):
         gripper, part = (torch.rand(2, *self.batch_size, 2) * 2 - 1).unbind(0)
-        gripper[:, 1], part[:, 1] = gripper[:, 1].abs() - 1, part[:, 1].abs()  # below, above
+        gripper[:, 1] = gripper[:, 1].abs() - 1  # below
+        part[:, 1] = part[:, 1].abs()  # above
         step = torch.zeros(*self.batch_size, 1, dtype=torch.int64)
         return TensorDict(self._told(gripper, part, step), self.batch_size)
 
     def _step(self, tensordict):
-        gripper = (tensordict["gripper"] + 0.12 * tensordict["action"].clamp(-1, 1)).clamp(-1, 1)
+        gripper = (
+            tensordict["gripper"] + 0.12 * tensordict["action"].clamp(-1, 1)
+        ).clamp(-1, 1)
         told = self._told(gripper, tensordict["part"], tensordict["step"] + 1)
-        return TensorDict(told | {"reward": told["success"].float()}, self.batch_size)
+        return TensorDict(
+            told | {"reward": told["success"].float()}, self.batch_size
+        )
 
     def _set_seed(self, seed):
         torch.manual_seed(seed)
@@ -106,7 +112,9 @@ class ReachEnv(EnvBase):
 
 def demonstrator(tensordict):
     way = (tensordict["part"] - tensordict["gripper"]) / 0.12
-    return tensordict.set("action", way / way.norm(dim=-1, keepdim=True).clamp_min(1.0))
+    return tensordict.set(
+        "action", way / way.norm(dim=-1, keepdim=True).clamp_min(1.0)
+    )
 
 
 rollout = ReachEnv(120).rollout(STEPS, demonstrator)
@@ -134,17 +142,31 @@ plt.show()
 def train(demos, iterations=700):
     torch.manual_seed(0)
     prior = PastPrior(chunk_length=4, sigma=0.5)
-    windows = window_replay_buffer(demos, prior, batch_size=64, observation_steps=1)
-    encoder = ImageEncoder(["camera"], state_dim=2, image_size=SIZE, crop_size=28, backbone="small")
+    windows = window_replay_buffer(
+        demos, prior, batch_size=64, observation_steps=1
+    )
+    encoder = ImageEncoder(
+        ["camera"],
+        state_dim=2,
+        image_size=SIZE,
+        crop_size=28,
+        backbone="small",
+    )
     network = VisionNetwork(
         encoder,
-        VelocityMLP(2, encoder.observation_dim, 4, observation_steps=1, hidden_dim=64),
+        VelocityMLP(
+            2, encoder.observation_dim, 4, observation_steps=1, hidden_dim=64
+        ),
     )
-    network = PreconditionedNetwork(network, moments=SourceMoments.fit(windows, prior))
+    network = PreconditionedNetwork(
+        network, moments=SourceMoments.fit(windows, prior)
+    )
     actor = WarmPriorActor(network, prior, nfe=1, clip=1.0)
     loss_module = FlowMatchingLoss(actor)
     optimizer = torch.optim.AdamW(network.parameters(), lr=2e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, iterations)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+        optimizer, iterations
+    )
     losses = []
     for _ in range(iterations):
         optimizer.zero_grad()
@@ -173,7 +195,9 @@ blind, blind_losses = train(blank, iterations=300)
 
 def play(actor, camera=True):
     env = ReachEnv(200)
-    env = TransformedEnv(env, policy_transforms(actor.prior, observation_steps=1))
+    env = TransformedEnv(
+        env, policy_transforms(actor.prior, observation_steps=1)
+    )
 
     def policy(tensordict):
         if not camera:
@@ -186,10 +210,15 @@ def play(actor, camera=True):
 
 
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.4))
-for told, curve in (("with images", losses), ("images blanked", blind_losses)):
+for told, curve in (
+    ("with images", losses),
+    ("images blanked", blind_losses),
+):
     means = torch.tensor(curve).view(-1, 10).mean(1)
     axes[0].plot(torch.arange(len(means)) * 10 + 5, means, label=told)
-axes[0].set(title="Training", xlabel="iterations", ylabel="flow-matching loss")
+axes[0].set(
+    title="Training", xlabel="iterations", ylabel="flow-matching loss"
+)
 axes[0].set_ylim(bottom=0)
 axes[0].legend()
 for axis, name, played in (
@@ -198,9 +227,18 @@ for axis, name, played in (
 ):
     solved = played["next", "success"].any(1).float().mean()
     for i in range(12):
-        path = torch.cat([played["gripper"][i], played["next", "gripper"][i, -1:]])
+        path = torch.cat(
+            [played["gripper"][i], played["next", "gripper"][i, -1:]]
+        )
         axis.plot(*path.T, ".-", lw=1, ms=4, color=f"C{i % 10}")
-        axis.plot(*played["part"][i, 0], "*", ms=11, color=f"C{i % 10}", mec="black", mew=0.5)
+        axis.plot(
+            *played["part"][i, 0],
+            "*",
+            ms=11,
+            color=f"C{i % 10}",
+            mec="black",
+            mew=0.5,
+        )
     axis.set(title=f"{name}: {solved:.0%} reach the part", aspect="equal")
     axis.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1), xlabel="x")
 axes[1].set_ylabel("y")
