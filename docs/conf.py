@@ -1,6 +1,7 @@
 """Sphinx configuration: ``sphinx-build -W -b html docs docs/_build``."""
 
 import re
+import sys as _sys
 from functools import cache as _cache
 from importlib.metadata import version as _version
 from pathlib import Path as _Path
@@ -23,9 +24,10 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_design",
+    "sphinx_gallery.gen_gallery",
     "sphinx-mathjax-offline",  # formulas need no internet
 ]
-exclude_patterns = ["_build", "_templates"]
+exclude_patterns = ["_build", "_templates", "tutorials/*.rst"]
 templates_path = ["_templates"]
 html_theme = "furo"
 html_title = "warmprior"
@@ -45,6 +47,31 @@ toc_object_entries_show_parents = "hide"
 doctest_test_doctest_blocks = ""
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
+
+# The tutorials run when the pages are built, in the order of their numbers, each from the same state; an
+# error ends the build. ``make docs ARGS='-D plot_gallery=0'`` leaves them as text.
+_sys.path.insert(0, str(_Path(__file__).parent))
+sphinx_gallery_conf = {
+    "examples_dirs": "tutorials",
+    "gallery_dirs": "auto_tutorials",
+    "within_subsection_order": "FileNameSortKey",
+    "reset_modules": ("matplotlib", "tutorial_state.reset"),
+    "abort_on_example_error": True,
+    "min_reported_time": 1_000_000,
+    "write_computation_times": False,
+    "show_signature": False,
+    "download_all_examples": False,
+    "notebook_extensions": set(),
+    "capture_repr": ("_repr_html_",),
+}
+
+
+def _one_download(app, docname, source):
+    """Leave one link to a tutorial's script, the one below it."""
+    if docname.startswith("auto_tutorials/"):
+        above = r"\.\. only:: html\n\n    \.\. note::\n        :class: sphx-glr-download-link-note.*?(?=^\S)"
+        below = r"    \.\. container:: sphx-glr-download sphx-glr-download-zip.*"
+        source[0] = re.sub(f"{above}|{below}", "", source[0], flags=re.M | re.S)
 
 
 def _show_own_signature(app, what, name, obj, options, signature, return_annotation):
@@ -99,6 +126,7 @@ def _keep_what_formulas_need(app, error):
 
 def setup(app):
     """Connect the handlers above."""
+    app.connect("source-read", _one_download)
     app.connect("autodoc-process-signature", _show_own_signature)
     app.connect("missing-reference", _resolve_other_names)
     app.connect("html-page-context", _fold_navigation, priority=900)
