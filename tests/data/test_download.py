@@ -195,7 +195,7 @@ def test_a_damaged_file_of_the_right_size_is_refused(hub, content, tmp_path):
 
 
 def test_a_server_that_never_ends_is_left(hub, content, tmp_path, monkeypatch):
-    monkeypatch.setattr("warmprior.data.download.LIMIT_SECONDS", 2.0)
+    monkeypatch.setattr("warmprior.io.hub.LIMIT_SECONDS", 2.0)
     hub.put(FIRST, content)
     hub.put(MIRROR, content)
     hub.delay = 8.0
