@@ -66,7 +66,11 @@ def read_config(path: Path) -> dict[str, Any]:
 
 
 def pretrained_folder(
-    place: str | Path, *, revision: str | None, token: str | None, endpoint: str | None
+    place: str | Path,
+    *,
+    revision: str | None = None,
+    token: str | None = None,
+    endpoint: str | None = None,
 ) -> Path:
     """Where the files of a policy lie, fetched from the hub if need be.
 
