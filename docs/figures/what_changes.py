@@ -1,0 +1,87 @@
+"""The picture of README and landing page: three sources, their flows, what is executed.
+
+python docs/figures/what_changes.py        # trains the toy's policies, two minutes, and writes docs/_static
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
+from warmprior.envs.navigation1d import (
+    HALF_HEIGHT,
+    HALF_WIDTH,
+    OBSTACLES,
+    navigation_positions,
+)
+from warmprior.experiments import NAVIGATION_PRESETS, Store, navigation_problem
+from warmprior.experiments.figures import new_figure
+from warmprior.experiments.navigation1d import play_navigation
+
+OUT = Path(__file__).parents[1] / "_static" / "what_changes.png"
+ABOVE, BELOW = "#1f77b4", "#d95f02"
+SOURCES = {
+    "Gaussian noise": GaussianPrior(16),
+    "WP-Past: what was just executed": PastPrior(16),
+    "WP-Preview: its own earlier forecast": PreviewPrior(16),
+}
+AHEAD = 4
+"""The coordinate of the chunk that is shown."""
+
+
+def main() -> None:
+    """Train, and draw."""
+    recipe, problem = NAVIGATION_PRESETS["quick"], navigation_problem()
+    data = SharedObservations(problem.data, 16)
+    figure, axes = new_figure(11.0, 5.4, 2, 3)
+    flows, paths = axes[:3], axes[3:]
+    with tempfile.TemporaryDirectory() as folder:
+        store = Store(problem, recipe.network, Path(folder), Path(folder))
+        store.run = replace(store.run, logger="none")
+        for column, (name, prior) in enumerate(SOURCES.items()):
+            actor = store.policy(prior, recipe.training)
+            window = data.windows(prior)
+            # Of a demonstration that passes above the first obstacle, while it does.
+            index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
+            batch = window[index : index + 1].expand(160).contiguous()
+            generator = torch.Generator().manual_seed(0)
+            lines = flow_paths(actor, batch, 50, generator=generator)[..., AHEAD, 0]
+            axis, t = flows[column], torch.linspace(0, 1, lines.shape[-1])
+            for line in lines[:48]:
+                axis.plot(t, line, color=ABOVE if line[-1] > 0 else BELOW, lw=0.6, alpha=0.6)
+            axis.hist(
+                lines[:, 0].numpy(),
+                30,
+                orientation="horizontal",
+                color="0.55",
+                bottom=-0.02,
+                weights=torch.full((len(lines),), -0.006).tolist(),
+            )
+            axis.set(title=name, xlim=(-0.22, 1.02), ylim=(-2.6, 2.6), xlabel="time of the flow")
+            axis.set_xticks([0, 1], ["source", "action"])
+            rollout = play_navigation(actor, 0, nfe=9, rollouts=64)
+            heights = executed_actions(rollout)[0].squeeze(-1)
+            axis, x = paths[column], navigation_positions()
+            for c in OBSTACLES:
+                axis.fill_between(
+                    [c - HALF_WIDTH, c + HALF_WIDTH], -HALF_HEIGHT, HALF_HEIGHT, color="0.8"
+                )
+            for line in heights[:24]:
+                axis.plot(x, line, color=ABOVE if line[0] > 0 else BELOW, lw=0.6, alpha=0.6)
+            axis.plot(x, heights[0], color="0.1", lw=1.3, marker="o", ms=3.5, markevery=16)
+            axis.set(xlabel="position along the way", ylim=(-1.5, 1.5))
+    flows[0].set_ylabel("one action of the chunk")
+    paths[0].set_ylabel("height of the robot")
+    for axis in (*flows[1:], *paths[1:]):
+        axis.set_yticklabels([])
+    figure.savefig(OUT, dpi=110)
+    print(f"written to {OUT}")
+
+
+if __name__ == "__main__":
+    main()
