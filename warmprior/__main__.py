@@ -32,7 +32,7 @@ def info(args: argparse.Namespace) -> None:
     actor = _policy(args)
     config, count = actor.config(), sum(p.numel() for p in actor.parameters())
     place = pretrained_folder(args.folder, revision=args.revision)
-    written = read_json(place / CONFIG)["warmprior"]
+    written = read_json(place / CONFIG).get("warmprior", "of an unknown version")
     for name, value in {
         "prior": actor.prior,
         "network": f"{config['network']} ({count:,} parameters)",

@@ -14,6 +14,43 @@ TOKEN = "hf_loopback"
 """Who has it may write, and read what is private."""
 
 
+class Loopback:
+    """A server whose ``answer`` is given every request."""
+
+    def __init__(self) -> None:
+        hub = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                hub.answer(self)
+
+            do_HEAD = do_POST = do_PUT = do_GET
+
+            def log_message(self, *args) -> None:
+                pass
+
+        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.address = f"http://127.0.0.1:{self.server.server_port}"
+        self.thread = threading.Thread(target=self.server.serve_forever, daemon=True)
+        self.thread.start()
+
+    def answer(self, request: BaseHTTPRequestHandler) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        self.server.shutdown()
+        self.server.server_close()
+        self.thread.join()
+
+
+def reachable(monkeypatch) -> None:
+    """Let the hub's client go to the loopback interface."""
+    for name in ("http_proxy", "https_proxy", "all_proxy"):
+        monkeypatch.delenv(name, raising=False)
+        monkeypatch.delenv(name.upper(), raising=False)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+
+
 class Repository:
     def __init__(self, private: bool) -> None:
         self.private = private
@@ -33,33 +70,14 @@ class Repository:
         return revision if revision in self.commits else None
 
 
-class ModelHub:
+class ModelHub(Loopback):
     """Repositories by name, and the requests that were made, as ``"METHOD path"``."""
 
     def __init__(self) -> None:
         self.repositories: dict[str, Repository] = {}
         self.objects: dict[str, bytes] = {}
         self.requests: list[str] = []
-        hub = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                hub.answer(self)
-
-            do_HEAD = do_POST = do_PUT = do_GET
-
-            def log_message(self, *args) -> None:
-                pass
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.address = f"http://127.0.0.1:{self.server.server_port}"
-        self.thread = threading.Thread(target=self.server.serve_forever, daemon=True)
-        self.thread.start()
-
-    def close(self) -> None:
-        self.server.shutdown()
-        self.server.server_close()
-        self.thread.join()
+        super().__init__()
 
     def files(self, name: str, revision: str = "main") -> dict[str, bytes]:
         repository = self.repositories[name]
@@ -172,13 +190,10 @@ def _etag(content: bytes) -> str:
 @contextmanager
 def model_hub(monkeypatch, cache):
     """A hub for the client, which has an empty cache and no token of its own."""
-    for name in ("http_proxy", "https_proxy", "all_proxy"):
-        monkeypatch.delenv(name, raising=False)
-        monkeypatch.delenv(name.upper(), raising=False)
+    reachable(monkeypatch)
     for name in ("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN"):
         monkeypatch.delenv(name, raising=False)
     constants = "huggingface_hub.constants."
-    monkeypatch.setattr(constants + "HF_HUB_OFFLINE", False)
     monkeypatch.setattr(constants + "HF_HUB_DISABLE_XET", True)  # files go by git-lfs's protocol
     monkeypatch.setattr(constants + "HF_HUB_CACHE", str(cache / "hub"))
     monkeypatch.setattr(constants + "HF_TOKEN_PATH", str(cache / "no_token"))

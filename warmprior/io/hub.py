@@ -173,9 +173,10 @@ def explained(error: Exception, repository: str, revision: str | None = None) ->
             f"the hub does not allow this with {repository}: {_TOKEN} that has the permission"
         )
     if offline and isinstance(error, kinds.OfflineModeIsEnabled | kinds.LocalEntryNotFoundError):
+        cached = isinstance(error, kinds.LocalEntryNotFoundError)
         return ConnectionError(
-            f"the hub may not be asked for {repository}, as HF_HUB_OFFLINE is set, and it is not in the "
-            "cache: unset it"
+            f"the hub may not be asked for {repository}, as HF_HUB_OFFLINE is set"
+            f"{', and it is not in the cache' if cached else ''}: unset it"
         )
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     reason = f"{type(error).__name__}: {lines[0] if lines else 'no message'}"

@@ -423,8 +423,8 @@ class WarmPriorActor(TensorDictModuleBase):
             if folder == Path(directory):
                 raise
             raise ValueError(
-                f"{directory} at the hub: {error} If it was damaged here, remove {folder.parents[1]} to "
-                "fetch it again."
+                f"{directory} at the hub: {error} (if it was damaged here, remove {folder.parents[1]} "
+                "to fetch it again)"
             ) from error
         actor.sampler.generator = generator
         return actor.to(device).eval()
