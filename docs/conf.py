@@ -11,6 +11,7 @@ from sphinx.util.inspect import stringify_signature
 
 project = "warmprior"
 author = "the warmprior developers"
+copyright = "2026, the warmprior developers. MIT licence"
 release = version = _version("warmprior")
 
 extensions = [
@@ -42,14 +43,15 @@ toc_object_entries_show_parents = "hide"
 
 # The docstrings' examples are run by pytest.
 doctest_test_doctest_blocks = ""
-myst_enable_extensions = ["dollarmath"]
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 
 
 def _show_own_signature(app, what, name, obj, options, signature, return_annotation):
     """Show what a class takes where a base class or metaclass hides it behind ``*args``."""
-    if what == "class" and (signature or "").startswith("(*args") and "__init__" in vars(obj):
-        signature = stringify_signature(_signature(obj.__init__, bound_method=True))
+    if what == "class" and (signature or "").startswith("(*args"):
+        own = stringify_signature(_signature(obj.__init__, bound_method=True))
+        signature = signature if own.startswith("(*args") else own
     return signature, return_annotation
 
 

@@ -45,7 +45,7 @@ class GaussianPrior(Prior):
 
 
 class PastPrior(Prior):
-    r"""WP-Past: the mean is the last ``H`` executed actions (Eq. 2), ``sigma`` 0.5 by default.
+    r"""WP-Past: the mean is the last ``H`` executed actions, ``sigma`` 0.5 by default (Equation 2).
 
     In training :math:`\mu_\tau = a^{data}[i-H+\tau]` if the whole window lies inside the episode, and
     nothing is warm otherwise. At decisions the mean is the last ``H`` actions executed in the episode,
