@@ -34,6 +34,7 @@ PYTEST := $(BIN)/python -m pytest -n logical --dist loadfile
 test: install
 	$(PYTEST) $(ARGS)
 
+# The built documentation, the wheel in an empty environment, long trainings.
 test-slow: install
 	$(PYTEST) -m slow $(ARGS)
 

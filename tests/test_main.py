@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
+from importlib.metadata import version
 
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
+from tests.io.hub_server import TOKEN, model_hub
 from tests.processes import apart
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.__main__ import main
@@ -89,6 +93,60 @@ def test_info(saved, capsys):
     assert main(["info", str(saved[0])]) == 0
     told = capsys.readouterr().out
     assert "PastPrior(chunk_length=8" in told and "Lift" in told and "VelocityMLP" in told
+
+
+def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("huggingface_hub")
+    folder, episode = saved
+    monkeypatch.chdir(tmp_path)
+    assert main(["push", str(folder), "me/lift", "--dry-run"]) == 0
+    card = capsys.readouterr().out
+    assert card.startswith("---") and "Lift of robosuite" in card and "Any success rate." in card
+    with model_hub(monkeypatch, tmp_path / "cache") as hub:
+        assert main(["push", str(folder), "me/lift"]) == 2
+        assert "give a token" in capsys.readouterr().err and not hub.repositories
+        monkeypatch.setenv("HF_TOKEN", TOKEN)
+        assert main(["push", str(folder), "me/lift", "--private", "--licence", "mit"]) == 0
+        assert hub.repositories["me/lift"].branches["main"] in capsys.readouterr().out
+        assert b'license: "mit"' in hub.files("me/lift")["README.md"]
+        assert hub.repositories["me/lift"].private
+        assert main(["push", str(folder), "me/lift", "--revision", "v1"]) == 0
+        for extra in ([], ["--revision", "v1"]):
+            assert main(["info", "me/lift", *extra]) == 0
+            assert "PastPrior(chunk_length=8" in capsys.readouterr().out
+        assert main(["evaluate", "me/lift", "--episodes", "1", "--nfe", "1"]) == 0
+        assert f" {episode.steps} control steps on average" in capsys.readouterr().out
+        for argv, message in (
+            (["info", "me/other"], "no folder me/other here, and the hub has no repository"),
+            (["info", "me/lift", "--revision", "v2"], "no branch, tag or commit v2"),
+            (["push", "me/lift", "me/lift"], "there is no such folder"),
+            (["push", str(folder), "lift"], "use user/name"),
+            (["push", str(folder), "me/lift", "--run", str(tmp_path)], "has no results.json"),
+        ):
+            assert main(argv) == 2
+            told = capsys.readouterr().err
+            assert message in told and told.splitlines()[-1].startswith("warmprior: error: ")
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"warmprior {version('warmprior')}\n"
+
+
+def test_info_tells_who_wrote_it(saved, tmp_path, capsys):
+    """A policy of an earlier version is read, and is not said to be of this one."""
+    folder = tmp_path / "earlier"
+    shutil.copytree(saved[0], folder)
+    config = json.loads((folder / "config.json").read_text()) | {"warmprior": "0.1.0"}
+    del config["sha256"]
+    weights = hashlib.sha256((folder / "model.safetensors").read_bytes()).hexdigest()
+    text = json.dumps(config, sort_keys=True) + weights
+    config["sha256"] = hashlib.sha256(text.encode()).hexdigest()
+    (folder / "config.json").write_text(json.dumps(config))
+    assert main(["info", str(folder)]) == 0
+    assert "written by   warmprior 0.1.0, format 3" in capsys.readouterr().out
 
 
 def test_what_a_user_can_mend_is_told_in_one_line(saved, tmp_path, capsys):

@@ -5,11 +5,14 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from warmprior.io.files import read_json
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.pretrained import CONFIG, pretrained_folder
 from warmprior.modules.prior import Prior
 
 UNPLAYED = ("episodes", "nfe", "top_k", "play_on", "grid")
@@ -19,7 +22,7 @@ UNPLAYED = ("episodes", "nfe", "top_k", "play_on", "grid")
 def _policy(args: argparse.Namespace) -> WarmPriorActor:
     for place in args.prior:
         Prior.find(place)  # imported, it can be loaded by its name
-    return WarmPriorActor.from_pretrained(args.folder)
+    return WarmPriorActor.from_pretrained(args.folder, revision=args.revision)
 
 
 def info(args: argparse.Namespace) -> None:
@@ -28,6 +31,8 @@ def info(args: argparse.Namespace) -> None:
 
     actor = _policy(args)
     config, count = actor.config(), sum(p.numel() for p in actor.parameters())
+    place = pretrained_folder(args.folder, revision=args.revision)
+    written = read_json(place / CONFIG).get("warmprior", "of an unknown version")
     for name, value in {
         "prior": actor.prior,
         "network": f"{config['network']} ({count:,} parameters)",
@@ -35,7 +40,7 @@ def info(args: argparse.Namespace) -> None:
         "normaliser": "kept" if actor.normalizer is not None else "none",
         "environment": environment_name(actor) or "not kept",
         "images": (actor.environment or {}).get("images", "none"),
-        "written by": f"warmprior {config['warmprior']}, format {config['format']}",
+        "written by": f"warmprior {written}, format {config['format']}",
     }.items():
         print(f"{name:12} {value}")
 
@@ -87,6 +92,24 @@ def evaluate(args: argparse.Namespace) -> None:
         print(f"{args.video}: episode {args.first_seed}, {'' if outcome else 'not '}solved")
 
 
+def push(args: argparse.Namespace) -> None:
+    """Send a saved policy to the Hugging Face hub, with a card that tells what is known of it."""
+    from warmprior.experiments import model_card, policy_results
+
+    branch, args.revision = args.revision, None  # of the repository, not of the folder
+    if not Path(args.folder).is_dir():
+        raise FileNotFoundError(f"no policy at {args.folder}: there is no such folder")
+    actor = _policy(args)
+    results = None if args.run_folder is None else policy_results(args.run_folder, args.folder)
+    card = model_card(actor, results, repository=args.repository, licence=args.licence)
+    if args.dry_run:
+        print(card)
+        return
+    private = args.private or None
+    commit = actor.push_to_hub(args.repository, card=card, private=private, revision=branch)
+    print(f"{args.repository}: commit {commit}")
+
+
 def train(args: argparse.Namespace) -> None:
     """Train policies, and play nothing: the options of benchmarks/robomimic.py."""
     from warmprior.experiments import PRESETS, Comparison, comparison_preset, parse, started
@@ -131,6 +154,8 @@ def convert(args: argparse.Namespace) -> None:
 def make_parser() -> argparse.ArgumentParser:
     """The commands and their options."""
     parser = argparse.ArgumentParser(prog="python -m warmprior", description=__doc__)
+    told = f"warmprior {version('warmprior')}"
+    parser.add_argument("--version", action="version", version=told, help="tell it, and end")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def command(run: Callable[[argparse.Namespace], None]) -> Callable[..., Any]:
@@ -138,9 +163,17 @@ def make_parser() -> argparse.ArgumentParser:
         added.set_defaults(run=run)
         return added.add_argument
 
-    for run in (info, evaluate):
+    for run in (info, push, evaluate):
         add = command(run)
-        add("folder", type=Path, help="written by save_pretrained, such as .../policy_010000")
+        place = "" if run is push else ", or user/name of a repository at the Hugging Face hub"
+        add("folder", help=f"written by save_pretrained, such as .../policy_010000{place}")
+        if run is push:
+            add("repository", help="user/name; made if needed")
+            add("--run", dest="run_folder", type=Path, help="whose results the card tells")
+            add("--private", action="store_true", help="if it is made")
+            add("--licence", help="of the policy, as the hub calls it, such as mit")
+            add("--dry-run", action="store_true", help="print the card, and send nothing")
+        add("--revision", help="branch, tag or commit of the repository (default: main)")
         add(
             "--prior",
             action="append",

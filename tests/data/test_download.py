@@ -1,15 +1,14 @@
 from __future__ import annotations
 
 import hashlib
-import threading
 import time
 from collections import Counter
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
+from tests.io.hub_server import Loopback, reachable
 from warmprior.data.download import (
     MIMICGEN_REPOSITORY,
     REPOSITORIES,
@@ -26,7 +25,7 @@ FIRST, MIRROR = REPOSITORIES
 FILE = "v1.5/square/ph/low_dim_v15.hdf5"
 
 
-class Hub:
+class Hub(Loopback):
     """A server on the loopback interface that answers as the hub's file addresses do.
 
     ``files`` maps (repository, path) to (announced length, body); ``missing`` is the error code for
@@ -39,63 +38,41 @@ class Hub:
         self.delay = 0.0
         self.sent: dict[str, bytes] = {}  # by repository, instead of what is announced
         self.requests: Counter[tuple[str, str]] = Counter()
-        hub = self
+        super().__init__()
 
-        class Handler(BaseHTTPRequestHandler):
-            def _answer(self, body: bool) -> None:
-                parts = self.path.split("/resolve/main/")
-                repository = parts[0].removeprefix("/datasets/")
-                hub.requests[self.command, repository] += 1
-                found = hub.files.get((repository, parts[-1]))
-                if found is None:
-                    self.send_response(404)
-                    self.send_header("X-Error-Code", hub.missing)
-                    self.send_header("X-Repo-Commit", "b" * 40)
-                    self.send_header("Content-Length", "0")
-                    self.end_headers()
-                    return
-                announced, content = found
-                digest = hashlib.sha256(content).hexdigest()
-                content = hub.sent.get(repository, content)
-                time.sleep(hub.delay if body else 0.0)
-                self.send_response(200)
-                self.send_header("ETag", f'"{digest}"')
-                self.send_header("X-Repo-Commit", "a" * 40)
-                self.send_header("X-Linked-Size", str(announced))
-                self.send_header("Content-Length", str(len(content)))
-                self.end_headers()
-                if body:
-                    self.wfile.write(content)
-
-            def do_HEAD(self) -> None:
-                self._answer(body=False)
-
-            def do_GET(self) -> None:
-                self._answer(body=True)
-
-            def log_message(self, *args) -> None:
-                pass
-
-        self.server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self.address = f"http://127.0.0.1:{self.server.server_port}"
-        self.thread = threading.Thread(target=self.server.serve_forever, daemon=True)
-        self.thread.start()
+    def answer(self, request) -> None:
+        parts = request.path.split("/resolve/main/")
+        repository = parts[0].removeprefix("/datasets/")
+        self.requests[request.command, repository] += 1
+        found = self.files.get((repository, parts[-1]))
+        if found is None:
+            request.send_response(404)
+            request.send_header("X-Error-Code", self.missing)
+            request.send_header("X-Repo-Commit", "b" * 40)
+            request.send_header("Content-Length", "0")
+            request.end_headers()
+            return
+        body = request.command == "GET"
+        announced, content = found
+        digest = hashlib.sha256(content).hexdigest()
+        content = self.sent.get(repository, content)
+        time.sleep(self.delay if body else 0.0)
+        request.send_response(200)
+        request.send_header("ETag", f'"{digest}"')
+        request.send_header("X-Repo-Commit", "a" * 40)
+        request.send_header("X-Linked-Size", str(announced))
+        request.send_header("Content-Length", str(len(content)))
+        request.end_headers()
+        if body:
+            request.wfile.write(content)
 
     def put(self, repository: str, content: bytes, announced: int | None = None) -> None:
         self.files[repository, FILE] = (announced or len(content), content)
 
-    def close(self) -> None:
-        self.server.shutdown()
-        self.server.server_close()
-        self.thread.join()
-
 
 @pytest.fixture
 def hub(monkeypatch):
-    for name in ("http_proxy", "https_proxy", "all_proxy"):
-        monkeypatch.delenv(name, raising=False)
-        monkeypatch.delenv(name.upper(), raising=False)
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    reachable(monkeypatch)
     server = Hub()
     yield server
     server.close()
@@ -195,7 +172,7 @@ def test_a_damaged_file_of_the_right_size_is_refused(hub, content, tmp_path):
 
 
 def test_a_server_that_never_ends_is_left(hub, content, tmp_path, monkeypatch):
-    monkeypatch.setattr("warmprior.data.download.LIMIT_SECONDS", 2.0)
+    monkeypatch.setattr("warmprior.io.hub.LIMIT_SECONDS", 2.0)
     hub.put(FIRST, content)
     hub.put(MIRROR, content)
     hub.delay = 8.0

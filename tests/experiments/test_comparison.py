@@ -50,6 +50,18 @@ def test_meta_tells_what_computed(undisturbed):
     assert [p["seed"] for p in meta["policies"]] == [0, 1] * 3
 
 
+def test_a_run_of_another_version_is_not_continued(undisturbed, monkeypatch):
+    before = stored(undisturbed)
+    for module in ("results", "store"):
+        monkeypatch.setattr(f"warmprior.experiments.{module}.version", lambda package: "9.9.9")
+    number = before["meta"]["versions"]["warmprior"]
+    with pytest.raises(
+        ValueError, match=rf"was begun with warmprior {number}, not 9.9.9 and torch"
+    ):
+        comparison(undisturbed, 1, resume=True)
+    assert stored(undisturbed) == before
+
+
 def test_another_number_of_workers_continues(undisturbed, tmp_path):
     """Stored rows are kept, missing ones played."""
     whole = stored(undisturbed)["rows"]

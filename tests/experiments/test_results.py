@@ -90,6 +90,25 @@ def test_resuming_another_runs_file_is_refused(tmp_path):
         resumed(results.path, IDENTITY | {"study": "another"})
 
 
+def test_a_run_whose_policies_other_versions_trained_is_refused(tmp_path):
+    def meta(number, torch, *folders):
+        policies = [{"seed": i, "folder": folder} for i, folder in enumerate(folders)]
+        return {"versions": {"warmprior": number, "torch": torch}, "policies": policies}
+
+    path, mine = tmp_path / "results.json", meta("0.2.0", "2.11.0", "a-2", "b-2")
+    for theirs, told in (
+        (meta("0.1.0", "2.11.0", "a-1", "b-1"), "begun with warmprior 0.1.0, not 0.2.0: other"),
+        (meta("0.2.0", "2.10.0", "a-1", "b-1"), "begun with torch 2.10.0, not 2.11.0: other"),
+        (meta("0.1.0", "2.10.0", "a-1", "b-1"), "0.1.0, not 0.2.0 and torch 2.10.0, not 2.11.0"),
+        (meta("0.2.0", "2.11.0", "a-1", "b-1"), "another build of this version"),
+    ):
+        Results(path, theirs, IDENTITY).save()
+        with pytest.raises(ValueError, match=rf"results\.json was .*{told}.*another --out"):
+            Results(path, mine, IDENTITY, resume=True)
+    Results(path, meta("0.2.0", "2.11.0", "b-2"), IDENTITY).save()
+    Results(path, mine, IDENTITY, resume=True)  # those of a failed seed may be missing
+
+
 def test_summary_takes_the_best_checkpoints_of_each_seed():
     cell = select(compared(), prior="past", nfe=1)
     summary = success_summary(cell, top_k=1)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from warmprior.envs.mimicgen import is_mimicgen
 from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
+from warmprior.io.hub import deadline, snapshot, until
 
 __all__ = [
     "MIMICGEN_REPOSITORY",
@@ -29,9 +28,6 @@ REPOSITORIES = ("robomimic/robomimic_datasets", "amandlek/robomimic")
 
 MIMICGEN_REPOSITORY = "amandlek/mimicgen_datasets"
 """The one that holds MimicGen's, under the licence CC BY-NC-SA 4.0."""
-
-LIMIT_SECONDS = 3600.0
-"""For everything that one call fetches, whatever a server does."""
 
 
 def download_robomimic(
@@ -155,16 +151,15 @@ def download_lerobot(
     if revision is None and (home / repository / "meta" / "info.json").is_file():
         return home / repository
     revision = LEROBOT_VERSION if revision is None else revision
-    fetch = partial(
-        hub.snapshot_download,
-        repository,
-        repo_type="dataset",
-        revision=revision,
-        cache_dir=home / "hub",
-        allow_patterns=list(files),
-    )
     try:
-        return _until(time.monotonic() + LIMIT_SECONDS, lambda: Path(fetch()))
+        return snapshot(
+            repository,
+            files,
+            repo_type="dataset",
+            revision=revision,
+            cache_dir=home / "hub",
+            extra="lerobot",
+        )
     except Exception as error:  # the client's errors share no base class
         reason = str(error).strip() or "no message"
         raise OSError(
@@ -204,7 +199,7 @@ def _download(
     hub = require("huggingface_hub", "sim")
     require("h5py", "sim")
     failures: list[str] = []
-    deadline = time.monotonic() + LIMIT_SECONDS
+    latest = deadline()
     for repository in repositories:
         where = {
             "repo_id": repository,
@@ -222,11 +217,11 @@ def _download(
         # underneath, and OSError for a broken connection, a full disk or a short file.
         try:
             try:
-                return _until(deadline, partial(fetch, force))
+                return until(latest, partial(fetch, force))
             except DatasetError:
                 if force:
                     raise
-                return _until(deadline, partial(fetch, True))
+                return until(latest, partial(fetch, True))
         except Exception as error:
             reason = str(error).strip() or "no message"
             failures.append(f"{repository}: {type(error).__name__}: {reason}")
@@ -256,28 +251,3 @@ def _published_digest(hub: Any, where: dict[str, Any]) -> str | None:
     except Exception:  # without a connection, what is there has to do
         return None
     return etag if etag is not None and len(etag) == 64 else None
-
-
-def _until(deadline: float, call: Callable[[], Path]) -> Path:
-    """Call something that may never end; left behind, it ends with the process.
-
-    Raises:
-        TimeoutError: if it has not returned by the deadline.
-    """
-    result: list[Path] = []
-    failure: list[BaseException] = []
-
-    def run() -> None:
-        try:
-            result.append(call())
-        except BaseException as error:
-            failure.append(error)
-
-    thread = threading.Thread(target=run, name="download", daemon=True)
-    thread.start()
-    thread.join(max(0.0, deadline - time.monotonic()))
-    if failure:
-        raise failure[0]
-    if not result:
-        raise TimeoutError(f"not complete after {LIMIT_SECONDS:.0f} s")
-    return result[0]

@@ -1,5 +1,6 @@
 """Experiments: from options to trained policies, rows, tables and figures. Needs ``warmprior[sim]``."""
 
+from warmprior.experiments.card import PolicyResults, model_card, policy_results
 from warmprior.experiments.cli import parse, started, write_report
 from warmprior.experiments.comparison import Comparison
 from warmprior.experiments.condition import Condition
@@ -74,6 +75,7 @@ __all__ = [
     "NavigationRecipe",
     "NetworkOptions",
     "PolicyOptions",
+    "PolicyResults",
     "Problem",
     "Recipe",
     "Results",
@@ -91,6 +93,7 @@ __all__ = [
     "judge_navigation",
     "mean_cell",
     "mean_known",
+    "model_card",
     "navigation_problem",
     "observe",
     "paper_success",
@@ -107,6 +110,7 @@ __all__ = [
     "plot_sigma",
     "plot_success",
     "plot_success_bars",
+    "policy_results",
     "prior_color",
     "prior_label",
     "record",

@@ -26,6 +26,7 @@ __all__ = [
     "grouped",
     "mean_known",
     "played",
+    "read_results",
     "select",
     "success_summary",
 ]
@@ -170,7 +171,8 @@ class Results:
         resume: keep the rows that the file has.
 
     Raises:
-        ValueError: if the file to resume is damaged or belongs to a run with another identity.
+        ValueError: if the file to resume is damaged, or belongs to a run with another identity or one whose
+            policies were trained by other versions.
     """
 
     def __init__(
@@ -186,17 +188,10 @@ class Results:
         self.rows: list[Row] = []
         self._started = time.monotonic()
         if resume and self.path.exists():
-            stored = read_json(self.path)
-            try:
-                earlier = float(stored["meta"]["wall_time_s"])
-                theirs, self.rows = stored["meta"]["identity"], _read_rows(stored["rows"])
-            except (AttributeError, KeyError, TypeError, ValueError) as error:
-                reason = str(error) if type(error) is ValueError else repr(error)
-                raise ValueError(
-                    f"{self.path} is not a results file of this version: {reason}"
-                ) from error
-            check_identity(self.path, theirs, identity)
-            self._started -= earlier
+            theirs, self.rows = read_results(self.path)
+            check_identity(self.path, theirs["identity"], identity)
+            _check_policies(self.path, theirs, self.meta)
+            self._started -= float(theirs["wall_time_s"])
 
     def find(self, facts: Mapping[str, Fact]) -> Row | None:
         """The row with exactly these facts, if there is one."""
@@ -222,6 +217,47 @@ class Results:
         rows = [_stored(row) for row in self.rows]
         text = json.dumps({"meta": self.meta, "rows": rows}, indent=1, allow_nan=False) + "\n"
         write_atomic(self.path, lambda temporary: temporary.write_text(text))
+
+
+def _check_policies(path: Path, theirs: Mapping[str, Any], mine: Mapping[str, Any]) -> None:
+    """Refuse to continue a run whose policies would all be trained anew, beside rows of the old ones."""
+
+    def folders(meta: Mapping[str, Any]) -> set[Any]:
+        return {policy["folder"] for policy in meta.get("policies", ()) if "folder" in policy}
+
+    if folders(theirs) <= folders(mine):
+        return
+    before, now = (
+        {"warmprior": "?", "torch": "?", **m.get("versions", {})} for m in (theirs, mine)
+    )
+    changed = [name for name in ("warmprior", "torch") if before[name] != now[name]]
+    told = " and ".join(f"{name} {before[name]}, not {now[name]}" for name in changed)
+    raise ValueError(
+        f"{path} was begun with {told or 'another build of this version'}: other policies would be "
+        "trained now. Finish it with the versions it was begun with, or begin anew with another --out"
+    )
+
+
+def read_results(path: Path) -> tuple[dict[str, Any], list[Row]]:
+    """Read a results file.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        Facts about the run, and its rows.
+
+    Raises:
+        ValueError: if it is damaged or of another version.
+    """
+    stored = read_json(path)
+    try:
+        meta = stored["meta"]
+        float(meta["wall_time_s"]), dict(meta["identity"])
+        return meta, _read_rows(stored["rows"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        reason = str(error) if type(error) is ValueError else repr(error)
+        raise ValueError(f"{path} is not a results file of this version: {reason}") from error
 
 
 def _stored(row: Row) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -20,9 +19,7 @@ from warmprior import keys
 from warmprior.io.files import (
     as_json,
     check_regular,
-    file_digest,
     load_file,
-    read_json,
     save_file,
     tensor_shapes,
     write_atomic,
@@ -32,14 +29,20 @@ from warmprior.modules.compiled import uncompiled, without_compilation
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import DEFAULT_NFE, ODEActor, Solver
+from warmprior.modules.pretrained import (
+    CONFIG,
+    FORMAT,
+    WEIGHTS,
+    pretrained_digest,
+    pretrained_folder,
+    push,
+    read_config,
+)
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.sampler import PriorSampler
 
 __all__ = ["WarmPriorActor"]
-
-FORMAT = 3
-"""Version of the layout that :meth:`WarmPriorActor.save_pretrained` writes."""
 
 _PRECISIONS = {name: getattr(torch, name) for name in ("float16", "bfloat16", "float32", "float64")}
 
@@ -317,10 +320,60 @@ class WarmPriorActor(TensorDictModuleBase):
         """
         config, tensors = self._saveable()
         directory = Path(directory)
-        weights = directory / "model.safetensors"
+        weights = directory / WEIGHTS
         write_atomic(weights, lambda path: save_file(tensors, path))
-        text = json.dumps(config | {"sha256": _digest(config, weights)}, indent=2) + "\n"
-        write_atomic(directory / "config.json", lambda path: path.write_text(text))
+        text = json.dumps(config | {"sha256": pretrained_digest(config, weights)}, indent=2) + "\n"
+        write_atomic(directory / CONFIG, lambda path: path.write_text(text))
+
+    def push_to_hub(
+        self,
+        repository: str,
+        *,
+        card: str | None = None,
+        private: bool | None = None,
+        revision: str | None = None,
+        message: str = "Upload a policy of warmprior",
+        token: str | None = None,
+        endpoint: str | None = None,
+    ) -> str:
+        """Save the policy in a repository of the Hugging Face hub, which is made if needed.
+
+        Args:
+            repository: such as ``"user/name"``.
+
+        Keyword Args:
+            card: text of its ``README.md``, such as :func:`~warmprior.experiments.model_card` writes; by
+                default what is there stays.
+            private: whether a new repository is private; by default what the account has set.
+            revision: branch; the main one by default.
+            message: of the commit.
+            token: with which to write; by default the hub client's own.
+            endpoint: address of the hub or of a server like it; by default the hub client's own.
+
+        Returns:
+            The commit, as ``revision`` of :meth:`from_pretrained` takes it.
+
+        Raises:
+            TypeError: see :meth:`save_pretrained`.
+            ValueError: likewise; if the name is no ``"user/name"``; or if it is to be private, and there is a
+                public repository of that name.
+            OSError: if the hub does not take it: a ``PermissionError`` without a token that may write.
+            ImportError: if huggingface_hub is not installed.
+
+        Examples:
+            >>> actor.push_to_hub("user/square-past", card=model_card(actor))  # doctest: +SKIP
+            '0123456789abcdef0123456789abcdef01234567'
+        """
+        return push(
+            self.save_pretrained,
+            repository,
+            card=card,
+            private=private,
+            revision=revision,
+            message=message,
+            token=token,
+            endpoint=endpoint,
+        )
 
     @classmethod
     def from_pretrained(
@@ -330,25 +383,57 @@ class WarmPriorActor(TensorDictModuleBase):
         prior: Prior | None = None,
         device: torch.device | str = "cpu",
         generator: torch.Generator | None = None,
+        revision: str | None = None,
+        token: str | None = None,
+        endpoint: str | None = None,
     ) -> WarmPriorActor:
-        """Load a policy that :meth:`save_pretrained` wrote; it returns bit-identical chunks.
+        """Load a policy that :meth:`save_pretrained` or :meth:`push_to_hub` wrote.
+
+        It returns bit-identical chunks. Nothing of it is run: weights are tensors, and the configuration
+        names classes that are imported already.
 
         Args:
-            directory: where ``config.json`` and ``model.safetensors`` lie.
+            directory: where ``config.json`` and ``model.safetensors`` lie; or, as text, ``"user/name"`` of a
+                repository at the Hugging Face hub, where there is no such folder.
 
         Keyword Args:
             prior: the prior that the environment carries, if any: it must be the policy's own.
             device: where to put the weights.
             generator: source of randomness of the sampler.
+            revision: branch, tag or commit of the repository; its main branch by default.
+            token: for a private repository; by default the hub client's own.
+            endpoint: address of the hub or of a server like it; by default the hub client's own.
 
         Raises:
-            FileNotFoundError: if a file is missing.
+            FileNotFoundError: if a file, the repository or the revision is missing.
             ValueError: if the files are damaged, of another format version, do not fit each other, or
-                belong to a policy with another prior.
+                belong to a policy with another prior; or if a revision of a folder is asked for.
+            PermissionError: if the hub does not let this user read it.
+            OSError: if the hub cannot be asked, and the policy is not in its client's cache.
+            ImportError: if the hub has to be asked, and huggingface_hub is not installed.
+
+        Examples:
+            >>> WarmPriorActor.from_pretrained("user/square-past")  # doctest: +SKIP
+            WarmPriorActor(...)
         """
-        directory = Path(directory)
-        path, weights = directory / "config.json", directory / "model.safetensors"
-        config = _read_config(path)
+        folder = pretrained_folder(directory, revision=revision, token=token, endpoint=endpoint)
+        try:
+            actor = cls._read(folder, prior)
+        except ValueError as error:
+            if folder == Path(directory):
+                raise
+            raise ValueError(
+                f"{directory} at the hub: {error} (if it was damaged here, remove {folder.parents[1]} "
+                "to fetch it again)"
+            ) from error
+        actor.sampler.generator = generator
+        return actor.to(device).eval()
+
+    @classmethod
+    def _read(cls, directory: Path, prior: Prior | None) -> WarmPriorActor:
+        """The policy in a folder, checked."""
+        path, weights = directory / CONFIG, directory / WEIGHTS
+        config = read_config(path)
         if not weights.exists():
             raise FileNotFoundError(f"no policy weights at {weights}")
         check_regular(weights)
@@ -362,7 +447,9 @@ class WarmPriorActor(TensorDictModuleBase):
             raise ValueError(
                 f"{weights} does not fit {path}: it is damaged or belongs to another network ({misfit})"
             )
-        if config.get("sha256") is not None and config["sha256"] != _digest(config, weights):
+        if config.get("sha256") is not None and config["sha256"] != pretrained_digest(
+            config, weights
+        ):
             raise ValueError(
                 f"{weights} or {path} is damaged or was changed since the policy was saved: copy the "
                 "folder again. To change a setting, pass it to the call, or save the policy anew."
@@ -383,8 +470,7 @@ class WarmPriorActor(TensorDictModuleBase):
         if problem:
             raise ValueError(f"{weights}: {problem}. It is damaged: copy the policy again.")
         actor.load_state_dict(tensors)
-        actor.sampler.generator = generator
-        return actor.to(device).eval()
+        return actor
 
     @classmethod
     def _from_config(cls, config: dict[str, Any]) -> WarmPriorActor:
@@ -471,25 +557,3 @@ def _bad_value(actor: WarmPriorActor, tensors: Mapping[str, Tensor]) -> str | No
         if statistic and name.endswith("_scale") and not (value > 0).all():
             return f"{name} holds a scale that is not positive"
     return None
-
-
-def _digest(config: dict[str, Any], weights: Path) -> str:
-    """Digest of a configuration and of the file of weights that belongs to it."""
-    text = json.dumps({k: v for k, v in config.items() if k != "sha256"}, sort_keys=True)
-    return hashlib.sha256((text + file_digest(weights)).encode()).hexdigest()
-
-
-def _read_config(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        raise FileNotFoundError(f"no policy at {path.parent}: {path.name} is missing")
-    config = read_json(path)
-    found = config.get("format") if isinstance(config, dict) else None
-    if found != FORMAT:
-        raise ValueError(
-            f"{path} has format {found}, this version of warmprior reads {FORMAT}: "
-            "save the policy again with a matching version"
-        )
-    missing = [part for part in ("prior", "network", "actor", "normalizer") if part not in config]
-    if missing:
-        raise ValueError(f"{path} is incomplete: it lacks {', '.join(missing)}")
-    return config
