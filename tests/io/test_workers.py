@@ -221,3 +221,29 @@ def test_the_state_of_a_worker_is_its_own():
     with WorkerPool(1, state) as pool:
         assert list(gather(pool, [partial(add, [1])]).values()) == [[1]]
     assert state == []
+
+
+FAKED = """
+import torch
+from functools import partial
+from warmprior.io.workers import WorkerPool
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+def gradient(state, factor):
+    weight = torch.ones((), requires_grad=True)
+    (factor * weight).backward()
+    return weight.grad.item()
+
+with FakeTensorMode():
+    torch.ones(2)
+gradient(None, 1.0)
+with WorkerPool(1, None) as pool:
+    pool.submit(partial(gradient, factor=3.0))
+    print(pool.wait()[0][1])
+"""
+
+
+def test_workers_compute_gradients_after_something_was_compiled():
+    # In a process of its own: autograd counts devices once.
+    done = subprocess.run([sys.executable, "-c", FAKED], capture_output=True, text=True)
+    assert done.stdout == "3.0\n", done.stderr

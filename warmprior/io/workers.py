@@ -32,6 +32,10 @@ __all__ = [
 
 _forks = True
 
+# Autograd counts devices when it first computes a gradient, and refuses to work in forks from then on if there is
+# one. Compiling anything, or fake tensors, let it see a GPU that is not there: let it count before.
+torch.ones((), requires_grad=True).backward()
+
 
 class WorkerError(RuntimeError):
     """A worker process died, or cannot do the work."""
