@@ -32,8 +32,8 @@ __all__ = [
 
 _forks = True
 
-# Autograd counts devices when it first computes a gradient, and refuses to work in forks from then on if there is
-# one. Compiling anything, or fake tensors, let it see a GPU that is not there: let it count before.
+# Autograd counts devices when it first computes a gradient, and refuses to work in forks from then on if
+# there is one. Compiling anything, or fake tensors, let it see a GPU that is not there: it counts before.
 torch.ones((), requires_grad=True).backward()
 
 
