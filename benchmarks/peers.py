@@ -42,6 +42,7 @@ from warmprior import (
 from warmprior.experiments import table
 from warmprior.experiments.figures import new_figure
 from warmprior.experiments.results import Row, facts_of_machine
+from warmprior.io.distributed import check_device
 from warmprior.io.script import run_script
 
 NFES = (1, 3, 9)
@@ -394,9 +395,12 @@ def run(argv: Sequence[str] | None) -> None:
     options = parser.parse_args(argv)
     if options.repeats < 1 or options.batch_size < 1 or not 1e4 <= options.parameters <= 1e9:
         parser.error("--repeats and --batch-size must be at least 1, --parameters 1e4 to 1e9")
+    check_device(options.device)
     torch.manual_seed(0)
-    options.out.mkdir(parents=True, exist_ok=True)
     peers = [PEERS[name][0](options.parameters, options.device) for name in found(options.peers)]
+    if not peers:
+        raise ValueError("none of these peers is installed: pip install 'warmprior[vla]'")
+    options.out.mkdir(parents=True, exist_ok=True)
     with tqdm(desc="rounds", dynamic_ncols=True) as bar:
         rows = measure(peers, options, Clock(options.repeats, bar))
     meta = facts_of_machine(

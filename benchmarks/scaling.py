@@ -162,7 +162,7 @@ def measured_once(
 
 
 def whole_comparison(recorded: Sequence[Played], step: float, cores: int) -> float:
-    """Hours of the ``cpu`` preset on all task-styles, if all were like these episodes."""
+    """Hours of the ``cpu`` preset on all task-styles, if all were like these episodes, at any NFE."""
     cells = [Cell(CPU_PRESET["iterations"], nfe, AT_ONCE) for nfe in range(CPU_PRESET["cells"])]
 
     def following(number: int) -> dict[Job, float]:
@@ -259,6 +259,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
     add("--out", type=Path, default=Path("runs/scaling"), help="output folder (%(default)s)")
     options = parser.parse_args(argv)
     options.processes = sorted({1, *(options.processes or [available_cores()])})
+    if max(options.processes) > available_cores():
+        parser.error(f"--processes can be measured up to the number of cores, {available_cores()}")
     if min([*options.processes, *options.cores, options.repeats]) < 1 or options.episodes < 2:
         parser.error("--processes, --cores and --repeats must be at least 1, --episodes at least 2")
     return options
@@ -281,7 +283,9 @@ def run(argv: Sequence[str] | None) -> None:
             recorded.append(record(state, seed))
             bar.update()
     observation = state.env.reset()
-    batches = {n: decide(state, torch.stack([observation] * n)) for n in (1, 2, 4, 8, 16, 32, 64)}
+    # Up to as many rows as are simulated; in between it is interpolated.
+    sizes = [2**i for i in range(max(options.cores).bit_length() + 1)]
+    batches = {n: decide(state, torch.stack([observation] * n)) for n in sizes}
     state.env.close()
     step = results["measured"][1]["training"]
     results["decision_seconds"] = batches

@@ -68,3 +68,13 @@ def test_the_script(tmp_path, capsys, monkeypatch):
     ]
     assert all(row["measures"]["samples_per_second"] > 0 for row in rows)
     assert (tmp_path / "peers.png").stat().st_size > 10_000
+
+
+def test_bad_input_comes_before_any_folder(tmp_path, capsys, monkeypatch):
+    out = tmp_path / "out"
+    assert peers.main(["--device", "cuda:7", "--out", str(out)]) == 2
+    assert "--device cuda:7" in capsys.readouterr().err
+    monkeypatch.setattr(peers, "find_spec", lambda name: None)
+    assert peers.main(["--peers", "lerobot_diffusion", "--out", str(out)]) == 2
+    assert "none of these peers is installed" in capsys.readouterr().err
+    assert not out.exists()

@@ -84,6 +84,10 @@ def test_the_script(tmp_path, capsys):
     results = json.loads((out / "scaling.json").read_text())
     assert set(results["measured"]) == {"1", "2"}
     assert results["simulated"]["1"]["apart"] == pytest.approx(1.0)
+    assert set(results["decision_seconds"]) == {"1", "2", "4", "8", "16", "32"}
+    one, two = (results["measured"][n] for n in "12")
+    assert results["evaluation_over_lockstep"] == two["lockstep"] / two["apart"]
+    assert results["training_scaling"] == one["training"] / two["training"] / 2
     assert all(len(e["decisions"]) == len(e["steps"]) for e in results["recorded"])
     assert (out / "scaling.png").stat().st_size > 10_000
     assert "16 cores" in (out / "table.md").read_text()

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 import torch
 import torch.distributed as dist
 
+from tests.together import together
 from warmprior.experiments import RunOptions
 from warmprior.io import distributed
-from warmprior.io.distributed import check_device, launched, process_group, rank, world_size
+from warmprior.io.distributed import (
+    check_device,
+    launched,
+    leader_first,
+    process_group,
+    rank,
+    world_size,
+)
 from warmprior.io.script import run_script
 from warmprior.io.workers import WorkerError
 
@@ -87,3 +97,22 @@ def test_other_errors_pass():
     with pytest.raises(RuntimeError, match="shapes do not fit"), process_group():
         raise RuntimeError("shapes do not fit")
     assert distributed.STEP < distributed.PATIENCE
+
+
+def _leaders_fail(folder):
+    told = []
+    for error in (FloatingPointError("NaN"), ValueError("damaged"), None, OSError("full")):
+        try:
+            with leader_first():
+                if error is not None and rank() == 0:
+                    raise error
+        except BaseException as found:
+            told.append([type(found).__name__, str(found)])
+    (folder / str(rank())).write_text(json.dumps(told))
+
+
+def test_what_fails_in_the_first_fails_in_all_and_nobody_waits(tmp_path):
+    together(_leaders_fail, tmp_path)
+    first, other = (json.loads((tmp_path / str(number)).read_text()) for number in range(2))
+    assert first == [["FloatingPointError", "NaN"], ["ValueError", "damaged"], ["OSError", "full"]]
+    assert other == [*first[:2], ["SystemExit", "2"]]

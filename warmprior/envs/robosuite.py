@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -275,7 +276,7 @@ class RobosuiteWrapper(_EnvWrapper):
         return success, terminated, out_of_time and not terminated, terminated or out_of_time
 
     def _tell(
-        self, flags: Sequence[_Flags], measured: Sequence[dict[str, Any]]
+        self, flags: Sequence[_Flags], measured: Collection[dict[str, Any]]
     ) -> list[TensorDictBase]:
         """A result per step, of which the last ones tell what was measured."""
         # Arrays are made tensors and split, instead of one small tensor per entry and step.
@@ -305,17 +306,21 @@ class RobosuiteWrapper(_EnvWrapper):
         return result
 
     def control_steps(self, actions: torch.Tensor, keep: int) -> list[TensorDictBase]:
-        """Take control steps until the episode ends, with nothing but physics in between.
+        """Take control steps until the episode ends, with nothing but physics in between where possible.
 
-        :class:`~warmprior.ChunkStep` executes chunks by it, where no transform has to look at every step.
+        :class:`~warmprior.ChunkStep` executes chunks by it, where no transform and no subclass's ``_step``
+        has to see every step. Observations that are no poses, pictures among them, are taken at every step.
 
         Args:
             actions: ``[n, d_a]``, ``n >= 1``, in the environment's units.
-            keep: of how many of the last steps to tell the observations; of the others only the reward,
-                ``"success"`` and the done flags.
+            keep: of how many of the last steps, at least 1, to tell the observations; of the others only the
+                reward, ``"success"`` and the done flags.
 
         Returns:
             What each step led to, ``n`` or fewer.
+
+        Raises:
+            ValueError: if ``keep < 1``.
 
         Examples:
             >>> _ = env.reset()  # doctest: +SKIP
@@ -323,10 +328,12 @@ class RobosuiteWrapper(_EnvWrapper):
             >>> ["observation" in step for step in steps[-2:]]  # doctest: +SKIP
             [False, True]
         """
+        if keep < 1:
+            raise ValueError(f"keep must be at least 1, got {keep}")
         rows = actions.detach().cpu().double().unbind(0)
         flags: list[_Flags] = []
         states: list[np.ndarray] = []
-        measured: list[dict[str, Any]] = []
+        measured = deque[dict[str, Any]](maxlen=keep)
         for action in rows:
             if self._late is not None:
                 success = self._late.advance(action.numpy())
@@ -339,8 +346,8 @@ class RobosuiteWrapper(_EnvWrapper):
                 break
         if self._late is not None:
             # One more than is told: see ControlLoop.look_back.
-            measured = [self._measure(o) for o in self._late.look_back(states[-keep - 1 :])]
-        return self._tell(flags, measured[-keep:])
+            measured.extend(map(self._measure, self._late.look_back(states[-keep - 1 :])))
+        return self._tell(flags, measured)
 
 
 class RobosuiteEnv(RobosuiteWrapper):

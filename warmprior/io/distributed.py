@@ -122,13 +122,39 @@ def leader_first() -> Iterator[None]:
     """Let the first process do something before the others, which find it done.
 
     Raises:
+        FloatingPointError: in all, if that is what it led to in the first: such failures end a training, and
+            not the run.
+        ValueError: likewise.
+        SystemExit: in the others, if it failed otherwise in the first, which tells why.
         WorkerError: if the first process ended meanwhile.
     """
-    if rank():
-        _wait()
+    told: list[Any] = [None]
+    if not rank():
+        try:
+            yield
+        except BaseException as error:
+            told = [
+                (
+                    next((n for n, kind in _SHARED.items() if isinstance(error, kind)), ""),
+                    str(error),
+                )
+            ]
+            raise
+        finally:
+            if world_size() > 1:
+                with process_group():
+                    dist.broadcast_object_list(told, 0, _waiting)
+        return
+    with process_group():
+        dist.broadcast_object_list(told, 0, _waiting)
+    if told[0] is not None:
+        kind, text = told[0]
+        raise _SHARED[kind](text) if kind else SystemExit(2)
     yield
-    if world_size() > 1 and not rank():
-        _wait()
+
+
+_SHARED: dict[str, type[Exception]] = {"number": FloatingPointError, "value": ValueError}
+"""Errors that :func:`leader_first` raises in all processes."""
 
 
 def from_leader[T](make: Callable[[], T]) -> T:
@@ -222,7 +248,7 @@ def check_device(device: str) -> None:
         kind, index = torch.device(device).type, torch.device(device).index
         if kind == "cuda" and torch.cuda.is_available():
             devices = torch.cuda.device_count()
-            local = int(os.environ["LOCAL_WORLD_SIZE"]) if launched() else 1
+            local = int(os.environ.get("LOCAL_WORLD_SIZE", 1)) if launched() else 1
             if launched() and index is not None:
                 raise ValueError(
                     f"--device {device}: under torchrun every process takes a GPU of its own: --device cuda"

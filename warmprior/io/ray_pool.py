@@ -50,13 +50,14 @@ def check_ray(address: str | None = None) -> str | None:
         ConnectionError: if nothing answers there, or the cluster has another Ray or Python.
     """
     require("ray", "ray")
+    option = "--ray-address" if address else "RAY_ADDRESS"
     address = address or os.environ.get("RAY_ADDRESS") or "local"
     if address == "local":
         return None
     host, _, port = address.rpartition(":")
     if address != "auto" and not (host and port.isdecimal() and "/" not in host):
         raise ValueError(
-            f"--ray-address {address} is not the address of a cluster's head, HOST:PORT (6379 by default); "
+            f"{option} {address} is not the address of a cluster's head, HOST:PORT (6379 by default); "
             "start from one of its machines, not through ray://"
         )
     try:
@@ -73,7 +74,7 @@ def check_ray(address: str | None = None) -> str | None:
     except (OSError, OverflowError) as error:
         reason = str(error)
     raise ConnectionError(
-        f"--ray-address {address} is no cluster to work on: {reason.strip(' .')}. Start one with ray start "
+        f"{option} {address} is no cluster to work on: {reason.strip(' .')}. Start one with ray start "
         "--head (RAY_AUTH_MODE=token if it asks for a token), or leave out --ray-address and RAY_ADDRESS for "
         "this machine alone"
     )
@@ -223,9 +224,7 @@ class RayPool[State]:
         Args:
             job: picklable, and repeatable.
         """
-        task = self._ray.remote(_run).options(
-            num_cpus=1, num_gpus=self._gpus(job), max_retries=self._retries
-        )
+        task = self._task.options(num_cpus=1, num_gpus=self._gpus(job), max_retries=self._retries)
         self._running[task.remote(self._setup, job)] = job
 
     def wait(self, timeout: float | None = None) -> list[tuple[Any, Any]]:
@@ -269,6 +268,8 @@ class RayPool[State]:
                 torch.get_float32_matmul_precision(),
                 self._ray.put(self._make_state),
             )
+            # Once: Ray sends every new remote function to the cluster.
+            self._task = self._ray.remote(_run)
             self._connection = stack.pop_all()
         return self
 
@@ -320,20 +321,27 @@ def ray_cluster(
             stack.callback(ray.shutdown)
             ray.init(**options, logging_level="ERROR")
         with _tokens(folders) as tokens:
-            for node in ray.nodes():
-                if node["Alive"] and node["Resources"].get("CPU", 0) >= 1:  # it may get jobs
-                    _check_node(ray, node, tokens)
+            nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
+            looks = [
+                _look_at(ray, node, tokens) for node in nodes
+            ]  # all at once: each takes seconds
+            for node, look in zip(nodes, looks, strict=True):
+                _check_node(ray, node, look)
         yield ray
 
 
-def _check_node(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> None:
+def _look_at(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> Any:
+    """A task that tells what a machine has and sees."""
     from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-    name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
     there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
-    task = ray.remote(_look).options(num_cpus=0, scheduling_strategy=there)
+    return ray.remote(_look).options(num_cpus=0, scheduling_strategy=there).remote(tokens)
+
+
+def _check_node(ray: Any, node: Mapping[str, Any], look: Any) -> None:
+    name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
     try:
-        theirs, unseen = ray.get(task.remote(tokens), timeout=NODE_PATIENCE)
+        theirs, unseen = ray.get(look, timeout=NODE_PATIENCE)
     except ray.exceptions.RayError as error:
         cause = getattr(error, "cause", None) or error
         raise WorkerError(f"{name} cannot start this library: {cause}") from error

@@ -8,6 +8,7 @@ from typing import Any
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs import EnvBase
 from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform, TransformedEnv
 
 from warmprior import keys
@@ -58,7 +59,7 @@ class LateTransforms:
         self._one_by_one, self._at_once = self._transforms[:first], self._transforms[first:]
         self._control_steps: Callable[[Tensor, int], list[TensorDictBase]] | None = None
         if brief and not self._one_by_one and not step.base.batch_size:
-            self._control_steps = getattr(step.base, "control_steps", None)
+            self._control_steps = _control_steps(step.base)
 
     @classmethod
     def of(
@@ -146,6 +147,13 @@ class LateTransforms:
                 result = transform._step(before, result)
             before = result
         return before
+
+
+def _control_steps(base: EnvBase) -> Callable[[Tensor, int], list[TensorDictBase]] | None:
+    """That of an environment whose ``_step`` is the one that it goes with: a subclass may have another."""
+    owner = next((cls for cls in type(base).__mro__ if "control_steps" in vars(cls)), None)
+    same = owner is not None and type(base)._step is owner._step  # type: ignore[attr-defined]
+    return getattr(base, "control_steps", None) if same else None
 
 
 def advance(
