@@ -26,6 +26,8 @@ pytest.importorskip("ray")
 OWN_CODE = """
 import os, time
 
+pytestmark = pytest.mark.cluster
+
 class State:
     # Tells, in a file, that it was made.
     def __init__(self, folder):
