@@ -35,6 +35,7 @@ html_title = "warmprior"
 # A page per class and function of docs/reference/*.rst, without what classes inherit: TorchRL documents
 # its own methods.
 autosummary_generate = True
+python_use_unqualified_type_names = True
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
@@ -77,7 +78,11 @@ def _one_download(app, docname, source):
 def _show_own_signature(app, what, name, obj, options, signature, return_annotation):
     """Show what a class takes where a base class or metaclass hides it behind ``*args``."""
     if what == "class" and (signature or "").startswith("(*args"):
-        own = stringify_signature(_signature(obj.__init__, bound_method=True))
+        own = stringify_signature(
+            _signature(obj.__init__, bound_method=True),
+            show_annotation=False,
+            show_return_annotation=False,
+        )
         signature = signature if own.startswith("(*args") else own
     return signature, return_annotation
 
