@@ -20,13 +20,13 @@ from warmprior.io import ray_pool
 from warmprior.io.ray_pool import RayPool, check_ray
 from warmprior.io.workers import Failure, WorkerError
 
+pytestmark = pytest.mark.cluster
+
 pytest.importorskip("ray")
 
 
 OWN_CODE = """
 import os, time
-
-pytestmark = pytest.mark.cluster
 
 class State:
     # Tells, in a file, that it was made.
