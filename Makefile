@@ -28,20 +28,15 @@ benchmark: install
 throughput: install
 	$(BIN)/python benchmarks/throughput.py $(ARGS)
 
-# Files side by side, one per core: tests of one file share what they have trained. Those that connect to a Ray
-# cluster have a process of their own: forks of one with many threads can wait for ever.
-PYTEST := $(BIN)/python -m pytest
-SIDE_BY_SIDE := -n logical --dist loadfile
-OR_NONE := || [ $$? -eq 5 ]
+# Files side by side, one per core: tests of one file share what they have trained.
+PYTEST := $(BIN)/python -m pytest -n logical --dist loadfile
 
 test: install
-	$(PYTEST) $(SIDE_BY_SIDE) -m "not slow and not cluster" $(ARGS) $(OR_NONE)
-	$(PYTEST) -m "not slow and cluster" $(ARGS) $(OR_NONE)
+	$(PYTEST) -m "not slow" $(ARGS)
 
 # The built documentation, the wheel in an empty environment, long trainings.
 test-slow: install
-	$(PYTEST) $(SIDE_BY_SIDE) -m "slow and not cluster" $(ARGS) $(OR_NONE)
-	$(PYTEST) -m "slow and cluster" $(ARGS) $(OR_NONE)
+	$(PYTEST) -m slow $(ARGS)
 
 $(GROOT)/installed: pyproject.toml constraints.txt $(GROOT_NEEDS)
 	$(PYTHON) -m venv $(GROOT)

@@ -11,10 +11,12 @@ import hypothesis
 import pytest
 import torch
 
-from warmprior.io.workers import start_method
-
-# The tests' tensors are small: a second thread gains nothing, and on a busy machine costs much.
+# The tests' tensors are small: a second thread gains nothing, and on a busy machine costs much. TorchRL goes
+# back to the number that it was imported with when an environment closes, and with more than one a process
+# forked after that would wait for threads that it lacks: so before it is imported.
 torch.set_num_threads(1)
+
+from warmprior.io.workers import start_method  # noqa: E402
 
 # Timings on a shared machine say nothing: no test fails for being slow once.
 hypothesis.settings.register_profile("shared-machine", deadline=None)

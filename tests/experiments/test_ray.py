@@ -27,8 +27,6 @@ from warmprior.experiments import Comparison, Store
 from warmprior.io.script import run_script
 from warmprior.io.workers import end_with_parent
 
-pytestmark = pytest.mark.cluster
-
 
 def told_of(rows):
     return [{**row.facts, **row.measures, "outcomes": row.outcomes} for row in rows]

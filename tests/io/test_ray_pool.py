@@ -20,8 +20,6 @@ from warmprior.io import ray_pool
 from warmprior.io.ray_pool import RayPool, check_ray
 from warmprior.io.workers import Failure, WorkerError
 
-pytestmark = pytest.mark.cluster
-
 pytest.importorskip("ray")
 
 

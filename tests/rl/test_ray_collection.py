@@ -22,8 +22,6 @@ from warmprior.rl import PriorSpaceConfig
 from warmprior.rl.agent import PriorSpaceAgent
 from warmprior.rl.ray_collection import WarmUpSwitch
 
-pytestmark = pytest.mark.cluster
-
 
 def test_a_buffer_says_which_policy_acts():
     agent = PriorSpaceAgent(make_actor(), PriorSpaceConfig(nfe=2, hidden_dim=8, num_layers=1))
