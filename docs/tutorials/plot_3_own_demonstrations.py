@@ -177,9 +177,7 @@ def train(prior, iterations=1000):
     )
     training = BehaviourCloning(actor, normalized, config, root / prior.name)
     training.run(description=None)  # no progress bar
-    return WarmPriorActor.from_pretrained(
-        root / prior.name / f"policy_{iterations:06d}"
-    )
+    return WarmPriorActor.from_pretrained(training.policy_path())
 
 
 policies = {

@@ -295,7 +295,7 @@ def test_a_normaliser_of_other_keys_is_kept_with_the_policy(tmp_path, key):
     actor.normalizer = Normalizer({k: -v for k, v in limits.items()}, limits)
     cloning = training(tmp_path / "run", actor=actor)
     cloning.run(None)
-    loaded = WarmPriorActor.from_pretrained(cloning.policy_path(cloning.config.iterations))
+    loaded = WarmPriorActor.from_pretrained(cloning.policy_path())
     assert loaded.normalizer.config() == actor.normalizer.config()
 
 

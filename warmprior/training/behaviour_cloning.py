@@ -259,9 +259,11 @@ class BehaviourCloning:
         """Where the training state lies."""
         return self.directory / "state.safetensors"
 
-    def policy_path(self, iteration: int) -> Path:
-        """Where the policy kept after ``iteration`` lies."""
-        return policy_path(self.directory, iteration)
+    def policy_path(self, iteration: int | None = None) -> Path:
+        """Where the policy kept after ``iteration`` lies, the last one by default."""
+        return policy_path(
+            self.directory, self.config.iterations if iteration is None else iteration
+        )
 
     def step(self) -> torch.Tensor:
         """One gradient step: sample, loss, backward, optimiser, schedule, averaging.
