@@ -79,7 +79,7 @@ def test_a_loaded_policy_decides_as_before(finished):
 
 def test_diagnostics_see_what_the_encoder_makes_of_images(finished):
     (path,) = finished.glob("cache/rendered/*.hdf5")
-    folder = next(f for f in finished.glob("policies/**/policy_000004"))
+    (folder,) = finished.glob("policies/*gaussian*/policy_000004")
     actor = WarmPriorActor.from_pretrained(folder).eval()
     keys = ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]
     images = ["agentview_image", "robot0_eye_in_hand_image"]
