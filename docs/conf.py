@@ -10,6 +10,8 @@ from furo.navigation import get_navigation_tree
 from sphinx.util.inspect import signature as _signature
 from sphinx.util.inspect import stringify_signature
 
+_sys.path.insert(0, str(_Path(__file__).parent))  # error_messages, tutorial_state
+
 project = "warmprior"
 author = "the warmprior developers"
 copyright = "2026, the warmprior developers. MIT licence"
@@ -26,6 +28,7 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "sphinx-mathjax-offline",  # formulas need no internet
+    "error_messages",
 ]
 exclude_patterns = ["_build", "_templates", "tutorials/*.rst"]
 templates_path = ["_templates"]
@@ -51,7 +54,6 @@ myst_heading_anchors = 3
 
 # The tutorials run when the pages are built, in the order of their numbers, each from the same state; an
 # error ends the build. ``make docs ARGS='-D plot_gallery=0'`` leaves them as text.
-_sys.path.insert(0, str(_Path(__file__).parent))
 sphinx_gallery_conf = {
     "examples_dirs": "tutorials",
     "gallery_dirs": "auto_tutorials",

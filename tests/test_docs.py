@@ -52,6 +52,30 @@ def test_top_level_names_belong_to_a_package():
     assert set(warmprior.__all__) - {"__version__"} <= known
 
 
+@pytest.mark.parametrize(
+    "refused",
+    [
+        lambda: warmprior.PastPrior(0),
+        lambda: warmprior.PastPrior(4, sigma=-1.0),
+        lambda: warmprior.training.evaluate(None, None, episodes=0, first_seed=0),
+        lambda: warmprior.WarmPriorActor.from_pretrained("nowhere"),
+        lambda: warmprior.training.warmup_cosine(None, 10, warmup_ratio=1.5),
+    ],
+)
+def test_what_an_error_says_is_on_the_page_of_errors(refused, monkeypatch):
+    """With "…" where the message has a value."""
+    pytest.importorskip("docutils")
+    monkeypatch.syspath_prepend(str(DOCS))
+    listed = importlib.import_module("error_messages").messages()
+    with pytest.raises((ValueError, OSError)) as error:
+        refused()
+    said = " ".join(str(error.value).split())
+    pattern = {message: re.escape(message.text).replace("…", ".*") for message in listed}
+    fits = [message for message, text in pattern.items() if re.fullmatch(text, said)]
+    found = max(fits, key=lambda message: len(message.text))
+    assert found.kind == error.type.__name__ and len(found.text) > len(said) / 2
+
+
 @pytest.mark.slow
 def test_docs_build_without_warnings_and_hold_every_public_name(tmp_path):
     pytest.importorskip("sphinx")
