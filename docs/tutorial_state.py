@@ -10,8 +10,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-# Nothing is fetched while the pages are built, and nobody watches the bars.
-os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_DISABLE_PROGRESS_BARS": "1"}
+# Nothing is fetched while the pages are built, and nobody watches bars or logs.
+os.environ |= {
+    "HF_HUB_OFFLINE": "1",
+    "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
+    "RL_LOGGING_LEVEL": "WARNING",
+}
 
 STYLE = {
     "figure.dpi": 100,
