@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import random
+import warnings
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -14,6 +15,7 @@ import torch
 os.environ |= {
     "HF_HUB_OFFLINE": "1",
     "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
+    "HF_HUB_DISABLE_PROGRESS_BARS": "1",
     "RL_LOGGING_LEVEL": "WARNING",
 }
 
@@ -30,6 +32,7 @@ STYLE = {
 
 def reset(gallery_conf: Any, fname: str) -> None:
     """Seeds, threads and the style of figures; sphinx-gallery calls it before each script."""
+    warnings.filterwarnings("ignore", "Cannot enable progress bars")
     random.seed(0)
     np.random.seed(0)
     torch.manual_seed(0)

@@ -135,7 +135,7 @@ axes[0].set_ylabel("height (executed action)")
 plt.show()
 
 # %%
-# What to notice: WP-Past keeps the side on which it began, so that nearly half of its episodes
+# What to notice: WP-Past keeps the side on which it began, so that a third of its episodes
 # happen to take the right one. The Gaussian policy would have to choose it anew at every decision,
 # and hardly ever does.
 #
@@ -271,10 +271,10 @@ axes[0].legend(loc="upper left")
 plt.show()
 
 # %%
-# What to notice: grey is the time without an agent. Both agents stay where their frozen policy is
+# What to notice: grey is the time without an agent. Both agents stay near their frozen policy
 # for a while, until enough of what they collected has told them where the reward is, and then solve
-# every episode. They begin from very different levels. The frozen WP-Past earns a reward in nearly
-# every other episode, the Gaussian policy in one of fifty, so that the second agent has to find its
+# every episode. They begin from very different levels. The frozen WP-Past earns a reward in a
+# third of its episodes, the Gaussian policy in one of twenty, so that the second agent has to find its
 # few successes first.
 #
 # Playing
@@ -334,8 +334,8 @@ folder.cleanup()
 #
 # What can be read from it is what an agent lives on. With chunks of four an episode has sixteen
 # decisions, and the Gaussian policy takes the right side at all of them so rarely that in 12,000
-# steps its agent does not learn where the reward is. WP-Past meets the reward in every third
-# episode, however often it decides. Where the frozen policy succeeds now and then, the two differ
+# steps its agent does not learn where the reward is. WP-Past meets the reward in a third of
+# its episodes or more, however often it decides. Where the frozen policy succeeds now and then, the two differ
 # little, and three seeds of a toy do not rank them.
 #
 # On a robot task the frozen policy comes from a run of ``robomimic.py``, or is trained first:

@@ -321,8 +321,8 @@ folder.cleanup()
 # this flow happens to carry what starts above to actions above. Do not count on it; for these
 # weights the source is one that they have never seen, and a toy with one action dimension is kind.
 # Fine-tuning adds nothing to that at nine evaluations; a few episodes more collide. It shows below,
-# at a single evaluation, where a policy returns the mean of what
-# its source leaves open: the unchanged weights run through the middle whatever the source, and the
+# at a single evaluation, where a policy returns the mean of what its source
+# leaves open: the unchanged weights run through the middle whatever the source, and the
 # fine-tuned ones have begun to leave it. Most episodes still collide, for they begin there, at a
 # first decision without a past, and 400 iterations are few.
 #
