@@ -335,8 +335,8 @@ folder.cleanup()
 # What can be read from it is what an agent lives on. With chunks of four an episode has sixteen
 # decisions, and the Gaussian policy takes the right side at all of them so rarely that in 12,000
 # steps its agent does not learn where the reward is. WP-Past meets the reward in a third of
-# its episodes or more, however often it decides. Where the frozen policy succeeds now and then, the two differ
-# little, and three seeds of a toy do not rank them.
+# its episodes or more, however often it decides. Where both frozen policies succeed now and then,
+# the agents differ little, and three seeds of a toy do not rank them.
 #
 # On a robot task the frozen policy comes from a run of ``robomimic.py``, or is trained first:
 #
