@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import os
 import random
+import warnings
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-# Nothing is fetched while the pages are built, and nobody watches the bars.
-os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_DISABLE_PROGRESS_BARS": "1"}
+# Nothing is fetched while the pages are built, and nobody watches bars or logs.
+os.environ |= {
+    "HF_HUB_OFFLINE": "1",
+    "HF_DATASETS_DISABLE_PROGRESS_BARS": "1",
+    "HF_HUB_DISABLE_PROGRESS_BARS": "1",
+    "RL_LOGGING_LEVEL": "WARNING",
+}
 
 STYLE = {
     "figure.dpi": 100,
@@ -26,6 +32,7 @@ STYLE = {
 
 def reset(gallery_conf: Any, fname: str) -> None:
     """Seeds, threads and the style of figures; sphinx-gallery calls it before each script."""
+    warnings.filterwarnings("ignore", "Cannot enable progress bars")
     random.seed(0)
     np.random.seed(0)
     torch.manual_seed(0)

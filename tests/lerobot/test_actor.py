@@ -126,6 +126,25 @@ def test_several_observations_and_the_lead_of_a_chunk(policy):
         actor(short)
 
 
+def test_a_single_observation_of_a_policy_that_may_see_several(policy):
+    made, prior = policy("multi_task_dit", n_obs_steps=1), PastPrior(LENGTH, sigma=0.0)
+    actor = LeRobotActor(made, prior, names=NAMES, preprocess=told)
+    data = TensorDict(
+        {
+            "observation": {"state": torch.randn(3, 1, STATE)},
+            "prior": {
+                "loc": torch.randn(3, LENGTH, ACTION),
+                "warm": torch.ones(3, LENGTH, 1, dtype=torch.bool),
+            },
+        },
+        [3],
+    )
+    with watch("multi_task_dit", made) as seen:
+        chunk = actor(data)["vla_action", "chunk"]
+    assert torch.equal(seen.x[0], data["prior", "loc"])
+    torch.testing.assert_close(chunk, seen.x[0] + sum(seen.out) / len(seen.out))
+
+
 def test_collectors_and_batched_environments(policy):
     prior = PastPrior(LENGTH)
     actor = actor_of(policy("pi05"), prior)

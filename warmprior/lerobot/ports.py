@@ -327,6 +327,9 @@ def _check_multi_task_dit(policy: Any) -> None:
 def _predict_multi_task_dit(policy: Any, batch: dict[str, Any]) -> None:
     # Its own predict_action_chunk takes the observations from its queue.
     policy.eval()
+    if policy.config.n_obs_steps == 1:  # the queue gives even a single one its dimension of time
+        seen = policy.config.input_features
+        batch = {name: v.unsqueeze(1) if name in seen else v for name, v in batch.items()}
     with torch.no_grad():
         policy._generate_actions(policy._prepare_batch(batch))
 

@@ -54,6 +54,7 @@ class PriorSpaceTraining:
         ray_address: of the cluster.
 
     Attributes:
+        agent: what learns; its ``policy`` is the agent followed by the decoder.
         decoder: the frozen policy as a decoder.
         steps: control steps so far, those of the warm-up included.
         curve: the evaluations so far, see :meth:`run`.
