@@ -17,7 +17,7 @@ DRAWN = re.compile(r'/ f?"([a-z0-9_]+?)_?(?:\{[^"]*|\.png|\.mp4)"')
 
 
 def _drawing() -> dict[str, str]:
-    """Benchmarks that draw by the library's figures, and their source: all but throughput.py, which only times."""
+    """Benchmarks that draw by the library's figures, and their source: not throughput.py, which times."""
     scripts = (ROOT / "benchmarks").glob("[!_]*.py")
     found = {script.name: script.read_text() for script in scripts}
     return {name: source for name, source in found.items() if DRAWS.search(source)}
