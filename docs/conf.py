@@ -30,10 +30,13 @@ extensions = [
     "sphinx-mathjax-offline",  # formulas need no internet
     "error_messages",
 ]
-exclude_patterns = ["_build", "_templates", "tutorials/*.rst"]
 templates_path = ["_templates"]
 html_theme = "furo"
 html_title = "warmprior"
+html_static_path = ["_static"]
+html_css_files = ["gallery.css"]
+# Pictures come with the pages that show them, and not with the static files a second time.
+exclude_patterns = ["_build", "_templates", "tutorials/*.rst", "**.png"]
 
 # A page per class and function of docs/reference/*.rst, without what classes inherit: TorchRL documents
 # its own methods.
@@ -120,6 +123,17 @@ def _fold_navigation(app, pagename, templatename, context, doctree):
         context["furo_navigation_tree"] = get_navigation_tree(tree)
 
 
+def _link_back_to_documentation(app, pagename, templatename, context, doctree):
+    """Lead ``[docs]`` of a module's source to an object's page as that page names it.
+
+    viewcode takes the package of the first one for all objects of a module, but some are documented as
+    ``warmprior.NAME`` and others as ``warmprior.PACKAGE.NAME``.
+    """
+    if pagename.startswith("_modules/"):
+        other = r'(/api/)([\w.]*?)(\w+)\.html#(?:\w+\.)*?\3((?:\.\w+)*)"'
+        context["body"] = re.sub(other, r'\1\2\3.html#\2\3\4"', context["body"])
+
+
 def _keep_what_formulas_need(app, error):
     """MathJax comes with inputs, outputs and voices that these pages do not use, 20 MB of them."""
     folder = _Path(app.outdir) / "_static" / "mathjax"
@@ -137,4 +151,5 @@ def setup(app):
     app.connect("autodoc-process-signature", _show_own_signature)
     app.connect("missing-reference", _resolve_other_names)
     app.connect("html-page-context", _fold_navigation, priority=900)
+    app.connect("html-page-context", _link_back_to_documentation)
     app.connect("build-finished", _keep_what_formulas_need, priority=900)

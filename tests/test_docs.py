@@ -76,13 +76,14 @@ def test_what_an_error_says_is_on_the_page_of_errors(refused, monkeypatch):
     assert found.kind == error.type.__name__ and len(found.text) > len(said) / 2
 
 
-@pytest.mark.slow
-def test_docs_build_without_warnings_and_hold_every_public_name(tmp_path):
+@pytest.fixture(scope="module")
+def built(tmp_path_factory) -> Path:
+    """The pages, built without a warning."""
     pytest.importorskip("sphinx")
-    from sphinx.util.inventory import InventoryFile
-
+    out = tmp_path_factory.mktemp("docs")
     # Tutorials that ran before run again: what they use may have changed.
     run_all = ["-D", "sphinx_gallery_conf.run_stale_examples=True"]
+    apart = ["-d", str(tmp_path_factory.mktemp("doctrees"))]
     subprocess.run(
         [
             sys.executable,
@@ -92,13 +93,42 @@ def test_docs_build_without_warnings_and_hold_every_public_name(tmp_path):
             "--keep-going",
             "-q",
             *run_all,
+            *apart,
             str(DOCS),
-            str(tmp_path),
+            str(out),
         ],
         check=True,
     )
-    inventory = InventoryFile.loads((tmp_path / "objects.inv").read_bytes(), uri="")
+    return out
+
+
+@pytest.mark.slow
+def test_built_docs_hold_every_public_name(built):
+    from sphinx.util.inventory import InventoryFile
+
+    inventory = InventoryFile.loads((built / "objects.inv").read_bytes(), uri="")
     described = {
         name for kind, items in inventory.data.items() if kind.startswith("py:") for name in items
     }
     assert set(_reference()) <= described
+
+
+@pytest.mark.slow
+def test_source_pages_lead_back_to_what_documents_them(built):
+    links = [
+        (page.parent / path, anchor)
+        for page in (built / "_modules").rglob("*.html")
+        for path, anchor in re.findall(
+            r'<a class="viewcode-back" href="([^"#]*)#?([^"]*)"', page.read_text()
+        )
+    ]
+    assert len(links) > 100
+    pages = {path: path.read_text() for path, _ in links}
+    assert [link for link in links if f' id="{link[1]}"' not in pages[link[0]]] == []
+
+
+@pytest.mark.slow
+def test_built_docs_are_small_and_hold_the_films(built):
+    assert sum(path.stat().st_size for path in built.rglob("*") if path.is_file()) < 30_000_000
+    films = re.findall(r'<video[^>]* src="([^"#]+)', (built / "gallery.html").read_text())
+    assert films and all((built / film).is_file() for film in films)

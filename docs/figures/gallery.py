@@ -1,0 +1,62 @@
+"""Puts pictures and films of runs on the gallery's page: small files that look the same.
+
+python docs/figures/gallery.py runs/budget/budget.png              # the name is that in docs/_static/gallery
+python docs/figures/gallery.py runs/can-ph-quick/success.png success_can.png
+
+Pictures get at most 1400 pixels in width and a palette of 256 colours. Films stay as they are, but for the
+index, which goes to the front: browsers begin to play before they have all of it (needs PyAV).
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from PIL import Image
+
+from warmprior.io.extras import require
+
+OUT = Path(__file__).parents[1] / "_static" / "gallery"
+WIDTH = 1400
+
+
+def reduce_picture(source: Path, target: Path) -> None:
+    """Write the picture with fewer pixels and colours."""
+    with Image.open(source) as picture:
+        image = picture.convert("RGB")
+    if image.width > WIDTH:
+        image = image.resize((WIDTH, round(image.height * WIDTH / image.width)), Image.LANCZOS)
+    # Scattered errors hide the palette in photographs, and would cost lines on white their sharpness.
+    photograph = source.name.startswith("filmstrip")
+    dither = Image.Dither.FLOYDSTEINBERG if photograph else Image.Dither.NONE
+    palette = image.quantize(256, Image.Quantize.MEDIANCUT)
+    reduced = image.quantize(palette=palette, dither=dither)
+    colours, paper = reduced.getpalette(), reduced.getpixel((0, 0))
+    colours[3 * paper : 3 * paper + 3] = 255, 255, 255  # not the mean of what is nearly white
+    reduced.putpalette(colours)
+    reduced.save(target, optimize=True)
+
+
+def copy_film(source: Path, target: Path) -> None:
+    """Write the same frames with the index in front."""
+    av = require("av", "lerobot")
+    options = {"movflags": "faststart"}
+    with av.open(str(source)) as read, av.open(str(target), "w", options=options) as written:
+        stream = written.add_stream_from_template(read.streams.video[0])
+        for packet in read.demux(read.streams.video[0]):
+            if packet.dts is not None:  # the last one flushes
+                packet.stream = stream
+                written.mux(packet)
+
+
+def main(source: str, name: str | None = None) -> None:
+    """Put a file on the page."""
+    path = Path(source)
+    target = OUT / (name or path.name)
+    OUT.mkdir(exist_ok=True)
+    (copy_film if path.suffix == ".mp4" else reduce_picture)(path, target)
+    print(f"{target}: {target.stat().st_size:,} bytes, of {path.stat().st_size:,}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,73 @@
+"""The gallery's page, its files, and the benchmarks that draw."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from PIL import Image
+
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "gallery.md").read_text()
+FILES = ROOT / "docs" / "_static" / "gallery"
+LIMIT, FILM_LIMIT = 4_000_000, 250_000
+DRAWS = re.compile(r"\b(?:plot_\w+|new_figure|study_success)\b")
+# "name.png", and f"name_{...}" of names that tell what they are of.
+DRAWN = re.compile(r'/ f?"([a-z0-9_]+?)_?(?:\{[^"]*|\.png|\.mp4)"')
+
+
+def _drawing() -> dict[str, str]:
+    """Benchmarks that draw by the library's figures, and their source: not throughput.py, which times."""
+    scripts = (ROOT / "benchmarks").glob("[!_]*.py")
+    found = {script.name: script.read_text() for script in scripts}
+    return {name: source for name, source in found.items() if DRAWS.search(source)}
+
+
+def _sections() -> dict[str, str]:
+    parts = re.split(r"^## `(\w+\.py)`.*$", PAGE, flags=re.M)[1:]
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
+def _shown() -> set[str]:
+    """Paths of the pictures and films that the page shows."""
+    films = re.findall(r'(?:src|href)="([^"#]+)', PAGE)
+    return {*re.findall(r"^```\{(?:image|figure)\} (\S+)$", PAGE, re.M), *films}
+
+
+def test_every_benchmark_that_draws_has_a_section_with_a_command_and_a_picture():
+    assert set(_sections()) == set(_drawing())
+    for name, text in _sections().items():
+        assert f"```console\npython benchmarks/{name}" in text
+        assert "_static/" in text
+
+
+def test_every_kind_of_picture_is_named():
+    study = (ROOT / "warmprior" / "experiments" / "success_study.py").read_text()
+    sources = _drawing() | {"robomimic.py": study}
+    kinds = {name: set(DRAWN.findall(source)) for name, source in sources.items()}
+    assert kinds["robomimic.py"] == {"success", "learning_curves", "filmstrip", "film"}
+    assert kinds["chunking.py"] == {"chunk_lengths", "bars", "violins"}
+    for name, found in kinds.items():
+        named = re.findall(r"`([a-z0-9_]+?)(?:_PRIOR)?\.(?:png|mp4)`", _sections()[name])
+        assert found <= set(named), name
+
+
+def test_everything_shown_exists_and_everything_kept_is_shown():
+    assert all((ROOT / "docs" / path).is_file() for path in _shown())
+    kept = {f"_static/gallery/{path.name}" for path in FILES.iterdir()}
+    assert kept == {path for path in _shown() if path.startswith("_static/gallery/")}
+
+
+def test_every_picture_and_film_is_told_in_words():
+    directives = re.findall(r"^```\{(?:image|figure)\} \S+\n(.*)$", PAGE, re.M)
+    assert directives and all(re.match(r":alt: \w.{20}", line) for line in directives)
+    films = re.findall(r"<video (.*?)</video>", PAGE, re.S)
+    assert films and all(re.search(r'aria-label="\w.{20}', film) for film in films)
+
+
+def test_files_are_small():
+    assert sum(path.stat().st_size for path in FILES.iterdir()) <= LIMIT
+    assert all(path.stat().st_size <= FILM_LIMIT for path in FILES.glob("*.mp4"))
+    for path in FILES.glob("*.png"):
+        with Image.open(path) as picture:
+            assert picture.width <= 1400
