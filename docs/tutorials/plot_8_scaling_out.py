@@ -135,7 +135,7 @@ folder.cleanup()
 
 with open("scaling.json") as file:
     recorded = json.load(file)
-print(recorded["command"], "\nat commit", recorded["commit"])
+print(recorded["command"], "\nrecorded with commit", recorded["commit"])
 
 figure, axis = plt.subplots(figsize=(6, 3.6))
 simulated = recorded["simulated"]
@@ -172,7 +172,8 @@ plt.show()
 # %%
 # What to notice: only the crosses were measured, at one and two cores. Lockstep is what a
 # vectorised environment does: at every decision all wait for the slowest, and in the end for the
-# longest episode. Episodes apart lose at the end alone, and a whole comparison has so many of them
+# longest episode; its crosses lie below its line, for what the exchange between processes costs is
+# not simulated. Episodes apart lose at the end alone, and a whole comparison has so many of them
 # that it hardly matters. :doc:`/scaling` has the numbers, and what they leave out.
 #
 # More machines
