@@ -126,6 +126,28 @@ def test_several_observations_and_the_lead_of_a_chunk(policy):
         actor(short)
 
 
+def test_the_rest_of_the_source_is_drawn_anew_for_actors_and_fixed_for_decoders(policy):
+    made, prior = policy("multi_task_dit"), PastPrior(LENGTH - 1, sigma=0.0)
+    actor = actor_of(made, prior)
+    observation = torch.randn(1, 2, STATE).expand(2, -1, -1)
+    loc = torch.randn(1, LENGTH - 1, ACTION).expand(2, -1, -1)
+    warm = torch.ones(2, LENGTH - 1, 1, dtype=torch.bool)
+    data = TensorDict(
+        {"observation": {"state": observation}, "prior": {"loc": loc, "warm": warm}}, [2]
+    )
+    with watch("multi_task_dit", made) as seen:
+        for _ in range(2):
+            actor(data.clone())
+        acted = torch.cat([x[:, 0] for x in seen.x[:: len(seen.x) // 2]])
+    assert torch.cdist(acted, acted).add(torch.eye(4)).min() > 1e-3  # two decisions of two rows
+    data["prior", "noise"] = loc.contiguous()
+    with watch("multi_task_dit", made) as seen:
+        chunks = [actor.ode(data.clone())["vla_action", "chunk"] for _ in range(2)]
+        decoded = torch.cat([x[:, 0] for x in seen.x[:: len(seen.x) // 2]])
+    assert torch.equal(decoded, decoded[:1].expand(4, -1))
+    assert torch.equal(*chunks)
+
+
 def test_a_single_observation_of_a_policy_that_may_see_several(policy):
     made, prior = policy("multi_task_dit", n_obs_steps=1), PastPrior(LENGTH, sigma=0.0)
     actor = LeRobotActor(made, prior, names=NAMES, preprocess=told)

@@ -25,7 +25,7 @@ class LeRobotFlow(TensorDictModuleBase):
     """The sampler of a LeRobot policy in the place of :class:`~warmprior.ODEActor`.
 
     A deterministic map ``(noise, observation) -> chunk``: what pads the prior's part of the source is one
-    draw, the same for every call.
+    draw, the same for every call and row, unless a call brings its own.
     The policy's weights are not among the parameters of this module.
 
     Args:
@@ -96,8 +96,13 @@ class LeRobotFlow(TensorDictModuleBase):
         """
         check_steps(nfe)
 
-    def forward(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
-        """Write the chunk."""
+    def forward(
+        self,
+        tensordict: TensorDictBase,
+        nfe: int | None = None,
+        padding: Tensor | None = None,
+    ) -> TensorDictBase:
+        """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source of what the prior has no part in."""
         nfe = self.nfe if nfe is None else nfe
         check_steps(nfe)
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
@@ -111,9 +116,10 @@ class LeRobotFlow(TensorDictModuleBase):
         batch = noise.shape[:-2]
         a0 = noise.reshape(-1, *noise.shape[-2:])
         inputs = self._batch(network_observation(tensordict.get(self.in_keys[1]), batch))
-        # One draw for all rows: a chunk does not depend on who is asked beside it.
-        generator = torch.Generator(a0.device).manual_seed(self.seed)
-        padding = self.source.place(a0[:1].detach(), generator)
+        if padding is None:
+            # One draw for all rows: a chunk does not depend on who is asked beside it.
+            generator = torch.Generator(a0.device).manual_seed(self.seed)
+            padding = self.source.place(a0[:1].detach(), generator)
         whole = padding.expand(len(a0), -1, -1).clone()
         whole[:, self.source.positions, : self.source.action_dim] = a0
         chunks: list[Tensor] = []
@@ -161,7 +167,9 @@ class LeRobotActor(TensorDictModuleBase):
     ``(observation, loc, warm) -> (noise, chunk)``: it acts in ``env.rollout`` and collectors with
     :class:`~warmprior.ActionHistory` and
     :class:`~warmprior.ChunkStep`, resets included, and :class:`~warmprior.PriorDecoder` takes it as a frozen
-    policy. Chunks are in the model's units: append what denormalises them next to the environment.
+    policy. What the model's source has beside the prior's part (padded dimensions, positions before the
+    chunk) is drawn for every decision; :class:`~warmprior.PriorDecoder` keeps it fixed. Chunks are in the
+    model's units: append what denormalises them next to the environment.
 
     Args:
         policy: of LeRobot, see :class:`WarmPriorAdapter`.
@@ -246,11 +254,9 @@ class LeRobotActor(TensorDictModuleBase):
                 "environment"
             )
         batch = loc.shape[:-2]
+        generator = self.generator if generator is None else generator
         a0 = self.ode.source.draw(
-            loc.reshape(-1, *loc.shape[-2:]),
-            warm.reshape(-1, *warm.shape[-2:]),
-            self.generator if generator is None else generator,
+            loc.reshape(-1, *loc.shape[-2:]), warm.reshape(-1, *warm.shape[-2:]), generator
         )
-        return self.ode(
-            tensordict.set(self.ode.in_keys[0], a0.reshape(*batch, *a0.shape[-2:])), nfe=nfe
-        )
+        tensordict.set(self.ode.in_keys[0], a0.reshape(*batch, *a0.shape[-2:]))
+        return self.ode(tensordict, nfe=nfe, padding=self.ode.source.place(a0, generator))
