@@ -71,7 +71,6 @@ first.train()
 # ------------------------
 # A policy lies in a folder that is named by all that determines it, in ``policies/`` beside the
 # runs. A run with a third seed finds the other four policies there, and trains two.
-# (The messages name every policy that is ready, those that were found among them.)
 
 policies = Path(folder.name) / "grid" / "policies"
 found = {path.name for path in policies.iterdir()}

@@ -99,6 +99,11 @@ def test_the_same_policy_is_trained_once(tmp_path, capsys):
     compared = comparison(tmp_path, 2, priors=twice, seeds=1)
     assert len(compared.run().rows) == 4  # two checkpoints, two NFEs
     assert capsys.readouterr().out.count("trained ") == 1
+    (tmp_path / "out" / "results.json").unlink()
+    comparison(tmp_path, 2, priors=[PastPrior(H)], seeds=2).run()
+    told = capsys.readouterr().out
+    assert told.count("found drift own, past") == 1 and told.count("trained drift own, past") == 1
+    assert "found" in told.partition("seed 0, 20 iterations")[0]
 
 
 class Unhashable(PastPrior):

@@ -287,6 +287,7 @@ class Comparison:
         tracker = self._tracker(everyone)
         failed: dict[int, str] = {}
         running = set[Job]()
+        found = {n for n, contestant in enumerate(everyone) if contestant.path.is_dir()}
         iterations = sum(c.training.iterations for c in everyone)
         episodes = sum(_amount(job, everyone) for job in jobs if not isinstance(job, Measure))
         with (
@@ -314,7 +315,8 @@ class Comparison:
                         schedule.trained(job.number)
                         chosen.store.note_trained(chosen.prior, chosen.training, result)
                         self.results.save()
-                        progress.say(f"trained {chosen}, {chosen.training.iterations} iterations")
+                        done = "found" if job.number in found else "trained"
+                        progress.say(f"{done} {chosen}, {chosen.training.iterations} iterations")
                     else:
                         for row in outcomes.add(job, result):
                             self.results.add(row, order=self._place)
