@@ -58,7 +58,7 @@ fuzz: install
 	$(BIN)/python -W ignore -m tests.fuzz $(ARGS)
 
 docs: install
-	$(BIN)/sphinx-build -W -q -b html $(ARGS) docs docs/_build
+	$(BIN)/sphinx-build -W -q -b html -d build/doctrees $(ARGS) docs docs/_build
 
 clean:
 	rm -rf .venv $(GROOT) docs/_build docs/auto_tutorials build dist .pytest_cache .ruff_cache .mypy_cache .hypothesis

@@ -32,6 +32,7 @@ extensions = [
 ]
 templates_path = ["_templates"]
 html_theme = "furo"
+smartquotes = False  # options and messages are to be copied
 html_title = "warmprior"
 html_static_path = ["_static"]
 html_css_files = ["gallery.css"]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +16,9 @@ PACKAGE = Path(__file__).parents[1] / "warmprior"
 VALUE = "…"
 """Stands for what a message fills in."""
 
+KINDS = re.compile(r"^(\w+Error|\w*Failure|SystemExit|warn)$")
+"""Calls that make an error or give a warning."""
+
 
 class Message(NamedTuple):
     """What is raised or warned of, where, and in which words."""
@@ -24,36 +28,84 @@ class Message(NamedTuple):
     text: str
 
 
-def _text(expression: ast.expr) -> str:
-    match expression:
-        case ast.Constant(value=str(text)):
-            return text
-        case ast.JoinedStr(values=parts):
-            return "".join(map(_text, parts))
-        case ast.BinOp(left=left, op=ast.Add(), right=right):
-            return _text(left) + _text(right)
-        case ast.IfExp(body=body, orelse=orelse):
-            return f"{_text(body)} / {_text(orelse)}"
-    return VALUE
-
-
 def _name(function: ast.expr) -> str:
     return function.attr if isinstance(function, ast.Attribute) else ast.unparse(function)
 
 
+def _pairs(target: ast.expr, value: ast.expr) -> Iterator[tuple[str, ast.expr]]:
+    """Names and what an assignment gives them."""
+    match target, value:
+        case ast.Name(id=name), _:
+            yield name, value
+        case ast.Tuple(elts=targets), ast.Tuple(elts=values) if len(targets) == len(values):
+            for one, its in zip(targets, values, strict=True):
+                yield from _pairs(one, its)
+
+
+def _assigned(scope: ast.AST) -> Iterator[tuple[str, ast.expr]]:
+    """Names and what they are given in a scope, by ``=`` or one after another by loops over literals."""
+    for node in ast.walk(scope):
+        match node:
+            case ast.Assign(targets=[target], value=value):
+                yield from _pairs(target, value)
+            case ast.For(target=target, iter=ast.Tuple(elts=values) | ast.List(elts=values)):
+                for value in values:
+                    yield from _pairs(target, value)
+            case ast.For(
+                target=ast.Tuple(elts=[target, _]),
+                iter=ast.Call(func=ast.Attribute(value=ast.Dict(keys=values), attr="items")),
+            ):
+                for value in filter(None, values):
+                    yield from _pairs(target, value)
+
+
+def _text(expression: ast.expr, known: Mapping[str, list[ast.expr]]) -> str:
+    match expression:
+        case ast.Constant(value=str(text)):
+            return text
+        case ast.JoinedStr(values=parts):
+            return "".join(_text(part, known) for part in parts)
+        case ast.FormattedValue(value=value, conversion=-1, format_spec=None):
+            return _text(value, known)
+        case ast.BinOp(left=left, op=ast.Add(), right=right):
+            return _text(left, known) + _text(right, known)
+        case ast.IfExp(body=body, orelse=orelse):
+            return _choice(body, orelse, known=known)
+        case ast.Name(id=name) if name in known:
+            rest = {other: values for other, values in known.items() if other != name}
+            return _choice(*known[name], known=rest)
+    return VALUE
+
+
+def _choice(*expressions: ast.expr, known: Mapping[str, list[ast.expr]]) -> str:
+    """What may stand there, or that it is a value."""
+    texts = list(dict.fromkeys(_text(expression, known) for expression in expressions))
+    return " / ".join(filter(None, texts)) if all(t != VALUE for t in texts) else VALUE
+
+
 def messages() -> Iterator[Message]:
-    """All that are written where they are raised, in the order of the code."""
+    """All that are written where an error is made or a warning given, in the order of the code."""
     for path in sorted(PACKAGE.rglob("*.py")):
-        module = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
-        for node in ast.walk(ast.parse(path.read_text())):
-            call = node.exc if isinstance(node, ast.Raise) else node
-            if not isinstance(call, ast.Call) or not call.args:
-                continue
-            kind = _name(call.func)
-            if isinstance(node, ast.Raise) or kind == "warn":
-                text = " ".join(_text(call.args[0]).split())
-                if any(letter.isalpha() for letter in text):
-                    yield Message(module, "warning" if kind == "warn" else kind, text)
+        parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+        module = ".".join(part for part in parts if part != "__init__")
+        body = ast.parse(path.read_text()).body
+        constants = [
+            pair for node in body if isinstance(node, ast.Assign) for pair in _assigned(node)
+        ]
+        for statement in body:
+            for scope in statement.body if isinstance(statement, ast.ClassDef) else [statement]:
+                known = {name: [value] for name, value in constants}
+                own: dict[str, list[ast.expr]] = {}
+                for name, value in _assigned(scope):
+                    own.setdefault(name, []).append(value)
+                known |= own
+                for node in ast.walk(scope):
+                    if not (isinstance(node, ast.Call) and node.args):
+                        continue
+                    kind = KINDS.search(_name(node.func))
+                    text = " ".join(_text(node.args[0], known).split()).replace(2 * VALUE, VALUE)
+                    if kind and any(letter.isalpha() for letter in text):
+                        yield Message(module, "warning" if kind[0] == "warn" else kind[0], text)
 
 
 class ErrorMessages(Directive):

@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 import warmprior
+from warmprior.io import hub
+from warmprior.io.workers import WorkerError, worker_died
 
 DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
@@ -52,6 +54,10 @@ def test_top_level_names_belong_to_a_package():
     assert set(warmprior.__all__) - {"__version__"} <= known
 
 
+def _raise(error):
+    raise error
+
+
 @pytest.mark.parametrize(
     "refused",
     [
@@ -60,6 +66,8 @@ def test_top_level_names_belong_to_a_package():
         lambda: warmprior.training.evaluate(None, None, episodes=0, first_seed=0),
         lambda: warmprior.WarmPriorActor.from_pretrained("nowhere"),
         lambda: warmprior.training.warmup_cosine(None, 10, warmup_ratio=1.5),
+        lambda: _raise(hub.explained(OSError("no route"), "user/policy")),
+        lambda: _raise(worker_died("worker 1 of 2", "wait")),
     ],
 )
 def test_what_an_error_says_is_on_the_page_of_errors(refused, monkeypatch):
@@ -67,13 +75,24 @@ def test_what_an_error_says_is_on_the_page_of_errors(refused, monkeypatch):
     pytest.importorskip("docutils")
     monkeypatch.syspath_prepend(str(DOCS))
     listed = importlib.import_module("error_messages").messages()
-    with pytest.raises((ValueError, OSError)) as error:
+    with pytest.raises((ValueError, OSError, WorkerError)) as error:
         refused()
     said = " ".join(str(error.value).split())
     pattern = {message: re.escape(message.text).replace("…", ".*") for message in listed}
     fits = [message for message, text in pattern.items() if re.fullmatch(text, said)]
     found = max(fits, key=lambda message: len(message.text))
     assert found.kind == error.type.__name__ and len(found.text) > len(said) / 2
+
+
+def test_errors_that_troubleshooting_quotes_exist(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS))
+    listed = [message.text for message in importlib.import_module("error_messages").messages()]
+    bold = re.findall(r"\*\*(.*?)\*\*", (DOCS / "troubleshooting.md").read_text(), re.S)
+    quoted = [part for text in bold for part in re.findall(r'"(.*?)"', text)]
+    assert len(quoted) > 3
+    for words in quoted:
+        filled = words.replace(" N ", " … ")
+        assert any(filled in text for text in listed), words
 
 
 @pytest.fixture(scope="module")

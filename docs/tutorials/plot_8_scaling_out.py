@@ -202,7 +202,7 @@ plt.show()
 # .. code-block:: console
 #
 #    torchrun --nproc-per-node 2 benchmarks/robomimic.py --preset paper --device cuda
-#    torchrun --nproc-per-node 8 benchmarks/robomimic.py --resume --out runs/paper
+#    torchrun --nproc-per-node 8 benchmarks/robomimic.py --resume --out runs/square-ph-paper
 #
 # On CPUs that does not pay: two processes reached 0.64 times twice the speed of one with the paper's
 # transformer, and less with small networks. None of it has been run on a GPU, or on more than one

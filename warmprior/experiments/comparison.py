@@ -278,6 +278,7 @@ class Comparison:
         if not rank():
             self.results.save()
         everyone = [*self.contestants, *self._missing_teachers()]
+        found = {n for n, contestant in enumerate(everyone) if contestant.path.is_dir()}
         together = self._train_together(everyone) if world_size() > 1 else {}
         outcomes = Outcomes(self.contestants, self.recipe, whole_cells=self._on_ray)
         following = {}
@@ -287,7 +288,6 @@ class Comparison:
         tracker = self._tracker(everyone)
         failed: dict[int, str] = {}
         running = set[Job]()
-        found = {n for n, contestant in enumerate(everyone) if contestant.path.is_dir()}
         iterations = sum(c.training.iterations for c in everyone)
         episodes = sum(_amount(job, everyone) for job in jobs if not isinstance(job, Measure))
         with (

@@ -152,7 +152,7 @@ def explained(error: Exception, repository: str, revision: str | None = None) ->
     hub = require("huggingface_hub", "sim")
     if isinstance(error, RuntimeError) and isinstance(error.__cause__, Exception):
         error = error.__cause__  # a file's upload tells no more than that it failed
-    kinds, offline = hub.errors, hub.constants.HF_HUB_OFFLINE
+    kinds, offline = require("huggingface_hub.errors", "sim"), hub.constants.HF_HUB_OFFLINE
     status = getattr(getattr(error, "response", None), "status_code", None)
     if isinstance(error, kinds.GatedRepoError):
         return PermissionError(
