@@ -1,6 +1,6 @@
 """The paper's Fig. 7: reinforcement learning in the source space of a frozen policy.
 
-python benchmarks/prior_space_rl.py --preset unit            # the navigation toy, under two minutes
+python benchmarks/prior_space_rl.py --preset unit            # the navigation toy, about two minutes
 python benchmarks/prior_space_rl.py                          # lift from a weak policy, half an hour
 python benchmarks/prior_space_rl.py --preset paper --task square --run runs/square-ph-paper
 python benchmarks/prior_space_rl.py --resume                 # after an interruption

@@ -35,6 +35,7 @@ html_theme = "furo"
 smartquotes = False  # options and messages are to be copied
 html_title = "warmprior"
 html_static_path = ["_static"]
+html_favicon = "_static/favicon.svg"
 html_css_files = ["gallery.css"]
 # Pictures come with the pages that show them, and not with the static files a second time.
 exclude_patterns = ["_build", "_templates", "tutorials/*.rst", "**.png"]

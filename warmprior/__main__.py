@@ -118,6 +118,7 @@ def train(args: argparse.Namespace) -> None:
         PRESETS,
         args.options,
         study="train",
+        program="python -m warmprior train",
         description=train.__doc__,
         preset=comparison_preset,
         unused=UNPLAYED,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+from contextlib import redirect_stdout
 
 import pytest
 import torch
@@ -30,9 +32,11 @@ class FailingStore(Store):
 def run(folder):
     (folder / "policies").mkdir(exist_ok=True)
     made = comparison(folder, 1, priors=PRIORS, kind=FailingStore, seeds=1, episodes=2)
-    made.run()
+    with redirect_stdout(io.StringIO()) as told:
+        made.run()
     assert rank() == 0 and world_size() == 1  # the others have ended
     (folder / "failures").write_text(json.dumps(made.failures))
+    (folder / "told").write_text(told.getvalue())
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +67,12 @@ def test_all_trained_and_one_played(folders):
             ), key
     trained = sorted((folders[1] / "policies" / "trained by 2").read_text().splitlines())
     assert trained == sorted(f"{prior.name} {r}" for prior in PRIORS for r in range(2))
+
+
+def test_what_all_trained_is_not_said_to_be_found(folders):
+    for folder in folders:
+        told = (folder / "told").read_text()
+        assert told.count("trained drift own") == 2 and "found" not in told
 
 
 def test_a_training_that_fails_in_all_does_not_stop_the_others(folders):

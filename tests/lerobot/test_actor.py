@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -15,6 +15,7 @@ from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
 from warmprior import PastPrior, PreviewPrior, policy_transforms
 from warmprior.lerobot import LeRobotActor
 from warmprior.rl import PriorDecoder
+from warmprior.training import evaluate
 
 
 class Arm(EnvBase):
@@ -50,6 +51,17 @@ class Arm(EnvBase):
 
     def _set_seed(self, seed):
         return seed
+
+
+class WithSuccess(Arm):
+    """It also tells that nothing was solved."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_spec["success"] = Binary(1, shape=(1,), dtype=torch.bool)
+
+    def _observed(self):
+        return super()._observed().set("success", torch.zeros(1, dtype=torch.bool))
 
 
 NAMES = {"state": "observation.state", "top": CAMERA}
@@ -146,6 +158,20 @@ def test_the_rest_of_the_source_is_drawn_anew_for_actors_and_fixed_for_decoders(
         decoded = torch.cat([x[:, 0] for x in seen.x[:: len(seen.x) // 2]])
     assert torch.equal(decoded, decoded[:1].expand(4, -1))
     assert torch.equal(*chunks)
+
+
+def test_evaluation_draws_from_its_seeds_whatever_generator_an_actor_has(policy):
+    prior = PastPrior(LENGTH)
+    env = environment(prior, WithSuccess())
+    actor = actor_of(policy("pi05"), prior)
+
+    def chunks(**options):
+        played = evaluate(actor, env, episodes=2, first_seed=0, **options)
+        return torch.cat([episode.decisions["vla_action", "chunk"] for episode in played])
+
+    first = chunks()
+    assert torch.equal(chunks(), first)
+    assert not torch.equal(chunks(policy_seed=1), first)
 
 
 def test_a_single_observation_of_a_policy_that_may_see_several(policy):

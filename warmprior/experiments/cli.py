@@ -30,6 +30,7 @@ def parse[R: Recipe](
     argv: Sequence[str] | None,
     *,
     study: str,
+    program: str | None = None,
     description: str | None = None,
     preset: Callable[[R], R] | None = None,
     unused: Collection[str] = (),
@@ -45,6 +46,7 @@ def parse[R: Recipe](
 
     Keyword Args:
         study: name of the experiment; a folder holds one.
+        program: what ``--help`` calls it; the script by default.
         description: of ``--help``.
         preset: chooses the preset of what is asked for, where it depends on more than its name.
         unused: options that have no effect in this experiment, and are refused.
@@ -60,7 +62,9 @@ def parse[R: Recipe](
         told = io.StringIO()
         try:
             with redirect_stderr(told):
-                return tyro.cli(kind, default=default, args=argv, description=description)
+                return tyro.cli(
+                    kind, prog=program, default=default, args=argv, description=description
+                )
         except SystemExit as stop:
             # What a dataclass refuses is told as all that we refuse; what no option is, by tyro.
             refused: Any = stop.__context__

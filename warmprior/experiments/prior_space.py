@@ -250,7 +250,7 @@ PRIOR_SPACE_PRESETS: dict[str, PriorSpaceRecipe] = {
         ),
         agents=GroupOptions(threads=1),
     ),
-    # The navigation toy with a goal, three seeds: under two minutes.
+    # The navigation toy with a goal, three seeds: about two minutes.
     "unit": PriorSpaceRecipe(
         network=_TOY.network,
         training=replace(_TOY.training, iterations=800, save_every=800),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -155,7 +156,7 @@ def _acting(policy: TensorDictModuleBase, seed: int, nfe: int | None) -> Iterato
     """A policy that draws from a seed, while all other draws stay as they were."""
     options: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
     device = _device(policy)
-    if isinstance(policy, WarmPriorActor):
+    if "generator" in inspect.signature(policy.forward).parameters:
         options["generator"] = torch.Generator(device).manual_seed(seed)
         yield lambda data: policy(data, **options)
         return
@@ -270,9 +271,9 @@ def evaluate(
         episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
         first_seed: seed of the first episode; keep it away from the data's seeds.
         nfe: network evaluations per chunk of a :class:`~warmprior.WarmPriorActor`; its own by default.
-        policy_seed: of the policy's random draws: those of a :class:`~warmprior.WarmPriorActor`, or those
-            that another module takes from PyTorch's global generator. The latter goes on afterwards as if
-            nothing had been played.
+        policy_seed: of the policy's random draws: those of one that takes a ``generator``, such as a
+            :class:`~warmprior.WarmPriorActor`, or those that another module takes from PyTorch's global
+            generator. The latter goes on afterwards as if nothing had been played.
         description: of the progress bar; no bar if ``None``.
 
     Returns:
