@@ -158,6 +158,8 @@ def test_the_rest_of_the_source_is_drawn_anew_for_actors_and_fixed_for_decoders(
         decoded = torch.cat([x[:, 0] for x in seen.x[:: len(seen.x) // 2]])
     assert torch.equal(decoded, decoded[:1].expand(4, -1))
     assert torch.equal(*chunks)
+    with pytest.raises(ValueError, match=r"padding must be \[2, \d+, \d+\].*got \[2, 3, 4\]"):
+        actor.ode(data.clone(), padding=torch.zeros(2, 3, 4))
 
 
 def test_evaluation_draws_from_its_seeds_whatever_generator_an_actor_has(policy):

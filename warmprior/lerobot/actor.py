@@ -45,7 +45,8 @@ class LeRobotFlow(TensorDictModuleBase):
         chunk_key: key written, ``[*B, P, d_a]``, the model's units.
 
     Raises:
-        ValueError: if gradients are asked for: LeRobot's samplers compute none.
+        ValueError: if gradients are asked for: LeRobot's samplers compute none, or ``padding`` has another
+            shape than the model's source.
         KeyError: if an input key is missing.
     """
 
@@ -120,6 +121,12 @@ class LeRobotFlow(TensorDictModuleBase):
             # One draw for all rows: a chunk does not depend on who is asked beside it.
             generator = torch.Generator(a0.device).manual_seed(self.seed)
             padding = self.source.place(a0[:1].detach(), generator)
+        wanted = (self.source.length, self.source.width)
+        if padding.shape not in ((1, *wanted), (len(a0), *wanted)):
+            raise ValueError(
+                f"padding must be {[len(a0), *wanted]}, the whole source of every row, got "
+                f"{list(padding.shape)}"
+            )
         whole = padding.expand(len(a0), -1, -1).clone()
         whole[:, self.source.positions, : self.source.action_dim] = a0
         chunks: list[Tensor] = []
