@@ -62,6 +62,11 @@ class Comparison:
         ValueError: if a prior allows none of the NFEs, is longer than every demonstration, rows could not
             tell two policies apart, or the folder's results belong to other options.
         OSError: if the folder cannot be written to.
+
+    See Also:
+        - :class:`~warmprior.experiments.Store`: where the policies are.
+        - :func:`~warmprior.experiments.success_table`: a table of the rows.
+        - :func:`~warmprior.training.evaluate`: the evaluation alone.
     """
 
     def __init__(

@@ -28,7 +28,12 @@ SHIFT = 0.15
 
 @dataclass(frozen=True)
 class NavigationRecipe(Recipe):
-    """A comparison of sources on the toy; its episodes are rollouts."""
+    """A comparison of sources on the toy; its episodes are rollouts.
+
+    See Also:
+        - :func:`~warmprior.experiments.judge_navigation`: plays one of its policies.
+        - :data:`~warmprior.experiments.NAVIGATION_PRESETS`: budgets.
+    """
 
     @property
     def name(self) -> str:
@@ -99,6 +104,10 @@ def play_navigation(
 
     Returns:
         The rollout, ``[rollouts, decisions]``.
+
+    See Also:
+        - :func:`~warmprior.experiments.judge_navigation`: measures what it did.
+        - :func:`~warmprior.experiments.plot_navigation`: draws it.
     """
     generator = torch.Generator().manual_seed(seed)
     transforms = policy_transforms(actor.prior, observation_steps=1)

@@ -44,6 +44,9 @@ class Row:
         outcomes: of the episodes played, a character each in the order of their seeds: ``1`` if solved,
             else ``0``. Rows of the same seeds compare episode by episode.
 
+    See Also:
+        :class:`~warmprior.experiments.Results`: the file of rows.
+
     Examples:
         >>> row = Row({"prior": "past"}, {"success_rate": 0.5, "kappa": float("nan")})
         >>> row["prior"], row["success_rate"], row["kappa"]
@@ -94,6 +97,9 @@ def select(rows: Iterable[Row], measure: str | None = None, **facts: Fact) -> li
         rows: of any kind.
         measure: its name; any by default.
         facts: by name.
+
+    See Also:
+        :func:`~warmprior.experiments.grouped`: sorts what is found.
     """
     return [
         row
@@ -104,7 +110,12 @@ def select(rows: Iterable[Row], measure: str | None = None, **facts: Fact) -> li
 
 
 def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row]]:
-    """Rows by what a function makes of them, in the order of their first."""
+    """Rows by what a function makes of them, in the order of their first.
+
+    See Also:
+        - :func:`~warmprior.experiments.select`: narrows the rows first.
+        - :func:`~warmprior.experiments.table`: draws groups as lines and columns.
+    """
     groups: dict[Any, list[Row]] = {}
     for row in rows:
         groups.setdefault(key(row), []).append(row)
@@ -112,7 +123,11 @@ def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Ro
 
 
 def mean_known(rows: Iterable[Row], measure: str) -> float | None:
-    """Mean of a measure over the rows that know it; ``None`` if none does."""
+    """Mean of a measure over the rows that know it; ``None`` if none does.
+
+    See Also:
+        :func:`~warmprior.experiments.mean_cell`: writes it into a table.
+    """
     values = [value for row in rows if (value := row.get(measure)) is not None]
     return math.fsum(values) / len(values) if values else None
 
@@ -126,6 +141,10 @@ def success_summary(rows: Iterable[Row], top_k: int) -> SeedSummary:
 
     Raises:
         ValueError: if there is no row.
+
+    See Also:
+        - :func:`~warmprior.diagnostics.top_k_mean`: the mean of one seed.
+        - :func:`~warmprior.diagnostics.summarize_seeds`: mean and spread over seeds.
     """
     by_seed: dict[int, list[float]] = {}
     for row in rows:
@@ -173,6 +192,10 @@ class Results:
     Raises:
         ValueError: if the file to resume is damaged, or belongs to a run with another identity or one whose
             policies were trained by other versions.
+
+    See Also:
+        - :class:`~warmprior.experiments.Row`: what it holds.
+        - :func:`~warmprior.experiments.select`: finds rows.
     """
 
     def __init__(

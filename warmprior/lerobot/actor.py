@@ -47,6 +47,10 @@ class LeRobotFlow(TensorDictModuleBase):
     Raises:
         ValueError: if gradients are asked for: LeRobot's samplers compute none.
         KeyError: if an input key is missing.
+
+    See Also:
+        - :class:`~warmprior.lerobot.LeRobotActor`: this with a prior and memory: a whole policy.
+        - :class:`~warmprior.lerobot.WarmPriorAdapter`: stays within LeRobot instead.
     """
 
     guidance = None

@@ -22,6 +22,10 @@ class Interpolant:
     Subclasses give a ``name``, :meth:`coefficients` and, if they take arguments, :meth:`config`. The
     coefficients must satisfy :math:`\alpha(0)=\beta(1)=1` and :math:`\alpha(1)=\beta(0)=0`, so that the flow
     starts at the source and ends at the data.
+
+    See Also:
+        - :class:`~warmprior.LinearInterpolant`: the default.
+        - :class:`~warmprior.FlowMatchingLoss`: regresses its velocity.
     """
 
     name: ClassVar[str]
@@ -79,6 +83,10 @@ class Interpolant:
 class LinearInterpolant(Interpolant):
     r"""Straight line: :math:`\alpha = 1 - t`, :math:`\beta = t` (Lipman et al., 2023; the paper's).
 
+    See Also:
+        - :class:`~warmprior.TrigonometricInterpolant`: keeps the variance of uncorrelated ends.
+        - :class:`~warmprior.PolynomialInterpolant`: starts at rest.
+
     Examples:
         >>> import torch
         >>> a0, a1 = torch.zeros(1, 2, 1), torch.ones(1, 2, 1)
@@ -99,6 +107,9 @@ class TrigonometricInterpolant(Interpolant):
     r"""Quarter circle: :math:`\alpha = \cos(\pi t/2)`, :math:`\beta = \sin(\pi t/2)`.
 
     Keeps the variance constant for uncorrelated unit-variance ends (Albergo and Vanden-Eijnden, 2023).
+
+    See Also:
+        :class:`~warmprior.LinearInterpolant`: the default.
     """
 
     name = "trigonometric"
@@ -119,6 +130,9 @@ class PolynomialInterpolant(Interpolant):
 
     Raises:
         ValueError: if ``n <= 0``.
+
+    See Also:
+        :class:`~warmprior.LinearInterpolant`: the power 1.
     """
 
     name = "polynomial"

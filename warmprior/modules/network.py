@@ -29,6 +29,11 @@ class VelocityNetwork(nn.Module):
 
     Raises:
         ValueError: if a width or length is not positive.
+
+    See Also:
+        - :class:`~warmprior.VelocityMLP`: the small one.
+        - :class:`~warmprior.ChiTransformer`: the paper's.
+        - :class:`~warmprior.PreconditionedNetwork`: wraps any of them.
     """
 
     encodes: bool = False
@@ -226,6 +231,9 @@ class TimestepEmbedding(nn.Module):
 
     Raises:
         ValueError: if ``dim`` is odd or < 4.
+
+    See Also:
+        :class:`~warmprior.ChiTransformer`: embeds its times with it.
 
     Examples:
         >>> import torch

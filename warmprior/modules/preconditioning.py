@@ -41,6 +41,10 @@ class SourceMoments(nn.Module):
     Raises:
         ValueError: if the shapes differ, or an entry is NaN or infinite.
 
+    See Also:
+        - :class:`~warmprior.PreconditionedNetwork`: scales inputs and outputs by them.
+        - :func:`~warmprior.training.precondition`: estimates them and wraps a network.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

@@ -30,6 +30,10 @@ def uniform_times(
         generator: source of randomness on ``device``.
         dtype: of the result.
         device: of the result.
+
+    See Also:
+        - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
+        - :class:`~warmprior.FlowMatchingLoss`: draws its times so.
     """
     return torch.rand(shape, generator=generator, dtype=dtype, device=device)
 
@@ -51,6 +55,10 @@ def u_shaped_times(
         generator: source of randomness on ``device``.
         dtype: of the result.
         device: of the result.
+
+    See Also:
+        - :func:`~warmprior.objectives.times.logit_normal_times`: prefers the middle.
+        - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
 
     Examples:
         >>> import torch
@@ -74,6 +82,10 @@ def logit_normal_times(
         generator: source of randomness on ``device``.
         dtype: of the result.
         device: of the result.
+
+    See Also:
+        - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
+        - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
     """
     return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
 

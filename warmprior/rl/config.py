@@ -46,6 +46,10 @@ class PriorSpaceConfig:
 
     Raises:
         ValueError: for a number out of its range, naming it.
+
+    See Also:
+        - :class:`~warmprior.rl.PriorSpaceTraining`: trains by it.
+        - :class:`~warmprior.DSRLNALoss`: the loss of ``dsrl-na``.
     """
 
     algorithm: Literal["dsrl-na", "dsrl-sac"] = "dsrl-na"

@@ -62,6 +62,11 @@ class PriorSpaceTraining:
     Raises:
         ValueError: if the recipe does not suit the policy, or the folder's state belongs to another
             recipe or policy, or its replay buffer to another wiring.
+
+    See Also:
+        - :class:`~warmprior.rl.PriorSpaceConfig`: its recipe.
+        - :class:`~warmprior.PriorAnchor`: what the environment needs.
+        - :func:`~warmprior.training.evaluate`: plays episodes with ``agent.policy``.
     """
 
     def __init__(

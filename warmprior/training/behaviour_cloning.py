@@ -143,6 +143,11 @@ class BehaviourCloning:
             loaded again (:meth:`WarmPriorActor.check_saveable`), or its prior conditions the network and it
             reads another key than :class:`~warmprior.MeanObservation` writes.
         TypeError: if the policy cannot be saved.
+
+    See Also:
+        - :class:`~warmprior.training.TrainingConfig`: its recipe.
+        - :class:`~warmprior.FlowMatchingLoss`: the loss alone, for a loop of your own.
+        - :func:`~warmprior.training.evaluate`: plays episodes with what it trained.
     """
 
     def __init__(

@@ -42,6 +42,10 @@ class TrainingConfig:
 
     Raises:
         ValueError: for a number out of its range, naming it.
+
+    See Also:
+        - :class:`~warmprior.training.BehaviourCloning`: trains by it.
+        - :class:`~warmprior.rl.PriorSpaceConfig`: the recipe of agents.
     """
 
     iterations: int = 200_000
