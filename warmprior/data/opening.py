@@ -124,7 +124,11 @@ def open_demonstrations(
 
 
 class Demonstrations(ABC):
-    """Demonstrations at one place, of which nothing big is read before :meth:`replay`."""
+    """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
+
+    See Also:
+        :func:`~warmprior.data.opening.open_demonstrations`: finds the one for a place.
+    """
 
     name: str
     """What results call the place."""

@@ -249,7 +249,7 @@ def bootstrap_ratio(
         ValueError: if the shapes differ, or an option is out of range.
 
     See Also:
-        :func:`~warmprior.diagnostics.curvature`: whose ratio between two policies it serves.
+        :func:`~warmprior.experiments.straightness`: curvatures relative to a baseline's, with such intervals.
 
     Examples:
         >>> import torch

@@ -182,7 +182,7 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
         title: of the figure.
 
     See Also:
-        - :func:`~warmprior.experiments.plot_success`: posteriors at one chunk length.
+        - :func:`~warmprior.experiments.plot_success`: posteriors of the rates.
         - :func:`~warmprior.experiments.success_table`: the same in numbers.
     """
     figure, (axis,) = new_figure(1.8 + 1.5 * len(grouped(rows, lambda row: row["chunk"])), 3.6)

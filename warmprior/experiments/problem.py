@@ -73,6 +73,13 @@ class Problem:
         - :func:`~warmprior.experiments.robosuite_problem`: one of demonstrations in robosuite.
         - :func:`~warmprior.experiments.navigation_problem`: the toy.
         - :class:`~warmprior.experiments.Store`: trains policies on it.
+
+    Examples:
+        >>> from warmprior.envs import GoalNavigationEnv, navigation_demonstrations
+        >>> problem = Problem(
+        ...     "goal", "toy", navigation_demonstrations(), GoalNavigationEnv, identity="1")
+        >>> problem.name, problem.vector.shape
+        ('goal toy', torch.Size([384, 9]))
     """
 
     task: str

@@ -218,7 +218,7 @@ def exclusive(directory: Path) -> Iterator[None]:
         BlockingIOError: if another process is in there.
 
     See Also:
-        :func:`~warmprior.io.files.write_atomic`: for readers that do not ask.
+        :func:`~warmprior.io.files.write_atomic`: what readers see is whole without a lock.
     """
     directory.mkdir(parents=True, exist_ok=True)
     folder = os.open(directory, os.O_RDONLY)

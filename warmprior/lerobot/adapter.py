@@ -32,7 +32,7 @@ def history_indices(chunk_length: int, length: int, lead: int = 0) -> list[int]:
         lead: positions of the chunk before the current step.
 
     See Also:
-        :class:`~warmprior.lerobot.WarmPriorAdapter`: needs the steps that it names.
+        :class:`~warmprior.lerobot.WarmPriorAdapter`: reads these steps of a dataset.
 
     Examples:
         >>> history_indices(2, 3)

@@ -25,7 +25,7 @@ class RelativeActions:
 
     See Also:
         - :class:`~warmprior.lerobot.ActionMemory`: remembers the actions.
-        - :class:`~warmprior.lerobot.WarmPriorAdapter`: makes it for policies with relative actions.
+        - :class:`~warmprior.lerobot.WarmPriorAdapter`: takes it as ``relative``.
     """
 
     def __init__(self, preprocessor: Any, postprocessor: Any) -> None:

@@ -74,7 +74,7 @@ class ChiTransformer(VelocityNetwork):
         ValueError: if ``num_heads`` does not divide ``embedding_dim``.
 
     See Also:
-        - :class:`~warmprior.VelocityMLP`: a small network, for toys and tests.
+        - :class:`~warmprior.VelocityMLP`: a small network for vectors.
         - :class:`~warmprior.VisionNetwork`: puts encoders of images before it.
 
     Examples:

@@ -31,7 +31,7 @@ class ForecastPrior(LearnedPrior):
         chunk_length: ``H``.
 
     See Also:
-        - :class:`~warmprior.CVAEPrior`: a learned source with a latent.
+        - :class:`~warmprior.LeapPrior`: the same from the observation alone.
         - :func:`~warmprior.training.learn_prior`: fits a learned prior before the policy.
 
     Examples:

@@ -26,6 +26,18 @@ class Interpolant:
     See Also:
         - :class:`~warmprior.LinearInterpolant`: the default.
         - :class:`~warmprior.FlowMatchingLoss`: regresses its velocity.
+
+    Examples:
+        >>> class SineInterpolant(Interpolant):
+        ...     name = "sine"
+        ...     def coefficients(self, t):
+        ...         beta = torch.sin(math.pi / 2 * t) ** 2
+        ...         speed = math.pi / 2 * torch.sin(math.pi * t)
+        ...         return 1 - beta, beta, -speed, speed
+        >>> path = SineInterpolant()
+        >>> a_t, velocity = path(torch.zeros(1, 2, 1), torch.ones(1, 2, 1), torch.tensor([0.5]))
+        >>> round(float(a_t[0, 0]), 3), round(float(velocity[0, 0]), 3)
+        (0.5, 1.571)
     """
 
     name: ClassVar[str]

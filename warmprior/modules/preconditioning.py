@@ -214,6 +214,10 @@ class PreconditionedNetwork(VelocityNetwork):
         ValueError: if the moments or the trend do not have the network's shapes, or the path has no finite
             velocity at its ends.
 
+    See Also:
+        - :class:`~warmprior.SourceMoments`: what it has to know.
+        - :func:`~warmprior.training.precondition`: estimates that and wraps a network.
+
     Examples:
         >>> import torch
         >>> from warmprior import VelocityMLP

@@ -58,7 +58,7 @@ class PastPrior(Prior):
     See Also:
         - :class:`~warmprior.PreviewPrior`: starts from the policy's own forecast instead.
         - :class:`~warmprior.HistoryPrior`: lets the network see the last actions, with a Gaussian source.
-        - :class:`~warmprior.ActionHistory`: remembers the mean in the environment.
+        - :class:`~warmprior.ActionHistory`: writes the mean for the next decision in the environment.
 
     Examples:
         >>> import torch
@@ -108,7 +108,7 @@ class PreviewPrior(Prior):
 
     See Also:
         - :class:`~warmprior.PastPrior`: starts from what was executed instead.
-        - :class:`~warmprior.ChunkStep`: executes a chunk and keeps the rest as the next mean.
+        - :class:`~warmprior.ActionHistory`: writes the mean for the next decision in the environment.
 
     Examples:
         >>> import torch

@@ -36,7 +36,7 @@ class StepPrior(PointForecastPrior):
         ValueError: if ``start_time`` is not in (0, 1), ``stall`` below 0, or one of the three not finite.
 
     See Also:
-        :class:`~warmprior.LeapPrior`: moves the source itself to a learned forecast.
+        :class:`~warmprior.ForecastPrior`: moves the source itself to a learned forecast.
 
     Examples:
         >>> import torch

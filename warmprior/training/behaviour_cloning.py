@@ -148,6 +148,20 @@ class BehaviourCloning:
         - :class:`~warmprior.training.TrainingConfig`: its recipe.
         - :class:`~warmprior.FlowMatchingLoss`: the loss alone, for a loop of your own.
         - :func:`~warmprior.training.evaluate`: plays episodes with what it trained.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
+        >>> actor = WarmPriorActor(network, PastPrior(4))
+        >>> config = TrainingConfig(iterations=2, batch_size=8, checkpoints=1)
+        >>> data = navigation_demonstrations()
+        >>> with TemporaryDirectory() as folder:
+        ...     training = BehaviourCloning(actor, data, config, folder, observation_steps=1)
+        ...     _ = training.run()
+        ...     sorted(path.name for path in Path(folder).iterdir())
+        ['policy_000002', 'state.safetensors']
     """
 
     def __init__(

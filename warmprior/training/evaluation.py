@@ -298,6 +298,19 @@ def evaluate(
         - :func:`~warmprior.training.play_episode`: a single one.
         - :func:`~warmprior.training.parallel_env`: several simulators at a time.
         - :func:`~warmprior.diagnostics.success_posterior`: what the successes tell about the rate.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+        >>> from warmprior.envs import GoalNavigationEnv
+        >>> prior = PastPrior(8)
+        >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
+        >>> transforms = policy_transforms(prior, observation_steps=1)
+        >>> env = TransformedEnv(GoalNavigationEnv((1, 1), batch_size=[4]), transforms)
+        >>> played = evaluate(WarmPriorActor(network, prior), env, episodes=6, first_seed=100)
+        >>> [episode.seed for episode in played]
+        [100, 101, 102, 103, 104, 105]
+        >>> rate = sum(episode.success for episode in played) / len(played)
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")

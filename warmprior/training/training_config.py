@@ -46,6 +46,11 @@ class TrainingConfig:
     See Also:
         - :class:`~warmprior.training.BehaviourCloning`: trains by it.
         - :class:`~warmprior.rl.PriorSpaceConfig`: the recipe of agents.
+
+    Examples:
+        >>> config = TrainingConfig(iterations=1_000, batch_size=256, checkpoints=4)
+        >>> config.checkpoint_iterations
+        [250, 500, 750, 1000]
     """
 
     iterations: int = 200_000
