@@ -273,6 +273,11 @@ def navigation_problem() -> Problem:
     See Also:
         - :class:`~warmprior.envs.NavigationEnv`: its environment.
         - :func:`~warmprior.envs.navigation_demonstrations`: its data.
+
+    Examples:
+        >>> problem = navigation_problem()
+        >>> problem.name, problem.make_env(batch_size=[8]).batch_size
+        ('navigation toy', torch.Size([8]))
     """
     return Problem(
         "navigation", "toy", navigation_demonstrations(), NavigationEnv, "navigation1d", {}

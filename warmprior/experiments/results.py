@@ -99,7 +99,12 @@ def select(rows: Iterable[Row], measure: str | None = None, **facts: Fact) -> li
         facts: by name.
 
     See Also:
-        :func:`~warmprior.experiments.grouped`: sorts what is found.
+        :func:`~warmprior.experiments.grouped`: gathers what is found.
+
+    Examples:
+        >>> rows = [Row({"prior": p, "seed": s}, {"kappa": s + 0.5}) for p in "ab" for s in (0, 1)]
+        >>> [row["kappa"] for row in select(rows, "kappa", prior="b")]
+        [0.5, 1.5]
     """
     return [
         row
@@ -115,6 +120,11 @@ def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Ro
     See Also:
         - :func:`~warmprior.experiments.select`: narrows the rows first.
         - :func:`~warmprior.experiments.table`: draws groups as lines and columns.
+
+    Examples:
+        >>> rows = [Row({"prior": p, "seed": s}, {"kappa": s + 0.5}) for s in (0, 1) for p in "ba"]
+        >>> {prior: len(found) for prior, found in grouped(rows, lambda row: row["prior"]).items()}
+        {'b': 2, 'a': 2}
     """
     groups: dict[Any, list[Row]] = {}
     for row in rows:
@@ -127,6 +137,10 @@ def mean_known(rows: Iterable[Row], measure: str) -> float | None:
 
     See Also:
         :func:`~warmprior.experiments.mean_cell`: writes it into a table.
+
+    Examples:
+        >>> mean_known([Row({}, {"kappa": 1.0}), Row({}, {"kappa": None}), Row({}, {"kappa": 3.0})], "kappa")
+        2.0
     """
     values = [value for row in rows if (value := row.get(measure)) is not None]
     return math.fsum(values) / len(values) if values else None
@@ -145,6 +159,14 @@ def success_summary(rows: Iterable[Row], top_k: int) -> SeedSummary:
     See Also:
         - :func:`~warmprior.diagnostics.top_k_mean`: the mean of one seed.
         - :func:`~warmprior.diagnostics.summarize_seeds`: mean and spread over seeds.
+
+    Examples:
+        >>> rates = {(0, 10): 0.5, (0, 20): 0.7, (1, 10): 0.9, (1, 20): 0.1}
+        >>> rows = [
+        ...     Row({"seed": seed, "checkpoint": after}, {"success_rate": rate})
+        ...     for (seed, after), rate in rates.items()]
+        >>> success_summary(rows, top_k=1)
+        SeedSummary(mean=0.8, std=0.1414..., seeds=2)
     """
     by_seed: dict[int, list[float]] = {}
     for row in rows:

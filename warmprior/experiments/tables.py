@@ -98,6 +98,10 @@ def mean_cell(measure: str, form: str, scale: float = 1.0) -> Cell:
     See Also:
         - :func:`~warmprior.experiments.table`: takes it for its cells.
         - :func:`~warmprior.experiments.mean_known`: the mean alone.
+
+    Examples:
+        >>> mean_cell("steps", ".1f")([Row({"seed": 0}, {"steps": 3.0}), Row({"seed": 1}, {"steps": 5.0})])
+        '4.0 ± 1.4'
     """
 
     def cell(rows: list[Row]) -> str | None:
@@ -121,6 +125,10 @@ def success_cell(top_k: int) -> Cell:
     See Also:
         - :func:`~warmprior.experiments.table`: takes it for its cells.
         - :func:`~warmprior.experiments.success_summary`: the numbers alone.
+
+    Examples:
+        >>> success_cell(top_k=1)([Row({"seed": 0}, {"success_rate": 0.75})])
+        '75.0'
     """
 
     def cell(rows: list[Row]) -> str:

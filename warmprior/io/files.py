@@ -138,6 +138,14 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
 
     See Also:
         :func:`~warmprior.io.files.exclusive`: keeps other processes out of the folder.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "new" / "table.md"
+        ...     write_atomic(path, lambda temporary: temporary.write_text("done"))
+        ...     path.read_text()
+        'done'
     """
     # Unique among the threads, processes and machines that may write the same file.
     owner = f"{os.getpid()}.{uuid.uuid4().hex}.{platform.node()}"

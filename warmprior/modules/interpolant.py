@@ -122,6 +122,11 @@ class TrigonometricInterpolant(Interpolant):
 
     See Also:
         :class:`~warmprior.LinearInterpolant`: the default.
+
+    Examples:
+        >>> alpha, beta, _, _ = TrigonometricInterpolant().coefficients(torch.tensor(1 / 3))
+        >>> round(alpha.item(), 3), round(beta.item(), 3)
+        (0.866, 0.5)
     """
 
     name = "trigonometric"
@@ -145,6 +150,12 @@ class PolynomialInterpolant(Interpolant):
 
     See Also:
         :class:`~warmprior.LinearInterpolant`: the power 1.
+
+    Examples:
+        >>> a0, a1, t = torch.zeros(1, 1, 1), torch.ones(1, 1, 1), torch.tensor([0.5])
+        >>> a_t, velocity = PolynomialInterpolant(n=2)(a0, a1, t)
+        >>> a_t.item(), velocity.item()
+        (0.25, 1.0)
     """
 
     name = "polynomial"

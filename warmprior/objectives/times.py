@@ -34,6 +34,12 @@ def uniform_times(
     See Also:
         - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
         - :class:`~warmprior.FlowMatchingLoss`: draws its times so.
+
+    Examples:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> t = uniform_times(torch.Size([1000]), generator, torch.float32, torch.device("cpu"))
+        >>> abs(float(t.mean()) - 0.5) < 0.05
+        True
     """
     return torch.rand(shape, generator=generator, dtype=dtype, device=device)
 
@@ -86,6 +92,12 @@ def logit_normal_times(
     See Also:
         - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
         - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
+
+    Examples:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> t = logit_normal_times(torch.Size([1000]), generator, torch.float32, torch.device("cpu"))
+        >>> bool(((t - 0.5).abs() < 0.25).float().mean() > 0.6)  # half of uniform ones
+        True
     """
     return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
 

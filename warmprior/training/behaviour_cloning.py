@@ -93,6 +93,14 @@ def precondition(
 
     Returns:
         The preconditioned network; the same for the same data and prior.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
+        >>> demos = navigation_demonstrations()
+        >>> type(precondition(network, demos, PastPrior(4), observation_steps=1)).__name__
+        'PreconditionedNetwork'
     """
     generator = torch.Generator(data.device or "cpu").manual_seed(0)
     if prior.teacher is None:  # which sees them

@@ -102,6 +102,15 @@ def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
 
     See Also:
         :class:`~warmprior.training.BehaviourCloning`: saves the averaged weights.
+
+    Examples:
+        >>> network = nn.Linear(1, 1, bias=False)
+        >>> average = ema_of(network, rate=0.9)
+        >>> for weight in (0.0, 1.0):
+        ...     _ = nn.init.constant_(network.weight, weight)
+        ...     average.update_parameters(network)
+        >>> round(average.module.weight.item(), 3)
+        0.1
     """
     if not 0.0 <= rate < 1.0:
         raise ValueError(f"the EMA rate must be in [0, 1), got {rate}")

@@ -60,6 +60,13 @@ def executed_chunk(tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK
     See Also:
         - :class:`~warmprior.InferenceDelay`: lets chunks take effect late.
         - :func:`~warmprior.diagnostics.executed_actions`: the actions of a whole rollout.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> chunk, leftover = torch.ones(1, 3, 1), torch.zeros(1, 3, 1)
+        >>> data = TensorDict({keys.CHUNK: chunk, keys.LEFTOVER: leftover}, [1])
+        >>> executed_chunk(data.set(keys.DELAY, torch.tensor([[1]]))).flatten().tolist()
+        [0.0, 1.0, 1.0]
     """
     delay = tensordict.get(keys.DELAY, None)
     if delay is None:
