@@ -16,8 +16,6 @@ from warmprior.io.workers import WorkerError, worker_died
 
 DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
-
-
 ROLE = re.compile(r":(?:class|func|meth|attr|data):`~?([\w.]+)`")
 
 
