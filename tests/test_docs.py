@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import pkgutil
 import re
 import subprocess
@@ -15,6 +16,7 @@ from warmprior.io.workers import WorkerError, worker_died
 
 DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
+ROLE = re.compile(r":(?:class|func|meth|attr|data):`~?([\w.]+)`")
 
 
 def _public(package: str) -> set[str]:
@@ -42,6 +44,37 @@ def test_reference_has_every_public_name_once_and_nothing_else():
         module, _, attribute = name.rpartition(".")
         assert not attribute.startswith("_")
         assert getattr(importlib.import_module(module), attribute).__module__ == module
+
+
+def _object(name: str) -> object:
+    module, _, attribute = name.rpartition(".")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _see_also(text: str) -> list[str]:
+    """What the section of that name links to."""
+    section = re.search(r"^See Also:\n((?:[ ]+.*\n?)+)", inspect.cleandoc(text), re.M)
+    return ROLE.findall(section[1]) if section else []
+
+
+def test_every_class_and_function_refers_to_another():
+    listed = _reference()
+    full = {name.rpartition(".")[2]: name for name in listed}
+    lonely = []
+    for name in listed:
+        described = _object(name)
+        if callable(described):  # a table is described on its page
+            parts = (target.split(".") for target in ROLE.findall(described.__doc__ or ""))
+            linked = {full[part] for target in parts for part in target if part in full}
+            lonely += [name] if linked <= {name} else []
+    assert lonely == []
+
+
+def test_see_also_links_to_what_the_reference_has():
+    listed = _reference()
+    links = [(name, to) for name in listed for to in _see_also(_object(name).__doc__ or "")]
+    assert len(links) > 100
+    assert [link for link in links if link[1] not in listed or link[0] == link[1]] == []
 
 
 def test_every_page_is_in_the_index():

@@ -201,6 +201,9 @@ def rotation_6d_to_rotvec(rotation_6d: Tensor) -> Tensor:
     Raises:
         ValueError: if the last dimension is not 6.
 
+    See Also:
+        :func:`~warmprior.envs.absolute_to_env_action`: turns whole actions.
+
     Examples:
         >>> rotation_6d_to_rotvec(torch.tensor([0.0, -1.0, 0.0, 1.0, 0.0, 0.0]))
         tensor([0.0000, 0.0000, 1.5708])

@@ -59,6 +59,10 @@ def download_robomimic(
         OSError: if no repository delivers a readable file; names every attempt and its cause.
         ImportError: if h5py or huggingface_hub is not installed.
 
+    See Also:
+        - :class:`~warmprior.data.RobomimicExperienceReplay`: reads the file.
+        - :func:`~warmprior.data.download_mimicgen`: MimicGen's files.
+
     Examples:
         >>> download_robomimic("square", "mh")  # doctest: +SKIP
         PosixPath('.../v1.5/square/mh/low_dim_v15.hdf5')
@@ -140,6 +144,9 @@ def download_lerobot(
     Raises:
         OSError: if the repository, or one of this version, cannot be had.
         ImportError: if huggingface_hub is not installed.
+
+    See Also:
+        :class:`~warmprior.data.LeRobotExperienceReplay`: reads the dataset.
 
     Examples:
         >>> download_lerobot("lerobot/libero")  # doctest: +SKIP

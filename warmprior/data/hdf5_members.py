@@ -24,7 +24,11 @@ _MAX_SOFT_LINKS = 16
 
 
 class DatasetError(ValueError):
-    """A demonstration file is not what it should be; the message says where and what to do."""
+    """A demonstration file is not what it should be; the message says where and what to do.
+
+    See Also:
+        :class:`~warmprior.data.RobomimicExperienceReplay`: raises it.
+    """
 
 
 @contextmanager

@@ -34,6 +34,10 @@ class DatasetIndex:
         action_dim: the width of the actions.
         env_args: the environment as it is described there; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
+
+    See Also:
+        - :class:`~warmprior.data.replay.DemonstrationReplay`: reads the values.
+        - :func:`~warmprior.data.opening.open_demonstrations`: finds what reads a place.
     """
 
     path: Path

@@ -50,6 +50,9 @@ class LeRobotSlice:
         feature: its name, such as ``"observation.state"``.
         start: the first column.
         stop: the one after the last.
+
+    See Also:
+        :class:`~warmprior.data.lerobot_index.LeRobotIndex`: has one per observation.
     """
 
     feature: str
@@ -68,6 +71,9 @@ class LeRobotIndex(DatasetIndex):
         images: the feature of each of the images to read.
         rendering: how the images were rendered, where that is known.
         first_state: of the simulator in the first step of all, where that is known.
+
+    See Also:
+        :func:`~warmprior.data.lerobot_index.read_lerobot_index`: makes it.
     """
 
     episodes: tuple[LeRobotEpisode, ...]
@@ -95,6 +101,10 @@ def action_names(arms: int) -> list[str]:
     Args:
         arms: how many.
 
+    See Also:
+        - :func:`~warmprior.data.lerobot_index.state_names`: of the observations.
+        - :func:`~warmprior.data.convert_robomimic`: writes these names.
+
     Examples:
         >>> action_names(1)[3:]
         ['robot0_rx', 'robot0_ry', 'robot0_rz', 'robot0_gripper']
@@ -107,6 +117,10 @@ def state_names(widths: Mapping[str, int]) -> list[str]:
 
     Args:
         widths: of the observations, in their order.
+
+    See Also:
+        - :func:`~warmprior.data.lerobot_index.action_names`: of the actions.
+        - :func:`~warmprior.data.convert_robomimic`: writes these names.
 
     Examples:
         >>> state_names({"robot0_gripper_qpos": 2})

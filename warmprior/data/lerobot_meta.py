@@ -46,6 +46,9 @@ class LeRobotEpisode:
         file: the parquet file below the dataset's folder.
         file_start: the ``index`` of the file's first step.
         videos: of each video feature the file, and the time in it at which the episode begins, in seconds.
+
+    See Also:
+        :class:`~warmprior.data.lerobot_index.LeRobotIndex`: has one per selected episode.
     """
 
     number: int

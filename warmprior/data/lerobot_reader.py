@@ -50,6 +50,9 @@ def lerobot_digest(index: LeRobotIndex) -> str:
 
     Args:
         index: of the dataset, with the images that are used.
+
+    See Also:
+        :func:`~warmprior.data.lerobot_index.read_lerobot_index`: makes the index.
     """
     root = index.path
     described = [

@@ -55,6 +55,9 @@ def check_place(place: str | Path, option: str) -> None:
         FileNotFoundError: if there is no such file or folder.
         ImportError: if what reads it is not installed.
 
+    See Also:
+        :func:`~warmprior.data.opening.open_demonstrations`: reads what is there.
+
     Examples:
         >>> check_place("lerobot:user/square", "--dataset")
         >>> check_place("lerobot:./square", "--dataset")
@@ -111,13 +114,21 @@ def open_demonstrations(
         place: an HDF5 file, or ``lerobot:`` and a folder or repository.
         env_args: of the environment, for a LeRobotDataset that does not describe its own.
 
+
+    See Also:
+        - :class:`~warmprior.data.opening.Demonstrations`: what it returns.
+        - :func:`~warmprior.data.opening.check_place`: looks first, and reads nothing.
     """
     dataset = _lerobot(place)
     return RobomimicFile(place) if dataset is None else LeRobotFolder(dataset, env_args)
 
 
 class Demonstrations(ABC):
-    """Demonstrations at one place, of which nothing big is read before :meth:`replay`."""
+    """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
+
+    See Also:
+        :func:`~warmprior.data.opening.open_demonstrations`: finds the one for a place.
+    """
 
     name: str
     """What results call the place."""

@@ -81,6 +81,10 @@ def curvature(
         ValueError: for bad batches or options, or a policy that is no flow.
         FloatingPointError: if a path becomes NaN or infinite.
 
+    See Also:
+        - :func:`~warmprior.diagnostics.flow_paths`: the paths themselves.
+        - :func:`~warmprior.diagnostics.source_leak`: what the source's noise does to actions.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

@@ -28,6 +28,10 @@ class HistoryShift(TensorDictModuleBase):
     Raises:
         ValueError: if ``std < 0``.
 
+    See Also:
+        - :func:`~warmprior.experiments.judge_navigation`: plays policies with and without it.
+        - :class:`~warmprior.PastPrior`: whose mean it disturbs.
+
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms

@@ -25,6 +25,9 @@ class MeanError:
     Attributes:
         target: distance of the mean from the demonstrated actions.
         revision: distance of the mean from the policy's prediction.
+
+    See Also:
+        :func:`~warmprior.diagnostics.mean_error`: measures it.
     """
 
     target: float

@@ -30,6 +30,10 @@ class Smoothness:
             both sides.
         boundaries: number of boundaries.
         executed: largest number of actions executed per decision.
+
+    See Also:
+        - :func:`~warmprior.diagnostics.smoothness`: measures it.
+        - :func:`~warmprior.diagnostics.compare_smoothness`: compares two policies.
     """
 
     boundary_jump: float

@@ -45,6 +45,9 @@ class SourceLeak:
         ratio_to_last: ``spread`` over that at the largest ``nfe`` measured.
         inner_step: mean distance between consecutive actions inside predicted chunks; NaN at ``H = 1``.
         data_inner_step: the same of the targets.
+
+    See Also:
+        :func:`~warmprior.diagnostics.source_leak`: measures it.
     """
 
     nfe: int
@@ -143,6 +146,10 @@ def source_leak(
         ValueError: for bad windows or options, fewer other episodes than neighbours, or if the prior
             allows none of the NFEs.
         FloatingPointError: if a prediction is NaN or infinite.
+
+    See Also:
+        - :class:`~warmprior.diagnostics.SourceLeak`: what it returns.
+        - :func:`~warmprior.diagnostics.curvature`: how far from straight the flow is.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor

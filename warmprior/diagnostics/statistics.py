@@ -38,6 +38,10 @@ def success_posterior(successes: int, episodes: int) -> Any:
         ValueError: if not ``0 <= successes <= episodes``.
         ImportError: if scipy is missing.
 
+    See Also:
+        - :func:`~warmprior.diagnostics.probability_better`: compares two rates.
+        - :func:`~warmprior.experiments.plot_success`: draws it.
+
     Examples:
         >>> round(float(success_posterior(9, 10).mean()), 3)  # (9 + 1) / (10 + 2)
         0.833
@@ -108,6 +112,9 @@ def top_k_mean(rates: Sequence[float], k: int) -> float:
     This is how the paper averages checkpoints. Choosing and reporting on the same episodes flatters
     every method alike.
 
+    See Also:
+        :func:`~warmprior.diagnostics.summarize_seeds`: over the seeds then.
+
     Examples:
         >>> top_k_mean([0.1, 0.9, 0.5, 0.7], 3)
         0.7...
@@ -158,6 +165,10 @@ class SeedSummary:
         mean: mean over seeds.
         std: sample standard deviation (divisor ``seeds - 1``); NaN for a single seed.
         seeds: number of seeds.
+
+    See Also:
+        - :func:`~warmprior.diagnostics.summarize_seeds`: makes it.
+        - :func:`~warmprior.diagnostics.exceeds_one_sigma`: compares two.
     """
 
     mean: float
@@ -170,6 +181,10 @@ def summarize_seeds(values: Sequence[float]) -> SeedSummary:
 
     Raises:
         ValueError: if there is no value.
+
+    See Also:
+        - :func:`~warmprior.diagnostics.top_k_mean`: over the checkpoints of a seed before.
+        - :func:`~warmprior.diagnostics.exceeds_one_sigma`: compares two summaries.
 
     Examples:
         >>> summarize_seeds([0.5, 0.7])
@@ -189,6 +204,10 @@ def exceeds_one_sigma(method: SeedSummary, base: SeedSummary) -> bool:
     """The paper's rule for a marked gain: non-overlapping one-sigma seed intervals (Table 1).
 
     Always false with a single seed: it has no spread to compare with.
+
+    See Also:
+        - :func:`~warmprior.diagnostics.summarize_seeds`: makes what it compares.
+        - :func:`~warmprior.diagnostics.paired_probability_better`: where both played the same episodes.
 
     Examples:
         >>> exceeds_one_sigma(SeedSummary(0.9, 0.02, 3), SeedSummary(0.8, 0.03, 3))
@@ -228,6 +247,9 @@ def bootstrap_ratio(
 
     Raises:
         ValueError: if the shapes differ, or an option is out of range.
+
+    See Also:
+        :func:`~warmprior.experiments.straightness`: curvatures relative to a baseline's, with such intervals.
 
     Examples:
         >>> import torch

@@ -36,6 +36,9 @@ UNDECIDED = 0.05
 def navigation_positions() -> Tensor:
     """Horizontal positions of the 64 steps, ``[64]``, from -1 to 1.
 
+    See Also:
+        :func:`~warmprior.envs.navigation_heights`: the demonstrations at these positions.
+
     Examples:
         >>> navigation_positions()[[0, -1]].tolist()
         [-1.0, 1.0]
@@ -48,6 +51,10 @@ def navigation_heights() -> Tensor:
 
     A demonstration is a scaled profile with a bump over each obstacle; the two sides come closest (0.35
     apart) at the start, between the obstacles, and at the end.
+
+    See Also:
+        - :func:`~warmprior.envs.navigation_demonstrations`: the same as training data.
+        - :func:`~warmprior.envs.navigation_positions`: where they are held.
 
     Examples:
         >>> heights = navigation_heights()
@@ -101,6 +108,9 @@ def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
     Returns:
         bool ``[*B, T - 1]``.
 
+    See Also:
+        :func:`~warmprior.envs.navigation_metrics`: counts the rollouts that do.
+
     Examples:
         >>> x = torch.tensor([-0.6, -0.3, 0.0])
         >>> navigation_collides(x, torch.tensor([0.0, 0.0, 0.0])).tolist()
@@ -142,6 +152,11 @@ class NavigationEnv(EnvBase):
     Keyword Args:
         batch_size: ``*B``, independent agents.
         device: of all tensors.
+
+    See Also:
+        - :func:`~warmprior.envs.navigation_demonstrations`: what to clone.
+        - :func:`~warmprior.envs.navigation_metrics`: judges what a policy does in it.
+        - :class:`~warmprior.envs.GoalNavigationEnv`: adds a goal and a reward.
 
     Examples:
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor, policy_transforms
@@ -254,6 +269,9 @@ class NavigationMetrics:
         recombination_rate: share of rollouts on the two routes that were not demonstrated.
         distance: mean distance to the nearest demonstration's height.
         jump: mean change of height at chunk boundaries.
+
+    See Also:
+        :func:`~warmprior.envs.navigation_metrics`: measures them.
     """
 
     switch_rate: float
@@ -274,6 +292,10 @@ def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
 
     Raises:
         ValueError: if the heights have another shape, are not finite, or a chunk is the whole episode.
+
+    See Also:
+        - :func:`~warmprior.diagnostics.executed_actions`: the heights of a rollout.
+        - :func:`~warmprior.experiments.judge_navigation`: plays and judges a policy.
 
     Examples:
         >>> metrics = navigation_metrics(navigation_heights(), chunk_length=4)

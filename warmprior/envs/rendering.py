@@ -47,6 +47,9 @@ def rendering_backend() -> str | None:
     Returns:
         ``"egl"``, ``"osmesa"``, or ``None`` if neither works.
 
+    See Also:
+        :class:`~warmprior.envs.RobosuiteEnv`: renders its cameras with it.
+
     Examples:
         >>> rendering_backend() in ("egl", "osmesa", None)  # doctest: +SKIP
         True

@@ -46,6 +46,9 @@ class TaskSpec:
         cameras: the cameras of robomimic's image files, third person first.
         scripted: whether a scripted expert exists.
         official: the styles of the data that robomimic or MimicGen publish for the task.
+
+    See Also:
+        :func:`~warmprior.envs.get_task`: finds one by its short name.
     """
 
     name: str
@@ -143,6 +146,10 @@ def get_task(name: str) -> TaskSpec:
 
     Raises:
         ValueError: if there is no such task.
+
+    See Also:
+        - :class:`~warmprior.envs.RobosuiteEnv`: the environment of a task.
+        - :data:`~warmprior.envs.TASKS`: all of them.
 
     Examples:
         >>> get_task("square").observation_dim

@@ -34,6 +34,10 @@ class PolicyResults:
         rows: what was measured of it; none if this checkpoint was not played.
         others: the same, of policies that differ in their training seed alone.
         grid: of the integration, in all rows.
+
+    See Also:
+        - :func:`~warmprior.experiments.policy_results`: reads them.
+        - :func:`~warmprior.experiments.model_card`: writes them.
     """
 
     training: Mapping[str, Any]
@@ -55,6 +59,9 @@ def policy_results(run: str | Path, policy: str | Path) -> PolicyResults:
     Raises:
         FileNotFoundError: if there are no results.
         ValueError: if they are damaged, or of other policies.
+
+    See Also:
+        :func:`~warmprior.experiments.model_card`: writes them for the hub.
     """
     path, folder = Path(run) / "results.json", Path(policy).resolve()
     if not path.is_file():

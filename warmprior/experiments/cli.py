@@ -54,6 +54,10 @@ def parse[R: Recipe](
     Raises:
         ValueError: naming the option that cannot work, or that a continued run does not have.
         SystemExit: for options that do not exist, and for ``--help``.
+
+    See Also:
+        - :func:`~warmprior.experiments.started`: opens the folder for work.
+        - :func:`~warmprior.experiments.record`: stores a recipe.
     """
     argv = sys.argv[1:] if argv is None else list(map(str, argv))
 
@@ -156,6 +160,10 @@ def started(recipe: Recipe, study: str) -> Iterator[Path]:
 
     Raises:
         OSError: if it cannot be written to, or another process works in it.
+
+    See Also:
+        - :func:`~warmprior.experiments.parse`: makes the recipe.
+        - :func:`~warmprior.io.files.exclusive`: keeps other processes out.
     """
     out = recipe.run.directory
     if rank():  # the first process is in it, for all
@@ -185,6 +193,9 @@ def write_report(out: Path, table: str, failures: Sequence[str] = ()) -> None:
 
     Raises:
         PartialFailure: if anything is, after the table is shown.
+
+    See Also:
+        :func:`~warmprior.experiments.success_table`: a table to write.
     """
     missing = "".join(f"- Missing: {failure}\n" for failure in failures)
     table += missing and f"\n{missing}"

@@ -62,6 +62,25 @@ class Comparison:
         ValueError: if a prior allows none of the NFEs, is longer than every demonstration, rows could not
             tell two policies apart, or the folder's results belong to other options.
         OSError: if the folder cannot be written to.
+
+    See Also:
+        - :class:`~warmprior.experiments.Store`: where the policies are.
+        - :func:`~warmprior.experiments.success_table`: a table of the rows.
+        - :func:`~warmprior.training.evaluate`: the evaluation alone.
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.experiments import (
+        ...     NAVIGATION_PRESETS, Comparison, RunOptions, Store, navigation_problem)
+        >>> recipe = NAVIGATION_PRESETS["quick"]
+        >>> with TemporaryDirectory() as folder:
+        ...     recipe = replace(recipe, run=RunOptions(out=Path(folder) / "run", logger="none"))
+        ...     stores = [Store.of(recipe, navigation_problem())]
+        ...     compared = Comparison(recipe, "navigation", stores=stores)
+        >>> [contestant.prior.name for contestant in compared.contestants]
+        ['gaussian', 'regression', 'history', 'past', 'past', 'preview', 'preview']
+        >>> compared.train()  # in worker processes, one per core  # doctest: +SKIP
     """
 
     def __init__(

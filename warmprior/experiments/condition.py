@@ -18,6 +18,10 @@ class Condition:
         delay: control steps until chunks take effect; ``None`` where the simulator waits.
         execute: actions executed per decision; all ``H`` by default.
         guidance: of the flow.
+
+    See Also:
+        - :class:`~warmprior.InferenceDelay`: lets chunks take effect late.
+        - :class:`~warmprior.RealTimeChunking`: guides late chunks.
     """
 
     delay: int | None = None

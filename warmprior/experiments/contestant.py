@@ -47,6 +47,9 @@ class Contestant:
         store: where it lies, with its problem.
         prior: its source distribution.
         training: its recipe, with its seed.
+
+    See Also:
+        :class:`~warmprior.experiments.Comparison`: evaluates several of them.
     """
 
     store: Store

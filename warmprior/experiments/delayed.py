@@ -32,6 +32,10 @@ class DelayedRecipe(Recipe):
         guidance: without any, and by Real-Time Chunking.
         toy: the navigation toy: beside the tasks, alone, or not at all.
         rtc: of the guidance.
+
+    See Also:
+        - :class:`~warmprior.experiments.Condition`: one of its delays.
+        - :class:`~warmprior.RealTimeChunking`: the guidance.
     """
 
     delay: tuple[int, ...] = (0, 2, 4)
@@ -116,6 +120,10 @@ def guided_labels(rows: Sequence[Row]) -> Callable[[Row], str]:
 
     Args:
         rows: all that are shown together.
+
+    See Also:
+        - :func:`~warmprior.experiments.source_labels`: without guidance.
+        - :func:`~warmprior.experiments.plot_delays`: uses it.
 
     Examples:
         >>> facts = {"sigma": 1.0, "chunk": 8}

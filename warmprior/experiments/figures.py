@@ -69,6 +69,10 @@ def plot_success(
     Keyword Args:
         title: of the figure.
         group: names what stands side by side.
+
+    See Also:
+        - :func:`~warmprior.diagnostics.success_posterior`: the density.
+        - :func:`~warmprior.experiments.plot_success_bars`: bars over chunk lengths.
     """
     rows = list(rows)
     label, groups = source_labels(rows), grouped(rows, group)
@@ -176,6 +180,10 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
     Keyword Args:
         top_k: checkpoints averaged per seed.
         title: of the figure.
+
+    See Also:
+        - :func:`~warmprior.experiments.plot_success`: posteriors of the rates.
+        - :func:`~warmprior.experiments.success_table`: the same in numbers.
     """
     figure, (axis,) = new_figure(1.8 + 1.5 * len(grouped(rows, lambda row: row["chunk"])), 3.6)
     columns = grouped_bars(
@@ -257,6 +265,9 @@ def plot_filmstrip(
 
     Keyword Args:
         title: of the figure.
+
+    See Also:
+        :func:`~warmprior.training.record_filmstrip`: makes the pictures.
     """
     figure, axes = new_figure(1.5 * len(frames), 2.0, columns=len(frames))
     for axis, frame, label in zip(axes, frames, labels, strict=True):
@@ -289,6 +300,9 @@ def plot_reinforcement(
     Keyword Args:
         title: of the figure.
         warmup_steps: control steps before the first update, shaded.
+
+    See Also:
+        :class:`~warmprior.rl.PriorSpaceTraining`: whose evaluations it draws.
     """
     rows = list(rows)
     figure, axes = new_figure(10.0, 3.8, 1, 2, share=True)

@@ -74,6 +74,10 @@ def prior_label(name: str, options: str = "") -> str:
         name: of the prior.
         options: that are not at their defaults, as :attr:`Prior.options` tells them.
 
+    See Also:
+        - :func:`~warmprior.experiments.prior_color`: its colour.
+        - :func:`~warmprior.experiments.source_labels`: tells the rows of a figure apart.
+
     Examples:
         >>> prior_label("past"), prior_label("past", "correlation=0.5"), prior_label("not imported")
         ('WP-Past', 'WP-Past, correlation=0.5', 'not imported')
@@ -83,7 +87,11 @@ def prior_label(name: str, options: str = "") -> str:
 
 
 def prior_color(name: str) -> str | None:
-    """The colour of a prior in figures; ``None`` (matplotlib's next) where it is not imported."""
+    """The colour of a prior in figures; ``None`` (matplotlib's next) where it is not imported.
+
+    See Also:
+        :func:`~warmprior.experiments.prior_label`: its name.
+    """
     prior = Prior.registered().get(name)
     return None if prior is None else prior.color
 
@@ -131,6 +139,10 @@ def source_labels(rows: Iterable[Row], *, chunks: bool = True) -> Callable[[Row]
 
     Keyword Args:
         chunks: whether H belongs to the name; not where it is told beside it.
+
+    See Also:
+        - :func:`~warmprior.experiments.prior_label`: the name of the prior alone.
+        - :func:`~warmprior.experiments.guided_labels`: adds the guidance.
 
     Examples:
         >>> rows = [Row({"prior": "past", "sigma": s, "chunk": 8}, {}) for s in (0.5, 1.0)]

@@ -28,7 +28,12 @@ SHIFT = 0.15
 
 @dataclass(frozen=True)
 class NavigationRecipe(Recipe):
-    """A comparison of sources on the toy; its episodes are rollouts."""
+    """A comparison of sources on the toy; its episodes are rollouts.
+
+    See Also:
+        - :func:`~warmprior.experiments.judge_navigation`: plays one of its policies.
+        - :data:`~warmprior.experiments.NAVIGATION_PRESETS`: budgets.
+    """
 
     @property
     def name(self) -> str:
@@ -99,6 +104,17 @@ def play_navigation(
 
     Returns:
         The rollout, ``[rollouts, decisions]``.
+
+    See Also:
+        - :func:`~warmprior.experiments.judge_navigation`: measures what it did.
+        - :func:`~warmprior.experiments.plot_navigation`: draws it.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
+        >>> rollout = play_navigation(WarmPriorActor(network, PastPrior(4)), seed=0, nfe=1, rollouts=2)
+        >>> rollout.shape  # 64 steps, four per decision
+        torch.Size([2, 16])
     """
     generator = torch.Generator().manual_seed(seed)
     transforms = policy_transforms(actor.prior, observation_steps=1)

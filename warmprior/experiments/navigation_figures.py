@@ -45,6 +45,9 @@ def plot_navigation(
         chunk_length: ``H``.
         title: of the figure.
         shown: how many rollouts to draw.
+
+    See Also:
+        :func:`~warmprior.experiments.play_navigation`: makes the paths.
     """
     rows = -(-(len(panels) + 1) // 3)
     figure, axes = new_figure(11.0, 0.7 + 3.0 * rows, rows, 3, share=True)

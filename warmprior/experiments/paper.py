@@ -61,6 +61,9 @@ def paper_success(
         chunk: ``H``.
         seen: what policies see, ``"state"`` or ``"image"``.
 
+    See Also:
+        :func:`~warmprior.experiments.success_table`: puts it beside what was measured.
+
     Examples:
         >>> paper_success("square", "mh", "preview", 1)
         77.8

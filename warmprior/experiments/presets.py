@@ -85,6 +85,10 @@ def comparison_preset(asked: Recipe, presets: Mapping[str, Recipe] | None = None
         asked: names both.
         presets: by name; :data:`PRESETS` by default.
 
+    See Also:
+        - :data:`~warmprior.experiments.PRESETS`: the budgets.
+        - :func:`~warmprior.experiments.parse`: applies the other options to it.
+
     Examples:
         >>> comparison_preset(Recipe(data=DataOptions(obs="image"))).network.encoder
         'small'

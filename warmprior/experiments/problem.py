@@ -68,6 +68,18 @@ class Problem:
 
     Raises:
         ValueError: if ``task`` or ``style`` is no name of a file.
+
+    See Also:
+        - :func:`~warmprior.experiments.robosuite_problem`: one of demonstrations in robosuite.
+        - :func:`~warmprior.experiments.navigation_problem`: the toy.
+        - :class:`~warmprior.experiments.Store`: trains policies on it.
+
+    Examples:
+        >>> from warmprior.envs import GoalNavigationEnv, navigation_demonstrations
+        >>> problem = Problem(
+        ...     "goal", "toy", navigation_demonstrations(), GoalNavigationEnv, identity="1")
+        >>> problem.name, problem.vector.shape
+        ('goal toy', torch.Size([384, 9]))
     """
 
     task: str
@@ -141,6 +153,10 @@ def robosuite_problem(
         ValueError: if it has no pose deltas to make absolute poses of, there is no such camera, its
             environment is unknown, or a file is of another task than the one that is named.
         ImportError: if its simulator is MimicGen's, and its package is missing.
+
+    See Also:
+        - :func:`~warmprior.experiments.find_problems`: all that the options name.
+        - :class:`~warmprior.envs.RobosuiteEnv`: its environment.
     """
     options = DataOptions() if options is None else options
     actions = options.actions
@@ -252,7 +268,17 @@ def _read(
 
 
 def navigation_problem() -> Problem:
-    """The one-dimensional navigation toy (Fig. 5)."""
+    """The one-dimensional navigation toy (Fig. 5).
+
+    See Also:
+        - :class:`~warmprior.envs.NavigationEnv`: its environment.
+        - :func:`~warmprior.envs.navigation_demonstrations`: its data.
+
+    Examples:
+        >>> problem = navigation_problem()
+        >>> problem.name, problem.make_env(batch_size=[8]).batch_size
+        ('navigation toy', torch.Size([8]))
+    """
     return Problem(
         "navigation", "toy", navigation_demonstrations(), NavigationEnv, "navigation1d", {}
     )
@@ -273,6 +299,10 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
 
     Raises:
         ValueError: if a file is of another task than the one that is named.
+
+    See Also:
+        - :func:`~warmprior.experiments.robosuite_problem`: a single file.
+        - :class:`~warmprior.experiments.Store`: trains on a problem.
     """
     options.check()
     if options.dataset is not None:
@@ -337,6 +367,10 @@ def observe(
 
     Raises:
         ValueError: if there are no demonstrations to hold out, or they are of another task.
+
+    See Also:
+        - :func:`~warmprior.diagnostics.curvature`: a measure on them.
+        - :func:`~warmprior.experiments.finished_policies`: the policies.
     """
     task, style = facts["task"], facts["style"]
     if options.validation is not None:

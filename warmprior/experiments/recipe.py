@@ -103,6 +103,9 @@ class DataOptions:
         cameras: of the images; by default the task's two, or four with two arms.
         image_size: side of the images in pixels.
         fast_rendering: render without reflections, shadows and smooth edges, three to five times faster.
+
+    See Also:
+        :func:`~warmprior.experiments.find_problems`: reads what they name.
     """
 
     task: tuple[str, ...] = ()
@@ -205,6 +208,10 @@ class NetworkOptions:
             downloads once, from random ones, or a small network.
         crop_size: side of the random window of an image that is seen in training, the central one else.
         share_encoder: one encoder for all cameras.
+
+    See Also:
+        - :class:`~warmprior.PreconditionedNetwork`: what ``precondition`` does.
+        - :class:`~warmprior.ChiTransformer`: the paper's network.
     """
 
     network: Literal["mlp", "chi_transformer"] = "mlp"
@@ -273,6 +280,10 @@ class SourceOptions:
         chunk: chunk lengths H.
         sigma: residual noise of the warm priors, one policy each (default: past 0.5, preview 1.0).
         cold_probability: share of training samples without a mean; the paper's Algorithm 1 has none.
+
+    See Also:
+        - :class:`~warmprior.Prior`: the class of one of your own.
+        - :class:`~warmprior.PastPrior`: the paper's first source.
     """
 
     prior: tuple[str, ...] = ("gaussian", "past", "preview")
@@ -327,6 +338,10 @@ class EvaluationOptions:
         play_on: go on after success, up to the time limit; solved is solved at any step.
         grid: of the integration: uniform, or dense-jump (one last step from half way; dense-jump:0.7 from
             there).
+
+    See Also:
+        - :func:`~warmprior.training.evaluate`: plays the episodes.
+        - :func:`~warmprior.experiments.success_summary`: averages the checkpoints.
     """
 
     seeds: int = 1
@@ -368,6 +383,9 @@ class RunOptions:
         logger: TorchRL logger of the training curves.
         engine: who computes, with the same results: processes of this machine, or Ray, on one or many.
         ray_address: HOST:PORT of a Ray cluster's head (default: $RAY_ADDRESS, or this machine alone).
+
+    See Also:
+        :func:`~warmprior.experiments.parse`: finds the folder and the stored options.
     """
 
     preset: str = "quick"
@@ -408,6 +426,9 @@ class HeldOutOptions:
         observations: how many; the paper's curvature has 2000.
         steps: Euler steps of a curvature.
         draws: source samples per observation.
+
+    See Also:
+        :func:`~warmprior.experiments.observe`: draws the observations.
     """
 
     validation: Path | None = None
@@ -428,6 +449,9 @@ class PolicyOptions:
 
     Attributes:
         run: a finished run of robomimic.py, whose policies to take instead of training them.
+
+    See Also:
+        :func:`~warmprior.experiments.finished_policies`: reads them.
     """
 
     run: Path | None = None
@@ -444,6 +468,11 @@ class Recipe:
         sources: what is compared.
         evaluation: how.
         run: where and how to compute.
+
+    See Also:
+        - :class:`~warmprior.experiments.Comparison`: runs it.
+        - :func:`~warmprior.experiments.parse`: makes it of a command line.
+        - :func:`~warmprior.experiments.comparison_preset`: starts from a budget.
     """
 
     data: Annotated[DataOptions, Flat] = field(default_factory=DataOptions)
@@ -580,6 +609,10 @@ class MeasuredRecipe(Recipe):
 
     Attributes:
         held_out: the observations.
+
+    See Also:
+        - :class:`~warmprior.experiments.HeldOutOptions`: its observations.
+        - :func:`~warmprior.experiments.straightness`: measures by it.
     """
 
     held_out: Annotated[HeldOutOptions, Flat] = field(default_factory=HeldOutOptions)

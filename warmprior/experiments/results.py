@@ -44,6 +44,9 @@ class Row:
         outcomes: of the episodes played, a character each in the order of their seeds: ``1`` if solved,
             else ``0``. Rows of the same seeds compare episode by episode.
 
+    See Also:
+        :class:`~warmprior.experiments.Results`: the file of rows.
+
     Examples:
         >>> row = Row({"prior": "past"}, {"success_rate": 0.5, "kappa": float("nan")})
         >>> row["prior"], row["success_rate"], row["kappa"]
@@ -94,6 +97,14 @@ def select(rows: Iterable[Row], measure: str | None = None, **facts: Fact) -> li
         rows: of any kind.
         measure: its name; any by default.
         facts: by name.
+
+    See Also:
+        :func:`~warmprior.experiments.grouped`: gathers what is found.
+
+    Examples:
+        >>> rows = [Row({"prior": p, "seed": s}, {"kappa": s + 0.5}) for p in "ab" for s in (0, 1)]
+        >>> [row["kappa"] for row in select(rows, "kappa", prior="b")]
+        [0.5, 1.5]
     """
     return [
         row
@@ -104,7 +115,17 @@ def select(rows: Iterable[Row], measure: str | None = None, **facts: Fact) -> li
 
 
 def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Row]]:
-    """Rows by what a function makes of them, in the order of their first."""
+    """Rows by what a function makes of them, in the order of their first.
+
+    See Also:
+        - :func:`~warmprior.experiments.select`: narrows the rows first.
+        - :func:`~warmprior.experiments.table`: draws groups as lines and columns.
+
+    Examples:
+        >>> rows = [Row({"prior": p, "seed": s}, {"kappa": s + 0.5}) for s in (0, 1) for p in "ba"]
+        >>> {prior: len(found) for prior, found in grouped(rows, lambda row: row["prior"]).items()}
+        {'b': 2, 'a': 2}
+    """
     groups: dict[Any, list[Row]] = {}
     for row in rows:
         groups.setdefault(key(row), []).append(row)
@@ -112,7 +133,15 @@ def grouped(rows: Iterable[Row], key: Callable[[Row], Any]) -> dict[Any, list[Ro
 
 
 def mean_known(rows: Iterable[Row], measure: str) -> float | None:
-    """Mean of a measure over the rows that know it; ``None`` if none does."""
+    """Mean of a measure over the rows that know it; ``None`` if none does.
+
+    See Also:
+        :func:`~warmprior.experiments.mean_cell`: writes it into a table.
+
+    Examples:
+        >>> mean_known([Row({}, {"kappa": 1.0}), Row({}, {"kappa": None}), Row({}, {"kappa": 3.0})], "kappa")
+        2.0
+    """
     values = [value for row in rows if (value := row.get(measure)) is not None]
     return math.fsum(values) / len(values) if values else None
 
@@ -126,6 +155,18 @@ def success_summary(rows: Iterable[Row], top_k: int) -> SeedSummary:
 
     Raises:
         ValueError: if there is no row.
+
+    See Also:
+        - :func:`~warmprior.diagnostics.top_k_mean`: the mean of one seed.
+        - :func:`~warmprior.diagnostics.summarize_seeds`: mean and spread over seeds.
+
+    Examples:
+        >>> rates = {(0, 10): 0.5, (0, 20): 0.7, (1, 10): 0.9, (1, 20): 0.1}
+        >>> rows = [
+        ...     Row({"seed": seed, "checkpoint": after}, {"success_rate": rate})
+        ...     for (seed, after), rate in rates.items()]
+        >>> success_summary(rows, top_k=1)
+        SeedSummary(mean=0.8, std=0.1414..., seeds=2)
     """
     by_seed: dict[int, list[float]] = {}
     for row in rows:
@@ -173,6 +214,10 @@ class Results:
     Raises:
         ValueError: if the file to resume is damaged, or belongs to a run with another identity or one whose
             policies were trained by other versions.
+
+    See Also:
+        - :class:`~warmprior.experiments.Row`: what it holds.
+        - :func:`~warmprior.experiments.select`: finds rows.
     """
 
     def __init__(

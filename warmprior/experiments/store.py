@@ -72,6 +72,11 @@ class Store:
 
     Raises:
         OSError: if ``directory`` cannot be written to.
+
+    See Also:
+        - :class:`~warmprior.experiments.Comparison`: evaluates what it holds.
+        - :class:`~warmprior.training.BehaviourCloning`: trains each policy.
+        - :func:`~warmprior.experiments.finished_policies`: reads them from a finished run.
     """
 
     problem: Problem
@@ -367,6 +372,10 @@ def finished_policies(
     Raises:
         FileNotFoundError: if there are no results, or a policy is missing.
         ValueError: if the results are of something else, or of several problems or recipes.
+
+    See Also:
+        - :class:`~warmprior.experiments.Store`: where a comparison keeps them.
+        - :func:`~warmprior.experiments.observe`: observations to measure them on.
     """
     meta = _facts_of(run)
     entries = [(Prior.from_config(entry["prior"]), entry) for entry in meta["policies"]]

@@ -110,6 +110,9 @@ def plot_chunk_lengths(rows: Sequence[Row], path: str | Path, *, top_k: int, tit
     Keyword Args:
         top_k: checkpoints averaged per seed.
         title: of the figure.
+
+    See Also:
+        :func:`~warmprior.diagnostics.smoothness`: measures the jumps.
     """
     by_nfe = grouped(rows, lambda row: row["nfe"])
     chunks = sorted({row["chunk"] for row in rows})
@@ -215,6 +218,10 @@ def plot_delays(
         label: names the source and guidance of a row.
         top_k: checkpoints averaged per seed.
         title: of the figure.
+
+    See Also:
+        - :class:`~warmprior.experiments.DelayedRecipe`: the comparison that it draws.
+        - :class:`~warmprior.RealTimeChunking`: the guidance.
     """
     rows = sorted(rows, key=lambda row: row["delay"])
     tasks = grouped(rows, lambda row: f"{row['task']} {row['data']}")

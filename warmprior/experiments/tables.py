@@ -49,6 +49,10 @@ def table(
         head: of the first column.
         notes: lines below the table.
 
+    See Also:
+        - :func:`~warmprior.experiments.mean_cell`: a cell of means.
+        - :func:`~warmprior.experiments.success_cell`: a cell of success rates.
+
     Examples:
         >>> rows = [Row({"H": h, "prior": p}, {"rate": r})
         ...         for h, p, r in [(1, "past", 0.5), (8, "past", 0.25), (8, "preview", 1.0)]]
@@ -90,6 +94,14 @@ def mean_cell(measure: str, form: str, scale: float = 1.0) -> Cell:
         measure: its name.
         form: format of the numbers.
         scale: what to multiply them with.
+
+    See Also:
+        - :func:`~warmprior.experiments.table`: takes it for its cells.
+        - :func:`~warmprior.experiments.mean_known`: the mean alone.
+
+    Examples:
+        >>> mean_cell("steps", ".1f")([Row({"seed": 0}, {"steps": 3.0}), Row({"seed": 1}, {"steps": 5.0})])
+        '4.0 ± 1.4'
     """
 
     def cell(rows: list[Row]) -> str | None:
@@ -109,6 +121,14 @@ def success_cell(top_k: int) -> Cell:
 
     Args:
         top_k: checkpoints averaged per seed.
+
+    See Also:
+        - :func:`~warmprior.experiments.table`: takes it for its cells.
+        - :func:`~warmprior.experiments.success_summary`: the numbers alone.
+
+    Examples:
+        >>> success_cell(top_k=1)([Row({"seed": 0}, {"success_rate": 0.75})])
+        '75.0'
     """
 
     def cell(rows: list[Row]) -> str:
@@ -142,6 +162,11 @@ def success_table(
         top_k: checkpoints averaged per seed.
         source: of the demonstrations, if it is known: ``"official"`` stands beside the paper's as an equal.
         notes: further ones.
+
+    See Also:
+        - :class:`~warmprior.experiments.Comparison`: makes the rows.
+        - :func:`~warmprior.experiments.paper_success`: the paper's numbers.
+        - :func:`~warmprior.experiments.plot_success_bars`: the same as a figure.
     """
     rows = select(rows, "success_rate")
     # In the order of the groups: all sources at one NFE side by side.

@@ -39,7 +39,11 @@ _waiting: dist.ProcessGroup | None = None
 
 
 def launched() -> bool:
-    """Whether ``torchrun`` started this process as one of several."""
+    """Whether ``torchrun`` started this process as one of several.
+
+    See Also:
+        :func:`~warmprior.io.distributed.joined`: joins them.
+    """
     names = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR")
     return all(name in os.environ for name in names) and int(os.environ["WORLD_SIZE"]) > 1
 
@@ -50,7 +54,11 @@ def world_size() -> int:
 
 
 def rank() -> int:
-    """The number of this process among them. The first, 0, is the one that writes and prints."""
+    """The number of this process among them. The first, 0, is the one that writes and prints.
+
+    See Also:
+        :func:`~warmprior.io.distributed.world_size`: how many there are.
+    """
     return dist.get_rank() if dist.is_initialized() else 0
 
 
@@ -63,6 +71,10 @@ def joined() -> Iterator[None]:
 
     Raises:
         WorkerError: if another process ended, or did not arrive within ten minutes.
+
+    See Also:
+        - :func:`~warmprior.io.distributed.launched`: whether there is anything to join.
+        - :func:`~warmprior.io.distributed.process_group`: tells errors of the group as what they are.
 
     Examples:
         >>> with joined():  # started without torchrun
@@ -105,6 +117,9 @@ def process_group() -> Iterator[None]:
 
     Raises:
         WorkerError: instead of them.
+
+    See Also:
+        :func:`~warmprior.io.distributed.joined`: starts the group.
     """
     try:
         yield
@@ -127,6 +142,9 @@ def leader_first() -> Iterator[None]:
         ValueError: likewise.
         SystemExit: in the others, if it failed otherwise in the first, which tells why.
         WorkerError: if the first process ended meanwhile.
+
+    See Also:
+        :func:`~warmprior.io.distributed.from_leader`: where the others need the result.
     """
     told: list[Any] = [None]
     if not rank():
@@ -167,6 +185,9 @@ def from_leader[T](make: Callable[[], T]) -> T:
         SystemExit: in the others, if it fails in the first, which tells why.
         WorkerError: if the first process ended meanwhile.
 
+    See Also:
+        :func:`~warmprior.io.distributed.leader_first`: where each makes, or finds, its own.
+
     Examples:
         >>> from_leader(lambda: 3)
         3
@@ -190,6 +211,9 @@ def go_on_alone() -> None:
 
     Raises:
         SystemExit: in the others, with success.
+
+    See Also:
+        :func:`~warmprior.io.distributed.joined`: the group that ends.
     """
     if world_size() == 1:
         return
@@ -205,6 +229,9 @@ def mean_over_processes(value: Tensor) -> Tensor:
 
     Args:
         value: of one shape everywhere.
+
+    See Also:
+        :func:`~warmprior.io.distributed.from_leader`: what one process knows.
 
     Examples:
         >>> mean_over_processes(torch.tensor(3.0))
@@ -224,6 +251,9 @@ def check_batch(size: int) -> None:
 
     Raises:
         ValueError: if there are more processes.
+
+    See Also:
+        :class:`~warmprior.training.BehaviourCloning`: shares its batches out.
     """
     if size < world_size():
         raise ValueError(
@@ -240,6 +270,9 @@ def check_device(device: str) -> None:
 
     Raises:
         ValueError: naming ``--device`` and what there is instead.
+
+    See Also:
+        :func:`~warmprior.io.distributed.joined`: the processes that share the devices.
 
     Examples:
         >>> check_device("cpu")

@@ -135,6 +135,17 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
 
     Raises:
         OSError: if the file cannot be written, naming ``path``.
+
+    See Also:
+        :func:`~warmprior.io.files.exclusive`: keeps other processes out of the folder.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "new" / "table.md"
+        ...     write_atomic(path, lambda temporary: temporary.write_text("done"))
+        ...     path.read_text()
+        'done'
     """
     # Unique among the threads, processes and machines that may write the same file.
     owner = f"{os.getpid()}.{uuid.uuid4().hex}.{platform.node()}"
@@ -213,6 +224,9 @@ def exclusive(directory: Path) -> Iterator[None]:
 
     Raises:
         BlockingIOError: if another process is in there.
+
+    See Also:
+        :func:`~warmprior.io.files.write_atomic`: what readers see is whole without a lock.
     """
     directory.mkdir(parents=True, exist_ok=True)
     folder = os.open(directory, os.O_RDONLY)

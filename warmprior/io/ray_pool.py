@@ -48,6 +48,9 @@ def check_ray(address: str | None = None) -> str | None:
         ImportError: if Ray is not installed.
         ValueError: if this is no address of a head.
         ConnectionError: if nothing answers there, or the cluster has another Ray or Python.
+
+    See Also:
+        :func:`~warmprior.io.ray_pool.ray_cluster`: connects to it.
     """
     require("ray", "ray")
     option = "--ray-address" if address else "RAY_ADDRESS"
@@ -97,6 +100,9 @@ def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str
 
     Raises:
         WorkerError: naming the machine and both versions, a ``RuntimeError``.
+
+    See Also:
+        :class:`~warmprior.io.ray_pool.RayPool`: whose machines have to agree.
 
     Examples:
         >>> check_versions({"torch": "2.11.0"}, {"torch": "2.10.0"}, "node-7")

@@ -52,6 +52,9 @@ def run_script(
 
     Returns:
         The exit code: 0, 2 after an error, 130 after Ctrl-C.
+
+    See Also:
+        :func:`~warmprior.io.distributed.launched`: whether it is one of several processes.
     """
     # Policies are shared between scripts, so all of them compute alike. Small networks gain nothing from
     # a second thread, and on a busy machine threads that wait for each other cost much.

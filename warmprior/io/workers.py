@@ -38,7 +38,12 @@ torch.ones((), requires_grad=True).backward()
 
 
 class WorkerError(RuntimeError):
-    """A worker process died, or cannot do the work."""
+    """A worker process died, or cannot do the work.
+
+    See Also:
+        - :func:`~warmprior.training.parallel_env`: its processes.
+        - :class:`~warmprior.io.workers.WorkerPool`: its workers.
+    """
 
 
 def worker_died(worker: str, advice: str) -> WorkerError:
@@ -94,6 +99,9 @@ class Failure:
 
     Attributes:
         reason: in words.
+
+    See Also:
+        :class:`~warmprior.io.workers.WorkerPool`: gives it in place of a result.
     """
 
     reason: str
@@ -143,6 +151,9 @@ class WorkerPool[State]:
 
     Raises:
         ValueError: if ``num_workers < 1``.
+
+    See Also:
+        :class:`~warmprior.io.ray_pool.RayPool`: the same on a cluster.
 
     Examples:
         >>> from functools import partial

@@ -48,6 +48,17 @@ class LeRobotFlow(TensorDictModuleBase):
         ValueError: if gradients are asked for: LeRobot's samplers compute none, or ``padding`` has another
             shape than the model's source.
         KeyError: if an input key is missing.
+
+    See Also:
+        - :class:`~warmprior.lerobot.LeRobotActor`: this with a prior and memory: a whole policy.
+        - :class:`~warmprior.lerobot.WarmPriorAdapter`: stays within LeRobot instead.
+
+    Examples:
+        >>> from warmprior import PastPrior
+        >>> from warmprior.lerobot import WarmPriorAdapter
+        >>> adapter = WarmPriorAdapter(policy, PastPrior(8))  # doctest: +SKIP
+        >>> flow = LeRobotFlow(policy, adapter.source, nfe=1)  # doctest: +SKIP
+        >>> chunk = flow(data)["vla_action", "chunk"]  # doctest: +SKIP
     """
 
     guidance = None

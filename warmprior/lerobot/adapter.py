@@ -31,6 +31,9 @@ def history_indices(chunk_length: int, length: int, lead: int = 0) -> list[int]:
         length: ``T``, the length of the policy's chunk.
         lead: positions of the chunk before the current step.
 
+    See Also:
+        :class:`~warmprior.lerobot.WarmPriorAdapter`: reads these steps of a dataset.
+
     Examples:
         >>> history_indices(2, 3)
         [-2, -1, 0, 1, 2]

@@ -26,6 +26,10 @@ class FlowPort(ABC):
 
     The policies themselves are not changed. Training and sampling run inside of :meth:`training` and
     :meth:`sampling`, which see to it that the source is used exactly once.
+
+    See Also:
+        - :func:`~warmprior.lerobot.port_for`: finds that of a policy.
+        - :data:`~warmprior.lerobot.PORTS`: all of them.
     """
 
     @abstractmethod
@@ -393,6 +397,10 @@ def port_for(policy: Any) -> FlowPort:
     Raises:
         ValueError: if there is none, or the policy has options that it does not support.
         ImportError: if there is none for this release.
+
+    See Also:
+        - :class:`~warmprior.lerobot.FlowPort`: what it returns.
+        - :data:`~warmprior.lerobot.PORTS`: all of them.
     """
     installed = version("lerobot")
     ports = next((PORTS[known] for known in PORTS if f"{installed}.".startswith(f"{known}.")), None)

@@ -22,6 +22,10 @@ class RelativeActions:
 
     Raises:
         ValueError: if the steps are not there, or relative actions are off in them.
+
+    See Also:
+        - :class:`~warmprior.lerobot.ActionMemory`: remembers the actions.
+        - :class:`~warmprior.lerobot.WarmPriorAdapter`: takes it as ``relative``.
     """
 
     def __init__(self, preprocessor: Any, postprocessor: Any) -> None:

@@ -37,6 +37,10 @@ class ChunkSource:
     Raises:
         ValueError: if the prior does not fit the policy.
 
+    See Also:
+        - :class:`~warmprior.lerobot.LeRobotFlow`: integrates from its samples.
+        - :class:`~warmprior.lerobot.WarmPriorAdapter`: puts it into a policy of LeRobot.
+
     Examples:
         >>> import torch
         >>> from warmprior import PastPrior
@@ -177,6 +181,9 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
     Raises:
         ValueError: if the statistics that the policy's units need are missing, a dimension never varies
             between its bounds, or the policy normalises actions elsewhere, or has no port.
+
+    See Also:
+        :class:`~warmprior.lerobot.WarmPriorAdapter`: warms the source in these units.
     """
     mode = port_for(policy).normalization(policy)
     own = (stats or {}).get("action", {})

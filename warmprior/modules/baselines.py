@@ -20,6 +20,9 @@ class RegressionPrior(GaussianPrior):
     Args:
         chunk_length: ``H``.
 
+    See Also:
+        :class:`~warmprior.GaussianPrior`: the flow beside which it is put.
+
     Examples:
         >>> import torch
         >>> from warmprior import VelocityMLP, WarmPriorActor

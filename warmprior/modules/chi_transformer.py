@@ -73,6 +73,10 @@ class ChiTransformer(VelocityNetwork):
     Raises:
         ValueError: if ``num_heads`` does not divide ``embedding_dim``.
 
+    See Also:
+        - :class:`~warmprior.VelocityMLP`: a small network for vectors.
+        - :class:`~warmprior.VisionNetwork`: puts encoders of images before it.
+
     Examples:
         >>> import torch
         >>> network = ChiTransformer(7, 23, 8, embedding_dim=24, num_layers=2)

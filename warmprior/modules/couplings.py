@@ -39,6 +39,9 @@ class OTPrior(GaussianPrior):
             observations are nested.
         ImportError: if scipy is missing.
 
+    See Also:
+        :class:`~warmprior.ReflowPrior`: pairs each source with what a trained flow makes of it.
+
     Examples:
         >>> import torch
         >>> prior = OTPrior(1, observation_weight=0.0)

@@ -74,6 +74,11 @@ class ImageEncoder(nn.Module):
     .. note::
         The windows of a training are drawn by PyTorch's global generator, like dropout.
 
+    See Also:
+        - :class:`~warmprior.VisionNetwork`: a velocity network behind it.
+        - :class:`~warmprior.EncodeObservation`: runs it next to the environment.
+        - :func:`~warmprior.modules.load_imagenet`: starts it from ImageNet's weights.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -210,6 +215,9 @@ def imagenet_weights() -> dict[str, Tensor]:
     Raises:
         OSError: if they are neither stored here nor can be downloaded, or what is stored is damaged.
         ImportError: if torchvision is missing.
+
+    See Also:
+        :func:`~warmprior.modules.load_imagenet`: puts them into an encoder.
     """
     torchvision: Any = require("torchvision.models", "vision")
     weights = torchvision.ResNet18_Weights.IMAGENET1K_V1

@@ -30,6 +30,10 @@ class ForecastPrior(LearnedPrior):
     Args:
         chunk_length: ``H``.
 
+    See Also:
+        - :class:`~warmprior.LeapPrior`: the same from the observation alone.
+        - :func:`~warmprior.training.learn_prior`: fits a learned prior before the policy.
+
     Examples:
         >>> import torch
         >>> prior = ForecastPrior(4).sized(action_dim=2, observation_dim=3, observation_steps=1)

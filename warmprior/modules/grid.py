@@ -42,6 +42,9 @@ def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[
     Raises:
         ValueError: see :func:`check_grid`.
 
+    See Also:
+        :func:`~warmprior.integrate`: takes its steps on such a grid.
+
     Examples:
         >>> grid_parts("dense-jump:0.75", 4), grid_parts("dense-jump", 1)
         ([(0.0, 0.75, 3), (0.75, 1.0, 1)], [(0.0, 1.0, 1)])

@@ -22,6 +22,22 @@ class Interpolant:
     Subclasses give a ``name``, :meth:`coefficients` and, if they take arguments, :meth:`config`. The
     coefficients must satisfy :math:`\alpha(0)=\beta(1)=1` and :math:`\alpha(1)=\beta(0)=0`, so that the flow
     starts at the source and ends at the data.
+
+    See Also:
+        - :class:`~warmprior.LinearInterpolant`: the default.
+        - :class:`~warmprior.FlowMatchingLoss`: regresses its velocity.
+
+    Examples:
+        >>> class SineInterpolant(Interpolant):
+        ...     name = "sine"
+        ...     def coefficients(self, t):
+        ...         beta = torch.sin(math.pi / 2 * t) ** 2
+        ...         speed = math.pi / 2 * torch.sin(math.pi * t)
+        ...         return 1 - beta, beta, -speed, speed
+        >>> path = SineInterpolant()
+        >>> a_t, velocity = path(torch.zeros(1, 2, 1), torch.ones(1, 2, 1), torch.tensor([0.5]))
+        >>> round(float(a_t[0, 0]), 3), round(float(velocity[0, 0]), 3)
+        (0.5, 1.571)
     """
 
     name: ClassVar[str]
@@ -79,6 +95,10 @@ class Interpolant:
 class LinearInterpolant(Interpolant):
     r"""Straight line: :math:`\alpha = 1 - t`, :math:`\beta = t` (Lipman et al., 2023; the paper's).
 
+    See Also:
+        - :class:`~warmprior.TrigonometricInterpolant`: keeps the variance of uncorrelated ends.
+        - :class:`~warmprior.PolynomialInterpolant`: starts at rest.
+
     Examples:
         >>> import torch
         >>> a0, a1 = torch.zeros(1, 2, 1), torch.ones(1, 2, 1)
@@ -99,6 +119,14 @@ class TrigonometricInterpolant(Interpolant):
     r"""Quarter circle: :math:`\alpha = \cos(\pi t/2)`, :math:`\beta = \sin(\pi t/2)`.
 
     Keeps the variance constant for uncorrelated unit-variance ends (Albergo and Vanden-Eijnden, 2023).
+
+    See Also:
+        :class:`~warmprior.LinearInterpolant`: the default.
+
+    Examples:
+        >>> alpha, beta, _, _ = TrigonometricInterpolant().coefficients(torch.tensor(1 / 3))
+        >>> round(alpha.item(), 3), round(beta.item(), 3)
+        (0.866, 0.5)
     """
 
     name = "trigonometric"
@@ -119,6 +147,15 @@ class PolynomialInterpolant(Interpolant):
 
     Raises:
         ValueError: if ``n <= 0``.
+
+    See Also:
+        :class:`~warmprior.LinearInterpolant`: the power 1.
+
+    Examples:
+        >>> a0, a1, t = torch.zeros(1, 1, 1), torch.ones(1, 1, 1), torch.tensor([0.5])
+        >>> a_t, velocity = PolynomialInterpolant(n=2)(a0, a1, t)
+        >>> a_t.item(), velocity.item()
+        (0.25, 1.0)
     """
 
     name = "polynomial"

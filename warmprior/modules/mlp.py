@@ -47,6 +47,10 @@ class VelocityMLP(VelocityNetwork):
         num_blocks: number of residual blocks of two layers.
         timestep_embedding_dim: width of the time embedding.
 
+    See Also:
+        - :class:`~warmprior.ChiTransformer`: the paper's network.
+        - :class:`~warmprior.PreconditionedNetwork`: wraps it in what is known before training.
+
     Examples:
         >>> import torch
         >>> network = VelocityMLP(7, 23, 8)

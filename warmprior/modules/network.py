@@ -29,6 +29,27 @@ class VelocityNetwork(nn.Module):
 
     Raises:
         ValueError: if a width or length is not positive.
+
+    See Also:
+        - :class:`~warmprior.VelocityMLP`: the small one.
+        - :class:`~warmprior.ChiTransformer`: the paper's.
+        - :class:`~warmprior.PreconditionedNetwork`: wraps any of them.
+
+    Examples:
+        >>> class LinearNetwork(VelocityNetwork):
+        ...     def __init__(self, action_dim, observation_dim, prediction_length, observation_steps):
+        ...         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+        ...         inputs = 1 + prediction_length * action_dim + observation_steps * observation_dim
+        ...         self.layer = nn.Linear(inputs, prediction_length * action_dim)
+        ...     def forward(self, t, a, observation):
+        ...         self.check_shapes(a, observation)
+        ...         inputs = torch.cat([t[:, None], a.flatten(1), observation.flatten(1)], -1)
+        ...         return self.layer(inputs).view_as(a)
+        >>> network = LinearNetwork(2, 5, prediction_length=4, observation_steps=1)
+        >>> network(torch.zeros(3), torch.zeros(3, 4, 2), torch.zeros(3, 1, 5)).shape
+        torch.Size([3, 4, 2])
+        >>> network.config()["name"]  # what a saved policy is loaded by
+        'LinearNetwork'
     """
 
     encodes: bool = False
@@ -226,6 +247,9 @@ class TimestepEmbedding(nn.Module):
 
     Raises:
         ValueError: if ``dim`` is odd or < 4.
+
+    See Also:
+        :class:`~warmprior.ChiTransformer`: embeds its times with it.
 
     Examples:
         >>> import torch

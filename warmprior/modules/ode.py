@@ -159,6 +159,10 @@ class ODEActor(TensorDictModuleBase):
             an unknown solver or grid, or guidance of what is no flow (``max_nfe=1``).
         KeyError: if an input key is missing.
 
+    See Also:
+        - :class:`~warmprior.WarmPriorActor`: this with a source before it: a whole policy.
+        - :func:`~warmprior.integrate`: the integration alone.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

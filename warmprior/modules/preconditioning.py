@@ -41,6 +41,10 @@ class SourceMoments(nn.Module):
     Raises:
         ValueError: if the shapes differ, or an entry is NaN or infinite.
 
+    See Also:
+        - :class:`~warmprior.PreconditionedNetwork`: scales inputs and outputs by them.
+        - :func:`~warmprior.training.precondition`: estimates them and wraps a network.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -209,6 +213,10 @@ class PreconditionedNetwork(VelocityNetwork):
     Raises:
         ValueError: if the moments or the trend do not have the network's shapes, or the path has no finite
             velocity at its ends.
+
+    See Also:
+        - :class:`~warmprior.SourceMoments`: what it has to know.
+        - :func:`~warmprior.training.precondition`: estimates that and wraps a network.
 
     Examples:
         >>> import torch

@@ -17,6 +17,10 @@ def _all_cold(like: Tensor) -> tuple[Tensor, Tensor]:
 class GaussianPrior(Prior):
     """The usual standard normal source: nothing is ever warm. The baseline of every comparison.
 
+    See Also:
+        - :class:`~warmprior.PastPrior`: starts from what was executed last.
+        - :class:`~warmprior.PreviewPrior`: starts from the policy's own forecast.
+
     Examples:
         >>> import torch
         >>> prior = GaussianPrior(8)
@@ -50,6 +54,11 @@ class PastPrior(Prior):
     In training :math:`\mu_\tau = a^{data}[i-H+\tau]` if the whole window lies inside the episode, and
     nothing is warm otherwise. At decisions the mean is the last ``H`` actions executed in the episode,
     however many of each chunk were executed, and nothing is warm before ``H`` actions were executed.
+
+    See Also:
+        - :class:`~warmprior.PreviewPrior`: starts from the policy's own forecast instead.
+        - :class:`~warmprior.HistoryPrior`: lets the network see the last actions, with a Gaussian source.
+        - :class:`~warmprior.ActionHistory`: writes the mean for the next decision in the environment.
 
     Examples:
         >>> import torch
@@ -96,6 +105,10 @@ class PreviewPrior(Prior):
     .. note::
         Algorithm 1 never shows the network a cold first half, which is what it meets at the first
         decision of every episode. ``cold_probability`` repairs that; it matters for small ``sigma``.
+
+    See Also:
+        - :class:`~warmprior.PastPrior`: starts from what was executed instead.
+        - :class:`~warmprior.ActionHistory`: writes the mean for the next decision in the environment.
 
     Examples:
         >>> import torch

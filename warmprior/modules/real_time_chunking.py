@@ -35,6 +35,11 @@ def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
         leftover: what the chunk before holds for the same control steps, ``[*B, P, d_a]``.
         delay: control steps until ``chunk`` takes effect, int64 ``[*B, 1]``.
 
+    See Also:
+        - :func:`~warmprior.transforms.shift_chunk`: takes the rest of the chunk before to the positions of
+          the next one.
+        - :class:`~warmprior.RealTimeChunking`: makes the prediction continue that rest.
+
     Examples:
         >>> import torch
         >>> chunk, leftover = torch.zeros(1, 4, 1), torch.ones(1, 4, 1)

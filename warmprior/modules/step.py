@@ -35,6 +35,9 @@ class StepPrior(PointForecastPrior):
     Raises:
         ValueError: if ``start_time`` is not in (0, 1), ``stall`` below 0, or one of the three not finite.
 
+    See Also:
+        :class:`~warmprior.ForecastPrior`: moves the source itself to a learned forecast.
+
     Examples:
         >>> import torch
         >>> prior = StepPrior(4, start_time=0.75).sized(

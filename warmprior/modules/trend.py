@@ -34,6 +34,10 @@ class RestingAction(nn.Module):
         normalizer: of the observations ``[d_o]`` and the actions ``[10 * arms]``; an identity by default,
             to be replaced by loading a state dict.
 
+    See Also:
+        - :class:`~warmprior.PoseTrend`: fits the deviation from it.
+        - :func:`~warmprior.training.precondition`: takes it off what the network has to learn.
+
     Examples:
         >>> import torch
         >>> rest = RestingAction(torch.arange(7)[None])

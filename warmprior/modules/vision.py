@@ -26,6 +26,11 @@ class VisionNetwork(VelocityNetwork):
     Raises:
         ValueError: if the network was built for other observations.
 
+    See Also:
+        - :class:`~warmprior.ImageEncoder`: the encoder.
+        - :class:`~warmprior.ChiTransformer`: a network to put behind it.
+        - :class:`~warmprior.CameraImages`: brings the images of an environment.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

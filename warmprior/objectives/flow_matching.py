@@ -160,6 +160,10 @@ class FlowMatchingLoss(LossModule):
             option that needs a flow with a prior whose field is none; or for another path than the network is
             preconditioned for.
 
+    See Also:
+        - :class:`~warmprior.training.BehaviourCloning`: the training loop around it.
+        - :func:`~warmprior.window_replay_buffer`: its batches.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

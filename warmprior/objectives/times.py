@@ -30,6 +30,16 @@ def uniform_times(
         generator: source of randomness on ``device``.
         dtype: of the result.
         device: of the result.
+
+    See Also:
+        - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
+        - :class:`~warmprior.FlowMatchingLoss`: draws its times so.
+
+    Examples:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> t = uniform_times(torch.Size([1000]), generator, torch.float32, torch.device("cpu"))
+        >>> abs(float(t.mean()) - 0.5) < 0.05
+        True
     """
     return torch.rand(shape, generator=generator, dtype=dtype, device=device)
 
@@ -51,6 +61,10 @@ def u_shaped_times(
         generator: source of randomness on ``device``.
         dtype: of the result.
         device: of the result.
+
+    See Also:
+        - :func:`~warmprior.objectives.times.logit_normal_times`: prefers the middle.
+        - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
 
     Examples:
         >>> import torch
@@ -74,6 +88,16 @@ def logit_normal_times(
         generator: source of randomness on ``device``.
         dtype: of the result.
         device: of the result.
+
+    See Also:
+        - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
+        - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
+
+    Examples:
+        >>> generator = torch.Generator().manual_seed(0)
+        >>> t = logit_normal_times(torch.Size([1000]), generator, torch.float32, torch.device("cpu"))
+        >>> bool(((t - 0.5).abs() < 0.25).float().mean() > 0.6)  # half of uniform ones
+        True
     """
     return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
 

@@ -46,6 +46,18 @@ class PriorSpaceConfig:
 
     Raises:
         ValueError: for a number out of its range, naming it.
+
+    See Also:
+        - :class:`~warmprior.rl.PriorSpaceTraining`: trains by it.
+        - :class:`~warmprior.DSRLNALoss`: the loss of ``dsrl-na``.
+
+    Examples:
+        >>> config = PriorSpaceConfig(algorithm="dsrl-sac", delta=1.5, hidden_dim=128)
+        >>> config.environment_steps, config.gamma
+        (1000000, 0.99)
+        >>> PriorSpaceConfig(gamma=1.5)
+        Traceback (most recent call last):
+        ValueError: gamma must lie in (0, 1], got 1.5
     """
 
     algorithm: Literal["dsrl-na", "dsrl-sac"] = "dsrl-na"

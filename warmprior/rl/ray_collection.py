@@ -34,6 +34,10 @@ class WarmUpSwitch(TensorDictModuleBase):
 
     Attributes:
         learning: bool ``[]``.
+
+    See Also:
+        - :func:`~warmprior.rl.ray_collection.ray_rounds`: collects with it.
+        - :class:`~warmprior.ResidualSampler`: what acts at first.
     """
 
     def __init__(self, warmup: TensorDictModuleBase, policy: TensorDictModuleBase) -> None:

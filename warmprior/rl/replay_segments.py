@@ -25,6 +25,9 @@ class ReplaySegments:
         directory: the folder; created with the first segment.
         segments: how many of its segments are to be kept.
 
+    See Also:
+        :class:`~warmprior.rl.PriorSpaceTraining`: saves its replay buffer so.
+
     Examples:
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder:

@@ -47,6 +47,10 @@ class ResidualSampler(TensorDictModuleBase):
         ValueError: for an unknown distribution or a ``sigma`` that is not a finite number > 0.
         KeyError: (when called) if the anchor is missing.
 
+    See Also:
+        - :class:`~warmprior.PriorDecoder`: decodes what it draws.
+        - :func:`~warmprior.make_prior_space_actor`: the agent that takes its place.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

@@ -62,6 +62,31 @@ class PriorSpaceTraining:
     Raises:
         ValueError: if the recipe does not suit the policy, or the folder's state belongs to another
             recipe or policy, or its replay buffer to another wiring.
+
+    See Also:
+        - :class:`~warmprior.rl.PriorSpaceConfig`: its recipe.
+        - :class:`~warmprior.PriorAnchor`: what the environment needs.
+        - :func:`~warmprior.training.evaluate`: plays episodes with ``agent.policy``.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from torchrl.envs import TransformedEnv
+        >>> from warmprior import PastPrior, PriorAnchor, VelocityMLP, WarmPriorActor, policy_transforms
+        >>> from warmprior.envs import GoalNavigationEnv
+        >>> prior = PastPrior(8)
+        >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
+        >>> def make_env(seed):
+        ...     transforms = policy_transforms(prior, observation_steps=1)
+        ...     transforms.append(PriorAnchor(prior, seed=seed))
+        ...     return TransformedEnv(GoalNavigationEnv((1, 1), batch_size=[2]), transforms)
+        >>> config = PriorSpaceConfig(
+        ...     environment_steps=40, warmup_steps=20, evaluate_every=40, evaluation_episodes=2,
+        ...     batch_size=4, updates=1, noise_critic_steps=1, hidden_dim=8, num_layers=1)
+        >>> with TemporaryDirectory() as folder:
+        ...     training = PriorSpaceTraining(
+        ...         WarmPriorActor(network, prior), make_env, config, folder, evaluation_seed=100)
+        ...     [row["evaluation"] for row in training.run()]
+        ['base', 'greedy', 'stochastic']
     """
 
     def __init__(

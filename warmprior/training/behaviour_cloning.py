@@ -93,6 +93,14 @@ def precondition(
 
     Returns:
         The preconditioned network; the same for the same data and prior.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
+        >>> demos = navigation_demonstrations()
+        >>> type(precondition(network, demos, PastPrior(4), observation_steps=1)).__name__
+        'PreconditionedNetwork'
     """
     generator = torch.Generator(data.device or "cpu").manual_seed(0)
     if prior.teacher is None:  # which sees them
@@ -143,6 +151,25 @@ class BehaviourCloning:
             loaded again (:meth:`WarmPriorActor.check_saveable`), or its prior conditions the network and it
             reads another key than :class:`~warmprior.MeanObservation` writes.
         TypeError: if the policy cannot be saved.
+
+    See Also:
+        - :class:`~warmprior.training.TrainingConfig`: its recipe.
+        - :class:`~warmprior.FlowMatchingLoss`: the loss alone, for a loop of your own.
+        - :func:`~warmprior.training.evaluate`: plays episodes with what it trained.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
+        >>> actor = WarmPriorActor(network, PastPrior(4))
+        >>> config = TrainingConfig(iterations=2, batch_size=8, checkpoints=1)
+        >>> data = navigation_demonstrations()
+        >>> with TemporaryDirectory() as folder:
+        ...     training = BehaviourCloning(actor, data, config, folder, observation_steps=1)
+        ...     _ = training.run()
+        ...     sorted(path.name for path in Path(folder).iterdir())
+        ['policy_000002', 'state.safetensors']
     """
 
     def __init__(

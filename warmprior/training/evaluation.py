@@ -82,6 +82,10 @@ def parallel_env(
 
     Raises:
         ValueError: if ``num_envs < 1``.
+
+    See Also:
+        - :func:`~warmprior.training.evaluate`: plays episodes in it.
+        - :class:`~warmprior.envs.RobosuiteEnv`: what its processes usually hold.
     """
     if num_envs < 1:
         raise ValueError(f"the number of environments must be at least 1, got {num_envs}")
@@ -217,6 +221,10 @@ def play_episode(
         ValueError: if the environment has batch dimensions, or a seed is negative.
         KeyError: if it does not tell ``"success"``, or lacks the policy's transforms.
 
+    See Also:
+        - :func:`~warmprior.training.evaluate`: many of them, one by one or side by side.
+        - :func:`~warmprior.training.record_video`: films one.
+
     Examples:
         >>> env = TransformedEnv(RobosuiteEnv("lift"), policy_transforms(prior))  # doctest: +SKIP
         >>> play_episode(actor, env, seed=10_000_000, nfe=1).success  # doctest: +SKIP
@@ -285,6 +293,24 @@ def evaluate(
             episodes of given seeds in its rows, or adds an offset to them.
         KeyError: if it does not tell ``"success"``, or lacks the policy's transforms.
         WorkerError: if a worker process dies, a ``RuntimeError``.
+
+    See Also:
+        - :func:`~warmprior.training.play_episode`: a single one.
+        - :func:`~warmprior.training.parallel_env`: several simulators at a time.
+        - :func:`~warmprior.diagnostics.success_posterior`: what the successes tell about the rate.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+        >>> from warmprior.envs import GoalNavigationEnv
+        >>> prior = PastPrior(8)
+        >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
+        >>> transforms = policy_transforms(prior, observation_steps=1)
+        >>> env = TransformedEnv(GoalNavigationEnv((1, 1), batch_size=[4]), transforms)
+        >>> played = evaluate(WarmPriorActor(network, prior), env, episodes=6, first_seed=100)
+        >>> [episode.seed for episode in played]
+        [100, 101, 102, 103, 104, 105]
+        >>> rate = sum(episode.success for episode in played) / len(played)
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")

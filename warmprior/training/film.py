@@ -98,6 +98,10 @@ class Filmstrip:
         frames: uint8 ``[h, w, 3]`` each; the first before the first action, the last at the end.
         steps: control steps executed before each frame.
         success: whether the task was solved.
+
+    See Also:
+        - :func:`~warmprior.training.record_filmstrip`: makes it.
+        - :func:`~warmprior.experiments.plot_filmstrip`: draws it.
     """
 
     frames: list[np.ndarray]

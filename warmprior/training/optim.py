@@ -35,6 +35,10 @@ def make_optimizer(
         betas: decay rates of the moments.
         eps: added to the root of the second moment.
 
+    See Also:
+        - :func:`~warmprior.training.warmup_cosine`: the schedule of its learning rate.
+        - :class:`~warmprior.training.BehaviourCloning`: uses both.
+
     Examples:
         >>> from warmprior import VelocityMLP
         >>> optimizer = make_optimizer(VelocityMLP(2, 3, 8))
@@ -58,6 +62,9 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
 
     Raises:
         ValueError: if ``iterations < 1`` or ``warmup_ratio`` is not in [0, 1).
+
+    See Also:
+        :func:`~warmprior.training.make_optimizer`: the paper's optimizer.
 
     Examples:
         >>> import torch
@@ -92,6 +99,18 @@ def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
 
     Raises:
         ValueError: if ``rate`` is not in [0, 1).
+
+    See Also:
+        :class:`~warmprior.training.BehaviourCloning`: saves the averaged weights.
+
+    Examples:
+        >>> network = nn.Linear(1, 1, bias=False)
+        >>> average = ema_of(network, rate=0.9)
+        >>> for weight in (0.0, 1.0):
+        ...     _ = nn.init.constant_(network.weight, weight)
+        ...     average.update_parameters(network)
+        >>> round(average.module.weight.item(), 3)
+        0.1
     """
     if not 0.0 <= rate < 1.0:
         raise ValueError(f"the EMA rate must be in [0, 1), got {rate}")

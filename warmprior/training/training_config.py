@@ -42,6 +42,15 @@ class TrainingConfig:
 
     Raises:
         ValueError: for a number out of its range, naming it.
+
+    See Also:
+        - :class:`~warmprior.training.BehaviourCloning`: trains by it.
+        - :class:`~warmprior.rl.PriorSpaceConfig`: the recipe of agents.
+
+    Examples:
+        >>> config = TrainingConfig(iterations=1_000, batch_size=256, checkpoints=4)
+        >>> config.checkpoint_iterations
+        [250, 500, 750, 1000]
     """
 
     iterations: int = 200_000

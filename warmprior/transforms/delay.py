@@ -56,6 +56,17 @@ def executed_chunk(tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK
     Args:
         tensordict: ``[*B]`` decisions, such as those of a rollout.
         chunk_key: the prediction, ``[*B, P, d_a]``; without a delay beside it, it is executed as it is.
+
+    See Also:
+        - :class:`~warmprior.InferenceDelay`: lets chunks take effect late.
+        - :func:`~warmprior.diagnostics.executed_actions`: the actions of a whole rollout.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> chunk, leftover = torch.ones(1, 3, 1), torch.zeros(1, 3, 1)
+        >>> data = TensorDict({keys.CHUNK: chunk, keys.LEFTOVER: leftover}, [1])
+        >>> executed_chunk(data.set(keys.DELAY, torch.tensor([[1]]))).flatten().tolist()
+        [0.0, 1.0, 1.0]
     """
     delay = tensordict.get(keys.DELAY, None)
     if delay is None:
@@ -73,6 +84,9 @@ def shift_chunk(chunk: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
     Returns:
         The chunk's ``[steps, P)`` followed by zeros, ``[*B, P, d_a]``, and where it holds, bool
         ``[*B, P, 1]``.
+
+    See Also:
+        :func:`~warmprior.modules.with_leftover`: puts what is left before the next chunk.
 
     Examples:
         >>> import torch

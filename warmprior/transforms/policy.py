@@ -64,6 +64,10 @@ def policy_transforms(
     Raises:
         ValueError: for numbers that do not go together, see :class:`ChunkStep` and :class:`InferenceDelay`.
 
+    See Also:
+        - :func:`~warmprior.window_transforms`: the same for batches of demonstrations.
+        - :func:`~warmprior.training.evaluate`: plays episodes in the environment that has them.
+
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from warmprior import PreviewPrior

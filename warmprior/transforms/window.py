@@ -264,6 +264,10 @@ def window_replay_buffer(
         generator: source of randomness of sampler and prior; PyTorch's global one by default.
         renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
 
+    See Also:
+        - :func:`~warmprior.window_transforms`: its transforms, for a buffer of your own.
+        - :class:`~warmprior.FlowMatchingLoss`: takes its batches.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
