@@ -149,10 +149,11 @@ def explained(error: Exception, repository: str, revision: str | None = None) ->
         ``FileNotFoundError`` if there is no such repository or revision, ``PermissionError`` if it is not
         for this user, ``ConnectionError`` if the hub may not or cannot be asked, else ``OSError``.
     """
-    hub = require("huggingface_hub", "sim")
+    # Both by their own names: the package loads them when they are asked for.
+    kinds = require("huggingface_hub.errors", "sim")
+    offline = require("huggingface_hub.constants", "sim").HF_HUB_OFFLINE
     if isinstance(error, RuntimeError) and isinstance(error.__cause__, Exception):
         error = error.__cause__  # a file's upload tells no more than that it failed
-    kinds, offline = require("huggingface_hub.errors", "sim"), hub.constants.HF_HUB_OFFLINE
     status = getattr(getattr(error, "response", None), "status_code", None)
     if isinstance(error, kinds.GatedRepoError):
         return PermissionError(
