@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -249,6 +251,22 @@ def test_a_repository_that_cannot_be_had_is_named(tmp_path, monkeypatch):
     monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
     with pytest.raises(OSError, match=r"could not download user/nothing at v3\.0: (?s:.*)convert"):
         download_lerobot("user/nothing")
+
+
+def test_a_process_that_has_done_nothing_else_asks_the_hub(tmp_path):
+    """The client loads its parts when they are asked for."""
+    code = """
+from warmprior.data.download import download_lerobot
+try:
+    download_lerobot("user/none")
+except OSError as error:
+    print(error)
+"""
+    env = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path)}
+    env.pop("HF_LEROBOT_HOME", None)
+    call = [sys.executable, "-c", code]
+    told = subprocess.run(call, env=env, capture_output=True, text=True, check=True).stdout
+    assert "could not download user/none" in told
 
 
 def test_names_of_repositories(tmp_path, monkeypatch):

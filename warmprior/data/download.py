@@ -152,8 +152,7 @@ def download_lerobot(
         >>> download_lerobot("lerobot/libero")  # doctest: +SKIP
         PosixPath('.../hub/datasets--lerobot--libero/snapshots/...')
     """
-    hub = require("huggingface_hub", "lerobot")
-    default = Path(hub.constants.HF_HOME) / "lerobot"
+    default = Path(require("huggingface_hub.constants", "lerobot").HF_HOME) / "lerobot"
     home = Path(os.environ.get("HF_LEROBOT_HOME") or default).expanduser()
     if revision is None and (home / repository / "meta" / "info.json").is_file():
         return home / repository
