@@ -89,16 +89,15 @@ def messages() -> Iterator[Message]:
         parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
         module = ".".join(part for part in parts if part != "__init__")
         body = ast.parse(path.read_text()).body
-        constants = [
+        constants = dict(
             pair for node in body if isinstance(node, ast.Assign) for pair in _assigned(node)
-        ]
+        )
         for statement in body:
             for scope in statement.body if isinstance(statement, ast.ClassDef) else [statement]:
-                known = {name: [value] for name, value in constants}
                 own: dict[str, list[ast.expr]] = {}
                 for name, value in _assigned(scope):
                     own.setdefault(name, []).append(value)
-                known |= own
+                known = {name: [value] for name, value in constants.items()} | own
                 for node in ast.walk(scope):
                     if not (isinstance(node, ast.Call) and node.args):
                         continue
@@ -113,12 +112,10 @@ class ErrorMessages(Directive):
 
     def run(self) -> list[nodes.Node]:
         """Write them."""
-        self.state.document.settings.env.note_dependency(__file__)
+        for path in (__file__, *PACKAGE.rglob("*.py")):
+            self.state.document.settings.env.note_dependency(str(path))
         rooms: dict[str, list[Message]] = {}
         for message in messages():
-            self.state.document.settings.env.note_dependency(
-                str(PACKAGE.parent.joinpath(*message.module.split(".")).with_suffix(".py"))
-            )
             rooms.setdefault(".".join(message.module.split(".")[:2]), []).append(message)
         return [self._section(room, said) for room, said in rooms.items()]
 
