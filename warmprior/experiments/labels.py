@@ -91,6 +91,10 @@ def prior_color(name: str) -> str | None:
 
     See Also:
         :func:`~warmprior.experiments.prior_label`: its name.
+
+    Examples:
+        >>> prior_color("past") == prior_color("preview"), prior_color("not imported") is None
+        (False, True)
     """
     prior = Prior.registered().get(name)
     return None if prior is None else prior.color
