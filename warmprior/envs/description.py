@@ -145,6 +145,11 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         >>> actor = WarmPriorActor.from_pretrained("policy_010000")  # doctest: +SKIP
         >>> environment_of(actor).rollout(10, actor)["next", "success"].any()  # doctest: +SKIP
         tensor(True)
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> environment_of(WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8)))
+        Traceback (most recent call last):
+            ...
+        ValueError: the policy keeps no description of a robosuite environment, but None: build the ...
     """
     make_env, make_transforms = environment_parts(actor)
     return TransformedEnv(make_env(**options), make_transforms())

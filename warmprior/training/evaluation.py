@@ -247,8 +247,14 @@ def play_episode(
         - :func:`~warmprior.training.record_video`: films one.
 
     Examples:
-        >>> env = TransformedEnv(RobosuiteEnv("lift"), policy_transforms(prior))  # doctest: +SKIP
-        >>> play_episode(actor, env, seed=10_000_000, nfe=1).success  # doctest: +SKIP
+        >>> from warmprior import PastPrior, VelocityMLP, policy_transforms
+        >>> from warmprior.envs import GoalNavigationEnv
+        >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
+        >>> actor = WarmPriorActor(network, PastPrior(8))
+        >>> transforms = policy_transforms(actor.prior, observation_steps=1)
+        >>> env = TransformedEnv(GoalNavigationEnv((1, 1)), transforms)
+        >>> one, again = (play_episode(actor, env, seed=7, nfe=1) for _ in range(2))
+        >>> bool((one.decisions == again.decisions).all())
         True
     """
     if env.batch_size:
