@@ -61,9 +61,9 @@ def parse[R: Recipe](
 
     Examples:
         >>> from warmprior.experiments import PRESETS
-        >>> recipe = parse(PRESETS, ["--prior", "past", "--nfe", "1", "--out", "runs/past"], study="mine")
-        >>> recipe.sources.prior, recipe.evaluation.nfe, recipe.run.preset
-        (('past',), (1,), 'quick')
+        >>> recipe = parse(PRESETS, ["--task", "lift", "--prior", "past", "--nfe", "1"], study="mine")
+        >>> recipe.sources.prior, recipe.evaluation.nfe, recipe.run.out
+        (('past',), (1,), PosixPath('runs/mine-lift-ph-quick...'))
         >>> parse(PRESETS, ["--episodes", "0"], study="mine")
         Traceback (most recent call last):
             ...

@@ -167,11 +167,11 @@ def robosuite_problem(
         ...     with h5py.File(path, "w") as file:
         ...         widths = {f"obs/{key}": width for key, width in task.low_dim_widths.items()}
         ...         for name, width in {"actions": task.action_dim, "rewards": 1, **widths}.items():
-        ...             file[f"data/demo_0/{name}"] = torch.rand(9, width).numpy()
+        ...             file[f"data/demo_0/{name}"] = torch.arange(9.0)[:, None].expand(9, width).numpy()
         ...         file["data"].attrs["env_args"] = '{"env_name": "Lift", "env_kwargs": {}}'
         ...     problem = robosuite_problem(path)
-        >>> problem.name, problem.facts["steps"], problem.vector.shape
-        ('lift ph (file data)', 9, torch.Size([9, 19]))
+        >>> problem.name, problem.vector.shape, problem.vector.amin().item(), problem.vector.amax().item()
+        ('lift ph (file data)', torch.Size([9, 19]), -1.0, 1.0)
     """
     options = DataOptions() if options is None else options
     actions = options.actions

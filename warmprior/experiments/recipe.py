@@ -473,8 +473,10 @@ class HeldOutOptions:
         :func:`~warmprior.experiments.observe`: draws the observations.
 
     Examples:
-        >>> HeldOutOptions(observations=2000).steps
-        100
+        >>> HeldOutOptions(steps=1)
+        Traceback (most recent call last):
+            ...
+        ValueError: --steps must be between 2 and 1,000,000, got 1
         >>> HeldOutOptions(validation=Path("nowhere.hdf5"))
         Traceback (most recent call last):
             ...
