@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import doctest
 import importlib
 import inspect
 import pkgutil
@@ -16,6 +17,20 @@ from warmprior.io.workers import WorkerError, worker_died
 
 DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
+SHOWN_ALONE = {
+    "warmprior.data.download_lerobot": "fetches from the hub",
+    "warmprior.modules.imagenet_weights": "downloads them",
+    "warmprior.envs.rendering_backend": "differs between machines",
+    "warmprior.envs.mimicgen.register_mimicgen": "needs a package that is not on the package index",
+    "warmprior.io.ray_pool.RayPool": "starts a cluster",
+    "warmprior.io.ray_pool.ray_cluster": "starts a cluster",
+    "warmprior.rl.ray_collection.ray_rounds": "starts a cluster",
+    "warmprior.lerobot.LeRobotActor": "needs a policy of LeRobot",
+    "warmprior.lerobot.LeRobotFlow": "needs a policy of LeRobot",
+    "warmprior.lerobot.RelativeActions": "needs a policy of LeRobot",
+    "warmprior.lerobot.WarmPriorAdapter": "needs a policy of LeRobot",
+}
+"""Whose examples do not run as tests, and why."""
 ROLE = re.compile(r":(?:class|func|meth|attr|data):`~?([\w.]+)`")
 
 
@@ -68,6 +83,20 @@ def test_every_class_and_function_refers_to_another():
             linked = {full[part] for target in parts for part in target if part in full}
             lonely += [name] if linked <= {name} else []
     assert lonely == []
+
+
+def _runs(text: str) -> bool:
+    """Whether an example is more than imports and what doctest skips."""
+    found = doctest.DocTestParser().get_examples(text)
+    kept = [part.source for part in found if not part.options.get(doctest.SKIP)]
+    return any(not source.startswith(("import ", "from ")) for source in kept)
+
+
+def test_every_class_and_function_has_an_example():
+    described = {name: _object(name) for name in _reference()}
+    texts = {name: found.__doc__ or "" for name, found in described.items() if callable(found)}
+    assert [name for name, text in texts.items() if ">>> " not in text] == []
+    assert {name for name, text in texts.items() if not _runs(text)} == set(SHOWN_ALONE)
 
 
 def test_see_also_links_to_what_the_reference_has():

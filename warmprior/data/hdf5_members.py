@@ -28,6 +28,18 @@ class DatasetError(ValueError):
 
     See Also:
         :class:`~warmprior.data.RobomimicExperienceReplay`: raises it.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.data import RobomimicExperienceReplay
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "square.hdf5"
+        ...     _ = path.write_bytes(b"a download that broke off")
+        ...     RobomimicExperienceReplay(path)
+        Traceback (most recent call last):
+            ...
+        warmprior.data.hdf5_members.DatasetError: ...square.hdf5: not a readable HDF5 file (25 bytes; ...
     """
 
 

@@ -38,6 +38,14 @@ class DatasetIndex:
     See Also:
         - :class:`~warmprior.data.replay.DemonstrationReplay`: reads the values.
         - :func:`~warmprior.data.opening.open_demonstrations`: finds what reads a place.
+
+    Examples:
+        >>> index = DatasetIndex(
+        ...     path=Path("square.hdf5"), demos=("demo_0", "demo_1"), lengths=(120, 131),
+        ...     observation_keys=("object",), observation_dims=(14,), image_keys=(), image_size=0,
+        ...     available_keys=("object", "agentview_image"), action_dim=7, env_args={}, task=None)
+        >>> sum(index.lengths), index.cameras
+        (251, ('agentview',))
     """
 
     path: Path

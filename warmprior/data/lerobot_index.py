@@ -53,6 +53,12 @@ class LeRobotSlice:
 
     See Also:
         :class:`~warmprior.data.lerobot_index.LeRobotIndex`: has one per observation.
+
+    Examples:
+        >>> gripper = LeRobotSlice("observation.state", start=7, stop=9)
+        >>> frame = {"observation.state": list(range(9))}
+        >>> frame[gripper.feature][gripper.start : gripper.stop]
+        [7, 8]
     """
 
     feature: str
@@ -74,6 +80,17 @@ class LeRobotIndex(DatasetIndex):
 
     See Also:
         :func:`~warmprior.data.lerobot_index.read_lerobot_index`: makes it.
+
+    Examples:
+        >>> episode = LeRobotEpisode(0, 0, 120, PurePosixPath("data/chunk-000/file-000.parquet"), 0, {})
+        >>> index = LeRobotIndex(
+        ...     path=Path("square_lerobot"), demos=("0",), lengths=(120,), observation_keys=("object",),
+        ...     observation_dims=(14,), image_keys=(), image_size=0, available_keys=("object",),
+        ...     action_dim=7, env_args={}, task=None, episodes=(episode,),
+        ...     slices={"object": LeRobotSlice(ENVIRONMENT_STATE, 0, 14)}, features={}, images={},
+        ...     rendering=None, first_state=None)
+        >>> [str(file) for file in index.files]
+        ['data/chunk-000/file-000.parquet']
     """
 
     episodes: tuple[LeRobotEpisode, ...]

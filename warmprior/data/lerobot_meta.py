@@ -49,6 +49,12 @@ class LeRobotEpisode:
 
     See Also:
         :class:`~warmprior.data.lerobot_index.LeRobotIndex`: has one per selected episode.
+
+    Examples:
+        >>> file = PurePosixPath("data/chunk-000/file-001.parquet")
+        >>> episode = LeRobotEpisode(number=2, start=251, stop=375, file=file, file_start=120, videos={})
+        >>> episode.stop - episode.start, episode.start - episode.file_start  # steps, first row in the file
+        (124, 131)
     """
 
     number: int

@@ -53,6 +53,18 @@ def lerobot_digest(index: LeRobotIndex) -> str:
 
     See Also:
         :func:`~warmprior.data.lerobot_index.read_lerobot_index`: makes the index.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from types import SimpleNamespace
+        >>> with TemporaryDirectory() as folder:
+        ...     index = SimpleNamespace(path=Path(folder), files=[PurePosixPath("file-000.parquet")])
+        ...     def digest(content):
+        ...         _ = (index.path / "file-000.parquet").write_bytes(content)
+        ...         return lerobot_digest(index)
+        ...     len({digest(b"one"), digest(b"other"), digest(b"one")})
+        2
     """
     root = index.path
     described = [

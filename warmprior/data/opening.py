@@ -118,6 +118,13 @@ def open_demonstrations(
     See Also:
         - :class:`~warmprior.data.opening.Demonstrations`: what it returns.
         - :func:`~warmprior.data.opening.check_place`: looks first, and reads nothing.
+
+    Examples:
+        >>> found = open_demonstrations("lerobot:user/square")  # nothing is fetched yet
+        >>> type(found).__name__, found.name
+        ('LeRobotFolder', 'lerobot:square')
+        >>> open_demonstrations("data/square.hdf5").name
+        'square.hdf5'
     """
     dataset = _lerobot(place)
     return RobomimicFile(place) if dataset is None else LeRobotFolder(dataset, env_args)
@@ -128,6 +135,19 @@ class Demonstrations(ABC):
 
     See Also:
         :func:`~warmprior.data.opening.open_demonstrations`: finds the one for a place.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> import h5py
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "toy.hdf5"
+        ...     with h5py.File(path, "w") as file:
+        ...         for name, shape in {"actions": (9, 2), "rewards": (9,), "obs/object": (9, 3)}.items():
+        ...             file[f"data/demo_0/{name}"] = np.zeros(shape)
+        ...         file["data"].attrs["env_args"] = '{"env_name": "Toy", "env_kwargs": {}}'
+        ...     index = open_demonstrations(path).index(observation_keys=["object"])
+        >>> index.lengths, index.action_dim, index.observation_dims
+        ((9,), 2, (3,))
     """
 
     name: str

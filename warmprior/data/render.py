@@ -92,6 +92,10 @@ def render_demonstrations(
         >>> path = render_demonstrations("square.hdf5", ["agentview"])  # doctest: +SKIP
         >>> path.name  # doctest: +SKIP
         'square_agentview84_1f2e3d4c.hdf5'
+        >>> render_demonstrations("nowhere.hdf5", ["agentview"])
+        Traceback (most recent call last):
+            ...
+        FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
     path, index = Path(path), read_index(path, demos=demos)
     if cameras is None:

@@ -246,6 +246,20 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
             of a controller without pose deltas.
         OSError: if there is no space for memory maps.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> import h5py
+        >>> from warmprior.data import RobomimicExperienceReplay
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "toy.hdf5"
+        ...     with h5py.File(path, "w") as file:
+        ...         for name, shape in {"actions": (9, 2), "rewards": (9,), "obs/object": (9, 3)}.items():
+        ...             file[f"data/demo_0/{name}"] = np.ones(shape)
+        ...         file["data"].attrs["env_args"] = '{"env_name": "Toy", "env_kwargs": {}}'
+        ...     replay = RobomimicExperienceReplay(path, observation_keys=["object"], batch_size=4)
+        >>> replay.episode_lengths, replay.sample()["observation"].shape
+        (tensor([9]), torch.Size([4, 3]))
     """
 
     def __init__(

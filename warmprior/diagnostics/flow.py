@@ -118,6 +118,17 @@ def encoded_windows(
 
     Returns:
         Windows ``[n]`` with features ``[n, To, d_o]`` as the observation.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from warmprior import ImageEncoder, PastPrior, VelocityMLP, VisionNetwork
+        >>> encoder = ImageEncoder(["agentview_image"], 9, image_size=16, crop_size=12, backbone="small")
+        >>> network = VisionNetwork(encoder, VelocityMLP(2, encoder.observation_dim, 4, hidden_dim=8))
+        >>> images = torch.zeros(6, 2, 3, 16, 16, dtype=torch.uint8)
+        >>> windows = TensorDict(
+        ...     {"observation": {"state": torch.zeros(6, 2, 9), "agentview_image": images}}, [6])
+        >>> encoded_windows(WarmPriorActor(network, PastPrior(4)), windows)["observation"].shape
+        torch.Size([6, 2, 73])
     """
     key = policy.in_keys[0]
     observation = windows.get(key, None)

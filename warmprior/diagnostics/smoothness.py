@@ -34,6 +34,16 @@ class Smoothness:
     See Also:
         - :func:`~warmprior.diagnostics.smoothness`: measures it.
         - :func:`~warmprior.diagnostics.compare_smoothness`: compares two policies.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> rollout = TensorDict({
+        ...     "vla_action": {"chunk": torch.tensor([[[0.0], [1.0]], [[4.0], [5.0]]])},
+        ...     "next": {"executed_steps": torch.tensor([[2], [2]])}}, [2])
+        >>> found = smoothness(rollout)
+        >>> found.boundary_jump, found.inner_jump, found.jump_ratio, found.boundaries
+        (3.0, 1.0, 3.0, 1)
     """
 
     boundary_jump: float

@@ -48,6 +48,12 @@ class SourceLeak:
 
     See Also:
         :func:`~warmprior.diagnostics.source_leak`: measures it.
+
+    Examples:
+        >>> found = SourceLeak(nfe=1, spread=0.3, data_spread=0.2, ratio_to_last=1.5,
+        ...                    inner_step=0.11, data_inner_step=0.1)
+        >>> round(found.leak, 2), round(found.inner_step_ratio, 2), found.warning is None
+        (1.5, 1.1, False)
     """
 
     nfe: int

@@ -169,6 +169,11 @@ class SeedSummary:
     See Also:
         - :func:`~warmprior.diagnostics.summarize_seeds`: makes it.
         - :func:`~warmprior.diagnostics.exceeds_one_sigma`: compares two.
+
+    Examples:
+        >>> one, three = summarize_seeds([0.6]), summarize_seeds([0.5, 0.6, 0.7])
+        >>> one.std, round(three.std, 3), exceeds_one_sigma(one, three)
+        (nan, 0.1, False)
     """
 
     mean: float

@@ -46,6 +46,16 @@ def environment_description(
         images: of a policy that sees some: ``"cameras"`` and ``"size"``, see
             :class:`~warmprior.transforms.CameraImages`, ``"fast_rendering"``, and ``"low_dim_keys"``, what
             it sees besides, see :class:`RobosuiteEnv`.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> kept = environment_description({"env_name": "Lift", "env_kwargs": {}}, "ph", observation_steps=2)
+        >>> kept
+        {'robosuite': {'env_args': {'env_name': 'Lift', 'env_kwargs': {}}, 'style': 'ph'},
+         'observation_steps': 2}
+        >>> network = VelocityMLP(7, 19, prediction_length=8, hidden_dim=8)
+        >>> environment_name(WarmPriorActor(network, PastPrior(8), environment=kept))
+        'Lift'
     """
     description: dict[str, Any] = {
         "robosuite": {"env_args": dict(env_args), "style": style},
@@ -135,6 +145,11 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         >>> actor = WarmPriorActor.from_pretrained("policy_010000")  # doctest: +SKIP
         >>> environment_of(actor).rollout(10, actor)["next", "success"].any()  # doctest: +SKIP
         tensor(True)
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> environment_of(WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8)))
+        Traceback (most recent call last):
+            ...
+        ValueError: the policy keeps no description of a robosuite environment, but None: build the ...
     """
     make_env, make_transforms = environment_parts(actor)
     return TransformedEnv(make_env(**options), make_transforms())

@@ -272,6 +272,11 @@ class NavigationMetrics:
 
     See Also:
         :func:`~warmprior.envs.navigation_metrics`: measures them.
+
+    Examples:
+        >>> through = navigation_metrics(torch.zeros(2, 64), chunk_length=4)  # neither above nor below
+        >>> through.collision_rate, through.commit_rate, through.jump, through.switch_rate
+        (1.0, 1.0, 0.0, nan)
     """
 
     switch_rate: float

@@ -38,6 +38,16 @@ class PolicyResults:
     See Also:
         - :func:`~warmprior.experiments.policy_results`: reads them.
         - :func:`~warmprior.experiments.model_card`: writes them.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior.experiments.results import played
+        >>> results = PolicyResults(
+        ...     training={"task": "lift", "data": "ph", "seed": 0, "iterations": 5000}, checkpoint=5000,
+        ...     data={}, versions={}, rows=(played({"nfe": 1}, [True] * 9 + [False]),))
+        >>> card = model_card(WarmPriorActor(VelocityMLP(7, 19, 8), PastPrior(8)), results)
+        >>> [line for line in card.splitlines() if "90.0%" in line]
+        ['| 1 | 10 | 9 | 90.0% | 58.7% to 97.7% | - |']
     """
 
     training: Mapping[str, Any]
@@ -62,6 +72,21 @@ def policy_results(run: str | Path, policy: str | Path) -> PolicyResults:
 
     See Also:
         :func:`~warmprior.experiments.model_card`: writes them for the hub.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.experiments import Results
+        >>> from warmprior.experiments.results import played
+        >>> facts = {"task": "lift", "data": "ph", "seed": 0, "iterations": 20}
+        >>> policy = facts | {"prior": {"name": "past"}, "folder": "lift-ph-past"}
+        >>> meta = {"policies": [policy], "problems": [{"task": "lift", "style": "ph", "steps": 900}]}
+        >>> with TemporaryDirectory() as folder:
+        ...     run, policies = Path(folder) / "run", Path(folder) / "policies"
+        ...     row = played(facts | {"prior": "past", "checkpoint": 20, "nfe": 1}, [True, False])
+        ...     Results(run / "results.json", meta, {"recipe": {}}).add(row)
+        ...     found = policy_results(run, policies / "lift-ph-past" / "policy_000020")
+        >>> found.checkpoint, found.data, found.rows[0]["success_rate"]
+        (20, {'steps': 900}, 0.5)
     """
     path, folder = Path(run) / "results.json", Path(policy).resolve()
     if not path.is_file():

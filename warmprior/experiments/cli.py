@@ -58,6 +58,16 @@ def parse[R: Recipe](
     See Also:
         - :func:`~warmprior.experiments.started`: opens the folder for work.
         - :func:`~warmprior.experiments.record`: stores a recipe.
+
+    Examples:
+        >>> from warmprior.experiments import PRESETS
+        >>> recipe = parse(PRESETS, ["--task", "lift", "--prior", "past", "--nfe", "1"], study="mine")
+        >>> recipe.sources.prior, recipe.evaluation.nfe, recipe.run.out
+        (('past',), (1,), PosixPath('runs/mine-lift-ph-quick...'))
+        >>> parse(PRESETS, ["--episodes", "0"], study="mine")
+        Traceback (most recent call last):
+            ...
+        ValueError: --episodes must be between 1 and 1,000,000, got 0
     """
     argv = sys.argv[1:] if argv is None else list(map(str, argv))
 
@@ -164,6 +174,16 @@ def started(recipe: Recipe, study: str) -> Iterator[Path]:
     See Also:
         - :func:`~warmprior.experiments.parse`: makes the recipe.
         - :func:`~warmprior.io.files.exclusive`: keeps other processes out.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.experiments import RunOptions
+        >>> with TemporaryDirectory() as folder:
+        ...     recipe = Recipe(run=RunOptions(out=Path(folder) / "run"))
+        ...     with started(recipe, "mine") as out:
+        ...         [path.name for path in out.iterdir()]
+        Output folder: ...run
+        ['options.json']
     """
     out = recipe.run.directory
     if rank():  # the first process is in it, for all
@@ -196,6 +216,16 @@ def write_report(out: Path, table: str, failures: Sequence[str] = ()) -> None:
 
     See Also:
         :func:`~warmprior.experiments.success_table`: a table to write.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     write_report(Path(folder), "| Base | WP-Past |")
+        ...     (Path(folder) / "table.md").read_text()
+        <BLANKLINE>
+        | Base | WP-Past |
+        Results, table and pictures: ...
+        '| Base | WP-Past |'
     """
     missing = "".join(f"- Missing: {failure}\n" for failure in failures)
     table += missing and f"\n{missing}"

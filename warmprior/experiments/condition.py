@@ -22,6 +22,11 @@ class Condition:
     See Also:
         - :class:`~warmprior.InferenceDelay`: lets chunks take effect late.
         - :class:`~warmprior.RealTimeChunking`: guides late chunks.
+
+    Examples:
+        >>> late = Condition(delay=2, execute=4, guidance=RealTimeChunking())
+        >>> late.facts()
+        {'execute': 4, 'delay': 2, 'guidance': 'rtc'}
     """
 
     delay: int | None = None

@@ -50,6 +50,18 @@ class Contestant:
 
     See Also:
         :class:`~warmprior.experiments.Comparison`: evaluates several of them.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior import PastPrior
+        >>> from warmprior.experiments import NetworkOptions, navigation_problem
+        >>> with TemporaryDirectory() as folder:
+        ...     store = Store(navigation_problem(), NetworkOptions(), Path(folder), Path(folder) / "logs")
+        ...     contestant = Contestant(store, PastPrior(4), TrainingConfig(iterations=20, checkpoints=1))
+        ...     str(contestant), contestant.path.is_dir()
+        ('navigation toy, past, sigma 0.5, H 4, seed 0', False)
+        >>> [str(cell) for cell in contestant.cells(nfes=[9, 1], conditions=[Condition()])]
+        ['checkpoint 20, nfe 9', 'checkpoint 20, nfe 1']
     """
 
     store: Store

@@ -36,6 +36,17 @@ class DelayedRecipe(Recipe):
     See Also:
         - :class:`~warmprior.experiments.Condition`: one of its delays.
         - :class:`~warmprior.RealTimeChunking`: the guidance.
+
+    Examples:
+        >>> from warmprior.experiments import SourceOptions
+        >>> recipe = DelayedRecipe(delay=(0, 4), toy="alone", sources=SourceOptions(("past",)))
+        >>> (prior,) = recipe.sources.priors()
+        >>> [(c.delay, c.execute, c.guidance is not None) for c in recipe.conditions(prior)]
+        [(0, 4, False), (0, 4, True), (4, 4, False), (4, 4, True)]
+        >>> DelayedRecipe(delay=(), toy="alone").check()
+        Traceback (most recent call last):
+            ...
+        ValueError: --delay needs at least one value
     """
 
     delay: tuple[int, ...] = (0, 2, 4)

@@ -73,6 +73,17 @@ def plot_success(
     See Also:
         - :func:`~warmprior.diagnostics.success_posterior`: the density.
         - :func:`~warmprior.experiments.plot_success_bars`: bars over chunk lengths.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.experiments.results import played
+        >>> facts = {"options": "", "sigma": 1.0, "chunk": 8, "seed": 0, "nfe": 1}
+        >>> rows = [played(facts | {"prior": prior}, [True] * wins + [False] * (10 - wins))
+        ...         for prior, wins in {"gaussian": 5, "past": 8}.items()]
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_success(rows, Path(folder) / "success.png", title="lift ph")
+        ...     [path.name for path in Path(folder).iterdir()]
+        ['success.png']
     """
     rows = list(rows)
     label, groups = source_labels(rows), grouped(rows, group)
@@ -184,6 +195,16 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
     See Also:
         - :func:`~warmprior.experiments.plot_success`: posteriors of the rates.
         - :func:`~warmprior.experiments.success_table`: the same in numbers.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from matplotlib.image import imread
+        >>> facts = {"prior": "past", "options": "", "sigma": 0.5, "seed": 0, "nfe": 1, "checkpoint": 100}
+        >>> rows = [Row(facts | {"chunk": chunk}, {"success_rate": 0.7}) for chunk in (4, 8, 16)]
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_success_bars(rows, Path(folder) / "bars.png", top_k=1, title="lift ph")
+        ...     imread(Path(folder) / "bars.png").shape[:2]  # wider for every chunk length
+        (540, 945)
     """
     figure, (axis,) = new_figure(1.8 + 1.5 * len(grouped(rows, lambda row: row["chunk"])), 3.6)
     columns = grouped_bars(
@@ -217,6 +238,16 @@ def plot_learning_curves(
 
     Keyword Args:
         title: of the figure.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> facts = {"prior": "past", "options": "", "sigma": 0.5, "chunk": 8, "seed": 0, "nfe": 1}
+        >>> rows = [Row(facts | {"checkpoint": n}, {"success_rate": n / 100}) for n in (50, 100)]
+        >>> losses = {source_labels(rows)(rows[0]): [[(25, 0.9), (50, 0.5), (100, 0.4)]]}
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_learning_curves(losses, rows, Path(folder) / "curves.png", title="lift ph")
+        ...     [path.name for path in Path(folder).iterdir()]
+        ['curves.png']
     """
     rows = list(rows)
     figure, (left, right) = new_figure(9.0, 3.6, columns=2)
@@ -268,6 +299,15 @@ def plot_filmstrip(
 
     See Also:
         :func:`~warmprior.training.record_filmstrip`: makes the pictures.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from matplotlib.image import imread
+        >>> frames = [np.full((40, 40, 3), shade, np.uint8) for shade in (0, 120, 240)]
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_filmstrip(frames, ["step 0", "step 5", "step 9"], f"{folder}/film.png", title="lift")
+        ...     imread(f"{folder}/film.png").shape[:2]  # 225 pixels per frame
+        (300, 675)
     """
     figure, axes = new_figure(1.5 * len(frames), 2.0, columns=len(frames))
     for axis, frame, label in zip(axes, frames, labels, strict=True):
@@ -303,6 +343,17 @@ def plot_reinforcement(
 
     See Also:
         :class:`~warmprior.rl.PriorSpaceTraining`: whose evaluations it draws.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> agent = {"algorithm": "dsrl-na", "prior": "past", "options": "", "seed": 0}
+        >>> measured = [("base", 0, 0.2), ("greedy", 100, 0.6), ("stochastic", 100, 0.5)]
+        >>> rows = [Row(agent | {"evaluation": kind, "environment_steps": steps}, {"success_rate": rate})
+        ...         for kind, steps, rate in measured]
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_reinforcement(rows, Path(folder) / "agents.png", title="lift", warmup_steps=50)
+        ...     [path.name for path in Path(folder).iterdir()]
+        ['agents.png']
     """
     rows = list(rows)
     figure, axes = new_figure(10.0, 3.8, 1, 2, share=True)

@@ -91,6 +91,10 @@ def prior_color(name: str) -> str | None:
 
     See Also:
         :func:`~warmprior.experiments.prior_label`: its name.
+
+    Examples:
+        >>> prior_color("past"), prior_color("not imported")
+        ('#1f77b4', None)
     """
     prior = Prior.registered().get(name)
     return None if prior is None else prior.color

@@ -33,6 +33,16 @@ class NavigationRecipe(Recipe):
     See Also:
         - :func:`~warmprior.experiments.judge_navigation`: plays one of its policies.
         - :data:`~warmprior.experiments.NAVIGATION_PRESETS`: budgets.
+
+    Examples:
+        >>> from dataclasses import replace
+        >>> recipe = NAVIGATION_PRESETS["quick"]
+        >>> recipe.name, len(recipe.sources.priors())
+        ('h4', 7)
+        >>> replace(recipe, sources=SourceOptions(chunk=(40,))).check()
+        Traceback (most recent call last):
+            ...
+        ValueError: --chunk must be between 1 and 32, got 40
     """
 
     @property

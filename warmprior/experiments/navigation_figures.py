@@ -48,6 +48,15 @@ def plot_navigation(
 
     See Also:
         :func:`~warmprior.experiments.play_navigation`: makes the paths.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from matplotlib.image import imread
+        >>> panels = {"straight on": (navigation_heights() * 0, ["all collide"])}
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_navigation(panels, f"{folder}/paths.png", chunk_length=4, title="the toy")
+        ...     imread(f"{folder}/paths.png").shape[:2]  # one row of up to three panels
+        (555, 1650)
     """
     rows = -(-(len(panels) + 1) // 3)
     figure, axes = new_figure(11.0, 0.7 + 3.0 * rows, rows, 3, share=True)
@@ -106,6 +115,16 @@ def plot_flow_paths(paths: Mapping[str, Tensor], path: str | Path, *, title: str
 
     Keyword Args:
         title: of the figure.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> import torch
+        >>> from matplotlib.image import imread
+        >>> lines = torch.linspace(0, 1, 5) * torch.tensor([[-1.0], [1.0]])  # two straight paths
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_flow_paths({"Base": lines, "WP-Past": lines}, f"{folder}/flow.png", title="the toy")
+        ...     imread(f"{folder}/flow.png").shape[:2]  # 375 pixels per policy
+        (510, 825)
     """
     figure, axes = new_figure(2.5 * len(paths) + 0.5, 3.4, 1, len(paths), share=True)
     for axis, (name, lines) in zip(axes, paths.items(), strict=True):

@@ -157,6 +157,21 @@ def robosuite_problem(
     See Also:
         - :func:`~warmprior.experiments.find_problems`: all that the options name.
         - :class:`~warmprior.envs.RobosuiteEnv`: its environment.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> import h5py
+        >>> task = TASKS["lift"]
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "lift.hdf5"
+        ...     with h5py.File(path, "w") as file:
+        ...         widths = {f"obs/{key}": width for key, width in task.low_dim_widths.items()}
+        ...         for name, width in {"actions": task.action_dim, "rewards": 1, **widths}.items():
+        ...             file[f"data/demo_0/{name}"] = torch.arange(9.0)[:, None].expand(9, width).numpy()
+        ...         file["data"].attrs["env_args"] = '{"env_name": "Lift", "env_kwargs": {}}'
+        ...     problem = robosuite_problem(path)
+        >>> problem.name, problem.vector.shape, problem.vector.amin().item(), problem.vector.amax().item()
+        ('lift ph (file data)', torch.Size([9, 19]), -1.0, 1.0)
     """
     options = DataOptions() if options is None else options
     actions = options.actions
@@ -303,6 +318,15 @@ def find_problems(options: DataOptions, observation_steps: int = 2) -> list[Prob
     See Also:
         - :func:`~warmprior.experiments.robosuite_problem`: a single file.
         - :class:`~warmprior.experiments.Store`: trains on a problem.
+
+    Examples:
+        >>> [problem.name for problem in find_problems(DataOptions(task=("lift", "can")))]  # doctest: +SKIP
+        Data: 150 ph scripted demonstrations per task. ...
+        ['lift ph (scripted data)', 'can ph (scripted data)']
+        >>> find_problems(DataOptions(data=("core",)))
+        Traceback (most recent call last):
+            ...
+        ValueError: --data core is that of MimicGen's files: add --download, or --dataset FILE
     """
     options.check()
     if options.dataset is not None:
@@ -371,6 +395,14 @@ def observe(
     See Also:
         - :func:`~warmprior.diagnostics.curvature`: a measure on them.
         - :func:`~warmprior.experiments.finished_policies`: the policies.
+
+    Examples:
+        >>> told = {"task": "lift", "style": "ph", "source": "official", "file": "low_dim_v15.hdf5"}
+        >>> normalizer = Normalizer.fit(navigation_demonstrations(), ("observation", "action"))
+        >>> observe(HeldOutOptions(), told, normalizer, chunk_length=8, observation_steps=2)
+        Traceback (most recent call last):
+            ...
+        ValueError: these policies are trained on demonstrations of low_dim_v15.hdf5: add --validation ...
     """
     task, style = facts["task"], facts["style"]
     if options.validation is not None:

@@ -106,6 +106,15 @@ class DataOptions:
 
     See Also:
         :func:`~warmprior.experiments.find_problems`: reads what they name.
+
+    Examples:
+        >>> options = DataOptions(data=("ph", "mh"), demonstrations=(20, 60))
+        >>> options.count("ph"), options.count("mh"), options.generated
+        (20, 60, True)
+        >>> DataOptions(task=("tool_hang",)).check()
+        Traceback (most recent call last):
+            ...
+        ValueError: there is no scripted expert for tool_hang: add --download for the official data, or ...
     """
 
     task: tuple[str, ...] = ()
@@ -212,6 +221,13 @@ class NetworkOptions:
     See Also:
         - :class:`~warmprior.PreconditionedNetwork`: what ``precondition`` does.
         - :class:`~warmprior.ChiTransformer`: the paper's network.
+
+    Examples:
+        >>> options = NetworkOptions(network="chi_transformer", hidden_dim=48)
+        >>> network = options.make(action_dim=7, observation_dim=23, prediction_length=8)
+        >>> seen, noisy = torch.zeros(1, options.observation_steps, 23), torch.zeros(1, 8, 7)
+        >>> type(network).__name__, network(torch.zeros(1), noisy, seen).shape
+        ('ChiTransformer', torch.Size([1, 8, 7]))
     """
 
     network: Literal["mlp", "chi_transformer"] = "mlp"
@@ -284,6 +300,16 @@ class SourceOptions:
     See Also:
         - :class:`~warmprior.Prior`: the class of one of your own.
         - :class:`~warmprior.PastPrior`: the paper's first source.
+
+    Examples:
+        >>> options = SourceOptions(("gaussian", "preview,correlation=0.5"), chunk=(8, 4))
+        >>> [(prior.label, prior.options, prior.chunk_length) for prior in options.priors()]
+        [('Base', '', 4), ('WP-Preview', 'correlation=0.5', 4),
+         ('Base', '', 8), ('WP-Preview', 'correlation=0.5', 8)]
+        >>> SourceOptions(("gaussian",), sigma=(0.5,)).check_sigma()
+        Traceback (most recent call last):
+            ...
+        ValueError: --sigma belongs to warm priors; gaussian take none
     """
 
     prior: tuple[str, ...] = ("gaussian", "past", "preview")
@@ -342,6 +368,14 @@ class EvaluationOptions:
     See Also:
         - :func:`~warmprior.training.evaluate`: plays the episodes.
         - :func:`~warmprior.experiments.success_summary`: averages the checkpoints.
+
+    Examples:
+        >>> EvaluationOptions(nfe=(1, 9, 1)).nfes, EvaluationOptions(play_on=True).environment
+        ([9, 1], {'terminate_on_success': False})
+        >>> EvaluationOptions(episodes=0)
+        Traceback (most recent call last):
+            ...
+        ValueError: --episodes must be between 1 and 1,000,000, got 0
     """
 
     seeds: int = 1
@@ -386,6 +420,14 @@ class RunOptions:
 
     See Also:
         :func:`~warmprior.experiments.parse`: finds the folder and the stored options.
+
+    Examples:
+        >>> RunOptions(out=Path("runs/square"), logger="none").directory
+        PosixPath('runs/square')
+        >>> RunOptions(ray_address="node-1:6379")
+        Traceback (most recent call last):
+            ...
+        ValueError: --ray-address belongs to --engine ray
     """
 
     preset: str = "quick"
@@ -429,6 +471,16 @@ class HeldOutOptions:
 
     See Also:
         :func:`~warmprior.experiments.observe`: draws the observations.
+
+    Examples:
+        >>> HeldOutOptions(steps=1)
+        Traceback (most recent call last):
+            ...
+        ValueError: --steps must be between 2 and 1,000,000, got 1
+        >>> HeldOutOptions(validation=Path("nowhere.hdf5"))
+        Traceback (most recent call last):
+            ...
+        FileNotFoundError: --validation nowhere.hdf5: no such file
     """
 
     validation: Path | None = None
@@ -452,6 +504,13 @@ class PolicyOptions:
 
     See Also:
         :func:`~warmprior.experiments.finished_policies`: reads them.
+
+    Examples:
+        >>> from warmprior.experiments import finished_policies
+        >>> finished_policies(PolicyOptions(run=Path("nowhere")).run)
+        Traceback (most recent call last):
+            ...
+        FileNotFoundError: --run nowhere: it has no results.json; name a run of robomimic.py
     """
 
     run: Path | None = None
@@ -473,6 +532,17 @@ class Recipe:
         - :class:`~warmprior.experiments.Comparison`: runs it.
         - :func:`~warmprior.experiments.parse`: makes it of a command line.
         - :func:`~warmprior.experiments.comparison_preset`: starts from a budget.
+
+    Examples:
+        >>> recipe = Recipe(
+        ...     data=DataOptions(task=("lift",)), sources=SourceOptions(("gaussian", "ot")),
+        ...     training=TrainingConfig(seed=5, batch_size=1), evaluation=EvaluationOptions(seeds=3))
+        >>> recipe.name, list(recipe.seeds)
+        ('lift-ph', [5, 6, 7])
+        >>> recipe.check()
+        Traceback (most recent call last):
+            ...
+        ValueError: ot pairs within a batch: --batch-size must be at least 2
     """
 
     data: Annotated[DataOptions, Flat] = field(default_factory=DataOptions)
@@ -613,6 +683,16 @@ class MeasuredRecipe(Recipe):
     See Also:
         - :class:`~warmprior.experiments.HeldOutOptions`: its observations.
         - :func:`~warmprior.experiments.straightness`: measures by it.
+
+    Examples:
+        >>> from warmprior.experiments import PRESETS
+        >>> recipe = MeasuredRecipe.of(PRESETS["quick"], held_out=HeldOutOptions(observations=100))
+        >>> recipe.network == PRESETS["quick"].network, recipe.held_out.observations
+        (True, 100)
+        >>> replace(recipe, data=DataOptions(task=("lift", "can"))).check()
+        Traceback (most recent call last):
+            ...
+        ValueError: this study has one --task, got lift can
     """
 
     held_out: Annotated[HeldOutOptions, Flat] = field(default_factory=HeldOutOptions)

@@ -218,6 +218,16 @@ class Results:
     See Also:
         - :class:`~warmprior.experiments.Row`: what it holds.
         - :func:`~warmprior.experiments.select`: finds rows.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     results = Results(Path(folder) / "results.json", {"machine": "mine"}, {"study": "noise"})
+        ...     for steps in (120, 90):  # the second is the same measurement, made again
+        ...         results.add(Row({"prior": "past", "seed": 0}, {"mean_steps": steps}))
+        ...     meta, rows = read_results(results.path)
+        >>> meta["identity"], [row["mean_steps"] for row in rows]
+        ({'study': 'noise'}, [90])
     """
 
     def __init__(

@@ -77,6 +77,20 @@ class Store:
         - :class:`~warmprior.experiments.Comparison`: evaluates what it holds.
         - :class:`~warmprior.training.BehaviourCloning`: trains each policy.
         - :func:`~warmprior.experiments.finished_policies`: reads them from a finished run.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior import PastPrior
+        >>> from warmprior.experiments import navigation_problem
+        >>> options, run = NetworkOptions(hidden_dim=8, observation_steps=1), RunOptions(logger="none")
+        >>> prior, training = PastPrior(4), TrainingConfig(iterations=4, batch_size=8, log_every=2)
+        >>> with TemporaryDirectory() as folder:
+        ...     store = Store(navigation_problem(), options, Path(folder), Path(folder) / "logs", run)
+        ...     losses = store.train(prior, training, progress=lambda iterations: None)
+        ...     store.folder(prior, training).name, store.load(prior, training).prior.name
+        ('navigation-toy-past-seed0-...', 'past')
+        >>> [iteration for iteration, loss in losses]
+        [2, 4]
     """
 
     problem: Problem
@@ -376,6 +390,24 @@ def finished_policies(
     See Also:
         - :class:`~warmprior.experiments.Store`: where a comparison keeps them.
         - :func:`~warmprior.experiments.observe`: observations to measure them on.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior import PastPrior
+        >>> from warmprior.experiments import Results, navigation_problem
+        >>> options, run = NetworkOptions(hidden_dim=8), RunOptions(logger="none")
+        >>> prior, training = PastPrior(4), TrainingConfig(iterations=1, batch_size=8)
+        >>> with TemporaryDirectory() as folder:  # what a Comparison does
+        ...     out, policies = Path(folder) / "run", Path(folder) / "policies"
+        ...     store = Store(navigation_problem(), options, policies, out / "logs", run)
+        ...     _ = store.train(prior, training, progress=lambda iterations: None)
+        ...     kept = {"folder": store.folder(prior, training).name, "iterations": 1, "seed": 0}
+        ...     kept["prior"] = prior.config()
+        ...     meta = {"policies": [kept], "problems": [{"task": "navigation", "style": "toy"}]}
+        ...     Results(out / "results.json", meta, {}).save()
+        ...     problem, actors = finished_policies(out)
+        >>> problem["task"], actors["past", ""][0].prior.chunk_length
+        ('navigation', 4)
     """
     meta = _facts_of(run)
     entries = [(Prior.from_config(entry["prior"]), entry) for entry in meta["policies"]]

@@ -106,6 +106,19 @@ def straightness(
     Raises:
         ValueError: if the training seeds or the chunk lengths differ, or no policy is a flow.
         FloatingPointError: if a path becomes NaN or infinite.
+
+    Examples:
+        >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> def untrained(prior):
+        ...     network = VelocityMLP(1, 9, prior.prediction_length, observation_steps=1, hidden_dim=8)
+        ...     return {0: WarmPriorActor(network, prior)}
+        >>> policies = {"base": untrained(GaussianPrior(4)), "past": untrained(PastPrior(4))}
+        >>> shared = SharedObservations(navigation_demonstrations(), 4, observation_steps=1, count=20)
+        >>> with warnings.catch_warnings(action="ignore"):  # that an untrained field does not move
+        ...     rows = straightness(policies, shared, n_steps=4)
+        >>> [(row["policy"], row["mean"], row["ratio"]) for row in rows]
+        [('base', 'training', None), ('past', 'training', None), ('past', 'deployed', None)]
     """
     priors = {name: next(iter(actors.values())).prior for name, actors in policies.items()}
     policies = {name: actors for name, actors in policies.items() if priors[name].is_flow}

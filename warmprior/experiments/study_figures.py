@@ -39,6 +39,18 @@ def plot_sigma(
         top_k: checkpoints averaged per seed.
         title: of the figure.
         paper: add the success rates that the paper reports.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from matplotlib.image import imread
+        >>> facts = {"options": "", "chunk": 8, "seed": 0, "nfe": 1, "checkpoint": 100}
+        >>> cells = [("gaussian", 1.0, 0.5), ("past", 1.0, 0.6), ("past", 0.5, 0.8), ("preview", 1.0, 0.7)]
+        >>> rows = [Row(facts | {"prior": prior, "sigma": sigma}, {"success_rate": rate})
+        ...         for prior, sigma, rate in cells]
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_sigma(rows, f"{folder}/sigma.png", top_k=1, title="lift ph")
+        ...     imread(f"{folder}/sigma.png").shape[:2]  # 780 pixels per warm source
+        (630, 1560)
     """
     played = select(rows, "success_rate")
     measured = pooled(select(rows, "ratio_executed", mean="training"))
@@ -113,6 +125,18 @@ def plot_chunk_lengths(rows: Sequence[Row], path: str | Path, *, top_k: int, tit
 
     See Also:
         :func:`~warmprior.diagnostics.smoothness`: measures the jumps.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from matplotlib.image import imread
+        >>> facts = {"prior": "past", "options": "", "sigma": 0.5, "seed": 0, "checkpoint": 100}
+        >>> measures = {"success_rate": 0.7, "boundary_jump": 0.2, "inner_jump": 0.1}
+        >>> rows = [Row(facts | {"iterations": 100, "chunk": chunk, "nfe": nfe}, measures)
+        ...         for chunk in (4, 8) for nfe in (9, 1)]
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_chunk_lengths(rows, f"{folder}/chunks.png", top_k=1, title="lift ph")
+        ...     imread(f"{folder}/chunks.png").shape[:2]  # 510 pixels per NFE
+        (900, 1020)
     """
     by_nfe = grouped(rows, lambda row: row["nfe"])
     chunks = sorted({row["chunk"] for row in rows})
@@ -164,6 +188,18 @@ def plot_budget(rows: Sequence[Row], path: str | Path, *, top_k: int, title: str
     Keyword Args:
         top_k: checkpoints averaged per seed.
         title: of the figure.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from matplotlib.image import imread
+        >>> facts = {"prior": "past", "options": "", "sigma": 0.5, "chunk": 8, "seed": 0, "nfe": 1}
+        >>> measured = [(100, {"success_rate": 0.4, "action_error": 0.2}),
+        ...             (1000, {"success_rate": 0.8, "action_error": 0.1})]
+        >>> rows = [Row(facts | {"iterations": n, "checkpoint": n}, found) for n, found in measured]
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_budget(rows, f"{folder}/budget.png", top_k=1, title="lift ph")
+        ...     imread(f"{folder}/budget.png").shape[:2]  # 540 pixels per NFE
+        (900, 540)
     """
     by_nfe = grouped(sorted(rows, key=lambda row: row["nfe"]), lambda row: row["nfe"])
     budgets = sorted({row["iterations"] for row in rows})
@@ -222,6 +258,17 @@ def plot_delays(
     See Also:
         - :class:`~warmprior.experiments.DelayedRecipe`: the comparison that it draws.
         - :class:`~warmprior.RealTimeChunking`: the guidance.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> facts = {"task": "lift", "data": "ph", "prior": "past", "options": "", "sigma": 0.5, "chunk": 8,
+        ...          "seed": 0, "nfe": 1, "checkpoint": 100, "iterations": 100}
+        >>> measures = {"success_rate": 0.7, "boundary_jump": 0.2}
+        >>> rows = [Row(facts | {"delay": delay}, measures) for delay in (0, 2)]
+        >>> with TemporaryDirectory() as folder:
+        ...     plot_delays(rows, f"{folder}/delays.png", label=source_labels(rows), top_k=1, title="lift")
+        ...     [path.name for path in Path(folder).iterdir()]
+        ['delays.png']
     """
     rows = sorted(rows, key=lambda row: row["delay"])
     tasks = grouped(rows, lambda row: f"{row['task']} {row['data']}")

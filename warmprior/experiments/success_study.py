@@ -45,6 +45,15 @@ def study_success(
     Raises:
         ValueError: naming the option that cannot work.
         PartialFailure: if policies failed, after the report on the others.
+
+    Examples:
+        >>> from warmprior.experiments import PRESETS
+        >>> study_success(PRESETS, ["--task", "lift", "--prior", "past"], study="mine")  # doctest: +SKIP
+        Output folder: runs/mine-lift-ph-quick
+        >>> study_success(PRESETS, ["--chunk", "0"], study="mine")
+        Traceback (most recent call last):
+            ...
+        ValueError: --chunk must be between 1 and 1,000,000, got 0
     """
     recipe = parse(presets, argv, study=study, description=description, preset=preset)
     with started(recipe, study) as out:

@@ -167,6 +167,18 @@ def success_table(
         - :class:`~warmprior.experiments.Comparison`: makes the rows.
         - :func:`~warmprior.experiments.paper_success`: the paper's numbers.
         - :func:`~warmprior.experiments.plot_success_bars`: the same as a figure.
+
+    Examples:
+        >>> from warmprior.experiments.results import played
+        >>> facts = {"task": "lift", "data": "ph", "options": "", "sigma": 1.0, "chunk": 8, "seed": 0,
+        ...          "iterations": 100, "checkpoint": 100, "nfe": 1}
+        >>> rows = [played(facts | {"prior": prior}, [True] * wins + [False] * (10 - wins))
+        ...         for prior, wins in {"gaussian": 5, "past": 8}.items()]
+        >>> for line in success_table(rows, top_k=1, source="scripted").splitlines()[:3]:
+        ...     print(line)
+        | Success rate (%) | NFE 1: Base | NFE 1: WP-Past |
+        |---|---|---|
+        | Lift-PH, measured (scripted data) | 50.0 | **80.0** (+30.0) |
     """
     rows = select(rows, "success_rate")
     # In the order of the groups: all sources at one NFE side by side.
@@ -268,6 +280,18 @@ def flow_table(rows: Sequence[Row]) -> str:
     Args:
         rows: evaluations with one sigma and chunk length per prior; the baseline's first. With the times of
             :meth:`Comparison.timed` it tells these as well.
+
+    Examples:
+        >>> facts = {"task": "lift", "data": "ph", "options": "", "sigma": 1.0, "chunk": 8, "seed": 0,
+        ...          "iterations": 100, "checkpoint": 100, "nfe": 1}
+        >>> rows = [Row({"prior": prior} | facts, {"kappa": kappa, "coverage": 0.9})
+        ...         for prior, kappa in {"gaussian": 4.0, "past": 1.0}.items()]
+        >>> for line in flow_table(rows).splitlines()[:4]:
+        ...     print(line)
+        | Flow of the executed positions | Base | WP-Past |
+        |---|---|---|
+        | Lift-PH, curvature / Base's | 1.00 | 0.25 |
+        | Lift-PH, actions inside the source's 90% interval | 0.90 | 0.90 |
     """
     rows = last_checkpoints(select(rows, "kappa"))
     # They hold at any NFE: those of the largest of each policy.
@@ -384,6 +408,20 @@ def curvature_table(rows: Sequence[Row], facts: Mapping[str, Any], *, source: st
 
     Keyword Args:
         source: what the observations are, in words.
+
+    Examples:
+        >>> facts = {"options": "", "sigma": 1.0, "chunk": 4, "seed": 0, "mean": "training"}
+        >>> def row(prior, *ratio):  # with the ends of its interval
+        ...     ends = zip(("", "_low", "_high"), ratio)
+        ...     measures = {name + end: value for end, value in ends for name in RATIOS}
+        ...     return Row(facts | {"policy": prior, "prior": prior}, measures | {"observations": 500})
+        >>> rows = [row("gaussian", 1.0, 1.0, 1.0), row("past", 0.4, 0.3, 0.5)]
+        >>> table = curvature_table(rows, {"task": "lift", "style": "ph"}, source="new demonstrations")
+        >>> for line in table.splitlines()[:3]:
+        ...     print(line)
+        | curvature relative to the first column | Base | WP-Past |
+        |---|---|---|
+        | Lift-PH, whole prediction, training mean | 1.000 | 0.400 [0.300, 0.500] |
     """
     chosen = pooled(rows)
     first = chosen[0]

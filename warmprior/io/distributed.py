@@ -43,13 +43,28 @@ def launched() -> bool:
 
     See Also:
         :func:`~warmprior.io.distributed.joined`: joins them.
+
+    Examples:
+        >>> from unittest.mock import patch
+        >>> told = {"RANK": "0", "LOCAL_RANK": "0", "WORLD_SIZE": "2", "MASTER_ADDR": "localhost"}
+        >>> with patch.dict(os.environ, told):  # as torchrun does
+        ...     launched()
+        True
+        >>> with patch.dict(os.environ, told | {"WORLD_SIZE": "1"}):
+        ...     launched()
+        False
     """
     names = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR")
     return all(name in os.environ for name in names) and int(os.environ["WORLD_SIZE"]) > 1
 
 
 def world_size() -> int:
-    """How many processes train together: 1 unless this one has :func:`joined` others."""
+    """How many processes train together: 1 unless this one has :func:`joined` others.
+
+    Examples:
+        >>> 256 // world_size()  # windows per process; here there is one
+        256
+    """
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
@@ -58,6 +73,11 @@ def rank() -> int:
 
     See Also:
         :func:`~warmprior.io.distributed.world_size`: how many there are.
+
+    Examples:
+        >>> if not rank():
+        ...     print("trained")  # by the first of several processes alone
+        trained
     """
     return dist.get_rank() if dist.is_initialized() else 0
 
@@ -120,6 +140,18 @@ def process_group() -> Iterator[None]:
 
     See Also:
         :func:`~warmprior.io.distributed.joined`: starts the group.
+
+    Examples:
+        >>> with process_group():
+        ...     raise RuntimeError("[gloo] Connection closed by peer")
+        Traceback (most recent call last):
+            ...
+        warmprior.io.workers.WorkerError: another of the processes that train together has ended, ...
+        >>> with process_group():
+        ...     raise RuntimeError("any other error")
+        Traceback (most recent call last):
+            ...
+        RuntimeError: any other error
     """
     try:
         yield
@@ -145,6 +177,17 @@ def leader_first() -> Iterator[None]:
 
     See Also:
         :func:`~warmprior.io.distributed.from_leader`: where the others need the result.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "data.txt"
+        ...     with leader_first():  # what it writes is there for the others
+        ...         if not path.exists():
+        ...             _ = path.write_text("generated")
+        ...     path.read_text()
+        'generated'
     """
     told: list[Any] = [None]
     if not rank():
@@ -214,6 +257,12 @@ def go_on_alone() -> None:
 
     See Also:
         :func:`~warmprior.io.distributed.joined`: the group that ends.
+
+    Examples:
+        >>> with joined():
+        ...     go_on_alone()  # of several processes the others end here
+        ...     world_size()
+        1
     """
     if world_size() == 1:
         return
@@ -254,6 +303,13 @@ def check_batch(size: int) -> None:
 
     See Also:
         :class:`~warmprior.training.BehaviourCloning`: shares its batches out.
+
+    Examples:
+        >>> check_batch(256)
+        >>> check_batch(0)
+        Traceback (most recent call last):
+            ...
+        ValueError: --batch-size 0 has fewer windows than there are processes, 1: start fewer, or choose ...
     """
     if size < world_size():
         raise ValueError(

@@ -227,6 +227,15 @@ def exclusive(directory: Path) -> Iterator[None]:
 
     See Also:
         :func:`~warmprior.io.files.write_atomic`: what readers see is whole without a lock.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder, exclusive(Path(folder)):
+        ...     with exclusive(Path(folder)):  # whoever comes second
+        ...         pass
+        Traceback (most recent call last):
+            ...
+        BlockingIOError: ... is in use by another process: wait until that has ended, or choose another folder
     """
     directory.mkdir(parents=True, exist_ok=True)
     folder = os.open(directory, os.O_RDONLY)

@@ -51,6 +51,14 @@ def check_ray(address: str | None = None) -> str | None:
 
     See Also:
         :func:`~warmprior.io.ray_pool.ray_cluster`: connects to it.
+
+    Examples:
+        >>> check_ray("node-1:6379")  # doctest: +SKIP
+        'node-1:6379'
+        >>> check_ray("ray://node-1:10001")
+        Traceback (most recent call last):
+            ...
+        ValueError: --ray-address ray://node-1:10001 is not the address of a cluster's head, HOST:PORT ...
     """
     require("ray", "ray")
     option = "--ray-address" if address else "RAY_ADDRESS"
@@ -186,6 +194,14 @@ class RayPool[State]:
 
     Raises:
         ImportError: if Ray is not installed.
+
+    Examples:
+        >>> from functools import partial
+        >>> from operator import add
+        >>> with RayPool(partial(int, "40")) as pool:  # doctest: +SKIP
+        ...     pool.submit(partial(add, 2))
+        ...     [result for job, result in pool.wait()]
+        [42]
     """
 
     def __init__(
@@ -314,6 +330,11 @@ def ray_cluster(
         ConnectionError: if there is no such cluster, or its Ray or Python is another.
         WorkerError: if a machine has other versions or cannot start the library.
         OSError: if a machine does not see a folder.
+
+    Examples:
+        >>> with ray_cluster(num_cpus=2) as ray:  # of this machine  # doctest: +SKIP
+        ...     ray.cluster_resources()["CPU"]
+        2.0
     """
     ray = require("ray", "ray")
     with contextlib.ExitStack() as stack:

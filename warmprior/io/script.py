@@ -55,6 +55,16 @@ def run_script(
 
     See Also:
         :func:`~warmprior.io.distributed.launched`: whether it is one of several processes.
+
+    Examples:
+        >>> from contextlib import redirect_stderr
+        >>> run_script(lambda: print("trained"), "train.py")
+        trained
+        0
+        >>> with redirect_stderr(sys.stdout):
+        ...     run_script(lambda: int("eight"), "train.py")
+        train.py: error: invalid literal for int() with base 10: 'eight'
+        2
     """
     # Policies are shared between scripts, so all of them compute alike. Small networks gain nothing from
     # a second thread, and on a busy machine threads that wait for each other cost much.

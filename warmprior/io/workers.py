@@ -43,6 +43,14 @@ class WorkerError(RuntimeError):
     See Also:
         - :func:`~warmprior.training.parallel_env`: its processes.
         - :class:`~warmprior.io.workers.WorkerPool`: its workers.
+
+    Examples:
+        >>> with WorkerPool(1, 3) as pool:
+        ...     pool.submit(os._exit)  # the worker ends with exit code 3
+        ...     pool.wait()
+        Traceback (most recent call last):
+            ...
+        warmprior.io.workers.WorkerError: worker 0 of 1 (exit code 3) died. It may have been killed for ...
     """
 
 
@@ -102,13 +110,31 @@ class Failure:
 
     See Also:
         :class:`~warmprior.io.workers.WorkerPool`: gives it in place of a result.
+
+    Examples:
+        >>> results = [0.9, Failure("its process was killed 4 times"), 0.7]
+        >>> [result.reason for result in results if isinstance(result, Failure)]
+        ['its process was killed 4 times']
     """
 
     reason: str
 
 
 class Pool[State](Protocol):
-    """What takes jobs: worker processes (:class:`WorkerPool`), or many machines (:class:`RayPool`)."""
+    """What takes jobs: worker processes (:class:`WorkerPool`), or many machines (:class:`RayPool`).
+
+    Examples:
+        >>> from functools import partial
+        >>> from operator import add
+        >>> def results(pool: Pool, jobs):  # works with any
+        ...     for job in jobs:
+        ...         pool.submit(job)
+        ...     while pool.running:
+        ...         yield from (result for _, result in pool.wait())
+        >>> with WorkerPool(1, 40) as pool:
+        ...     sorted(results(pool, [partial(add, 2), partial(add, 1)]))
+        [41, 42]
+    """
 
     @property
     def num_workers(self) -> int:

@@ -30,6 +30,13 @@ class FlowPort(ABC):
     See Also:
         - :func:`~warmprior.lerobot.port_for`: finds that of a policy.
         - :data:`~warmprior.lerobot.PORTS`: all of them.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> smolvla = SimpleNamespace(config=SimpleNamespace(chunk_size=50, max_action_dim=32))
+        >>> port = PORTS["0.6"]["smolvla"]
+        >>> port.length(smolvla), port.width(smolvla), port.lead(smolvla)
+        (50, 32, 0)
     """
 
     @abstractmethod
@@ -401,6 +408,16 @@ def port_for(policy: Any) -> FlowPort:
     See Also:
         - :class:`~warmprior.lerobot.FlowPort`: what it returns.
         - :data:`~warmprior.lerobot.PORTS`: all of them.
+
+    Examples:
+        >>> port_for(policy).length(policy)  # a SmolVLAPolicy  # doctest: +SKIP
+        50
+        >>> class ACTPolicy:
+        ...     name = "act"  # no flow
+        >>> port_for(ACTPolicy())
+        Traceback (most recent call last):
+            ...
+        ValueError: ACTPolicy of lerobot ... is not supported: supported are, by release, 0.6: pi0, pi05, ...
     """
     installed = version("lerobot")
     ports = next((PORTS[known] for known in PORTS if f"{installed}.".startswith(f"{known}.")), None)

@@ -26,6 +26,13 @@ class RelativeActions:
     See Also:
         - :class:`~warmprior.lerobot.ActionMemory`: remembers the actions.
         - :class:`~warmprior.lerobot.WarmPriorAdapter`: takes it as ``relative``.
+
+    Examples:
+        >>> relative = RelativeActions(preprocessor, postprocessor)  # doctest: +SKIP
+        >>> _ = preprocessor(observation)  # doctest: +SKIP
+        >>> before = relative.state()  # doctest: +SKIP
+        >>> relative.reanchor(chunk, before, before + 0.1).sub(chunk).mean()  # std 1  # doctest: +SKIP
+        tensor(-0.1000)
     """
 
     def __init__(self, preprocessor: Any, postprocessor: Any) -> None:

@@ -184,6 +184,14 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
 
     See Also:
         :class:`~warmprior.lerobot.WarmPriorAdapter`: warms the source in these units.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> class Policy:
+        ...     name = "smolvla"
+        ...     config = SimpleNamespace(normalization_mapping={"ACTION": SimpleNamespace(value="MIN_MAX")})
+        >>> action_std(Policy(), {"action": {"std": [0.5], "min": [-1.0], "max": [3.0]}})
+        tensor([0.2500])
     """
     mode = port_for(policy).normalization(policy)
     own = (stats or {}).get("action", {})

@@ -218,6 +218,10 @@ def imagenet_weights() -> dict[str, Tensor]:
 
     See Also:
         :func:`~warmprior.modules.load_imagenet`: puts them into an encoder.
+
+    Examples:
+        >>> imagenet_weights()["conv1.weight"].shape  # doctest: +SKIP
+        torch.Size([64, 3, 7, 7])
     """
     torchvision: Any = require("torchvision.models", "vision")
     weights = torchvision.ResNet18_Weights.IMAGENET1K_V1
@@ -245,6 +249,13 @@ def load_imagenet(encoder: ImageEncoder) -> None:
     Raises:
         ValueError: if it has another backbone.
         OSError: see :func:`imagenet_weights`.
+
+    Examples:
+        >>> load_imagenet(ImageEncoder(["agentview_image"], 9))  # doctest: +SKIP
+        >>> load_imagenet(ImageEncoder(["agentview_image"], 9, backbone="small"))
+        Traceback (most recent call last):
+            ...
+        ValueError: ImageNet's weights are for resnet18, not for 'small'
     """
     if encoder.backbone != "resnet18":
         raise ValueError(f"ImageNet's weights are for resnet18, not for {encoder.backbone!r}")

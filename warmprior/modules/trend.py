@@ -104,6 +104,14 @@ class PoseTrend(nn.Module):
 
     Raises:
         ValueError: if the shapes differ, or an entry is NaN or infinite.
+
+    Examples:
+        >>> rest = RestingAction(torch.arange(7)[None])
+        >>> trend = PoseTrend(rest, torch.zeros(10), torch.zeros(4, 10), torch.ones(4, 10))
+        >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7)
+        >>> source, target = trend(observation)  # the targets follow the gripper, the source does not
+        >>> source.abs().max(), target[1, 3, :3]
+        (tensor(0.), tensor([0.1000, 0.2000, 0.3000]))
     """
 
     centre: Tensor

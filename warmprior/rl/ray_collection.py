@@ -38,6 +38,19 @@ class WarmUpSwitch(TensorDictModuleBase):
     See Also:
         - :func:`~warmprior.rl.ray_collection.ray_rounds`: collects with it.
         - :class:`~warmprior.ResidualSampler`: what acts at first.
+
+    Examples:
+        >>> from tensordict.nn import TensorDictModule
+        >>> def always(value):
+        ...     def act(seen):
+        ...         return (torch.full_like(seen, value),) * 2
+        ...     return TensorDictModule(act, ["observation"], [keys.DELTA, keys.CHUNK])
+        >>> switch = WarmUpSwitch(warmup=always(0.0), policy=always(1.0))
+        >>> data = TensorDict({"observation": torch.zeros(1, 2)}, [1])
+        >>> before = switch(data)[keys.CHUNK]
+        >>> _ = switch.learning.fill_(True)
+        >>> before, switch(data)[keys.CHUNK]
+        (tensor([[0., 0.]]), tensor([[1., 1.]]))
     """
 
     def __init__(self, warmup: TensorDictModuleBase, policy: TensorDictModuleBase) -> None:
@@ -110,6 +123,11 @@ def ray_rounds(
     Raises:
         ValueError: if the cluster has fewer CPUs than there are to be actors.
         WorkerError: if an actor dies, or an environment in it fails, a ``RuntimeError``.
+
+    Examples:
+        >>> with ray_rounds(switch, make_env, collectors=2, num_envs=4, seed=0) as rounds:  # doctest: +SKIP
+        ...     next(rounds).shape
+        torch.Size([2, 4, 1])
     """
     with ray_cluster(address, collectors) as ray:
         from torchrl.collectors.distributed import RayCollector

@@ -43,6 +43,17 @@ class Episode:
             key for it, under ``"next"`` ``"executed_steps"`` and ``"done"``, and what
             :class:`~warmprior.InferenceDelay` told, if chunks took effect late. Episodes concatenated along
             ``D`` are a rollout for :func:`~warmprior.diagnostics.smoothness`.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP, policy_transforms
+        >>> from warmprior.envs import GoalNavigationEnv
+        >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
+        >>> actor = WarmPriorActor(network, PastPrior(8))
+        >>> transforms = policy_transforms(actor.prior, observation_steps=1)
+        >>> env = TransformedEnv(GoalNavigationEnv((1, 1)), transforms)
+        >>> episode = play_episode(actor, env, seed=7)
+        >>> episode.seed, int(episode.decisions["next", "executed_steps"].sum()) == episode.steps
+        (7, True)
     """
 
     seed: int
@@ -86,6 +97,16 @@ def parallel_env(
     See Also:
         - :func:`~warmprior.training.evaluate`: plays episodes in it.
         - :class:`~warmprior.envs.RobosuiteEnv`: what its processes usually hold.
+
+    Examples:
+        >>> from warmprior import PastPrior, policy_transforms
+        >>> from warmprior.envs import NavigationEnv
+        >>> def make_env(seed_offset, seed_stride):  # nothing in this one is random
+        ...     return NavigationEnv()
+        >>> make_transforms = partial(policy_transforms, PastPrior(8), observation_steps=1)
+        >>> env = parallel_env(make_env, make_transforms, num_envs=2)
+        >>> env.batch_size, env.is_closed  # the workers start with the first reset
+        (torch.Size([2]), True)
     """
     if num_envs < 1:
         raise ValueError(f"the number of environments must be at least 1, got {num_envs}")
@@ -226,8 +247,14 @@ def play_episode(
         - :func:`~warmprior.training.record_video`: films one.
 
     Examples:
-        >>> env = TransformedEnv(RobosuiteEnv("lift"), policy_transforms(prior))  # doctest: +SKIP
-        >>> play_episode(actor, env, seed=10_000_000, nfe=1).success  # doctest: +SKIP
+        >>> from warmprior import PastPrior, VelocityMLP, policy_transforms
+        >>> from warmprior.envs import GoalNavigationEnv
+        >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
+        >>> actor = WarmPriorActor(network, PastPrior(8))
+        >>> transforms = policy_transforms(actor.prior, observation_steps=1)
+        >>> env = TransformedEnv(GoalNavigationEnv((1, 1)), transforms)
+        >>> one, again = (play_episode(actor, env, seed=7, nfe=1) for _ in range(2))
+        >>> bool((one.decisions == again.decisions).all())
         True
     """
     if env.batch_size:

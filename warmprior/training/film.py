@@ -102,6 +102,12 @@ class Filmstrip:
     See Also:
         - :func:`~warmprior.training.record_filmstrip`: makes it.
         - :func:`~warmprior.experiments.plot_filmstrip`: draws it.
+
+    Examples:
+        >>> frames = [np.zeros((160, 160, 3), np.uint8) for _ in range(3)]
+        >>> strip = Filmstrip(frames, steps=[0, 38, 76], success=True)
+        >>> [f"step {step}" for step in strip.steps], np.hstack(strip.frames).shape
+        (['step 0', 'step 38', 'step 76'], (160, 480, 3))
     """
 
     frames: list[np.ndarray]
@@ -139,6 +145,15 @@ def record_filmstrip(
     Raises:
         RuntimeError: if nothing on this machine can render; the message names the packages to install.
         ValueError: if the policy keeps no description of its environment, or the size of a video is odd.
+
+    Examples:
+        >>> actor = WarmPriorActor.from_pretrained("policy_010000")  # doctest: +SKIP
+        >>> record_filmstrip(actor, seed=10_000_000, nfe=1, frames=5).steps  # doctest: +SKIP
+        [0, 24, 48, 71, 95]
+        >>> record_filmstrip(actor=None, seed=0, size=161, video=Path("film.mp4"))
+        Traceback (most recent call last):
+            ...
+        ValueError: the side of a video must be an even number of pixels, got 161
     """
     if video is not None:
         _check_size(size)
@@ -195,6 +210,15 @@ def record_video(
         ImportError: if PyAV is missing.
         RuntimeError: if nothing on this machine can render; the message names the packages to install.
         ValueError: if the policy keeps no description of its environment, or the size is odd.
+
+    Examples:
+        >>> actor = WarmPriorActor.from_pretrained("policy_010000")  # doctest: +SKIP
+        >>> record_video(actor, Path("film.mp4"), seed=10_000_000, nfe=1)  # doctest: +SKIP
+        True
+        >>> record_video(None, Path("film.mp4"), seed=0, size=255)
+        Traceback (most recent call last):
+            ...
+        ValueError: the side of a video must be an even number of pixels, got 255
     """
     _check_size(size)
     with _played(actor, seed, nfe, policy_seed, options) as played:

@@ -43,6 +43,10 @@ class CameraImages(Transform):
         ...     RobosuiteEnv("lift", sim_state=True), CameraImages(["agentview"], 84))
         >>> env.reset()["observation", "agentview_image"].shape  # doctest: +SKIP
         torch.Size([3, 84, 84])
+        >>> CameraImages(["agentview", "agentview"])
+        Traceback (most recent call last):
+            ...
+        ValueError: CameraImages needs different cameras, got ['agentview', 'agentview']
     """
 
     def __init__(self, cameras: Sequence[str], size: int = 84) -> None:

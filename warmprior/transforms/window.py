@@ -228,6 +228,15 @@ def window_transforms(
         observation_steps: ``To``.
         generator: see :class:`ActionWindow`.
         renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
+
+    Examples:
+        >>> from warmprior import PastPrior
+        >>> data = TensorDict({"observation": torch.zeros(50, 3), "action": torch.arange(50.0)[:, None],
+        ...                    "episode": torch.arange(50) // 25}, [50])
+        >>> windows = window_transforms(data, PastPrior(2), observation_steps=1)
+        >>> batch = windows(TensorDict({"frame": torch.tensor([10, 25])}, [2]))
+        >>> batch["vla_action", "chunk"].squeeze(-1).tolist(), batch["prior", "loc"].squeeze(-1).tolist()
+        ([[10.0, 11.0], [25.0, 26.0]], [[8.0, 9.0], [0.0, 0.0]])
     """
     window = ActionWindow(
         data, prior, observation_steps=observation_steps, generator=generator, **renamed

@@ -79,6 +79,10 @@ def generate_demonstrations(
         >>> path = generate_demonstrations("lift", n=20)  # doctest: +SKIP
         >>> path.name  # doctest: +SKIP
         'lift_ph_n20_seed0_v1.hdf5'
+        >>> generate_demonstrations("tool_hang")
+        Traceback (most recent call last):
+            ...
+        ValueError: there is no scripted expert for 'tool_hang'; only its official data exist: ...
     """
     spec = get_task(task)
     if not spec.scripted or task not in PLANS:
