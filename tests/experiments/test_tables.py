@@ -165,6 +165,19 @@ def test_flows_compare_with_the_first_sources_of_their_problem():
     assert "per squared" not in text  # nobody measured it
 
 
+@pytest.mark.parametrize("nfes", [(9, 1), (1, 9)])
+@pytest.mark.parametrize("last", ["nfe", "prior"])
+def test_flows_are_those_of_the_largest_nfe_in_whatever_order(nfes, last):
+    def flowing(kappa, **facts):
+        facts = FACTS | facts
+        facts[last] = facts.pop(last)
+        return Row(facts, {"success_rate": 1.0, "kappa": kappa})
+
+    kappas = {"gaussian": {9: 2.0, 1: 5.0}, "past": {9: 1.0, 1: 7.0}}
+    rows = [flowing(kappas[prior][nfe], prior=prior, nfe=nfe) for prior in kappas for nfe in nfes]
+    assert "curvature / Base's | 1.00 | 0.50 |" in flow_table(rows)
+
+
 def test_jumps_between_chunks_are_relative_to_the_steps_inside():
     told = [row(5, measures={"boundary_jump": 0.6, "inner_jump": j}) for j in (0.2,)]
     assert "jump between chunks / step inside | 3.00 |" in success_table(told, top_k=1, source=None)
