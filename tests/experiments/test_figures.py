@@ -266,6 +266,24 @@ def test_options_of_a_prior_have_panels_of_their_own_against_sigma(tmp_path, fig
         assert list(right.get_lines()[0].get_ydata()) == [ratio] * 2
 
 
+@pytest.mark.parametrize("bounds", [(8.0, 2.0), (None, None)])
+def test_without_a_baseline_the_bound_is_told_relative_to_the_first_sigma(
+    bounds, tmp_path, figures
+):
+    shown = []
+    for sigma, ratio, bound in zip((1.0, 0.5), (1.0, 0.4), bounds, strict=True):
+        facts = {"prior": "past", "options": "", "sigma": sigma, "seed": 0, "nfe": 1}
+        shown.append(Row(facts | {"checkpoint": 1}, {"success_rate": 0.5}))
+        measures = {"ratio_executed": ratio, "bound_executed": bound}
+        shown.append(Row(facts | {"mean": "training"}, measures))
+    plot_sigma(shown, tmp_path / "a.png", top_k=1, title="t")
+    ((axis,),) = figures
+    (right,) = (each for each in axis.figure.axes if each is not axis)
+    told = [(line.get_label(), list(line.get_ydata())) for line in right.get_lines()]
+    curvature = ("curvature (executed H)", [1.0, 0.4])
+    assert told == [curvature, ("branching bound", [1.0, 0.25])][: 1 if bounds[0] is None else 2]
+
+
 def test_options_of_a_prior_are_agents_of_their_own(tmp_path, figures):
     points = [(0, {"base": 0.0}), (90, {"greedy": 1.0, "stochastic": 1.0})]
     other = [

@@ -28,10 +28,10 @@ def plot_sigma(
     """Success against sigma, with the curvature and the branching bound on the same axis (appendix).
 
     A panel per warm source; shaded is one seed standard deviation. Curvature (executed positions, mean
-    of the training) and bound are those of the prior over those of the baseline.
+    of the training) and bound are those of the prior over those of the first source.
 
     Args:
-        rows: evaluations at one NFE, the baseline's first, and those of
+        rows: evaluations at one NFE, the baseline's first if there is one, and those of
             :func:`~warmprior.experiments.straightness` for the same policies.
         path: of the PNG.
 
@@ -57,7 +57,9 @@ def plot_sigma(
     by_source, curved = grouped(played, source_of), grouped(measured, source_of)
     warm = [source for source in by_source if Prior.find(source[0]).takes("sigma")]
     base = next((source for source in by_source if source not in warm), None)
-    base_bound = None if base is None else mean_known(curved.get(base, ()), "bound_executed")
+    # Curvatures are told relative to the first policy, whether or not it is a baseline; so is the bound.
+    policies = grouped(measured, lambda row: (source_of(row), row["sigma"]))
+    first_bound = mean_known(next(iter(policies.values()), ()), "bound_executed")
     figure, axes = new_figure(5.2 * len(warm), 4.2, 1, len(warm))
     for axis, source in zip(axes, warm, strict=True):
         prior, options = source
@@ -76,11 +78,13 @@ def plot_sigma(
         right = axis.twinx()
         for measure, scale, marker, label in (
             ("ratio_executed", 1.0, "s", "curvature (executed H)"),
-            ("bound_executed", base_bound, "^", "branching bound"),
+            ("bound_executed", first_bound, "^", "branching bound"),
         ):
             at = grouped(curved.get(source, ()), lambda row: row["sigma"])
             found = {s: mean_known(at.get(s, ()), measure) for s in sigmas}
             known = {s: value for s, value in found.items() if value is not None and scale}
+            if not known:
+                continue
             right.plot(
                 [sigmas.index(s) for s in known],
                 [value / scale for value in known.values()],  # type: ignore[operator]
@@ -92,7 +96,7 @@ def plot_sigma(
                 label=label,
             )
         right.set_ylim(bottom=0)
-        right.set_ylabel("relative to the baseline")
+        right.set_ylabel("relative to the first source")
         axis.set_xticks(range(len(sigmas)), [f"{s:g}" for s in sigmas])
         axis.set_xlabel(r"$\sigma$")
         axis.set_ylim(-0.02, 1.02)
