@@ -245,6 +245,16 @@ def test_options_of_a_prior_have_lines_of_their_own_against_the_budget(tmp_path,
     assert len(told_apart(below.get_lines())) == 2
 
 
+def _beside(axis):
+    """The axis of the right-hand side."""
+    (right,) = (
+        each
+        for each in axis.figure.axes
+        if each.bbox.bounds == axis.bbox.bounds and each is not axis
+    )
+    return right
+
+
 def test_options_of_a_prior_have_panels_of_their_own_against_sigma(tmp_path, figures):
     shown = [row(5, seed=0)]
     for sigma in (0.1, 0.5):
@@ -258,12 +268,23 @@ def test_options_of_a_prior_have_panels_of_their_own_against_sigma(tmp_path, fig
     assert [axis.get_title() for axis in panels] == TOLD
     for axis, success, ratio in zip(panels, (0.2, 0.8), (0.25, 0.75), strict=True):
         assert list(axis.get_lines()[0].get_ydata()) == [success] * 2
-        (right,) = (
-            each
-            for each in axis.figure.axes
-            if each.bbox.bounds == axis.bbox.bounds and each is not axis
-        )
-        assert list(right.get_lines()[0].get_ydata()) == [ratio] * 2
+        assert list(_beside(axis).get_lines()[0].get_ydata()) == [ratio] * 2
+
+
+def test_bounds_of_all_sources_are_told_relative_to_the_baselines(tmp_path, figures):
+    shown = []
+    for prior, sigma, bound in (
+        *(("gaussian", 1.0, 8.0), ("past", 1.0, 4.0), ("past", 0.5, 2.0)),
+        *(("preview", 1.0, 6.0), ("preview", 0.5, 1.0)),
+    ):
+        facts = {"prior": prior, "options": "", "sigma": sigma, "seed": 0, "nfe": 1}
+        shown.append(Row(facts | {"checkpoint": 1}, {"success_rate": 0.5}))
+        measures = {"ratio_executed": 1.0, "bound_executed": bound}
+        shown.append(Row(facts | {"mean": "training"}, measures))
+    plot_sigma(shown, tmp_path / "a.png", top_k=1, title="t")
+    (panels,) = figures
+    bounds = [list(_beside(axis).get_lines()[1].get_ydata()) for axis in panels]
+    assert bounds == [[0.5, 0.25], [0.75, 0.125]]
 
 
 @pytest.mark.parametrize("bounds", [(8.0, 2.0), (None, None)])
@@ -278,8 +299,7 @@ def test_without_a_baseline_the_bound_is_told_relative_to_the_first_sigma(
         shown.append(Row(facts | {"mean": "training"}, measures))
     plot_sigma(shown, tmp_path / "a.png", top_k=1, title="t")
     ((axis,),) = figures
-    (right,) = (each for each in axis.figure.axes if each is not axis)
-    told = [(line.get_label(), list(line.get_ydata())) for line in right.get_lines()]
+    told = [(line.get_label(), list(line.get_ydata())) for line in _beside(axis).get_lines()]
     curvature = ("curvature (executed H)", [1.0, 0.4])
     assert told == [curvature, ("branching bound", [1.0, 0.25])][: 1 if bounds[0] is None else 2]
 

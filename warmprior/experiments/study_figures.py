@@ -28,7 +28,7 @@ def plot_sigma(
     """Success against sigma, with the curvature and the branching bound on the same axis (appendix).
 
     A panel per warm source; shaded is one seed standard deviation. Curvature (executed positions, mean
-    of the training) and bound are those of the prior over those of the first source.
+    of the training) and bound are those of the prior over those of the first policy.
 
     Args:
         rows: evaluations at one NFE, the baseline's first if there is one, and those of
@@ -96,7 +96,7 @@ def plot_sigma(
                 label=label,
             )
         right.set_ylim(bottom=0)
-        right.set_ylabel("relative to the first source")
+        right.set_ylabel("relative to the first policy")
         axis.set_xticks(range(len(sigmas)), [f"{s:g}" for s in sigmas])
         axis.set_xlabel(r"$\sigma$")
         axis.set_ylim(-0.02, 1.02)

@@ -295,7 +295,9 @@ def flow_table(rows: Sequence[Row]) -> str:
     """
     rows = last_checkpoints(select(rows, "kappa"))
     # They hold at any NFE: those of the largest of each policy.
-    policies = grouped(rows, lambda row: tuple(row.facts[k] for k in row.facts if k != "nfe"))
+    policies = grouped(
+        rows, lambda row: tuple(row.facts[k] for k in sorted(row.facts) if k != "nfe")
+    )
     rows = [max(group, key=lambda row: row["nfe"]) for group in policies.values()]
     label = source_labels(rows)
     base = label(rows[0])
