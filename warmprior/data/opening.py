@@ -137,17 +137,11 @@ class Demonstrations(ABC):
         :func:`~warmprior.data.opening.open_demonstrations`: finds the one for a place.
 
     Examples:
-        >>> from tempfile import TemporaryDirectory
-        >>> import h5py
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "toy.hdf5"
-        ...     with h5py.File(path, "w") as file:
-        ...         for name, shape in {"actions": (9, 2), "rewards": (9,), "obs/object": (9, 3)}.items():
-        ...             file[f"data/demo_0/{name}"] = np.zeros(shape)
-        ...         file["data"].attrs["env_args"] = '{"env_name": "Toy", "env_kwargs": {}}'
-        ...     index = open_demonstrations(path).index(observation_keys=["object"])
-        >>> index.lengths, index.action_dim, index.observation_dims
-        ((9,), 2, (3,))
+        >>> place = open_demonstrations("nowhere.hdf5")  # not looked at yet
+        >>> place.index()
+        Traceback (most recent call last):
+            ...
+        FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
 
     name: str

@@ -45,15 +45,13 @@ class Episode:
             ``D`` are a rollout for :func:`~warmprior.diagnostics.smoothness`.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP, policy_transforms
-        >>> from warmprior.envs import GoalNavigationEnv
-        >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
-        >>> actor = WarmPriorActor(network, PastPrior(8))
-        >>> transforms = policy_transforms(actor.prior, observation_steps=1)
-        >>> env = TransformedEnv(GoalNavigationEnv((1, 1)), transforms)
-        >>> episode = play_episode(actor, env, seed=7)
-        >>> episode.seed, int(episode.decisions["next", "executed_steps"].sum()) == episode.steps
-        (7, True)
+        >>> from tensordict import TensorDict
+        >>> solved = Episode(7, True, 90, decisions=TensorDict({}, [12]))
+        >>> played = [solved, Episode(8, False, 400, decisions=TensorDict({}, [50]))]
+        >>> sum(episode.success for episode in played) / len(played)
+        0.5
+        >>> torch.cat([episode.decisions for episode in played]).batch_size  # a rollout
+        torch.Size([62])
     """
 
     seed: int
