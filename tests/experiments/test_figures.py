@@ -9,6 +9,8 @@ import torch
 pytest.importorskip("matplotlib")
 pytest.importorskip("tyro")
 
+from matplotlib.image import imread
+
 from tests.experiments.row_parts import compared, row
 from warmprior.experiments import (
     Row,
@@ -25,6 +27,7 @@ from warmprior.experiments import (
     plot_success,
     plot_success_bars,
     select,
+    source_labels,
     study_figures,
 )
 from warmprior.experiments import (
@@ -121,6 +124,29 @@ def test_success_pools_the_seeds_of_a_source(tmp_path, figures):
     means = [line.get_ydata()[0] for line in axis.get_lines()]
     assert means == pytest.approx([16 / 32, 25 / 32, 16 / 32])
     assert axis.get_legend_handles_labels()[1] == ["Base", "WP-Past", "WP-Preview"]
+
+
+@pytest.mark.parametrize(
+    "draw",
+    [
+        lambda rows, path: plot_success(rows, path, title="t"),
+        lambda rows, path: plot_success_bars(rows, path, top_k=1, title="t"),
+        lambda rows, path: plot_delays(rows, path, label=source_labels(rows), top_k=1, title="t"),
+    ],
+    ids=["violins", "bars", "delays"],
+)
+def test_names_of_many_sources_are_not_cut_off_at_the_edges(tmp_path, figures, draw):
+    options = [f"correlation=0.{k}" for k in range(1, 6)]
+    measures = {"boundary_jump": 0.5}
+    draw(
+        [row(prior="past", options=o, delay=0, measures=measures) for o in options],
+        tmp_path / "a.png",
+    )
+    image = imread(tmp_path / "a.png")[..., :3]
+    assert (image[:, :3] == 1).all() and (image[:, -3:] == 1).all()
+    ((axis, *_),) = figures
+    (legend,) = axis.figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [f"WP-Past, {o}" for o in options]
 
 
 def test_violins_of_several_groups_stand_side_by_side(tmp_path, figures):

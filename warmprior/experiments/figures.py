@@ -50,6 +50,18 @@ def band(axis: Any, x: Sequence[float], points: Sequence[SeedSummary], **line: A
     axis.fill_between(x, mean - spread, mean + spread, color=drawn.get_color(), alpha=0.2, lw=0)
 
 
+def legend_below(figure: Any, axis: Any) -> None:
+    """The legend of an axis below all axes, in as many columns as fit the figure's width."""
+    handles, labels = axis.get_legend_handles_labels()
+    for columns in range(len(labels), 0, -1):
+        legend = figure.legend(
+            handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9
+        )
+        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+            break
+        legend.remove()
+
+
 def plot_success(
     rows: Iterable[Row],
     path: str | Path,
@@ -121,7 +133,7 @@ def plot_success(
     axis.set_ylabel("success rate (posterior density)")
     axis.set_title(title, fontsize=10)
     axis.grid(axis="y", alpha=0.25)
-    figure.legend(loc="outside lower center", ncols=min(4, len(sources)), frameon=False, fontsize=9)
+    legend_below(figure, axis)
     figure.savefig(path, dpi=150)
 
 
@@ -132,7 +144,7 @@ def grouped_bars(
     label: Callable[[Row], str],
     summary: Callable[[list[Row]], SeedSummary],
     text: Callable[[float], str],
-) -> int:
+) -> None:
     """Bars of what was measured, side by side in groups, with one seed standard deviation.
 
     Args:
@@ -142,9 +154,6 @@ def grouped_bars(
         label: names its bar, for the legend.
         summary: of the rows of a bar.
         text: above a bar, of its mean.
-
-    Returns:
-        How many bars a group has.
     """
     groups = grouped(rows, group)
     sources, colors = list(grouped(rows, label)), source_colors(rows, label)
@@ -178,7 +187,6 @@ def grouped_bars(
     at = [g * (len(sources) + 0.8) + centre for g in range(len(groups))]
     axis.set_xticks(at, list(groups))
     axis.grid(axis="y", alpha=0.25)
-    return len(sources)
 
 
 def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, title: str) -> None:
@@ -207,7 +215,7 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
         (540, 945)
     """
     figure, (axis,) = new_figure(1.8 + 1.5 * len(grouped(rows, lambda row: row["chunk"])), 3.6)
-    columns = grouped_bars(
+    grouped_bars(
         axis,
         rows,
         lambda row: f"H = {row['chunk']}",
@@ -217,7 +225,7 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
     )
     axis.set_ylim(0, 1.08)
     axis.set_ylabel(f"success rate (NFE {rows[0]['nfe']})")
-    figure.legend(loc="outside lower center", ncols=min(4, columns), frameon=False, fontsize=9)
+    legend_below(figure, axis)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=150)
 

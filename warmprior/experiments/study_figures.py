@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from warmprior.diagnostics.statistics import summarize_seeds
-from warmprior.experiments.figures import band, grouped_bars, new_figure
+from warmprior.experiments.figures import band, grouped_bars, legend_below, new_figure
 from warmprior.experiments.labels import (
     prior_color,
     prior_label,
@@ -310,14 +310,6 @@ def plot_delays(
         below.set_ylim(bottom=0)
     axes[0].set_ylabel(f"success rate (NFE {rows[0]['nfe']})")
     axes[len(tasks)].set_ylabel("jump where chunks take effect")
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles,
-        labels,
-        loc="outside lower center",
-        ncols=min(3 * len(tasks), bars),
-        frameon=False,
-        fontsize=9,
-    )
+    legend_below(figure, axes[0])
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=150)
