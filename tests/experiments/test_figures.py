@@ -135,16 +135,26 @@ def test_success_pools_the_seeds_of_a_source(tmp_path, figures):
     ],
     ids=["violins", "bars", "delays"],
 )
-def test_names_of_many_sources_are_not_cut_off_at_the_edges(tmp_path, figures, draw):
-    options = [f"correlation=0.{k}" for k in range(1, 6)]
+@pytest.mark.parametrize(
+    "options",
+    [
+        [f"correlation=0.{k}" for k in range(1, 6)],
+        [f"correlation=0.{k}" for k in range(10, 40)],  # the legend is higher than the axes
+        ["correlation=0.5,a_long_name_of_an_option_beyond_the_width=0.5"],
+    ],
+    ids=["five", "thirty", "long"],
+)
+def test_names_of_sources_are_not_cut_off_at_the_edges(tmp_path, figures, draw, options):
     measures = {"boundary_jump": 0.5}
     draw(
         [row(prior="past", options=o, delay=0, measures=measures) for o in options],
         tmp_path / "a.png",
     )
     image = imread(tmp_path / "a.png")[..., :3]
-    assert (image[:, :3] == 1).all() and (image[:, -3:] == 1).all()
+    edges = image[:, :3], image[:, -3:], image[:3], image[-3:]
+    assert all((edge == 1).all() for edge in edges)
     ((axis, *_),) = figures
+    assert axis.get_window_extent().height > 100  # pixels
     (legend,) = axis.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == [f"WP-Past, {o}" for o in options]
 
@@ -196,6 +206,17 @@ def test_bars_of_success_and_jumps_by_delay(tmp_path, figures):
     assert [text.get_text() for text in below.texts] == 2 * ["0.50", "0.25", "0.10"]
     assert [text.get_text() for text in below.get_xticklabels()] == ["delay 0", "delay 2"]
     assert len({bar.get_facecolor() for bar in above.patches}) == 3
+
+
+def test_the_legend_of_delays_has_sources_of_later_tasks_as_well(tmp_path, figures):
+    parts = (("square", "gaussian"), ("can", "gaussian"), ("can", "past"))
+    shown = [
+        row(task=task, prior=prior, delay=0, measures={"boundary_jump": 0.5})
+        for task, prior in parts
+    ]
+    plot_delays(shown, tmp_path / "a.png", label=source_labels(shown), top_k=1, title="t")
+    (legend,) = figures[0][0].figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["Base", "WP-Past"]
 
 
 def test_learning_curves_have_a_loss_per_seed_and_success_per_checkpoint(tmp_path, figures):

@@ -50,16 +50,33 @@ def band(axis: Any, x: Sequence[float], points: Sequence[SeedSummary], **line: A
     axis.fill_between(x, mean - spread, mean + spread, color=drawn.get_color(), alpha=0.2, lw=0)
 
 
-def legend_below(figure: Any, axis: Any) -> None:
-    """The legend of an axis below all axes, in as many columns as fit the figure's width."""
-    handles, labels = axis.get_legend_handles_labels()
-    for columns in range(len(labels), 0, -1):
+def legend_below(figure: Any) -> None:
+    """One legend of all axes below them, in as many columns as the figure is wide.
+
+    The figure grows by its height, so that the axes keep theirs, and to its width if one column is wider.
+    """
+    handles = {
+        label: handle
+        for axis in figure.axes
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    for columns in range(max(1, len(handles)), 0, -1):
         legend = figure.legend(
-            handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=9
+            handles.values(),
+            handles.keys(),
+            loc="outside lower center",
+            ncols=columns,
+            frameon=False,
+            fontsize=9,
         )
-        if columns == 1 or legend.get_window_extent().width <= figure.bbox.width:
+        needed = legend.get_window_extent()
+        if columns == 1 or needed.width <= figure.bbox.width:
             break
         legend.remove()
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(
+        max(width, needed.width / figure.dpi), height + needed.height / figure.dpi
+    )
 
 
 def plot_success(
@@ -133,7 +150,7 @@ def plot_success(
     axis.set_ylabel("success rate (posterior density)")
     axis.set_title(title, fontsize=10)
     axis.grid(axis="y", alpha=0.25)
-    legend_below(figure, axis)
+    legend_below(figure)
     figure.savefig(path, dpi=150)
 
 
@@ -211,8 +228,8 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
         >>> rows = [Row(facts | {"chunk": chunk}, {"success_rate": 0.7}) for chunk in (4, 8, 16)]
         >>> with TemporaryDirectory() as folder:
         ...     plot_success_bars(rows, Path(folder) / "bars.png", top_k=1, title="lift ph")
-        ...     imread(Path(folder) / "bars.png").shape[:2]  # wider for every chunk length
-        (540, 945)
+        ...     imread(Path(folder) / "bars.png").shape[1]  # wider for every chunk length
+        945
     """
     figure, (axis,) = new_figure(1.8 + 1.5 * len(grouped(rows, lambda row: row["chunk"])), 3.6)
     grouped_bars(
@@ -225,7 +242,7 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
     )
     axis.set_ylim(0, 1.08)
     axis.set_ylabel(f"success rate (NFE {rows[0]['nfe']})")
-    legend_below(figure, axis)
+    legend_below(figure)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=150)
 

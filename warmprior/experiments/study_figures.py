@@ -310,6 +310,6 @@ def plot_delays(
         below.set_ylim(bottom=0)
     axes[0].set_ylabel(f"success rate (NFE {rows[0]['nfe']})")
     axes[len(tasks)].set_ylabel("jump where chunks take effect")
-    legend_below(figure, axes[0])
+    legend_below(figure)
     figure.suptitle(title, fontsize=10)
     figure.savefig(path, dpi=150)
