@@ -208,6 +208,14 @@ def test_bars_of_success_and_jumps_by_delay(tmp_path, figures):
     assert len({bar.get_facecolor() for bar in above.patches}) == 3
 
 
+def test_numbers_of_bars_stand_above_their_deviation_over_seeds(tmp_path, figures):
+    plot_success_bars(compared(), tmp_path / "a.png", top_k=1, title="t")
+    ((axis,),) = figures
+    heights = [text.xy[1] for text in axis.texts]
+    # 4, 5 and 6, 7, 8 and 9, and three times 5 of 10 episodes.
+    assert heights == pytest.approx([0.5 + 0.1, 0.8 + 0.1, 0.5])
+
+
 def test_the_legend_of_delays_has_sources_of_later_tasks_as_well(tmp_path, figures):
     parts = (("square", "gaussian"), ("can", "gaussian"), ("can", "past"))
     shown = [

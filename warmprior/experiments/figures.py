@@ -170,7 +170,7 @@ def grouped_bars(
         group: names the group of a row.
         label: names its bar, for the legend.
         summary: of the rows of a bar.
-        text: above a bar, of its mean.
+        text: above a bar and its deviation, of its mean.
     """
     groups = grouped(rows, group)
     sources, colors = list(grouped(rows, label)), source_colors(rows, label)
@@ -194,9 +194,10 @@ def grouped_bars(
             shown.add(source)
             axis.annotate(
                 text(found.mean),
-                (x, found.mean),
-                (0, 2),
+                (x, found.mean + np.nan_to_num(found.std)),  # above the error bar
+                (0, 4),
                 textcoords="offset points",
+                annotation_clip=False,
                 ha="center",
                 fontsize=8,
             )
