@@ -227,6 +227,19 @@ def test_the_legend_of_delays_has_sources_of_later_tasks_as_well(tmp_path, figur
     assert [text.get_text() for text in legend.get_texts()] == ["Base", "WP-Past"]
 
 
+def test_a_source_has_one_colour_whichever_task_of_the_delays_has_it(tmp_path, figures):
+    jumps = {"boundary_jump": 0.5}
+    of_square, of_can = (
+        list(variants(task=task, delay=0, measures=jumps)) for task in ("square", "can")
+    )
+    shown = [*of_square, *of_can[2:]]  # of can that with options alone
+    plot_delays(shown, tmp_path / "a.png", label=source_labels(shown), top_k=1, title="t")
+    ((square, can, *_),) = figures
+    past, correlated = (bar.get_facecolor() for bar in square.patches)
+    assert past != correlated
+    assert [bar.get_facecolor() for bar in can.patches] == [correlated]
+
+
 def test_learning_curves_have_a_loss_per_seed_and_success_per_checkpoint(tmp_path, figures):
     losses = {prior: [[(10, 1.0), (20, 0.5)]] * 3 for prior in ("gaussian", "past", "preview")}
     plot_learning_curves(losses, compared(), tmp_path / "b.png", title="t")

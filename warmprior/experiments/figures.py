@@ -159,6 +159,7 @@ def grouped_bars(
     rows: Sequence[Row],
     group: Callable[[Row], str],
     label: Callable[[Row], str],
+    color: Callable[[Row], Any],
     summary: Callable[[list[Row]], SeedSummary],
     text: Callable[[float], str],
 ) -> None:
@@ -169,11 +170,12 @@ def grouped_bars(
         rows: in the order of groups and bars.
         group: names the group of a row.
         label: names its bar, for the legend.
+        color: of the bar; the same function for all axes of a figure, whose legend is one.
         summary: of the rows of a bar.
         text: above a bar and its deviation, of its mean.
     """
     groups = grouped(rows, group)
-    sources, colors = list(grouped(rows, label)), source_colors(rows, label)
+    sources = list(grouped(rows, label))
     shown: set[str] = set()
     for g, members in enumerate(groups.values()):
         for j, source in enumerate(sources):
@@ -188,7 +190,7 @@ def grouped_bars(
                 0.85,
                 yerr=None if math.isnan(found.std) else found.std,
                 capsize=3,
-                color=colors(cell[0]),
+                color=color(cell[0]),
                 label=None if source in shown else source,
             )
             shown.add(source)
@@ -233,11 +235,13 @@ def plot_success_bars(rows: Sequence[Row], path: str | Path, *, top_k: int, titl
         945
     """
     figure, (axis,) = new_figure(1.8 + 1.5 * len(grouped(rows, lambda row: row["chunk"])), 3.6)
+    label = source_labels(rows, chunks=False)
     grouped_bars(
         axis,
         rows,
         lambda row: f"H = {row['chunk']}",
-        source_labels(rows, chunks=False),
+        label,
+        source_colors(rows, label),
         lambda cell: success_summary(cell, top_k),
         lambda mean: f"{100 * mean:.0f}",
     )

@@ -277,7 +277,7 @@ def plot_delays(
     rows = sorted(rows, key=lambda row: row["delay"])
     tasks = grouped(rows, lambda row: f"{row['task']} {row['data']}")
     delays = len({row["delay"] for row in rows})
-    bars = len(grouped(rows, label))
+    bars, color = len(grouped(rows, label)), source_colors(rows, label)
     width = 1.0 + delays * (0.6 + 0.33 * bars)
     figure, axes = new_figure(width * len(tasks), 6.0, 2, len(tasks))
     for column, (task, members) in enumerate(tasks.items()):
@@ -291,6 +291,7 @@ def plot_delays(
             members,
             delay,
             label,
+            color,
             lambda cell: success_summary(cell, top_k),
             lambda mean: f"{100 * mean:.0f}",
         )
@@ -301,6 +302,7 @@ def plot_delays(
             known,
             delay,
             label,
+            color,
             lambda cell: summarize_seeds([row["boundary_jump"] for row in cell]),
             lambda mean: f"{mean:.2f}",
         )
