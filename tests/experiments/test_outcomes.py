@@ -12,7 +12,13 @@ import pytest
 import torch
 from torchrl.envs import TransformedEnv
 
-from warmprior.diagnostics import SharedObservations, branching_bound, curvature, source_leak
+from warmprior.diagnostics import (
+    SharedObservations,
+    branching_bound,
+    curvature,
+    memory_gain,
+    source_leak,
+)
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.training import play_episode
 
@@ -74,6 +80,9 @@ def test_rows_tell_what_was_measured_of_their_policy(undisturbed):
         leak = source_leak(policy, windows, nfes=(1, 3), episodes=shared.episodes)[row["nfe"]]
         assert row["source_leak"] == pytest.approx(leak.leak)
         assert row["inner_step_ratio"] == pytest.approx(leak.inner_step_ratio)
+        gain = memory_gain(policy, windows, nfes=(1, 3))[row["nfe"]]
+        assert row["memory_gain"] == pytest.approx(gain)
+        assert (gain > 0) == prior.ever_warm
         generator = torch.Generator().manual_seed(0)
         if prior.ever_warm:
             windows = shared.deployed(policy, generator=generator)

@@ -129,6 +129,18 @@ def test_table_shows_what_the_source_leaks():
     assert "step inside chunks / data's (bound 1.3) | - | 1.50 (!) | - |" in text
 
 
+def test_table_shows_how_far_the_actions_follow_the_memory():
+    def following(old):
+        if old["checkpoint"] == 50:
+            return old
+        gain = 0.1 * old["seed"] * (old["prior"] != "gaussian")
+        return Row(old.facts, {**old.measures, "memory_gain": gain})
+
+    text = success_table([following(old) for old in compared()], top_k=1, source="scripted")
+    cells = "0.00 ± 0.00 | 0.10 ± 0.10 | 0.10 ± 0.10 |"
+    assert f"share of a shifted memory in the actions | {cells}" in text
+
+
 def with_outcomes(outcomes, **facts):
     return played(FACTS | facts, [c == "1" for c in outcomes])
 

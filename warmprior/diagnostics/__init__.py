@@ -7,6 +7,7 @@ from warmprior.diagnostics.curvature import curvature
 from warmprior.diagnostics.flow import encoded_windows
 from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revision
+from warmprior.diagnostics.memory_gain import memory_gain
 from warmprior.diagnostics.paths import flow_paths, forecast_mean
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.smoothness import (
@@ -47,6 +48,7 @@ __all__ = [
     "forecast_mean",
     "mean_error",
     "mean_revision",
+    "memory_gain",
     "paired_probability_better",
     "probability_better",
     "smoothness",

@@ -9,6 +9,7 @@ from tensordict import TensorDictBase
 
 from warmprior.diagnostics.flow import encoded_windows
 from warmprior.diagnostics.mean_error import mean_error
+from warmprior.diagnostics.memory_gain import memory_gain
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.source_leak import source_leak
 from warmprior.experiments.straightness import flow_measures
@@ -44,8 +45,8 @@ def measure(
         observation_steps: ``To``.
 
     Returns:
-        By NFE: the error of the policy's mean, its source leak (``None`` where no two episodes have steps
-        to compare), and what holds at any NFE, of its flow and source.
+        By NFE: the error of the policy's mean, its memory gain, its source leak (``None`` where no two
+        episodes have steps to compare), and what holds at any NFE, of its flow and source.
     """
     shared = SharedObservations(data.to("cpu"), chunk_length, observation_steps=observation_steps)
     drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
@@ -58,6 +59,7 @@ def measure(
     met = shared.met(policy, generator=generator)
     allowed = policy.prior.allowed_nfes(nfes)
     means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
+    gains = memory_gain(policy, shared.windows(policy.prior), nfes=nfes)
     flow = flow_measures(policy, met, generator=generator)
 
     def told(nfe: int) -> dict[str, float | None]:
@@ -67,6 +69,7 @@ def measure(
             "mean_revision_data": mean.revision,
             "source_leak": None if leak is None else leak.leak,
             "inner_step_ratio": None if leak is None else leak.inner_step_ratio,
+            "memory_gain": gains[nfe],
             **flow,
         }
 

@@ -247,6 +247,7 @@ def success_table(
             f"step inside chunks / data's (bound {INNER_STEP_BOUND:g})": _bounded(
                 "inner_step_ratio", INNER_STEP_BOUND
             ),
+            "share of a shifted memory in the actions": mean_cell("memory_gain", ".2f"),
             "jump between chunks / step inside": _jump,
         },
         head="Success rate (%)",
@@ -382,6 +383,12 @@ def _success_notes(rows: Sequence[Row], top_k: int, source: str | None, base: st
             "- Spread and steps tell how much of the source's noise reaches the actions (last checkpoints, "
             "training data): at or below the bound, none is seen. What exceeds it says more about the "
             "network's training than about the source."
+        )
+    if any(row.get("memory_gain") is not None for row in rows):
+        notes.append(
+            "- Share of a shifted memory: 0 if the actions do not depend on what was done or forecast "
+            "before, 1 if they repeat it. It helps where that knows more than the observation, and "
+            "carries errors on."
         )
     if len({row["prior"] for row in rows}) > 1:
         notes.append(
