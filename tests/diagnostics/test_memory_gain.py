@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.diagnostics.fields import D_A, H, batch, policy
+from tests.diagnostics.fields import D_A, Field, H, batch, policy
 from warmprior import (
     ForecastPrior,
     GaussianPrior,
@@ -16,11 +16,13 @@ from warmprior import (
     ImageEncoder,
     PastPrior,
     PreviewPrior,
+    RegressionPrior,
+    StepPrior,
     VelocityMLP,
     VisionNetwork,
     WarmPriorActor,
 )
-from warmprior.diagnostics import memory_gain
+from warmprior.diagnostics import encoded_windows, memory_gain
 from warmprior.transforms import MeanObservation
 
 N = 20_000
@@ -54,13 +56,26 @@ def test_euler_steps_multiply(nfe):
     assert found[nfe] == pytest.approx((1 + 0.7 / nfe) ** nfe, rel=1e-4)
 
 
-def test_directions_are_uniform():
-    """The mean square over directions is that of the singular values."""
-    prior, matrix = PastPrior(H), torch.tensor([[1.0, 2.0], [0.0, 0.5]])
+def test_the_gain_is_the_mean_slope_over_dimensions():
+    """What of a dimension appears in another one is none, and what turns round counts against it."""
+    prior, matrix = PastPrior(H), torch.tensor([[1.0, 2.0], [0.0, -0.5]])
     field = policy(lambda t, a, o: a @ matrix.T - a, prior)
     found = memory_gain(field, windows(prior, N), nfes=(1,))
-    expected = float(torch.linalg.svdvals(matrix).square().mean().sqrt())
-    assert found[1] == pytest.approx(expected, rel=0.02)
+    assert found[1] == pytest.approx(0.25, abs=0.03)
+    undone = memory_gain(policy(repeats(-0.4), prior), windows(prior), nfes=(1,))
+    assert undone[1] == pytest.approx(-0.4, rel=1e-4)
+
+
+@pytest.mark.parametrize("shift", [0.01, 0.05, 0.2])
+def test_a_flow_that_branches_has_the_slope_of_its_mean(shift):
+    """Actions are the sign of the source: E[a | mu] = erf(mu / (sigma sqrt 2)), whatever the shift."""
+    prior = PastPrior(H, sigma=0.5)
+    data = windows(prior, 4 * N)
+    data["prior", "loc"].zero_()
+    field = policy(lambda t, a, o: a.sign() - a, prior)
+    found = memory_gain(field, data, nfes=(1,), shift=shift)[1]
+    along = shift / math.sqrt(D_A)  # per dimension, as good as linear
+    assert found == pytest.approx(math.erf(along / 0.5 / math.sqrt(2)) / along, rel=0.05)
 
 
 def test_any_shift_gives_the_slope_between_both_sides():
@@ -85,24 +100,31 @@ def test_only_executed_positions_inside_the_episode_count():
     pad[0, 1:] = True
     data = windows(prior, 10, action_is_pad=pad)
     data["prior", "warm"][:] = True
-    squares = [0.1**2] + 9 * [0.1**2, 0.2**2, 0.3**2]
+    counted = [0.1] + 9 * [0.1, 0.2, 0.3]
     found = memory_gain(policy(repeats(shares), prior), data, nfes=(1,))
-    assert found[1] == pytest.approx(math.sqrt(sum(squares) / len(squares)), rel=1e-4)
+    assert found[1] == pytest.approx(sum(counted) / len(counted), rel=1e-4)
+    data["action_is_pad"][:] = True
+    assert math.isnan(memory_gain(policy(repeats(shares), prior), data, nfes=(1,))[1])
 
 
 @pytest.mark.parametrize(("sigma", "correlation"), [(0.5, 0.0), (1.0, 0.0), (0.5, 0.5), (0.5, 1.0)])
 def test_noise_lowers_the_gain_by_what_averaging_over_the_chunk_leaves(sigma, correlation):
-    """Actions are one height for a chunk and for its past: E[a1 | a0] by the normal equations."""
+    """Actions are one height for a chunk and for its past: E[a1 - a0 | a_t] by the normal equations."""
     prior, spread = PastPrior(H, sigma=sigma, correlation=correlation), 0.3
     signal = spread**2 * torch.ones(H, H, dtype=torch.float64)
     white, common = torch.eye(H, dtype=torch.float64), torch.ones(H, H, dtype=torch.float64)
     noise = sigma**2 * ((1 - correlation) * white + correlation * common)
-    best = (signal @ torch.linalg.pinv(signal + noise)).float()
-    field = policy(lambda t, a, o: torch.einsum("ij,njd->nid", best, a) - a, prior)
-    left = sigma**2 * (correlation + (1 - correlation) / H)
-    expected = spread**2 / (spread**2 + left)
-    found = memory_gain(field, windows(prior), nfes=(1,))
-    assert found[1] == pytest.approx(expected, rel=1e-3)
+
+    def exact(t, a, observation):
+        left = 1 - float(t.flatten()[0])  # a_t = height + left * noise
+        slope = -left * noise @ torch.linalg.pinv(signal + left**2 * noise)
+        return torch.einsum("ij,njd->nid", slope.float(), a)
+
+    kept = sigma**2 * (correlation + (1 - correlation) / H)
+    field = policy(exact, prior)
+    found = memory_gain(field, windows(prior), nfes=(1, 300))
+    assert found[1] == pytest.approx(spread**2 / (spread**2 + kept), rel=1e-3)
+    assert found[300] == pytest.approx(spread / math.sqrt(spread**2 + kept), rel=5e-3)
 
 
 def test_a_network_that_sees_the_mean_follows_it_as_well():
@@ -130,7 +152,12 @@ def test_a_network_that_sees_images_and_the_mean():
     states = torch.randn(n, 2, 4)
     data["observation"] = TensorDict({"state": states, "cam_image": images}, [n])
     data["prior", "warm"] = torch.ones(n, H, 1, dtype=torch.bool)
-    found = memory_gain(actor, MeanObservation()(data.clone()), nfes=(1,), shift=0.5)[1]
+    whole = MeanObservation()(data.clone())
+    found = memory_gain(actor, whole, nfes=(1,), shift=0.5)[1]
+    with pytest.raises(ValueError, match="images as they are, not encoded"):
+        memory_gain(actor, encoded_windows(actor, whole))
+    with pytest.raises(ValueError, match="holds no observation"):
+        memory_gain(actor, whole[:0])
 
     generator = torch.Generator().manual_seed(0)
     shift = torch.nn.functional.normalize(torch.randn(n, 1, D_A, generator=generator), dim=-1) / 2
@@ -143,12 +170,13 @@ def test_a_network_that_sees_images_and_the_mean():
         with torch.no_grad():
             v = network(torch.zeros(n), a0, moved["prior", "observation"])
         chunks.append(a0 + v)
-    expected = (chunks[0] - chunks[1]).square().sum(-1).mean().sqrt()
-    assert found > 1e-4
+    expected = ((chunks[0] - chunks[1]) * shift / 0.5).sum(-1).mean()
+    assert abs(found) > 1e-4
     assert found == pytest.approx(float(expected), rel=1e-3)
 
 
 def test_a_learned_source_is_asked_with_the_shifted_history():
+    torch.manual_seed(0)
     prior = ForecastPrior(H).sized(D_A, 4, 1)
     data = windows(prior)
     field = policy(lambda t, a, o: torch.zeros_like(a), prior)  # executes its source
@@ -162,8 +190,108 @@ def test_a_learned_source_is_asked_with_the_shifted_history():
         moved = loc + sign * 0.05 * direction
         with torch.no_grad():
             sides.append(prior.sample(moved, warm, generator, data["observation"]))
-    expected = float((sides[0] - sides[1]).square().sum(-1).mean().sqrt()) / 0.1
-    assert found == pytest.approx(expected, rel=1e-4) and found > 0
+    expected = float(((sides[0] - sides[1]) * direction).sum(-1).mean()) / 0.1
+    assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
+
+
+class SeenByTheSource(PastPrior):
+    """Starts from what the network is told, which tells the mean."""
+
+    conditions_network = True
+
+    def start(self, loc, warm, generator=None, observation=None):
+        return observation[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A))
+
+
+def test_a_start_that_depends_on_the_observation_gets_the_shifted_one():
+    prior = SeenByTheSource(H)
+    found = memory_gain(policy(repeats(0.6), prior), windows(prior), nfes=(1,))
+    assert found[1] == pytest.approx(0.6, rel=1e-4)
+
+
+def test_it_measures_where_samplers_start():
+    """STEP starts at a later time, from its forecast of what is remembered and less noise."""
+    torch.manual_seed(0)
+    prior = StepPrior(H, start_time=0.5).sized(D_A, 4, 1)
+    data = windows(prior)
+    stays = policy(lambda t, a, o: torch.zeros_like(a), prior)
+    found = memory_gain(stays, data, nfes=(1,), shift=0.05)[1]
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.nn.functional.normalize(torch.randn(50, 1, D_A, generator=generator), dim=-1)
+    state, loc, warm = generator.get_state(), data["prior", "loc"], data["prior", "warm"]
+    sides = []
+    for sign in (1, -1):
+        generator.set_state(state)
+        with torch.no_grad():
+            moved = loc + sign * 0.05 * direction
+            sides.append(prior.start(moved, warm, generator, data["observation"]))
+    expected = float(((sides[0] - sides[1]) * direction).sum(-1).mean()) / 0.1
+    assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
+
+
+def test_dropout_is_off():
+    class Dropping(Field):
+        def forward(self, t, a, observation):
+            return torch.nn.functional.dropout(-0.5 * a, training=self.training)
+
+    prior = PastPrior(H)
+    dropping = WarmPriorActor(Dropping(None), prior).train()
+    found = memory_gain(dropping, windows(prior), nfes=(1,))
+    assert found[1] == pytest.approx(0.5, rel=1e-4)
+
+
+def test_keys_may_have_other_names():
+    prior = PastPrior(H)
+    renamed = {"observation_key": "seen", "loc_key": ("m", "loc"), "warm_key": ("m", "warm")}
+    actor = WarmPriorActor(Field(repeats(0.3)), prior, **renamed)
+    data = windows(prior)
+    data = data.rename_key_("observation", "seen").rename_key_("prior", "m")
+    assert memory_gain(actor, data, nfes=(1,))[1] == pytest.approx(0.3, rel=1e-4)
+
+    prior = HistoryPrior(H)
+    field = Field(lambda t, a, o: 0.4 * o[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A)) - a)
+    data = windows(prior).rename_key_(("prior", "observation"), "told")
+    found = memory_gain(WarmPriorActor(field, prior, observation_key="told"), data, nfes=(1,))
+    assert found[1] == pytest.approx(0.4, rel=1e-4)
+
+
+def test_nfes_are_those_of_the_prior_in_order_and_batches_may_have_any_shape():
+    field = policy(lambda t, a, o: 0.7 * a, PastPrior(H))
+    data = windows(PastPrior(H), 48)
+    found = memory_gain(field, data, nfes=(9, 1, 3))
+    assert list(found) == [1, 3, 9]
+    assert memory_gain(field, data.reshape(4, 12), nfes=(1, 3, 9)) == found
+    regression = RegressionPrior(H)
+    assert list(memory_gain(policy(repeats(0.7), regression), windows(regression))) == [1]
+
+
+def test_a_generator_draws_directions_and_noise():
+    data = windows(PastPrior(H))
+    field = policy(lambda t, a, o: a.sin(), PastPrior(H))
+
+    def found(seed):
+        return memory_gain(field, data, nfes=(1,), generator=torch.Generator().manual_seed(seed))
+
+    assert found(0) == memory_gain(field, data, nfes=(1,))
+    assert found(1) == found(1) != found(0)
+
+
+def test_what_a_network_is_told_has_to_be_of_the_windows_mean():
+    prior = HistoryPrior(H)
+    data = windows(prior)
+    data["prior", "observation"] = data["prior", "observation"] + 1
+    with pytest.raises(ValueError, match="is not what MeanObservation makes of the windows'"):
+        memory_gain(policy(repeats(1.0), prior), data)
+
+
+def test_empty_windows_are_refused():
+    with pytest.raises(ValueError, match="holds no observation"):
+        memory_gain(policy(repeats(1.0), PastPrior(H)), windows(PastPrior(H))[:0])
+
+
+def test_a_split_that_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="split must be at least 1, got 0"):
+        memory_gain(policy(repeats(1.0), PastPrior(H)), windows(PastPrior(H)), split=0)
 
 
 @pytest.mark.parametrize("shift", [0.0, -1.0, math.nan, math.inf])

@@ -82,7 +82,7 @@ def test_rows_tell_what_was_measured_of_their_policy(undisturbed):
         assert row["inner_step_ratio"] == pytest.approx(leak.inner_step_ratio)
         gain = memory_gain(policy, windows, nfes=(1, 3))[row["nfe"]]
         assert row["memory_gain"] == pytest.approx(gain)
-        assert (gain > 0) == prior.ever_warm
+        assert (gain != 0) == prior.ever_warm
         generator = torch.Generator().manual_seed(0)
         if prior.ever_warm:
             windows = shared.deployed(policy, generator=generator)

@@ -138,6 +138,14 @@ def test_rows_are_found_by_their_facts_and_measures():
         rows[-1]["nfe"]
 
 
+def test_a_memory_gain_may_be_negative(tmp_path):
+    results = filled(tmp_path)
+    stored = json.loads(results.path.read_text())
+    stored["rows"][2]["measures"]["memory_gain"] = -0.1
+    results.path.write_text(json.dumps(stored))
+    assert resumed(results.path).rows[2]["memory_gain"] == -0.1
+
+
 @pytest.mark.parametrize(
     ("part", "change", "said"),
     [
@@ -158,6 +166,7 @@ def test_rows_are_found_by_their_facts_and_measures():
         ("measures", {"mean_steps": -1.0}, "mean_steps"),
         ("measures", {"source_leak": "high"}, "source_leak"),
         ("measures", {"inner_jump": -0.5}, "inner_jump"),
+        ("measures", {"memory_gain": "high"}, "memory_gain"),
         ("measures", {"success_rate": 0.9}, "success_rate"),
         ("measures", {"success_rate": None}, "successes"),
         (None, {"outcomes": "11111"}, "5 successes in 5 episodes"),

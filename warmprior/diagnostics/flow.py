@@ -13,6 +13,7 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded
+from warmprior.transforms.mean_observation import MeanObservation
 
 Field = Callable[[Tensor, Tensor], Tensor]
 
@@ -56,8 +57,8 @@ def flat_windows(
         KeyError: if a needed key is missing.
         ValueError: if the batch is empty, holds NaN or Inf, or belongs to another prediction length.
     """
-    observation_key, loc_key, warm_key = policy.in_keys
-    needed = [observation_key, loc_key, warm_key] + ([policy.chunk_key] if target_needed else [])
+    observation_key, loc_key, warm_key = policy.in_keys[:3]
+    needed = [*policy.in_keys, *([policy.chunk_key] if target_needed else [])]
     missing = [key for key in needed if batch.get(key, None) is None]
     if missing:
         raise KeyError(
@@ -119,6 +120,9 @@ def encoded_windows(
     Returns:
         Windows ``[n]`` with features ``[n, To, d_o]`` as the observation.
 
+    Raises:
+        ValueError: if there are none.
+
     Examples:
         >>> from tensordict import TensorDict
         >>> from warmprior import ImageEncoder, PastPrior, VelocityMLP, VisionNetwork
@@ -134,6 +138,8 @@ def encoded_windows(
     observation = windows.get(key, None)
     if not isinstance(observation, TensorDictBase):
         return windows
+    if windows.batch_size.numel() == 0:
+        raise ValueError("the batch holds no observation")
     device = next(policy.parameters()).device
     with evaluation_mode(policy):
         parts = [encoded(policy.network, part.to(device)) for part in observation.split(split)]
@@ -145,6 +151,20 @@ def encoded_windows(
         without = torch.cat([features[..., :bare], features[..., extended:]], -1)
         result.set(keys.OBSERVATION, without)
     return result
+
+
+def told_mean(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
+    """Write what a network that sees the mean is told of it anew, after the mean has changed.
+
+    Observations with images have to be as they are, not encoded.
+
+    Raises:
+        KeyError: if the windows lack the observation or the mean.
+    """
+    if not policy.prior.conditions_network:
+        return windows
+    told, loc_key, warm_key = policy.in_keys[:3]
+    return MeanObservation(loc_key=loc_key, warm_key=warm_key, out_key=told)(windows)
 
 
 def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:

@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from warmprior.diagnostics.flow import told_mean
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.transforms.mean_observation import MeanObservation
 
 __all__ = ["HistoryShift"]
 
@@ -52,11 +52,9 @@ class HistoryShift(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Disturb the mean and act."""
-        _, loc_key, warm_key = self.in_keys
+        _, loc_key, warm_key = self.in_keys[:3]
         loc, warm = tensordict.get(loc_key), tensordict.get(warm_key)
         noise = torch.randn(loc.shape, generator=self.generator, dtype=loc.dtype, device=loc.device)
         seen = tensordict.clone(recurse=False).set(loc_key, loc + self.std * noise * warm)
-        if self.policy.prior.conditions_network:
-            seen = MeanObservation()(seen)
-        out = self.policy(seen)
+        out = self.policy(told_mean(self.policy, seen))
         return tensordict.update(out.select(*self.out_keys))

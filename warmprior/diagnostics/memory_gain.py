@@ -9,15 +9,16 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
+from warmprior import keys
 from warmprior.diagnostics.flow import (
     allowed_nfes,
     encoded_windows,
     evaluation_mode,
     flat_windows,
     predict,
+    told_mean,
 )
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.transforms.mean_observation import MeanObservation
 
 __all__ = ["memory_gain"]
 
@@ -38,21 +39,26 @@ def memory_gain(
     window. The gain is
 
     .. math::
-        \sqrt{E\,\Big\lVert \frac{a_\tau(\mu + \delta e) - a_\tau(\mu - \delta e)}{2\delta} \Big\rVert^2}
+        E\,\Big[e \cdot \frac{a_\tau(\mu + \delta e) - a_\tau(\mu - \delta e)}{2\delta}\Big]
 
-    over windows, directions and the executed positions :math:`\tau` inside the episode: 0 for a policy that
-    does not depend on what was done before, 1 for one that repeats it. It is a property of the policy, not
-    a fault: the mean may know what the observation does not tell. But what demonstrations never contain, an
-    action of the policy's own that was wrong, is carried on by as much. One Euler step of an exact field is a
-    regression on the source, and the noise of the source's average over the chunk,
-    :math:`\sigma\sqrt{\rho + (1 - \rho)/H}` with a ``correlation`` of :math:`\rho`, lowers the gain: if past
-    and next actions are one height that varies by :math:`s` at an observation, it is
-    :math:`s^2 / (s^2 + \sigma^2 (\rho + (1 - \rho)/H))`.
+    over windows, directions and the executed positions :math:`\tau` inside the episode: the slope of actions
+    by the mean, averaged over the dimensions. It is 0 for a policy that does not depend on what was done
+    before, 1 for one that repeats it, and less than 0 for one that undoes it. It is a property of the policy,
+    not a fault: the mean may know what the observation does not tell. But what demonstrations never contain,
+    an action of the policy's own that was wrong, is carried on by as much.
+
+    How the source's noise lowers it can be told of an exact flow. If past and next actions are one height
+    that varies by :math:`s` at an observation, and :math:`V = \sigma^2 (\rho + (1 - \rho)/H)` is the variance
+    of the noise's average over the chunk, with a ``correlation`` of :math:`\rho`, it is
+    :math:`s^2 / (s^2 + V)` at one Euler step, a regression on the source, and :math:`s / \sqrt{s^2 + V}`,
+    which is more, at infinitely many.
+
+    Actions that a policy clips do not move: what lies beyond its ``clip`` counts as 0.
 
     Args:
         policy: the policy; its state stays as it is.
         windows: ``[*B]`` of the policy's own prior, normalised, see :class:`~warmprior.ActionWindow` and
-            :meth:`SharedObservations.windows`; images as they are, not encoded.
+            :meth:`SharedObservations.windows`. Images may be encoded, unless the network sees the mean.
 
     Keyword Args:
         nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
@@ -62,12 +68,13 @@ def memory_gain(
             seed. One direction and sample of the source per window, the same for every NFE.
 
     Returns:
-        By NFE, ascending; 0 if nothing of the windows is warm.
+        By NFE, ascending; 0 if nothing of the windows is warm, NaN if no position is inside an episode.
 
     Raises:
         KeyError: if the windows lack a key.
         ValueError: if the windows are empty, hold NaN or Inf, or belong to another prediction length, if
-            ``shift`` is not positive, or the prior allows none of the NFEs.
+            what a network sees of the mean is not what the windows' mean makes it, if ``shift`` or ``split``
+            is not positive, or the prior allows none of the NFEs.
         FloatingPointError: if a prediction is NaN or infinite.
 
     See Also:
@@ -87,38 +94,52 @@ def memory_gain(
     """
     if not (math.isfinite(shift) and shift > 0):
         raise ValueError(f"shift must be a finite number > 0, got {shift}")
+    if split < 1:
+        raise ValueError(f"split must be at least 1, got {split}")
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
-    _, loc_key, warm_key = policy.in_keys
-    seen = encoded_windows(policy, windows)
-    flat = flat_windows(policy, seen)
+    windows = windows.reshape(windows.batch_size.numel())
+    flat = flat_windows(policy, encoded_windows(policy, windows))
     device, n = flat.loc.device, len(flat)
+    plain = windows.to(device)
+    if prior.conditions_network:
+        _check_mean(policy, plain)
+    else:
+        plain = encoded_windows(policy, plain)
     if generator is None:
         generator = torch.Generator(device).manual_seed(0)
     normal = torch.randn(
         n, 1, flat.loc.shape[-1], generator=generator, dtype=flat.loc.dtype, device=device
     )
-    moved = shift * flat.warm * torch.nn.functional.normalize(normal, dim=-1)
+    direction = torch.nn.functional.normalize(normal, dim=-1)
     drawn = generator.get_state()
-    # A network that sees the mean encodes it together with the images.
-    plain = (windows if prior.conditions_network else seen).reshape(n).to(device)
+    observation_key, loc_key, _ = policy.in_keys[:3]
 
-    def predicted(loc: Tensor) -> dict[int, Tensor]:
+    def predicted(shift: float) -> dict[int, Tensor]:
         generator.set_state(drawn)  # the same noise on both sides
-        a0 = prior.start(loc, flat.warm, generator, flat.observation)
-        rows = plain.clone(recurse=False).set(loc_key, loc)
-        if prior.conditions_network:
-            rows = encoded_windows(
-                policy, MeanObservation(loc_key=loc_key, warm_key=warm_key)(rows)
-            )
-        rows = rows.select(*policy.in_keys)
+        loc = flat.loc + shift * flat.warm * direction
+        rows = told_mean(policy, plain.clone(recurse=False).set(loc_key, loc))
+        rows = encoded_windows(policy, rows).select(*policy.in_keys)
+        a0 = prior.start(loc, flat.warm, generator, rows.get(observation_key))
         return {nfe: predict(policy, rows, a0, nfe=nfe, split=split) for nfe in allowed}
 
     with evaluation_mode(policy):
-        up, down = predicted(flat.loc + moved), predicted(flat.loc - moved)
+        up, down = predicted(shift), predicted(-shift)
     executed = slice(prior.chunk_length)
     counted = flat.counted[:, executed, 0]
     gains = {}
     for nfe in allowed:
-        response = torch.linalg.vector_norm(up[nfe] - down[nfe], dim=-1)[:, executed] / (2 * shift)
-        gains[nfe] = float(response[counted].square().mean().sqrt())
+        along = ((up[nfe] - down[nfe])[:, executed] * direction).sum(-1) / (2 * shift)
+        gains[nfe] = float(along[counted].mean())
     return gains
+
+
+def _check_mean(policy: WarmPriorActor, windows: TensorDictBase) -> None:
+    key = policy.in_keys[0]
+    given, made = windows.get(key), told_mean(policy, windows.copy()).get(key)
+    if isinstance(given, TensorDictBase):
+        given, made = given.get(keys.STATE), made.get(keys.STATE)
+    if given.shape != made.shape or not torch.allclose(given, made, equal_nan=True):
+        raise ValueError(
+            f"{key!r} is not what MeanObservation makes of the windows' observation and mean: pass windows "
+            "of the policy's own prior, with images as they are, not encoded"
+        )

@@ -9,11 +9,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.flow import encoded_windows
+from warmprior.diagnostics.flow import encoded_windows, told_mean
 from warmprior.diagnostics.paths import forecast_mean
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
-from warmprior.transforms.mean_observation import MeanObservation
 from warmprior.transforms.window import window_transforms
 
 __all__ = ["SharedObservations"]
@@ -120,9 +119,7 @@ class SharedObservations:
         earlier = encoded_windows(policy, self.windows(policy.prior, offset=self.chunk_length))
         met = forecast_mean(policy, earlier, generator=generator)
         windows = self.windows(policy.prior).to(met.device).update(met)
-        if policy.prior.conditions_network:
-            windows = MeanObservation()(windows)
-        return encoded_windows(policy, windows)
+        return encoded_windows(policy, told_mean(policy, windows))
 
     def met(
         self, policy: WarmPriorActor, *, generator: torch.Generator | None = None

@@ -51,15 +51,16 @@ def measure(
     shared = SharedObservations(data.to("cpu"), chunk_length, observation_steps=observation_steps)
     drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
     shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
-    leaks = {}
+    leaks, windows = {}, shared.windows(policy.prior)
+    seen = encoded_windows(policy, windows)
     if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
-        windows = encoded_windows(policy, shared.windows(policy.prior))
-        leaks = source_leak(policy, windows, nfes=nfes, episodes=shared.episodes)
+        leaks = source_leak(policy, seen, nfes=nfes, episodes=shared.episodes)
     generator = torch.Generator().manual_seed(0)
     met = shared.met(policy, generator=generator)
     allowed = policy.prior.allowed_nfes(nfes)
     means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
-    gains = memory_gain(policy, shared.windows(policy.prior), nfes=nfes)
+    shifted = windows if policy.prior.conditions_network else seen
+    gains = memory_gain(policy, shifted, nfes=nfes)
     flow = flow_measures(policy, met, generator=generator)
 
     def told(nfe: int) -> dict[str, float | None]:

@@ -349,7 +349,7 @@ def _read_rows(records: Sequence[Any]) -> list[Row]:
 _TEXTS = ("task", "data", "prior", "options", "guidance")
 _COUNTS = {"chunk": 1, "nfe": 1, "seed": 0, "iterations": 1, "checkpoint": 0, "episodes": 1}
 _COUNTS |= {"successes": 0, "execute": 1, "delay": 0}
-_NOT_NEGATIVE = ("sigma", "mean_steps", "boundary_jump", "inner_jump", "source_leak", "memory_gain")
+_NOT_NEGATIVE = ("sigma", "mean_steps", "boundary_jump", "inner_jump", "source_leak")
 
 
 def _check(row: Row) -> None:

@@ -247,7 +247,7 @@ def success_table(
             f"step inside chunks / data's (bound {INNER_STEP_BOUND:g})": _bounded(
                 "inner_step_ratio", INNER_STEP_BOUND
             ),
-            "share of a shifted memory in the actions": mean_cell("memory_gain", ".2f"),
+            "memory gain (0: ignores what it did, 1: repeats it)": _memory_gain,
             "jump between chunks / step inside": _jump,
         },
         head="Success rate (%)",
@@ -350,6 +350,10 @@ def _jump(rows: list[Row]) -> str | None:
     return f"{jump / step:.2f}" if jump is not None and step else None
 
 
+def _memory_gain(rows: list[Row]) -> str | None:
+    return mean_cell("memory_gain", ".2f")(last_checkpoints(rows))
+
+
 def _bounded(measure: str, bound: float) -> Cell:
     """Mean of a measure over the seeds' last checkpoints, marked where it exceeds its bound."""
 
@@ -386,9 +390,9 @@ def _success_notes(rows: Sequence[Row], top_k: int, source: str | None, base: st
         )
     if any(row.get("memory_gain") is not None for row in rows):
         notes.append(
-            "- Share of a shifted memory: 0 if the actions do not depend on what was done or forecast "
-            "before, 1 if they repeat it. It helps where that knows more than the observation, and "
-            "carries errors on."
+            "- Memory gain: how much of a shift of what was done or forecast before reappears in the actions "
+            "(last checkpoints, training data). It helps where that knows more than the observation, and "
+            "carries the policy's own errors on."
         )
     if len({row["prior"] for row in rows}) > 1:
         notes.append(
