@@ -16,13 +16,14 @@ from warmprior import (
     ImageEncoder,
     PastPrior,
     PreviewPrior,
+    RealTimeChunking,
     RegressionPrior,
     StepPrior,
     VelocityMLP,
     VisionNetwork,
     WarmPriorActor,
 )
-from warmprior.diagnostics import encoded_windows, memory_gain
+from warmprior.diagnostics import HistoryShift, encoded_windows, memory_gain
 from warmprior.transforms import MeanObservation
 
 N = 20_000
@@ -274,6 +275,70 @@ def test_a_generator_draws_directions_and_noise():
 
     assert found(0) == memory_gain(field, data, nfes=(1,))
     assert found(1) == found(1) != found(0)
+
+
+def test_a_disturbed_memory_tells_a_network_of_it_whatever_its_keys():
+    """What lies under the usual observation key is another thing here."""
+    prior = HistoryPrior(H)
+    field = Field(lambda t, a, o: o[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A)) - a)
+    actor = WarmPriorActor(field, prior, nfe=1, observation_key="told")
+    data = windows(prior).rename_key_(("prior", "observation"), "told")
+    data["prior", "warm"][:] = True
+    data["observation"] = torch.full((50, 1, 9), 99.0)
+    before = data.clone()
+    found = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(3))(data.clone())
+    noise = torch.randn(50, H, D_A, generator=torch.Generator().manual_seed(3))
+    expected = data["prior", "loc"] + 0.3 * noise
+    torch.testing.assert_close(found[actor.chunk_key], expected)
+    assert memory_gain(actor, data, nfes=(1,))[1] == pytest.approx(1.0, rel=1e-4)
+    assert (data == before).all()
+
+
+class Anywhere(PastPrior):
+    """Starts at what the mean holds, on cold positions as well."""
+
+    def start(self, loc, warm, generator=None, observation=None):
+        return loc.clone()
+
+
+def test_cold_positions_stay_and_cold_windows_do_not_count():
+    data = windows(PastPrior(H), 4)
+    data["prior", "warm"][0] = False
+    data["prior", "warm"][1:, 0] = False  # of three positions two are warm
+    found = memory_gain(policy(repeats(1.0), Anywhere(H)), data, nfes=(1,))
+    assert found[1] == pytest.approx(2 / 3, rel=1e-4)
+    data["prior", "warm"][:] = False
+    assert memory_gain(policy(repeats(1.0), Anywhere(H)), data, nfes=(1,)) == {1: 0.0}
+
+
+def test_a_guided_policy_is_measured_as_it_acts():
+    """Against the policy itself, on both sides by hand; its guidance takes the source's own sigma."""
+    prior = PastPrior(H, sigma=0.5)
+    guided = WarmPriorActor(
+        Field(lambda t, a, o: a.sin()), prior, nfe=4, guidance=RealTimeChunking()
+    )
+    data = windows(prior, 20)
+    with pytest.raises(KeyError, match=r"or measure policy.replace\(guidance=None\)"):
+        memory_gain(guided, data)
+    data["rtc"] = TensorDict(
+        {
+            "leftover": torch.rand(20, H, D_A),
+            "valid": torch.ones(20, H, 1, dtype=torch.bool),
+            "delay": torch.ones(20, 1, dtype=torch.int64),
+        },
+        [20],
+    )
+    found = memory_gain(guided, data, nfes=(4,), shift=0.05)[4]
+    generator = torch.Generator().manual_seed(0)
+    direction = torch.nn.functional.normalize(torch.randn(20, 1, D_A, generator=generator), dim=-1)
+    state, sides = generator.get_state(), []
+    for sign in (1, -1):
+        generator.set_state(state)
+        moved = data.clone()
+        moved["prior", "loc"] += sign * 0.05 * direction
+        sides.append(guided(moved, generator=generator)[guided.chunk_key])
+    expected = float(((sides[0] - sides[1]) * direction).sum(-1).mean()) / 0.1
+    assert found == pytest.approx(expected, rel=1e-3)
 
 
 def test_what_a_network_is_told_has_to_be_of_the_windows_mean():

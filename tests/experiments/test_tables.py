@@ -133,11 +133,11 @@ def test_table_shows_how_far_the_actions_follow_the_memory():
     def following(old):
         if old["checkpoint"] == 50:
             return Row(old.facts, {**old.measures, "memory_gain": 9.0})
-        gain = 0.1 * old["seed"] * (old["prior"] != "gaussian")
+        gain = -0.0001 if old["prior"] == "gaussian" else 0.1 * old["seed"]
         return Row(old.facts, {**old.measures, "memory_gain": gain})
 
     text = success_table([following(old) for old in compared()], top_k=1, source="scripted")
-    cells = "0.00 ± 0.00 | 0.10 ± 0.10 | 0.10 ± 0.10 |"
+    cells = "0.000 ± 0.000 | 0.100 ± 0.100 | 0.100 ± 0.100 |"
     assert f"memory gain (0: ignores what it did, 1: repeats it) | {cells}" in text
     assert "- Memory gain: how much of a shift" in text
     assert "Memory gain" not in success_table(compared(), top_k=1, source="scripted")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -61,8 +62,9 @@ def flat_windows(
     needed = [*policy.in_keys, *([policy.chunk_key] if target_needed else [])]
     missing = [key for key in needed if batch.get(key, None) is None]
     if missing:
+        bare = "" if policy.ode.guidance is None else ", or measure policy.replace(guidance=None)"
         raise KeyError(
-            f"the batch lacks {missing}; sample windows from window_replay_buffer, or take a rollout"
+            f"the batch lacks {missing}; sample windows from window_replay_buffer, or take a rollout{bare}"
         )
     if batch.batch_size.numel() == 0:
         raise ValueError("the batch holds no observation")
@@ -156,15 +158,22 @@ def encoded_windows(
 def told_mean(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
     """Write what a network that sees the mean is told of it anew, after the mean has changed.
 
-    Observations with images have to be as they are, not encoded.
+    Observations with images have to be as they are, not encoded: the mean stands at their vector's end.
 
     Raises:
-        KeyError: if the windows lack the observation or the mean.
+        KeyError: if the windows lack what the network sees, or the mean.
     """
     if not policy.prior.conditions_network:
         return windows
     told, loc_key, warm_key = policy.in_keys[:3]
-    return MeanObservation(loc_key=loc_key, warm_key=warm_key, out_key=told)(windows)
+    make = MeanObservation(observation_key=told, loc_key=loc_key, warm_key=warm_key, out_key=told)
+    seen = windows.get(told)
+    width = MeanObservation.width(policy.prior, windows.get(loc_key).shape[-1])
+    if isinstance(seen, TensorDictBase):
+        bare: Any = seen.copy().set(keys.STATE, seen.get(keys.STATE)[..., :-width])
+    else:
+        bare = seen[..., :-width]
+    return make(windows.set(told, bare))
 
 
 def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
@@ -228,7 +237,7 @@ def predict(
         FloatingPointError: if one is NaN or infinite.
     """
     parts = rows.clone(recurse=False).set(policy.ode.in_keys[0], a0).split(split)
-    chunk = torch.cat([policy.ode(part, nfe=nfe).get(policy.chunk_key) for part in parts])
+    chunk = torch.cat([policy.integrate(part, nfe).get(policy.chunk_key) for part in parts])
     if not torch.isfinite(chunk).all():
         raise FloatingPointError(f"at NFE {nfe} a prediction is NaN or infinite")
     return chunk

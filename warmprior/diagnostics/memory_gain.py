@@ -53,7 +53,8 @@ def memory_gain(
     :math:`s^2 / (s^2 + V)` at one Euler step, a regression on the source, and :math:`s / \sqrt{s^2 + V}`,
     which is more, at infinitely many.
 
-    Actions that a policy clips do not move: what lies beyond its ``clip`` counts as 0.
+    Windows whose mean is all cold, as at a reset, do not count. Actions that a policy clips do not move: what
+    lies beyond its ``clip`` counts as 0. What is left of an old chunk for a policy's guidance stays as it is.
 
     Args:
         policy: the policy; its state stays as it is.
@@ -98,13 +99,12 @@ def memory_gain(
         raise ValueError(f"split must be at least 1, got {split}")
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
     windows = windows.reshape(windows.batch_size.numel())
-    flat = flat_windows(policy, encoded_windows(policy, windows))
+    encoded = encoded_windows(policy, windows)
+    flat = flat_windows(policy, encoded)
     device, n = flat.loc.device, len(flat)
-    plain = windows.to(device)
-    if prior.conditions_network:
-        _check_mean(policy, plain)
-    else:
-        plain = encoded_windows(policy, plain)
+    # A network that sees the mean encodes it together with the images.
+    plain = (windows if prior.conditions_network else encoded).to(device)
+    _check_mean(policy, plain)
     if generator is None:
         generator = torch.Generator(device).manual_seed(0)
     normal = torch.randn(
@@ -126,19 +126,23 @@ def memory_gain(
         up, down = predicted(shift), predicted(-shift)
     executed = slice(prior.chunk_length)
     counted = flat.counted[:, executed, 0]
+    followed = counted & flat.warm.any(1)
+    cold = 0.0 if counted.any() else math.nan
     gains = {}
     for nfe in allowed:
         along = ((up[nfe] - down[nfe])[:, executed] * direction).sum(-1) / (2 * shift)
-        gains[nfe] = float(along[counted].mean())
+        gains[nfe] = float(along[followed].mean()) if followed.any() else cold
     return gains
 
 
 def _check_mean(policy: WarmPriorActor, windows: TensorDictBase) -> None:
     key = policy.in_keys[0]
+    if not policy.prior.conditions_network:
+        return
     given, made = windows.get(key), told_mean(policy, windows.copy()).get(key)
     if isinstance(given, TensorDictBase):
         given, made = given.get(keys.STATE), made.get(keys.STATE)
-    if given.shape != made.shape or not torch.allclose(given, made, equal_nan=True):
+    if given.shape != made.shape or not torch.allclose(given.to(made.dtype), made):
         raise ValueError(
             f"{key!r} is not what MeanObservation makes of the windows' observation and mean: pass windows "
             "of the policy's own prior, with images as they are, not encoded"

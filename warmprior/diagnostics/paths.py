@@ -104,7 +104,7 @@ def forecast_mean(
     k = executed_positions(prior, executed)
     if k > prior.chunk_length:
         raise ValueError(f"at most H = {prior.chunk_length} actions are executed, got {k}")
-    _, loc_key, warm_key = policy.in_keys
+    _, loc_key, warm_key = policy.in_keys[:3]
     data = previous.select(*policy.in_keys).to(windows.loc.device)
     with evaluation_mode(policy):
         a0 = prior.start(
@@ -113,7 +113,8 @@ def forecast_mean(
             policy.sampler.generator if generator is None else generator,
             data.get(policy.in_keys[0]),
         )
-        chunk = policy.ode(data.set(policy.ode.in_keys[0], a0), nfe=nfe).get(policy.chunk_key)
+        data.set(policy.ode.in_keys[0], a0)
+        chunk = policy.integrate(data, nfe).get(policy.chunk_key)
         steps = torch.full((*data.batch_size, 1), k, device=chunk.device)
         # A decision whose own mean is warm lies at least H actions after the reset.
         elapsed = steps + prior.chunk_length * data.get(warm_key).any(-2)

@@ -351,7 +351,7 @@ def _jump(rows: list[Row]) -> str | None:
 
 
 def _memory_gain(rows: list[Row]) -> str | None:
-    return mean_cell("memory_gain", ".2f")(last_checkpoints(rows))
+    return mean_cell("memory_gain", "z.3f")(last_checkpoints(rows))
 
 
 def _bounded(measure: str, bound: float) -> Cell:

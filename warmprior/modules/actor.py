@@ -175,7 +175,15 @@ class WarmPriorActor(TensorDictModuleBase):
         generator: torch.Generator | None = None,
     ) -> TensorDictBase:
         """Sample the source and integrate it to the chunk."""
-        tensordict = self.sampler(tensordict, generator=generator)
+        return self.integrate(self.sampler(tensordict, generator=generator), nfe=nfe)
+
+    def integrate(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
+        """Integrate a source that was drawn before to the chunk, guided where the policy is.
+
+        Args:
+            tensordict: with the input keys and the source, ``[*B, P, d_a]``, under ``ode.in_keys[0]``.
+            nfe: network evaluations of this call; the policy's own by default.
+        """
         return self.ode(tensordict, nfe=nfe, sigma=self._sigma(tensordict))
 
     def _sigma(self, tensordict: TensorDictBase) -> Tensor | None:
