@@ -143,7 +143,7 @@ def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(prior_clas
     chunk = actor(MeanObservation()(expected))["vla_action", "chunk"]
     actor.sampler.generator.manual_seed(0)
     shifted = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(5))
-    out = shifted(data)
+    out = shifted(MeanObservation()(data) if actor.prior.conditions_network else data)
     torch.testing.assert_close(out["vla_action", "chunk"], chunk)
     assert (out["prior", "loc"] == 1).all()
     with pytest.raises(ValueError, match="std"):
