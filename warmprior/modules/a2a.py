@@ -30,7 +30,7 @@ class A2APrior(PointForecastPrior):
 
     name = "a2a"
     label = "A2A (action space)"
-    color = "#bf812d"
+    color = "#7f3b08"
     default_sigma = 0.0
     sees_observation = False
 

@@ -52,7 +52,7 @@ class OTPrior(GaussianPrior):
 
     name = "ot"
     label = "OT-CFM"
-    color = "#5e4fa2"
+    color = "#2ca02c"
     least_batch = 2
     GROUP: ClassVar[int] = 256
 
@@ -135,7 +135,7 @@ class ReflowPrior(GaussianPrior):
 
     name = "reflow"
     label = "2-rectified flow"
-    color = "#3288bd"
+    color = "#17becf"
     teacher = "gaussian"
 
     def __init__(self, chunk_length: int, *, teacher_nfe: int = 9) -> None:

@@ -45,7 +45,7 @@ class ForecastPrior(LearnedPrior):
 
     name = "forecast"
     label = "WP-Forecast"
-    color = "#7b3294"
+    color = "#d62728"
     default_sigma = 1.0
     always_warm = True
     calibration: Tensor

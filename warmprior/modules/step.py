@@ -52,7 +52,7 @@ class StepPrior(PointForecastPrior):
 
     name = "step"
     label = "STEP"
-    color = "#35978f"
+    color = "#00695c"
     stall: float
     stall_noise: float
 
