@@ -285,13 +285,19 @@ def test_a_disturbed_memory_tells_a_network_of_it_whatever_its_keys():
     data = windows(prior).rename_key_(("prior", "observation"), "told")
     data["prior", "warm"][:] = True
     data["observation"] = torch.full((50, 1, 9), 99.0)
+    data = data.to("cpu")  # on the policy's device already: nothing is copied by chance
     before = data.clone()
-    found = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(3))(data.clone())
+    shifted = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(3))
+    found = shifted(data).select(actor.chunk_key)
+    data = data.select(*before.keys(True, True))
+    assert (data == before).all()
     noise = torch.randn(50, H, D_A, generator=torch.Generator().manual_seed(3))
     expected = data["prior", "loc"] + 0.3 * noise
     torch.testing.assert_close(found[actor.chunk_key], expected)
     assert memory_gain(actor, data, nfes=(1,))[1] == pytest.approx(1.0, rel=1e-4)
     assert (data == before).all()
+    with pytest.raises(KeyError, match="told"):
+        shifted(data.exclude("told"))
 
 
 class Anywhere(PastPrior):
@@ -345,7 +351,7 @@ def test_what_a_network_is_told_has_to_be_of_the_windows_mean():
     prior = HistoryPrior(H)
     data = windows(prior)
     data["prior", "observation"] = data["prior", "observation"] + 1
-    with pytest.raises(ValueError, match="is not what MeanObservation makes of the windows'"):
+    with pytest.raises(ValueError, match="does not end in the windows' mean"):
         memory_gain(policy(repeats(1.0), prior), data)
 
 

@@ -2,9 +2,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 
-from tests.diagnostics.fields import D_A, H, batch, policy
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from tests.diagnostics.fields import D_A, Field, H, batch, policy
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, RealTimeChunking, WarmPriorActor
 from warmprior.diagnostics import flow_paths, forecast_mean
 
 
@@ -43,6 +44,26 @@ def test_forecast_of_the_past_needs_a_full_history():
     assert not forecast_mean(actor, data, executed=1)["prior", "warm"].any()
     data["prior", "warm"] = torch.ones_like(data["prior", "warm"])
     assert forecast_mean(actor, data, executed=1)["prior", "warm"].all()
+
+
+def test_the_forecast_of_a_guided_policy_is_what_it_would_do():
+    """With its source's own sigma in the guidance, which is not 1."""
+    prior = PastPrior(H, sigma=0.5)
+    field = Field(lambda t, a, o: a.sin())
+    actor = WarmPriorActor(field, prior, nfe=4, guidance=RealTimeChunking())
+    data = batch()
+    data["rtc"] = TensorDict(
+        {
+            "leftover": torch.rand(5, H, D_A, generator=torch.Generator().manual_seed(2)),
+            "valid": torch.ones(5, H, 1, dtype=torch.bool),
+            "delay": torch.ones(5, 1, dtype=torch.int64),
+        },
+        [5],
+    )
+    data["prior", "warm"][:] = True
+    found = forecast_mean(actor, data, generator=torch.Generator().manual_seed(0))
+    acted = actor(data.clone(), generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(found["prior", "loc"], acted[actor.chunk_key].detach())
 
 
 def test_bad_input_is_named():

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import pytest
+import torch
+from tensordict import TensorDict
 
 pytest.importorskip("tyro")
 
 from tests.diagnostics.fields import Field
 from tests.experiments.comparison_parts import ACTION_DIM, OBSERVATION_DIM, H, drift_problem
-from warmprior import HistoryPrior, WarmPriorActor
+from warmprior import HistoryPrior, ImageEncoder, VelocityMLP, VisionNetwork, WarmPriorActor
+from warmprior.diagnostics import SharedObservations, memory_gain
 from warmprior.experiments.measures import measure
+from warmprior.transforms import MeanObservation
 
 
 def test_the_memory_gain_of_a_network_that_sees_the_mean_is_that_of_what_it_is_told():
@@ -18,3 +22,29 @@ def test_the_memory_gain_of_a_network_that_sees_the_mean_is_that_of_what_it_is_t
     policy = WarmPriorActor(follows, HistoryPrior(H))
     found = measure(policy, drift_problem().data, (1,), chunk_length=H, observation_steps=2)
     assert found[1]["memory_gain"] == pytest.approx(0.4, rel=1e-4)
+
+
+def test_images_that_stand_beside_the_mean_are_encoded_with_it():
+    prior, n = HistoryPrior(H), 20
+    torch.manual_seed(0)
+    width = OBSERVATION_DIM + MeanObservation.width(prior, ACTION_DIM)
+    encoder = ImageEncoder(["cam_image"], width, image_size=16, crop_size=12, backbone="small")
+    velocity = VelocityMLP(ACTION_DIM, encoder.observation_dim, H, hidden_dim=16)
+    network = VisionNetwork(encoder, velocity)
+    for parameter in network.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)  # the last layer begins at zero
+    data = TensorDict(
+        {
+            "observation": {
+                "state": torch.randn(n, OBSERVATION_DIM),
+                "cam_image": torch.randint(0, 255, (n, 3, 16, 16), dtype=torch.uint8),
+            },
+            "action": torch.randn(n, ACTION_DIM),
+            "episode": torch.arange(n) // 10,
+        },
+        [n],
+    )
+    policy = WarmPriorActor(network, prior)
+    found = measure(policy, data, (1,), chunk_length=H, observation_steps=2)[1]["memory_gain"]
+    shared = SharedObservations(data, H, observation_steps=2)
+    assert found == pytest.approx(memory_gain(policy, shared.windows(prior))[1]) and found != 0

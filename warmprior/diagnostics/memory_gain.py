@@ -144,6 +144,6 @@ def _check_mean(policy: WarmPriorActor, windows: TensorDictBase) -> None:
         given, made = given.get(keys.STATE), made.get(keys.STATE)
     if given.shape != made.shape or not torch.allclose(given.to(made.dtype), made):
         raise ValueError(
-            f"{key!r} is not what MeanObservation makes of the windows' observation and mean: pass windows "
-            "of the policy's own prior, with images as they are, not encoded"
+            f"{key!r} does not end in the windows' mean, as MeanObservation writes it: pass windows of the "
+            "policy's own prior, with images as they are, not encoded"
         )
