@@ -41,3 +41,15 @@ def batch(n=5, length=H, d_a=D_A, **extra):
         [n],
     )
     return data.update(extra)
+
+
+def leftover(n=5):
+    """What real-time chunking reads of the old chunk, one action of which is still played."""
+    return TensorDict(
+        {
+            "leftover": torch.rand(n, H, D_A, generator=torch.Generator().manual_seed(2)),
+            "valid": torch.ones(n, H, 1, dtype=torch.bool),
+            "delay": torch.ones(n, 1, dtype=torch.int64),
+        },
+        [n],
+    )

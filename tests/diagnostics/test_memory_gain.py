@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.diagnostics.fields import D_A, Field, H, batch, policy
+from tests.diagnostics.fields import D_A, Field, H, batch, leftover, policy
 from warmprior import (
     ForecastPrior,
     GaussianPrior,
@@ -36,6 +36,26 @@ def windows(prior, n=50, warm=True, **extra):
     loc = torch.rand(n, length, D_A, generator=torch.Generator().manual_seed(2))
     found = batch(n, length).update({"prior": {"loc": loc, "warm": mask}}).update(extra)
     return MeanObservation()(found) if prior.conditions_network else found
+
+
+def seen_mean(observation):
+    """The mean in what a network is told of it."""
+    return observation[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A))
+
+
+def by_hand(act, data, shift=0.05):
+    """Slope of ``act(windows, generator)`` along the directions that a measurement draws."""
+    generator = torch.Generator().manual_seed(0)
+    normal = torch.randn(len(data), 1, D_A, generator=generator)
+    direction = torch.nn.functional.normalize(normal, dim=-1)
+    state, chunks = generator.get_state(), []
+    for sign in (1, -1):
+        generator.set_state(state)
+        moved = data.clone()
+        moved["prior", "loc"] += sign * shift * direction
+        with torch.no_grad():
+            chunks.append(act(moved, generator))
+    return float(((chunks[0] - chunks[1]) * direction).sum(-1).mean()) / (2 * shift)
 
 
 def repeats(share):
@@ -131,10 +151,8 @@ def test_noise_lowers_the_gain_by_what_averaging_over_the_chunk_leaves(sigma, co
 def test_a_network_that_sees_the_mean_follows_it_as_well():
     prior = HistoryPrior(H)
 
-    def seen(t, a, observation):
-        return 0.4 * observation[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A)) - a
-
-    found = memory_gain(policy(seen, prior), windows(prior), nfes=(1,))
+    field = policy(lambda t, a, o: 0.4 * seen_mean(o) - a, prior)
+    found = memory_gain(field, windows(prior), nfes=(1,))
     assert found[1] == pytest.approx(0.4, rel=1e-4)
 
 
@@ -160,20 +178,13 @@ def test_a_network_that_sees_images_and_the_mean():
     with pytest.raises(ValueError, match="holds no observation"):
         memory_gain(actor, whole[:0])
 
-    generator = torch.Generator().manual_seed(0)
-    shift = torch.nn.functional.normalize(torch.randn(n, 1, D_A, generator=generator), dim=-1) / 2
-    a0 = torch.randn(n, H, D_A, generator=generator)
-    chunks = []
-    for sign in (1, -1):
-        moved = data.clone()
-        moved["prior", "loc"] += sign * shift
-        moved = MeanObservation()(moved)
-        with torch.no_grad():
-            v = network(torch.zeros(n), a0, moved["prior", "observation"])
-        chunks.append(a0 + v)
-    expected = ((chunks[0] - chunks[1]) * shift / 0.5).sum(-1).mean()
+    def act(moved, generator):
+        a0 = torch.randn(n, H, D_A, generator=generator)
+        told = MeanObservation()(moved)["prior", "observation"]
+        return a0 + network(torch.zeros(n), a0, told)
+
     assert abs(found) > 1e-4
-    assert found == pytest.approx(float(expected), rel=1e-3)
+    assert found == pytest.approx(by_hand(act, data, shift=0.5), rel=1e-3)
 
 
 def test_a_learned_source_is_asked_with_the_shifted_history():
@@ -182,17 +193,12 @@ def test_a_learned_source_is_asked_with_the_shifted_history():
     data = windows(prior)
     field = policy(lambda t, a, o: torch.zeros_like(a), prior)  # executes its source
     found = memory_gain(field, data, nfes=(1,), shift=0.05)[1]
-    generator = torch.Generator().manual_seed(0)
-    direction = torch.nn.functional.normalize(torch.randn(50, 1, D_A, generator=generator), dim=-1)
-    state, loc, warm = generator.get_state(), data["prior", "loc"], data["prior", "warm"]
-    sides = []
-    for sign in (1, -1):
-        generator.set_state(state)
-        moved = loc + sign * 0.05 * direction
-        with torch.no_grad():
-            sides.append(prior.sample(moved, warm, generator, data["observation"]))
-    expected = float(((sides[0] - sides[1]) * direction).sum(-1).mean()) / 0.1
-    assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
+
+    def act(moved, generator):
+        loc, warm = moved["prior", "loc"], moved["prior", "warm"]
+        return prior.sample(loc, warm, generator, moved["observation"])
+
+    assert found == pytest.approx(by_hand(act, data), rel=1e-3) and abs(found) > 1e-4
 
 
 class SeenByTheSource(PastPrior):
@@ -201,7 +207,7 @@ class SeenByTheSource(PastPrior):
     conditions_network = True
 
     def start(self, loc, warm, generator=None, observation=None):
-        return observation[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A))
+        return seen_mean(observation)
 
 
 def test_a_start_that_depends_on_the_observation_gets_the_shifted_one():
@@ -217,17 +223,12 @@ def test_it_measures_where_samplers_start():
     data = windows(prior)
     stays = policy(lambda t, a, o: torch.zeros_like(a), prior)
     found = memory_gain(stays, data, nfes=(1,), shift=0.05)[1]
-    generator = torch.Generator().manual_seed(0)
-    direction = torch.nn.functional.normalize(torch.randn(50, 1, D_A, generator=generator), dim=-1)
-    state, loc, warm = generator.get_state(), data["prior", "loc"], data["prior", "warm"]
-    sides = []
-    for sign in (1, -1):
-        generator.set_state(state)
-        with torch.no_grad():
-            moved = loc + sign * 0.05 * direction
-            sides.append(prior.start(moved, warm, generator, data["observation"]))
-    expected = float(((sides[0] - sides[1]) * direction).sum(-1).mean()) / 0.1
-    assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
+
+    def act(moved, generator):
+        loc, warm = moved["prior", "loc"], moved["prior", "warm"]
+        return prior.start(loc, warm, generator, moved["observation"])
+
+    assert found == pytest.approx(by_hand(act, data), rel=1e-3) and abs(found) > 1e-4
 
 
 def test_dropout_is_off():
@@ -250,7 +251,7 @@ def test_keys_may_have_other_names():
     assert memory_gain(actor, data, nfes=(1,))[1] == pytest.approx(0.3, rel=1e-4)
 
     prior = HistoryPrior(H)
-    field = Field(lambda t, a, o: 0.4 * o[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A)) - a)
+    field = Field(lambda t, a, o: 0.4 * seen_mean(o) - a)
     data = windows(prior).rename_key_(("prior", "observation"), "told")
     found = memory_gain(WarmPriorActor(field, prior, observation_key="told"), data, nfes=(1,))
     assert found[1] == pytest.approx(0.4, rel=1e-4)
@@ -280,7 +281,7 @@ def test_a_generator_draws_directions_and_noise():
 def test_a_disturbed_memory_tells_a_network_of_it_whatever_its_keys():
     """What lies under the usual observation key is another thing here."""
     prior = HistoryPrior(H)
-    field = Field(lambda t, a, o: o[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A)) - a)
+    field = Field(lambda t, a, o: seen_mean(o) - a)
     actor = WarmPriorActor(field, prior, nfe=1, observation_key="told")
     data = windows(prior).rename_key_(("prior", "observation"), "told")
     data["prior", "warm"][:] = True
@@ -326,25 +327,13 @@ def test_a_guided_policy_is_measured_as_it_acts():
     data = windows(prior, 20)
     with pytest.raises(KeyError, match=r"or measure policy.replace\(guidance=None\)"):
         memory_gain(guided, data)
-    data["rtc"] = TensorDict(
-        {
-            "leftover": torch.rand(20, H, D_A),
-            "valid": torch.ones(20, H, 1, dtype=torch.bool),
-            "delay": torch.ones(20, 1, dtype=torch.int64),
-        },
-        [20],
-    )
+    data["rtc"] = leftover(20)
     found = memory_gain(guided, data, nfes=(4,), shift=0.05)[4]
-    generator = torch.Generator().manual_seed(0)
-    direction = torch.nn.functional.normalize(torch.randn(20, 1, D_A, generator=generator), dim=-1)
-    state, sides = generator.get_state(), []
-    for sign in (1, -1):
-        generator.set_state(state)
-        moved = data.clone()
-        moved["prior", "loc"] += sign * 0.05 * direction
-        sides.append(guided(moved, generator=generator)[guided.chunk_key])
-    expected = float(((sides[0] - sides[1]) * direction).sum(-1).mean()) / 0.1
-    assert found == pytest.approx(expected, rel=1e-3)
+
+    def act(moved, generator):
+        return guided(moved, generator=generator)[guided.chunk_key]
+
+    assert found == pytest.approx(by_hand(act, data), rel=1e-3)
 
 
 def test_what_a_network_is_told_has_to_be_of_the_windows_mean():

@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 
-from tests.diagnostics.fields import D_A, Field, H, batch, policy
+from tests.diagnostics.fields import D_A, Field, H, batch, leftover, policy
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, RealTimeChunking, WarmPriorActor
 from warmprior.diagnostics import flow_paths, forecast_mean
 
@@ -52,14 +51,7 @@ def test_the_forecast_of_a_guided_policy_is_what_it_would_do():
     field = Field(lambda t, a, o: a.sin())
     actor = WarmPriorActor(field, prior, nfe=4, guidance=RealTimeChunking())
     data = batch()
-    data["rtc"] = TensorDict(
-        {
-            "leftover": torch.rand(5, H, D_A, generator=torch.Generator().manual_seed(2)),
-            "valid": torch.ones(5, H, 1, dtype=torch.bool),
-            "delay": torch.ones(5, 1, dtype=torch.int64),
-        },
-        [5],
-    )
+    data["rtc"] = leftover()
     data["prior", "warm"][:] = True
     found = forecast_mean(actor, data, generator=torch.Generator().manual_seed(0))
     acted = actor(data.clone(), generator=torch.Generator().manual_seed(0))
