@@ -47,7 +47,7 @@ def leftover(n=5):
     """What real-time chunking reads of the old chunk, one action of which is still played."""
     return TensorDict(
         {
-            "leftover": torch.rand(n, H, D_A, generator=torch.Generator().manual_seed(2)),
+            "leftover": torch.rand(n, H, D_A, generator=torch.Generator().manual_seed(4)),
             "valid": torch.ones(n, H, 1, dtype=torch.bool),
             "delay": torch.ones(n, 1, dtype=torch.int64),
         },
