@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from warmprior import GaussianPrior, WarmPriorActor
+from warmprior import GaussianPrior, ImageEncoder, VelocityMLP, VisionNetwork, WarmPriorActor
 
 H, D_A = 3, 2
 
@@ -41,6 +41,17 @@ def batch(n=5, length=H, d_a=D_A, **extra):
         [n],
     )
     return data.update(extra)
+
+
+def seeing_network(d_a, state_dim, length):
+    """A small network that sees one camera, with weights of which none is zero."""
+    torch.manual_seed(0)
+    encoder = ImageEncoder(["cam_image"], state_dim, image_size=16, crop_size=12, backbone="small")
+    velocity = VelocityMLP(d_a, encoder.observation_dim, length, hidden_dim=16)
+    network = VisionNetwork(encoder, velocity)
+    for parameter in network.parameters():
+        parameter.data += 0.1 * torch.randn_like(parameter)  # the last layer begins at zero
+    return network
 
 
 def leftover(n=5):

@@ -8,19 +8,16 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.diagnostics.fields import D_A, Field, H, batch, leftover, policy
+from tests.diagnostics.fields import D_A, Field, H, batch, leftover, policy, seeing_network
 from warmprior import (
     ForecastPrior,
     GaussianPrior,
     HistoryPrior,
-    ImageEncoder,
     PastPrior,
     PreviewPrior,
     RealTimeChunking,
     RegressionPrior,
     StepPrior,
-    VelocityMLP,
-    VisionNetwork,
     WarmPriorActor,
 )
 from warmprior.diagnostics import HistoryShift, encoded_windows, memory_gain
@@ -56,6 +53,13 @@ def by_hand(act, data, shift=0.05):
         with torch.no_grad():
             chunks.append(act(moved, generator))
     return float(((chunks[0] - chunks[1]) * direction).sum(-1).mean()) / (2 * shift)
+
+
+def drawn(draw):
+    """Executes what a prior's ``sample`` or ``start`` gives."""
+    return lambda moved, generator: draw(
+        moved["prior", "loc"], moved["prior", "warm"], generator, moved["observation"]
+    )
 
 
 def repeats(share):
@@ -160,11 +164,7 @@ def test_a_network_that_sees_images_and_the_mean():
     """Against the same policy without its diagnostics: observations made anew on both sides."""
     prior, n = HistoryPrior(H), 8
     width = 4 + MeanObservation.width(prior, D_A)
-    torch.manual_seed(0)
-    encoder = ImageEncoder(["cam_image"], width, image_size=16, crop_size=12, backbone="small")
-    network = VisionNetwork(encoder, VelocityMLP(D_A, encoder.observation_dim, H, hidden_dim=16))
-    for parameter in network.parameters():
-        parameter.data += 0.1 * torch.randn_like(parameter)  # the last layer begins at zero
+    network = seeing_network(D_A, width, H)
     actor = WarmPriorActor(network, prior, nfe=1).eval()
     data = windows(GaussianPrior(H), n)
     images = torch.randint(0, 255, (n, 2, 3, 16, 16), dtype=torch.uint8)
@@ -193,12 +193,8 @@ def test_a_learned_source_is_asked_with_the_shifted_history():
     data = windows(prior)
     field = policy(lambda t, a, o: torch.zeros_like(a), prior)  # executes its source
     found = memory_gain(field, data, nfes=(1,), shift=0.05)[1]
-
-    def act(moved, generator):
-        loc, warm = moved["prior", "loc"], moved["prior", "warm"]
-        return prior.sample(loc, warm, generator, moved["observation"])
-
-    assert found == pytest.approx(by_hand(act, data), rel=1e-3) and abs(found) > 1e-4
+    expected = by_hand(drawn(prior.sample), data)
+    assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
 
 
 class SeenByTheSource(PastPrior):
@@ -223,12 +219,8 @@ def test_it_measures_where_samplers_start():
     data = windows(prior)
     stays = policy(lambda t, a, o: torch.zeros_like(a), prior)
     found = memory_gain(stays, data, nfes=(1,), shift=0.05)[1]
-
-    def act(moved, generator):
-        loc, warm = moved["prior", "loc"], moved["prior", "warm"]
-        return prior.start(loc, warm, generator, moved["observation"])
-
-    assert found == pytest.approx(by_hand(act, data), rel=1e-3) and abs(found) > 1e-4
+    expected = by_hand(drawn(prior.start), data)
+    assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
 
 
 def test_dropout_is_off():

@@ -8,9 +8,9 @@ from tensordict import TensorDict
 
 pytest.importorskip("tyro")
 
-from tests.diagnostics.fields import Field
+from tests.diagnostics.fields import Field, seeing_network
 from tests.experiments.comparison_parts import ACTION_DIM, OBSERVATION_DIM, H, drift_problem
-from warmprior import HistoryPrior, ImageEncoder, VelocityMLP, VisionNetwork, WarmPriorActor
+from warmprior import HistoryPrior, WarmPriorActor
 from warmprior.diagnostics import SharedObservations, memory_gain
 from warmprior.experiments.measures import measure
 from warmprior.transforms import MeanObservation
@@ -26,13 +26,8 @@ def test_the_memory_gain_of_a_network_that_sees_the_mean_is_that_of_what_it_is_t
 
 def test_images_that_stand_beside_the_mean_are_encoded_with_it():
     prior, n = HistoryPrior(H), 20
-    torch.manual_seed(0)
     width = OBSERVATION_DIM + MeanObservation.width(prior, ACTION_DIM)
-    encoder = ImageEncoder(["cam_image"], width, image_size=16, crop_size=12, backbone="small")
-    velocity = VelocityMLP(ACTION_DIM, encoder.observation_dim, H, hidden_dim=16)
-    network = VisionNetwork(encoder, velocity)
-    for parameter in network.parameters():
-        parameter.data += 0.1 * torch.randn_like(parameter)  # the last layer begins at zero
+    network = seeing_network(ACTION_DIM, width, H)
     data = TensorDict(
         {
             "observation": {

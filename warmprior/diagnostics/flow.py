@@ -167,10 +167,11 @@ def told_mean(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase
         return windows
     told, loc_key, warm_key = policy.in_keys[:3]
     make = MeanObservation(observation_key=told, loc_key=loc_key, warm_key=warm_key, out_key=told)
-    seen, loc = windows.get(told, None), windows.get(loc_key, None)
-    if seen is None or loc is None:
-        raise KeyError(f"the batch lacks {told!r}, which MeanObservation writes, or {loc_key!r}")
-    width = MeanObservation.width(policy.prior, loc.shape[-1])
+    for key in (told, loc_key):
+        if windows.get(key, None) is None:
+            raise KeyError(f"the batch lacks {key!r}; windows of the policy's own prior hold it")
+    seen = windows.get(told)
+    width = MeanObservation.width(policy.prior, windows.get(loc_key).shape[-1])
     if isinstance(seen, TensorDictBase):
         bare: Any = seen.copy().set(keys.STATE, seen.get(keys.STATE)[..., :-width])
     else:
