@@ -123,6 +123,13 @@ def test_before_chunk_step():
         env.rollout(2)
 
 
+def test_step_without_the_mean():
+    env = TransformedEnv(CountingEnv(5), policy_transforms(PastPrior(3)))
+    data = env.rand_action(env.reset())
+    with pytest.raises(KeyError, match=r"ActionHistory found no .*loc.*hand over what the reset"):
+        env.step(data.exclude("prior"))
+
+
 def test_prior_of_another_prediction_length():
     with pytest.raises(
         ValueError, match=r"takes chunks of 3 actions, but PreviewPrior.* predicts 6: use ChunkStep"

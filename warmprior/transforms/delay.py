@@ -6,14 +6,12 @@ from numbers import Integral
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Categorical, TensorSpec, Unbounded
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.modules.real_time_chunking import with_leftover
-from warmprior.transforms.chunk_keys import chunk_spec, executed_steps
+from warmprior.transforms.memory import ChunkMemory
 
 __all__ = ["InferenceDelay", "check_delay", "executed_chunk", "shift_chunk"]
 
@@ -101,7 +99,7 @@ def shift_chunk(chunk: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(valid, chunk.gather(-2, index), 0.0), valid
 
 
-class InferenceDelay(Transform):
+class InferenceDelay(ChunkMemory):
     r"""Lets every chunk take effect ``delay`` control steps after the observation that it answers.
 
     Simulators wait for policies and robots do not. Here the robot goes on meanwhile: of the ``execute``
@@ -163,81 +161,30 @@ class InferenceDelay(Transform):
         chunk_key: NestedKey = keys.CHUNK,
         executed_key: NestedKey = keys.EXECUTED,
     ) -> None:
-        super().__init__(in_keys=[chunk_key], out_keys=[keys.LEFTOVER, keys.VALID, keys.DELAY])
+        super().__init__(
+            (keys.LEFTOVER, keys.VALID, keys.DELAY), chunk_key=chunk_key, executed_key=executed_key
+        )
         check_delay(delay, execute)
         self.delay = delay
         self.execute = execute
-        self.chunk_key = unravel_key(chunk_key)
-        self.executed_key = unravel_key(executed_key)
-        self._chunk: TensorSpec | None = None
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        missing = [k for k in (keys.LEFTOVER, keys.DELAY) if tensordict.get(k, None) is None]
-        if missing:
-            raise KeyError(
-                f"InferenceDelay found no {missing} in a step's input: hand over what the reset or the step "
-                "before gave, with the chunk"
-            )
-        if tensordict.get(self.chunk_key, None) is None:
-            return tensordict  # ChunkStep tells
-        return tensordict.set(self.chunk_key, executed_chunk(tensordict, self.chunk_key))
+    def _check_length(self, length: int) -> None:
+        check_delay(self.delay, self.execute, length)
 
-    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def _remember(
+        self, tensordict: TensorDictBase, executed: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         # The chunk here is the executed one: TorchRL hands over the input that the inverses gave.
-        executed = executed_steps(next_tensordict, self.executed_key, "InferenceDelay")
         if (executed > self.execute).any():
             raise RuntimeError(
                 f"a decision executed {int(executed.max())} actions, and InferenceDelay was told "
                 f"execute={self.execute}: give it the number that ChunkStep has"
             )
-        before = tensordict.get(keys.LEFTOVER)
-        leftover, valid = shift_chunk(tensordict.get(self.chunk_key).to(before.dtype), executed)
-        delay = torch.full_like(executed, self.delay)
-        rows = tensordict.get("_step", None)
-        if rows is not None:
-            # A partial step: the chunks of the others were not executed.
-            rows = rows.view(*next_tensordict.batch_size, 1)
-            delay = torch.where(rows, delay, tensordict.get(keys.DELAY))
-            rows = rows.unsqueeze(-1)
-            leftover = torch.where(rows, leftover, before)
-            valid = torch.where(rows, valid, tensordict.get(keys.VALID))
-        next_tensordict.set(keys.LEFTOVER, leftover)
-        next_tensordict.set(keys.VALID, valid)
-        return next_tensordict.set(keys.DELAY, delay)
+        leftover, valid = shift_chunk(tensordict.get(self.chunk_key), executed)
+        return leftover, valid, torch.full_like(executed, self.delay)
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        # Nothing is left: TorchRL merges these rows into the sub-environments that were reset only.
-        batch, device = tensordict_reset.batch_size, tensordict_reset.device
-        chunk = self._chunk or self._check_chunk(self.parent.full_action_spec)
-        leftover = torch.zeros(*batch, *chunk.shape[-2:], dtype=chunk.dtype, device=device)
-        tensordict_reset.set(keys.LEFTOVER, leftover)
-        tensordict_reset.set(keys.VALID, torch.zeros_like(leftover[..., :1], dtype=torch.bool))
-        delay = torch.zeros(*batch, 1, dtype=torch.int64, device=device)
-        return tensordict_reset.set(keys.DELAY, delay)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing."""
-        return tensordict
-
-    def _check_chunk(self, action_spec: TensorSpec) -> TensorSpec:
-        chunk = chunk_spec(action_spec, self.chunk_key, "InferenceDelay")
-        check_delay(self.delay, self.execute, chunk.shape[-2])
-        # Kept because resets are frequent and TorchRL rebuilds specs on every access.
-        self._chunk = chunk
-        return chunk
-
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the leftover, where it holds, and the delay."""
-        chunk = self._check_chunk(self.parent.full_action_spec)
-        batch, device = observation_spec.shape, observation_spec.device
-        length, action_dim = chunk.shape[-2:]
-        observation_spec[keys.LEFTOVER] = Unbounded(
-            (*batch, length, action_dim), dtype=chunk.dtype, device=device
-        )
-        observation_spec[keys.VALID] = Categorical(
-            2, shape=(*batch, length, 1), dtype=torch.bool, device=device
-        )
-        observation_spec[keys.DELAY] = Unbounded((*batch, 1), dtype=torch.int64, device=device)
-        return observation_spec
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        self._check_input(tensordict)
+        if tensordict.get(self.chunk_key, None) is None:
+            return tensordict  # ChunkStep tells
+        return tensordict.set(self.chunk_key, executed_chunk(tensordict, self.chunk_key))
