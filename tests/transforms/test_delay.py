@@ -176,6 +176,8 @@ def test_only_the_rows_of_a_partial_step_change():
         policy_transforms(PRIORS["past"], observation_steps=1, execute=4, delay=2),
     )
     policy = told(6)
+    first = policy(env.reset()).set("_step", torch.tensor([True, False]))
+    assert env.step(first)["next", "rtc", "delay"].tolist() == [[2], [0]]
     data = env.step_mdp(env.step(policy(env.reset())))
     data.set("_step", torch.tensor([True, False]))
     after = env.step(policy(data))["next"]

@@ -117,6 +117,28 @@ def test_without_chunk_step():
         TransformedEnv(CountingEnv(5), ActionHistory(PastPrior(3))).reset()
 
 
+def test_another_key_of_executed_steps():
+    env = TransformedEnv(
+        CountingEnv(5), Compose(ChunkStep(3), ActionHistory(PastPrior(3), executed_key="other"))
+    )
+    with pytest.raises(
+        KeyError, match="found no 'other' after the step: append it after ChunkStep"
+    ):
+        env.rollout(2)
+
+
+def test_a_prior_s_mask_is_not_cast():
+    class Grey(PastPrior):
+        name = "grey-of-the-tests"
+
+        def next_mean(self, loc, chunk, executed_steps, elapsed_steps):
+            loc, warm = super().next_mean(loc, chunk, executed_steps, elapsed_steps)
+            return loc, 0.3 * warm
+
+    with pytest.raises(AssertionError, match="bool"):
+        check_env_specs(TransformedEnv(CountingEnv(5), policy_transforms(Grey(3))))
+
+
 def test_before_chunk_step():
     env = TransformedEnv(CountingEnv(5), Compose(ActionHistory(PastPrior(3)), ChunkStep(3)))
     with pytest.raises(KeyError, match="after ChunkStep"):
@@ -141,11 +163,14 @@ def test_prior_of_another_prediction_length():
 
 def test_renamed_keys():
     prior = PastPrior(2)
+    step_keys = {"chunk_key": "plan", "executed_key": "done_of_it"}
     history = ActionHistory(
-        prior, loc_key="mean", warm_key=("is", "warm"), elapsed_key="age", chunk_key="plan"
+        prior, loc_key="mean", warm_key=("is", "warm"), elapsed_key="age", **step_keys
     )
-    env = TransformedEnv(CountingEnv(5), Compose(ChunkStep(2, chunk_key="plan"), history))
+    env = TransformedEnv(CountingEnv(5), Compose(ChunkStep(2, **step_keys), history))
     check_env_specs(env)
+    assert env.observation_spec["age"].dtype == torch.int64
+    assert env.observation_spec["is", "warm"].dtype == torch.bool
     rollout = env.rollout(3)
     assert torch.equal(rollout["mean"][1:], rollout["plan"][:-1])
     assert rollout["age"].flatten().tolist() == [0, 2, 4]

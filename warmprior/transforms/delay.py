@@ -174,12 +174,12 @@ class InferenceDelay(ChunkMemory):
     def _remember(
         self, tensordict: TensorDictBase, executed: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
-        # The chunk here is the executed one: TorchRL hands over the input that the inverses gave.
         if (executed > self.execute).any():
             raise RuntimeError(
                 f"a decision executed {int(executed.max())} actions, and InferenceDelay was told "
                 f"execute={self.execute}: give it the number that ChunkStep has"
             )
+        # The chunk here is the executed one: TorchRL hands over the input that the inverses gave.
         leftover, valid = shift_chunk(tensordict.get(self.chunk_key), executed)
         return leftover, valid, torch.full_like(executed, self.delay)
 

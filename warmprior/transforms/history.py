@@ -45,7 +45,8 @@ class ActionHistory(ChunkMemory):
 
     Raises:
         ValueError: if the environment's chunks have another length than the prior's predictions.
-        KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks the mean.
+        KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks the mean, the mask or
+            the count.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv, Compose

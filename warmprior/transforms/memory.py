@@ -17,7 +17,7 @@ __all__ = ["ChunkMemory"]
 class ChunkMemory(Transform):
     """Writes a chunk, where it holds and a number of steps for the next decision, and zeros at resets.
 
-    A function of the step's own tensordict, without state: it gives the same in ``env.rollout``,
+    A function of the step's own tensordict, without state of its own: it gives the same in ``env.rollout``,
     collectors and batched environments, inside or outside of workers, with any policy (random ones
     included), and per sub-environment when some of them reset. Subclasses tell what is remembered.
 
@@ -30,6 +30,7 @@ class ChunkMemory(Transform):
         executed_key: the number of executed actions, int64 ``[*B, 1]``.
 
     Raises:
+        ValueError: (in an environment) if chunks are not as long as what is remembered needs.
         KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks what is remembered.
     """
 
@@ -40,8 +41,8 @@ class ChunkMemory(Transform):
         chunk_key: NestedKey = keys.CHUNK,
         executed_key: NestedKey = keys.EXECUTED,
     ) -> None:
+        super().__init__(in_keys=[chunk_key], out_keys=list(memory_keys))
         self.memory_keys = [unravel_key(key) for key in memory_keys]
-        super().__init__(in_keys=[chunk_key], out_keys=list(self.memory_keys))
         self.chunk_key = unravel_key(chunk_key)
         self.executed_key = unravel_key(executed_key)
         self._chunk: TensorSpec | None = None
@@ -75,11 +76,12 @@ class ChunkMemory(Transform):
         rows = tensordict.get("_step", None)
         for key, value in zip(self.memory_keys, self._remember(tensordict, executed), strict=True):
             before = tensordict.get(key)
-            value = value.to(before.dtype)  # policies may compute in another precision
+            if value.is_floating_point() and before.is_floating_point():
+                value = value.to(before.dtype)  # a policy may compute in another precision
             if rows is not None:
                 # A partial step: the others were not asked, and what lies in their chunk was not executed.
-                own = expand_as_right(rows.view(next_tensordict.batch_size), value)
-                value = torch.where(own, value, before)
+                asked = expand_as_right(rows.view(next_tensordict.batch_size), before)
+                value = torch.where(asked, value, before)
             next_tensordict.set(key, value)
         return next_tensordict
 
@@ -94,7 +96,7 @@ class ChunkMemory(Transform):
         return tensordict_reset
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing: the keys are already in the data."""
+        """Does nothing: in data the keys are already there."""
         return tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
