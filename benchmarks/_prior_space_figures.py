@@ -138,7 +138,7 @@ def collection_over_env(clock: Any) -> float:
     actor = frozen_policy(bare.observation_spec["observation"].shape[-1])
     decoder = PriorDecoder(actor, delta=0.5)
     transforms = policy_transforms(actor.prior, observation_steps=TO)
-    transforms.append(PriorAnchor(actor.prior))
+    transforms.append(PriorAnchor(actor))
     whole = Collection(
         TransformedEnv(RobosuiteEnv(task="lift"), transforms),
         TensorDictSequential(ResidualSampler(decoder), decoder),

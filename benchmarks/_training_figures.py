@@ -19,6 +19,7 @@ from torch import nn
 from tqdm import tqdm
 
 from warmprior import ChiTransformer, PastPrior, VelocityMLP, WarmPriorActor
+from warmprior.history import window_history
 from warmprior.io.distributed import joined, rank
 from warmprior.training import BehaviourCloning, TrainingConfig
 
@@ -159,8 +160,10 @@ def cuda_latency(clock: Any) -> dict[str, float] | None:
         return None
     actor = WarmPriorActor(paper_network().eval(), PRIOR).eval().to("cuda")
     actor.network.compile(mode="reduce-overhead")
-    mean = {"loc": torch.randn(1, H, D_A), "warm": torch.ones(1, H, 1, dtype=torch.bool)}
-    data = TensorDict({"observation": torch.randn(1, TO, D_O), "prior": mean}, [1]).to("cuda")
+    history = window_history(
+        torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H
+    )
+    data = TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to("cuda")
     found = {}
     with torch.no_grad():
         for nfe in (1, 3, 9):

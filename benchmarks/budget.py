@@ -68,7 +68,8 @@ def with_errors(comparison: Comparison, observations: SharedObservations) -> lis
     errors: dict[tuple[Any, ...], float] = {}
     for contestant in comparison.contestants:
         player = comparison.player(contestant)
-        windows = encoded_windows(player, observations.windows(contestant.prior))
+        windows = observations.windows(player.prior, see_history=contestant.method.sees_history)
+        windows = encoded_windows(player, windows)
         found = action_error(player, windows, nfes=comparison.nfes)
         for nfe, error in found.items():
             errors[(*contestant.facts().values(), nfe)] = error

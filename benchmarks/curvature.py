@@ -17,6 +17,7 @@ import torch
 
 from warmprior import WarmPriorActor
 from warmprior.diagnostics import SharedObservations, encoded_windows, flow_paths
+from warmprior.diagnostics.flow import sees_history
 from warmprior.experiments import (
     PRESETS,
     Comparison,
@@ -38,6 +39,7 @@ from warmprior.experiments import (
     write_report,
 )
 from warmprior.experiments.labels import with_space
+from warmprior.experiments.methods import Method
 from warmprior.experiments.navigation_figures import plot_flow_paths
 from warmprior.experiments.recipe import Flat
 from warmprior.experiments.record import refuse_ignored
@@ -75,7 +77,7 @@ class CurvatureRecipe(MeasuredRecipe):
             parts += [] if all(":" in name for name in self.sources.prior) else ["sources"]
             told = "--run measures policies as they were trained"
             refuse_ignored(self, base, parts, told, but=["preset", "device"])
-        elif not any(prior.is_flow for prior in self.sources.priors()):
+        elif not any(method.is_flow for method in self.sources.methods()):
             raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
 
 
@@ -85,7 +87,7 @@ class Measured:
 
     results: Results
     facts: dict[str, Any]
-    actors: dict[str, dict[int, WarmPriorActor]]
+    actors: dict[Method, dict[int, WarmPriorActor]]
     observations: SharedObservations
     source: str
 
@@ -117,8 +119,7 @@ def finished_run(recipe: CurvatureRecipe, run: Path) -> Measured:
     identity = {"study": "curvature", "recipe": record(recipe)}
     meta = facts_of_machine() | {"problems": [facts]}
     results = Results(recipe.run.directory / "results.json", meta, identity)
-    described = {next(iter(g.values())).prior.describe(): g for g in actors.values()}
-    return Measured(results, facts, described, observations, source)
+    return Measured(results, facts, actors, observations, source)
 
 
 def check_coordinate(recipe: CurvatureRecipe, observations: SharedObservations) -> None:
@@ -132,9 +133,10 @@ def draw(recipe: CurvatureRecipe, measured: Measured, rows: Sequence[Row]) -> No
     few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
     label = source_labels(rows)
     for policy, group in grouped(rows, lambda row: row["policy"]).items():
-        actor = next(iter(measured.actors[policy].values()))
+        actor = next(iter(next(g for m, g in measured.actors.items() if str(m) == policy).values()))
         generator = torch.Generator(recipe.run.device).manual_seed(0)
-        windows = encoded_windows(actor, few.windows(actor.prior))
+        windows = few.windows(actor.prior, see_history=sees_history(actor))
+        windows = encoded_windows(actor, windows)
         path = flow_paths(actor, windows, recipe.held_out.steps, generator=generator)
         paths[label(group[0])] = path[..., 0, recipe.coordinate].cpu()
     facts = measured.facts

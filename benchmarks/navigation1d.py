@@ -58,7 +58,7 @@ def judge(comparison: Comparison) -> list[Row]:
     rows = []
     for contestant in comparison.contestants:
         actor, seed = comparison.player(contestant).to("cpu"), contestant.training.seed
-        for nfe in contestant.prior.allowed_nfes(comparison.nfes):
+        for nfe in contestant.method.allowed_nfes(comparison.nfes):
             measures = judge_navigation(actor, seed, nfe=nfe, rollouts=rollouts)
             rows.append(Row(contestant.facts() | {"nfe": nfe}, measures))
     return rows
@@ -69,7 +69,7 @@ def curvatures(comparison: Comparison, observations: SharedObservations) -> list
     rows = []
     for seed in comparison.recipe.seeds:
         policies = {
-            name: {seed: group[seed].to("cpu")} for name, group in comparison.policies().items()
+            method: {seed: group[seed].to("cpu")} for method, group in comparison.policies().items()
         }
         rows += straightness(policies, observations, draws=4, seed=seed)
     return rows
@@ -103,19 +103,19 @@ def draw(comparison: Comparison, rows: Sequence[Row], observations: SharedObserv
     for contestant in comparison.contestants:
         if contestant.training.seed != seed:
             continue
-        prior, actor = contestant.prior, comparison.player(contestant).to("cpu")
-        nfe = max(prior.allowed_nfes(comparison.nfes))
+        method, actor = contestant.method, comparison.player(contestant).to("cpu")
+        nfe = max(method.allowed_nfes(comparison.nfes))
         (row,) = select(rows, "collision_rate", **contestant.facts(), nfe=nfe)
         text = [f"collides {row['collision_rate']:.0%}"]
         if row["switch_rate"] is not None:
             text[0] = f"switches sides at {row['switch_rate']:.1%} of boundaries, {text[0]}"
-        if prior.ever_warm:
+        if method.remembers:
             text.append(f"with its history shifted: collides {row['shifted_collision_rate']:.0%}")
         rollout = play_navigation(actor, seed, nfe=nfe)
         panels[label(row)] = (executed_actions(rollout)[0].squeeze(-1), text)
-        if prior.is_flow:
+        if method.is_flow:
             # One window of a demonstration, above the first obstacle, from many source samples.
-            window = observations.windows(prior)
+            window = observations.windows(actor.prior, see_history=method.sees_history)
             index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
             batch = window[index : index + 1].expand(48).contiguous()
             generator = torch.Generator().manual_seed(seed)

@@ -42,6 +42,7 @@ from warmprior import (
 from warmprior.experiments import table
 from warmprior.experiments.figures import new_figure
 from warmprior.experiments.results import Row, facts_of_machine
+from warmprior.history import window_history
 from warmprior.io.distributed import check_device
 from warmprior.io.script import run_script
 
@@ -94,8 +95,10 @@ def ours(name: str, make: Callable[[int], VelocityNetwork], width: int, device: 
     network = make(width).to(device)
     actor = WarmPriorActor(network, PRIOR)
     loss = FlowMatchingLoss(actor)
-    mean = {"loc": torch.zeros(1, H, D_A), "warm": torch.ones(1, H, 1, dtype=torch.bool)}
-    data = TensorDict({"observation": torch.randn(1, TO, D_O), "prior": mean}, [1]).to(device)
+    history = window_history(
+        torch.zeros(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H
+    )
+    data = TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
     return Peer(
         f"warmprior: FlowMatchingLoss, {name}",
         network,

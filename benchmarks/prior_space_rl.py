@@ -19,7 +19,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from warmprior import Prior, WarmPriorActor
+from warmprior import WarmPriorActor
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.experiments import (
     Comparison,
@@ -40,6 +40,7 @@ from warmprior.experiments import (
 )
 from warmprior.experiments.figures import agent_label
 from warmprior.experiments.labels import source_of, space_of, with_space
+from warmprior.experiments.methods import Method
 from warmprior.experiments.prior_space import (
     PRIOR_SPACE_PRESETS,
     PriorSpaceRecipe,
@@ -50,19 +51,20 @@ from warmprior.experiments.prior_space import (
 from warmprior.experiments.results import facts_of_machine, grouped
 from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.io.script import run_script
-from warmprior.modules.named_prior import options_of
-from warmprior.rl import PriorSpaceTraining
+from warmprior.modules.registry import options_of
+from warmprior.rl import PriorSpaceTraining, has_anchor
+from warmprior.training import load_policy, save_policy
 from warmprior.training.threads import torch_threads
 
 Source = tuple[str, str]
-"""Name and options of a prior: agents of several options of one prior are compared like those of several."""
+"""Name and options of a method: agents of several options of one are compared like those of several."""
 
 Frozen = dict[Source, dict[int, WarmPriorActor]]
 """Policies by source and training seed."""
 
 
-def source_of_prior(prior: Prior) -> Source:
-    return prior.name, prior.options
+def source_of_method(method: Method) -> Source:
+    return method.name, method.options
 
 
 def told(source: Source) -> str:
@@ -81,20 +83,15 @@ def slug(source: Source) -> str:
     return f"{name}-{short}" if plain else f"{name}-{short}-{digest_of(options)[:8]}"
 
 
-def is_asked(text: str, actor: WarmPriorActor) -> bool:
-    """Whether a policy is what a ``--prior`` names; what is not said there is as the policy has it."""
-    own, network = actor.prior, actor.network
-    if Prior.find(text) is not type(own):
-        return False
-    unsaid = {"sigma", "cold_probability"} - set(options_of(text))
-    asked = Prior.make(text, own.chunk_length, **{key: getattr(own, key) for key in unsaid})
-    sizes = (network.action_dim, network.observation_dim, network.observation_steps)
-    return asked.sized(*sizes).config() == own.config()
+def is_asked(text: str, own: Method) -> bool:
+    """Whether a method is what a ``--prior`` names; what is not said there is as the method has it."""
+    sigma = None if "sigma" in options_of(text) else own.sigma
+    return Method.parse(text, own.chunk_length, sigma=sigma).config() == own.config()
 
 
 def frozen_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], Frozen]:
     """The facts of the problem, and the policies: of --run, or trained now where they are not yet."""
-    run, device, priors = recipe.policies.run, recipe.run.device, recipe.sources.priors()
+    run, device, methods = recipe.policies.run, recipe.run.device, recipe.sources.methods()
     if run is not None:
         facts, actors = finished_policies(run, device)
         if recipe.data.task not in ((), (facts["task"],)):
@@ -102,15 +99,15 @@ def frozen_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any]
         taken: Frozen = {}
         missing = []
         for text, source in zip(
-            dict.fromkeys(recipe.sources.prior), map(source_of_prior, priors), strict=True
+            dict.fromkeys(recipe.sources.prior), map(source_of_method, methods), strict=True
         ):
-            found = [g for g in actors.values() if is_asked(text, next(iter(g.values())))]
+            found = [group for method, group in actors.items() if is_asked(text, method)]
             if found:
                 taken[source] = found[0]
             else:
                 missing.append(text)
         if missing:
-            have, lack = "; ".join(map(told, actors)), "; ".join(missing)
+            have, lack = "; ".join(told(source_of_method(m)) for m in actors), "; ".join(missing)
             raise ValueError(f"--run {run} has policies of {have}, but none of {lack}")
         return facts, taken
     stores = None
@@ -121,10 +118,10 @@ def frozen_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any]
     comparison.train()
     (store,) = comparison.stores
     frozen = {
-        source_of_prior(prior): {
-            seed: store.policy(prior, replace(recipe.training, seed=seed)) for seed in recipe.seeds
+        source_of_method(method): {
+            seed: store.policy(method, replace(recipe.training, seed=seed)) for seed in recipe.seeds
         }
-        for prior in priors
+        for method in methods
     }
     return comparison.results.meta["problems"][0], frozen
 
@@ -135,7 +132,7 @@ def kept_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], 
     To continue, they must find the very policies they began with, whatever has become of those, or would
     be trained by now.
     """
-    sources = dict.fromkeys(map(source_of_prior, recipe.sources.priors()))
+    sources = dict.fromkeys(map(source_of_method, recipe.sources.methods()))
     folders = {
         (source, seed): out / "policies" / f"{slug(source)}-seed{seed}"
         for source, seed in product(sources, recipe.seeds)
@@ -150,12 +147,12 @@ def kept_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], 
                     f"--run has {len(group)} seeds of {told(source)}: agent {seed} shares a policy"
                 )
             of_seeds = list(group.values())
-            group.get(seed, of_seeds[seed % len(of_seeds)]).save_pretrained(folder)
+            save_policy(group.get(seed, of_seeds[seed % len(of_seeds)]), folder)
         text = json.dumps(problem) + "\n"
         write_atomic(facts, lambda path: path.write_text(text))
     loaded: Frozen = {}
     for (source, seed), folder in folders.items():
-        actor = WarmPriorActor.from_pretrained(folder, device=recipe.run.device)
+        actor = load_policy(folder, device=recipe.run.device)
         loaded.setdefault(source, {})[seed] = actor
     return read_json(facts), loaded
 
@@ -225,7 +222,7 @@ def run(argv: Sequence[str] | None) -> None:
         diverged: dict[tuple[str, Source, int], str] = {}
         for seed, algorithm, source in product(recipe.seeds, recipe.agents.algorithm, frozen):
             agent, actor = f"{algorithm} {told(source)}, seed {seed}", frozen[source][seed]
-            config = recipe.agent(actor.prior, algorithm, seed)
+            config = recipe.agent(has_anchor(actor), algorithm, seed)
             training = PriorSpaceTraining(
                 agent_policy(actor),
                 agent_environment(recipe, actor),

@@ -40,7 +40,7 @@ from warmprior.experiments.results import Row, facts_of_machine
 from warmprior.experiments.worker import Job, Play
 from warmprior.io.script import run_script
 from warmprior.io.workers import WorkerPool, available_cores
-from warmprior.training import BehaviourCloning, TrainingConfig, evaluate
+from warmprior.training import BehaviourCloning, TrainingConfig, evaluate, load_policy
 from warmprior.training.evaluation import parallel_env, play_episode
 
 CPU_PRESET = {"policies": 3 * 3 * 8, "iterations": 10_000, "cells": 3, "episodes": 50}
@@ -268,7 +268,7 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 def run(argv: Sequence[str] | None) -> None:
     options = parse(argv)
-    actor = WarmPriorActor.from_pretrained(options.policy)
+    actor = load_policy(options.policy)
     actor.ode.check_nfe(options.nfe)
     options.out.mkdir(parents=True, exist_ok=True)
     state = State(actor, options.nfe)

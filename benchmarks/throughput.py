@@ -59,6 +59,7 @@ from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.simulator import task_env_args
 from warmprior.experiments.results import facts_of_machine
+from warmprior.history import window_history
 from warmprior.io.files import read_json, write_atomic
 from warmprior.io.ray_pool import RayPool
 from warmprior.io.workers import Pool, WorkerPool
@@ -180,8 +181,8 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
             assert torch.equal(action[H:], row["vla_action", "chunk"])
             assert torch.equal(pad[H:], row["action_is_pad"])
             assert torch.equal(item["observation.state"], row["observation"])
-            assert torch.equal(row["prior", "warm"].all(), ~pad[:H].any())
-            assert pad[:H].any() or torch.equal(action[:H], row["prior", "loc"])
+            assert int(row["history", "steps"]) == int((~pad[:H]).sum())
+            assert pad[:H].any() or torch.equal(action[:H], row["history", "actions"])
         ratio = clock.ratio(
             lambda: [theirs[i] for i in torch.randint(len(data), (64,)).tolist()],
             lambda: [buffer.sample() for _ in range(20)],
@@ -226,8 +227,8 @@ def actor_over_network(clock: Clock, compiled: bool = False) -> dict[str, float]
     call = torch.compile(paper_network().eval()) if compiled else paper_network().eval()
     actor = WarmPriorActor(call, PRIOR).eval()
     t, a, o = torch.rand(1), torch.randn(1, H, D_A), torch.randn(1, TO, D_O)
-    mean = {"loc": a, "warm": torch.ones(1, H, 1, dtype=torch.bool)}
-    data = TensorDict({"observation": o, "prior": mean}, [1])
+    history = window_history(a, torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
+    data = TensorDict({"observation": o, "history": history}, [1])
     found = {}
     with torch.no_grad():
         for nfe in (1, 3, 9):
@@ -320,8 +321,10 @@ def encoder_share(clock: Clock) -> dict[str, float]:
     actor = WarmPriorActor(VisionNetwork(encoder, network), PRIOR).eval()
     images = {name: torch.zeros(1, TO, 3, 84, 84, dtype=torch.uint8) for name in cameras}
     observation = TensorDict({"state": torch.randn(1, TO, 9), **images}, [1])
-    mean = {"loc": torch.randn(1, H, D_A), "warm": torch.ones(1, H, 1, dtype=torch.bool)}
-    data = TensorDict({"observation": observation, "prior": mean}, [1])
+    history = window_history(
+        torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H
+    )
+    data = TensorDict({"observation": observation, "history": history}, [1])
     with torch.no_grad():
         return {
             str(nfe): clock.ratio(partial(encoder, observation), partial(actor, data, nfe=nfe))

@@ -32,7 +32,7 @@ def _imported(tree: ast.Module) -> list[tuple[str, str]]:
 
 
 def _resolve(name: str) -> object:
-    """What a full name such as ``warmprior.training.evaluate`` or ``warmprior.Prior.couple`` stands for."""
+    """What a full name such as ``warmprior.training.evaluate`` or ``warmprior.Prior.mean`` stands for."""
     first, *parts = name.split(".")
     found: object = importlib.import_module(first)
     place = first

@@ -1,4 +1,4 @@
-"""A deterministic environment whose true returns, lengths and observations are known in closed form."""
+"""A deterministic environment whose returns, lengths and observations are known in closed form; histories."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
+
+from warmprior.history import advance, cold_history, without
 
 ACTION_DIM = 2
 
@@ -66,3 +68,13 @@ class ChunkPolicy(TensorDictModuleBase):
 
     def forward(self, tensordict):
         return tensordict.set(self.out_keys[0], self.chunk(tensordict))
+
+
+def random_history(prior, *batch, action_dim: int = ACTION_DIM, seed: int = 0, cold: float = 0.5):
+    """Histories after ``H`` executed actions, of which about a share is cold."""
+    generator = torch.Generator().manual_seed(seed)
+    shape = prior.history_length, prior.prediction_length, action_dim
+    chunk = torch.randn(*batch, *shape[1:], generator=generator)
+    executed = torch.full((*batch, 1), prior.chunk_length)
+    history = advance(cold_history(batch, *shape), chunk, executed)
+    return without(history, torch.rand(batch, generator=generator) < cold)

@@ -9,30 +9,34 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from warmprior.io.files import read_json
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.pretrained import CONFIG, pretrained_folder
 from warmprior.modules.prior import Prior
+from warmprior.modules.registry import find
 
 UNPLAYED = ("episodes", "nfe", "top_k", "play_on", "grid")
 """Options of what is not played."""
 
 
 def _policy(args: argparse.Namespace) -> WarmPriorActor:
+    import warmprior.experiments.learned_sources  # noqa: F401  # imported, they can be loaded by name
+    from warmprior.training.saved import load_policy
+
     for place in args.prior:
-        Prior.find(place)  # imported, it can be loaded by its name
-    return WarmPriorActor.from_pretrained(args.folder, revision=args.revision)
+        find(Prior, place)
+    return load_policy(args.folder, revision=args.revision)
 
 
 def info(args: argparse.Namespace) -> None:
     """Tell what a saved policy is."""
     from warmprior.envs.description import environment_name
+    from warmprior.training.saved import policy_config, policy_file
 
     actor = _policy(args)
-    config, count = actor.config(), sum(p.numel() for p in actor.parameters())
-    place = pretrained_folder(args.folder, revision=args.revision)
-    written = read_json(place / CONFIG).get("warmprior", "of an unknown version")
+    config, count = policy_config(actor), sum(p.numel() for p in actor.parameters())
+    written = policy_file(args.folder, revision=args.revision).get(
+        "warmprior", "of an unknown version"
+    )
     for name, value in {
         "prior": actor.prior,
         "network": f"{config['network']} ({count:,} parameters)",
@@ -95,6 +99,7 @@ def evaluate(args: argparse.Namespace) -> None:
 def push(args: argparse.Namespace) -> None:
     """Send a saved policy to the Hugging Face hub, with a card that tells what is known of it."""
     from warmprior.experiments import model_card, policy_results
+    from warmprior.training.saved import push_policy
 
     branch, args.revision = args.revision, None  # of the repository, not of the folder
     if not Path(args.folder).is_dir():
@@ -106,7 +111,7 @@ def push(args: argparse.Namespace) -> None:
         print(card)
         return
     private = args.private or None
-    commit = actor.push_to_hub(args.repository, card=card, private=private, revision=branch)
+    commit = push_policy(actor, args.repository, card=card, private=private, revision=branch)
     print(f"{args.repository}: commit {commit}")
 
 
@@ -127,7 +132,7 @@ def train(args: argparse.Namespace) -> None:
         comparison = Comparison(recipe, "train")
         comparison.train()
     for contestant in comparison.contestants:
-        print(f"{contestant.prior.describe()}, seed {contestant.training.seed}: {contestant.path}")
+        print(f"{contestant.method.describe()}, seed {contestant.training.seed}: {contestant.path}")
 
 
 def demonstrations(args: argparse.Namespace) -> None:
@@ -167,7 +172,7 @@ def make_parser() -> argparse.ArgumentParser:
     for run in (info, push, evaluate):
         add = command(run)
         place = "" if run is push else ", or user/name of a repository at the Hugging Face hub"
-        add("folder", help=f"written by save_pretrained, such as .../policy_010000{place}")
+        add("folder", help=f"written by save_policy, such as .../policy_010000{place}")
         if run is push:
             add("repository", help="user/name; made if needed")
             add("--run", dest="run_folder", type=Path, help="whose results the card tells")

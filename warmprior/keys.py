@@ -12,21 +12,22 @@ constant                key                                    shape and dtype
 :data:`OBSERVATION`     ``"observation"``                      ``[*B, To, d_o]`` float
 :data:`STATE`           ``"state"``, nested under observation  ``[*B, To, d_s]`` float
 :data:`FEATURES`        ``"features"``, of an encoder           ``[*B, To, d_o]`` float
-:data:`CONDITIONED`     ``("prior", "observation")``           ``[*B, To, d_o + P * d_a + 1]`` float
+:data:`CONDITIONED`     ``("prior", "observation")``           ``[*B, To, d_o + H * d_a + 1]`` float
 :data:`ACTION`          ``"action"``                           ``[*B, d_a]`` float
 :data:`EEF_POSE`        ``"eef_pose"``                         ``[*B, arms, 3, 4]`` float, raw
 :data:`SIM_STATE`       ``"sim_state"``                        ``[*B, 1 + nq + nv]`` float64, raw
+:data:`ACTIONS`         ``("history", "actions")``             ``[*B, H, d_a]`` float
+:data:`STEPS`           ``("history", "steps")``               ``[*B, 1]`` int64
+:data:`FORECAST`        ``("history", "forecast")``            ``[*B, P, d_a]`` float
+:data:`FORECAST_STEPS`  ``("history", "forecast_steps")``      ``[*B, 1]`` int64
 :data:`LOC`             ``("prior", "loc")``                   ``[*B, P, d_a]`` float
 :data:`WARM`            ``("prior", "warm")``                  ``[*B, P, 1]`` bool
 :data:`ANCHOR`          ``("prior", "anchor")``                ``[*B, P, d_a]`` float
 :data:`NOISE`           ``("prior", "noise")``, the source a0  ``[*B, P, d_a]`` float
 :data:`DELTA`           ``("prior", "delta")``                 ``[*B, P, d_a]`` float
-:data:`ELAPSED`         ``("prior", "elapsed")``               ``[*B, 1]`` int64
 :data:`CHUNK`           ``("vla_action", "chunk")``            ``[*B, P, d_a]`` float
 :data:`DECODED_NOISE`   ``("decoded", "noise")``               ``[*B, P, d_a]`` float
 :data:`DECODED_CHUNK`   ``("decoded", "chunk")``               ``[*B, P, d_a]`` float
-:data:`LEFTOVER`        ``("rtc", "leftover")``                ``[*B, P, d_a]`` float
-:data:`VALID`           ``("rtc", "valid")``                   ``[*B, P, 1]`` bool
 :data:`DELAY`           ``("rtc", "delay")``                   ``[*B, 1]`` int64
 :data:`IS_PAD`          ``"action_is_pad"``                    ``[*B, P]`` bool
 :data:`EXECUTED`        ``"executed_steps"``                   ``[*B, 1]`` int64
@@ -39,9 +40,10 @@ An observation with images has several entries, nested under :data:`OBSERVATION`
 :data:`STATE`, and images uint8 ``[*B, To, 3, h, w]`` under robomimic's names, such as
 ``"agentview_image"``.
 
-:data:`LEFTOVER` is what the chunk of the decision before holds for the control steps of the next one, where
-:data:`VALID` holds (0 behind), and :data:`DELAY` the number of control steps for which it goes on being
-executed while the next chunk is computed. At the first decision of an episode there is none, and no delay.
+:data:`HISTORY` is what the robot did and meant to do (:mod:`warmprior.history`). Data, environments and
+robots write it alike; the policy writes :data:`LOC`, :data:`WARM` and :data:`NOISE`. :data:`DELAY` is the
+number of control steps for which the last chunk goes on being executed while the next one is computed; 0
+where there is no last chunk.
 
 In prior-space reinforcement learning :data:`ANCHOR` is the centre of the agent's box and :data:`DELTA` its
 action, so that the source is always ``noise = anchor + delta``. An environment that decodes by itself tells
@@ -64,17 +66,19 @@ EEF_POSE = "eef_pose"
 SIM_STATE = "sim_state"
 FEATURES = "features"
 CONDITIONED = ("prior", "observation")
+HISTORY = "history"
+ACTIONS = ("history", "actions")
+STEPS = ("history", "steps")
+FORECAST = ("history", "forecast")
+FORECAST_STEPS = ("history", "forecast_steps")
 LOC = ("prior", "loc")
 WARM = ("prior", "warm")
 ANCHOR = ("prior", "anchor")
 NOISE = ("prior", "noise")
 DELTA = ("prior", "delta")
-ELAPSED = ("prior", "elapsed")
 CHUNK = ACTION_CHUNK_KEY
 DECODED_NOISE = ("decoded", "noise")
 DECODED_CHUNK = ("decoded", "chunk")
-LEFTOVER = ("rtc", "leftover")
-VALID = ("rtc", "valid")
 DELAY = ("rtc", "delay")
 IS_PAD = ACTION_IS_PAD_KEY
 EXECUTED = "executed_steps"

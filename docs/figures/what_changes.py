@@ -11,7 +11,6 @@ from pathlib import Path
 
 import torch
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.envs.navigation1d import (
     HALF_HEIGHT,
@@ -19,16 +18,16 @@ from warmprior.envs.navigation1d import (
     OBSTACLES,
     navigation_positions,
 )
-from warmprior.experiments import NAVIGATION_PRESETS, Store, navigation_problem
+from warmprior.experiments import NAVIGATION_PRESETS, Method, Store, navigation_problem
 from warmprior.experiments.figures import new_figure
 from warmprior.experiments.navigation1d import play_navigation
 
 OUT = Path(__file__).parents[1] / "_static" / "what_changes.png"
 ABOVE, BELOW = "#1f77b4", "#d95f02"
 SOURCES = {
-    "Gaussian noise": GaussianPrior(16),
-    "WP-Past: what was just executed": PastPrior(16),
-    "WP-Preview: its own earlier forecast": PreviewPrior(16),
+    "Gaussian noise": Method("gaussian", 16),
+    "WP-Past: what was just executed": Method("past", 16),
+    "WP-Preview: its own earlier forecast": Method("preview", 16),
 }
 AHEAD = 4
 """The coordinate of the chunk that is shown."""
@@ -43,9 +42,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         store = Store(problem, recipe.network, Path(folder), Path(folder))
         store.run = replace(store.run, logger="none")
-        for column, (name, prior) in enumerate(SOURCES.items()):
-            actor = store.policy(prior, recipe.training)
-            window = data.windows(prior)
+        for column, (name, method) in enumerate(SOURCES.items()):
+            actor = store.policy(method, recipe.training)
+            window = data.windows(actor.prior)
             # Of a demonstration that passes above the first obstacle, while it does.
             index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
             batch = window[index : index + 1].expand(160).contiguous()

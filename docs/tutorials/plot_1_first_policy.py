@@ -39,6 +39,7 @@ from warmprior.envs import (
     navigation_metrics,
     navigation_positions,
 )
+from warmprior.training import load_policy, save_policy
 
 torch.manual_seed(0)
 
@@ -89,11 +90,11 @@ plt.show()
 # Everything follows from the *prior*, the object that describes the source:
 #
 # * :func:`~warmprior.window_replay_buffer` is a TorchRL replay buffer of training windows:
-#   observation, target chunk, and the mean of the prior's source.
+#   observation, target chunk, and the *history*, what the agent did before.
 # * :class:`~warmprior.PreconditionedNetwork` scales the network's inputs and outputs by what is
 #   known of source and data.
-# * :class:`~warmprior.WarmPriorActor` draws from the source and integrates the network's velocity
-#   to a chunk; ``nfe`` is the number of network evaluations for that.
+# * :class:`~warmprior.WarmPriorActor` draws from the source, which the prior makes of the history,
+#   and integrates the network's velocity to a chunk; ``nfe`` is the number of network evaluations.
 # * :class:`~warmprior.FlowMatchingLoss` is a TorchRL loss module.
 #
 # Between the two policies nothing changes but the prior.
@@ -103,7 +104,7 @@ def train(prior, iterations=1000):
     """Behaviour cloning by flow matching."""
     torch.manual_seed(0)
     windows = window_replay_buffer(
-        demos, prior, batch_size=256, observation_steps=1
+        demos, prior, batch_size=256, observation_steps=1, withhold=0.1
     )
     network = VelocityMLP(
         action_dim=1,
@@ -131,22 +132,20 @@ def train(prior, iterations=1000):
 
 actors = {
     "Gaussian source": train(GaussianPrior(chunk_length=4)),
-    "WP-Past": train(
-        PastPrior(chunk_length=4, sigma=0.1, cold_probability=0.1)
-    ),
+    "WP-Past": train(PastPrior(chunk_length=4, sigma=0.1)),
 }
 
 # %%
 # ``chunk_length=4``: the policy predicts four actions, executes them, and decides again. ``sigma``
 # is how far the source spreads around the last four actions, in units of the normalised action. At
 # the first decision of an episode there is no past, and the source is the Gaussian one;
-# ``cold_probability=0.1`` hides the past from a tenth of the training windows, so that the network
-# knows this case well.
+# ``withhold=0.1`` hides the past from a tenth of the training windows, so that the network knows this
+# case well.
 #
 # Acting
 # ------
 # :func:`~warmprior.policy_transforms` makes of any TorchRL environment one that executes chunks and
-# remembers what the prior needs. The actor itself keeps no state, so ``rollout``, collectors and
+# remembers the history. The actor itself keeps no state, so ``rollout``, collectors and
 # parallel environments work as ever.
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.1), sharey=True)
@@ -229,8 +228,8 @@ plt.show()
 # prior along, and returns the same chunks bit by bit.
 
 with tempfile.TemporaryDirectory() as folder:
-    actors["WP-Past"].save_pretrained(folder)
-    loaded = WarmPriorActor.from_pretrained(folder)
+    save_policy(actors["WP-Past"], folder)
+    loaded = load_policy(folder)
     print(sorted(path.name for path in Path(folder).iterdir()))
 print(loaded.prior)
 

@@ -38,6 +38,7 @@ from warmprior.training import (
     BehaviourCloning,
     TrainingConfig,
     evaluate,
+    load_policy,
     precondition,
 )
 
@@ -177,7 +178,7 @@ def train(prior, iterations=1000):
     )
     training = BehaviourCloning(actor, normalized, config, root / prior.name)
     training.run(description=None)  # no progress bar
-    return WarmPriorActor.from_pretrained(training.policy_path())
+    return load_policy(training.policy_path())
 
 
 policies = {
@@ -322,7 +323,7 @@ for second, axis in enumerate(axes):
 plt.show()
 
 # %%
-# The policies are folders as in :doc:`tutorial 1 <plot_1_first_policy>`; ``from_pretrained`` above
+# The policies are folders as in :doc:`tutorial 1 <plot_1_first_policy>`; ``load_policy`` above
 # has loaded the last checkpoint of averaged weights. From here: :doc:`what one step costs
 # <plot_4_one_step>`, and :doc:`images <plot_5_images>`.
 

@@ -36,7 +36,7 @@ def train(prior, iterations=800, look=lambda iteration, actor: None):
     """As in tutorial 1; ``look`` is called after every iteration."""
     torch.manual_seed(0)
     windows = window_replay_buffer(
-        demos, prior, batch_size=256, observation_steps=1
+        demos, prior, batch_size=256, observation_steps=1, withhold=0.1
     )
     network = VelocityMLP(
         1, 9, prior.prediction_length, observation_steps=1, hidden_dim=64
@@ -79,9 +79,10 @@ def look(iteration, actor):
 
 actors = {
     "Gaussian source": train(GaussianPrior(4), look=look),
-    "WP-Past": train(PastPrior(4, sigma=0.1, cold_probability=0.1)),
-    "WP-Preview": train(PreviewPrior(4, sigma=0.1, cold_probability=0.1)),
+    "WP-Past": train(PastPrior(4, sigma=0.1)),
+    "WP-Preview": train(PreviewPrior(4, sigma=0.1)),
 }
+colors = dict(zip(actors, ("#7f7f7f", "#1f77b4", "#d95f02"), strict=True))
 
 # %%
 # Success against steps
@@ -97,7 +98,7 @@ for name, actor in actors.items():
     ]
     collisions = [row["collision_rate"] for row in played]
     print(f"{name:16}", [round(rate, 2) for rate in collisions])
-    axis.plot(nfes, collisions, "o-", color=actor.prior.color, label=name)
+    axis.plot(nfes, collisions, "o-", color=colors[name], label=name)
 axis.set(
     xscale="log",
     xlabel="network evaluations per chunk (NFE)",
@@ -138,7 +139,7 @@ for axis, (name, actor) in zip(axes, actors.items(), strict=True):
             ".",
             ms=3,
             alpha=0.5,
-            color=actor.prior.color,
+            color=colors[name],
         )
     axis.set_xticks(range(3), ["NFE 1", "NFE 2", "NFE 9"])
     axis.set_title(name)
@@ -168,13 +169,12 @@ for name, actor in actors.items():
     error.append(measured["one_step_error_executed"].square().mean().sqrt())
 
 figure, axes = plt.subplots(1, 3, figsize=(9, 2.8))
-colors = [actor.prior.color for actor in actors.values()]
 for axis, values, title in (
     (axes[0], kappa, "curvature $\\kappa$"),
     (axes[1], relative, "curvature / squared speed"),
     (axes[2], error, "error of one step"),
 ):
-    axis.bar(names, values, color=colors)
+    axis.bar(names, values, color=list(colors.values()))
     for place, value in enumerate(values):
         axis.text(place, value, f"{value:.3f}", ha="center", va="bottom")
     axis.set(title=title)
@@ -185,7 +185,7 @@ plt.show()
 # %%
 # What to notice: by ``kappa`` both warm sources are straight. By the ratio WP-Preview is not: its
 # way is so short that bends count for much in it, and for little in the action. Read the two
-# together, and trust the error. (``shared.met`` makes the mean that a *running* policy meets, from
+# together, and trust the error. (``shared.met`` makes the history that a *running* policy meets, with
 # its own previous prediction; ``shared.windows`` the one of the training.)
 #
 # Does the network leak?

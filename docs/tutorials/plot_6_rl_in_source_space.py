@@ -57,7 +57,7 @@ demos = navigation_demonstrations()
 def clone(prior, iterations=500):
     torch.manual_seed(0)
     windows = window_replay_buffer(
-        demos, prior, batch_size=256, observation_steps=1
+        demos, prior, batch_size=256, observation_steps=1, withhold=0.1
     )
     network = VelocityMLP(
         1, 9, prior.prediction_length, observation_steps=1, hidden_dim=64
@@ -81,8 +81,9 @@ def clone(prior, iterations=500):
 
 policies = {
     "Gaussian source": clone(GaussianPrior(8)),
-    "WP-Past": clone(PastPrior(8, sigma=0.5, cold_probability=0.1)),
+    "WP-Past": clone(PastPrior(8, sigma=0.5)),
 }
+colors = dict(zip(policies, ("#7f7f7f", "#1f77b4"), strict=True))
 
 # %%
 # The goal
@@ -98,7 +99,7 @@ policies = {
 
 def make_env(actor, seed):
     transforms = policy_transforms(actor.prior, observation_steps=1)
-    transforms.append(PriorAnchor(actor.prior, seed=seed))
+    transforms.append(PriorAnchor(actor, seed=seed))
     return TransformedEnv(
         GoalNavigationEnv((1, 1), batch_size=[32]), transforms
     )
@@ -246,7 +247,7 @@ for name, actor in policies.items():
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.0), sharey=True)
 for axis, (name, training) in zip(axes, trainings.items(), strict=True):
-    color = policies[name].prior.color
+    color = colors[name]
     curve = training.curve
     (base,) = [row for row in curve if row["evaluation"] == "base"]
     axis.axhline(base["success_rate"], color="0.4", ls="--", lw=1)

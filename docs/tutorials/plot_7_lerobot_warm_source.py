@@ -189,9 +189,9 @@ train(policy, lerobots_own_loss, iterations=400, learning_rate=3e-3)
 # policy's own loss, ``adapter.select_action`` its own sampler; both find the prior's sample where
 # they would draw noise, exactly once, or there is an error. The fine-tuning is the line it was.
 
-past = PastPrior(H, sigma=0.3, cold_probability=0.2)
+past = PastPrior(H, sigma=0.3)
 tuned = copy.deepcopy(policy)
-adapter = WarmPriorAdapter(tuned, past)
+adapter = WarmPriorAdapter(tuned, past, cold_probability=0.2)
 train(tuned, adapter.loss, iterations=400, learning_rate=2e-3)
 
 before, after = policy.state_dict(), tuned.state_dict()
@@ -215,19 +215,27 @@ adapters = {
     "Gaussian source": WarmPriorAdapter(policy, GaussianPrior(H)),
     "WP-Past": adapter,
 }
-for axis, (name, one) in zip(axes, adapters.items(), strict=True):
+colors = ("#7f7f7f", "#1f77b4")
+for axis, (name, one), color in zip(
+    axes, adapters.items(), colors, strict=True
+):
     history, chunk = windows["action"][:, :H], windows["action"][:, -H:]
     valid = ~windows["action_is_pad"][:, :H]
-    samples, _ = one.source.learn(history, valid, chunk)
+    share = one.cold_probability
+    samples, _ = one.source.learn(
+        history, valid, chunk, cold_probability=share
+    )
     warm = valid.all(1)
     error = (samples - chunk)[warm].square().mean().sqrt()
     step = 24
     forty = torch.full((40,), step)
-    samples, _ = one.source.learn(history[forty], valid[forty], chunk[forty])
+    samples, _ = one.source.learn(
+        history[forty], valid[forty], chunk[forty], cold_probability=share
+    )
     axis.plot(
         x[step : step + H],
         samples.squeeze(-1).T,
-        color=one.prior.color,
+        color=color,
         lw=0.7,
         alpha=0.6,
     )
@@ -294,6 +302,7 @@ for row, nfe in zip(axes, (9, 1), strict=True):
     for axis, (name, (played, prior)) in zip(
         row, players.items(), strict=True
     ):
+        color = colors[prior is past]
         heights = many_robots(played, prior, nfe)
         alone = one_robot(WarmPriorAdapter(played, prior, nfe=nfe))
         metrics = navigation_metrics(heights, H)
@@ -301,7 +310,7 @@ for row, nfe in zip(axes, (9, 1), strict=True):
             axis.fill_between(
                 [centre - 0.12, centre + 0.12], -0.45, 0.45, color="0.8"
             )
-        axis.plot(x, heights.T, color=prior.color, lw=0.5, alpha=0.5)
+        axis.plot(x, heights.T, color=color, lw=0.5, alpha=0.5)
         axis.plot(x, alone, color="black", lw=1.2)
         axis.plot(x[::H], alone[::H], "o", color="black", ms=3)
         axis.set(ylim=(-1.2, 1.2))

@@ -15,10 +15,10 @@ from pathlib import Path
 import matplotlib.pyplot as plt
 import torch
 
-from warmprior import GaussianPrior, PastPrior
 from warmprior.experiments import (
     NAVIGATION_PRESETS,
     Comparison,
+    Method,
     RunOptions,
     Store,
     judge_navigation,
@@ -49,16 +49,19 @@ def compare(run, seeds, envs):
             iterations=300,
             learning_rate=4e-3,
             save_every=300,
+            cold_probability=0.1,
         ),
         evaluation=replace(recipe.evaluation, seeds=seeds),
         run=RunOptions(out=Path(folder.name) / run, envs=envs, logger="none"),
     )
-    priors = [GaussianPrior(4), PastPrior(4, sigma=0.1, cold_probability=0.1)]
+    methods = [
+        Method.parse(name, 4, sigma=0.1) for name in ("gaussian", "past")
+    ]
     return Comparison(
         recipe,
         "grid",
         stores=[Store.of(recipe, navigation_problem())],
-        priors=priors,
+        methods=methods,
     )
 
 
@@ -104,21 +107,23 @@ for contestant in alone.contestants:
         strict=True,
     )
     equal = all(torch.equal(one, other) for one, other in pairs)
-    print(contestant.prior.label, "has the same weights:", equal)
+    print(contestant.method.label, "has the same weights:", equal)
 
 # %%
 # What the cells are for: the spread between seeds is part of the result.
 
 figure, axis = plt.subplots(figsize=(6, 2.4))
-for place, prior in enumerate(more.priors):
+for place, (method, color) in enumerate(
+    zip(more.methods, ("#7f7f7f", "#1f77b4"), strict=True)
+):
     rates = [
         judge_navigation(c.policy(), seed=0, nfe=3, rollouts=128)
         for c in more.contestants
-        if c.prior == prior
+        if c.method == method
     ]
     rates = [row["collision_rate"] for row in rates]
-    axis.plot(rates, [place] * len(rates), "o", color=prior.color, ms=8)
-axis.set_yticks([0, 1], [prior.label for prior in more.priors])
+    axis.plot(rates, [place] * len(rates), "o", color=color, ms=8)
+axis.set_yticks([0, 1], [method.label for method in more.methods])
 axis.set(xlabel="episodes that collide, NFE 3", xlim=(-0.03, 1.03))
 axis.set(ylim=(-0.5, 1.5), title="Three training seeds of each source")
 plt.show()

@@ -14,14 +14,17 @@ from torchrl.envs import TransformedEnv
 
 from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
+    ActionWindow,
     GaussianPrior,
-    HistoryPrior,
+    HistoryObservation,
     Normalizer,
     PastPrior,
     PreviewPrior,
+    Prior,
     RealTimeChunking,
     VelocityMLP,
     WarmPriorActor,
+    keys,
     policy_transforms,
 )
 from warmprior.deploy import AsyncExecutor
@@ -30,11 +33,10 @@ from warmprior.diagnostics import executed_actions
 OBSERVATION_DIM = 2 + ACTION_DIM
 
 
-def actor(prior, **options):
+def actor(prior, width=0, **options):
     torch.manual_seed(0)
-    extra = prior.prediction_length * ACTION_DIM + 1 if prior.conditions_network else 0
     network = VelocityMLP(
-        ACTION_DIM, OBSERVATION_DIM + extra, prior.prediction_length, hidden_dim=16
+        ACTION_DIM, OBSERVATION_DIM + width, prior.prediction_length, hidden_dim=16
     )
     with torch.no_grad():  # its head starts at zero
         for parameter in network.parameters():
@@ -146,13 +148,10 @@ def test_measured_delays_on_a_fake_clock():
     told = [int(data["rtc", "delay"]) for data in policy.given]
     assert told == [0, 1, 2, 2, 5, 5, 5, 1]
     for data in policy.given[1:]:
-        step, left = float(data["observation"]), data["rtc", "valid"].sum()
+        step, left = float(data["observation"]), int(data["history", "forecast_steps"])
         expected = step + torch.arange(float(left))
-        assert data["rtc", "leftover"][:left, 1].tolist() == expected.tolist()
-        assert not data["rtc", "leftover"][left:].any()
-        # WP-Preview's mean: the forecast of these very steps.
-        assert data["prior", "loc"][:6, 1].tolist() == [step + i for i in range(6)]
-        assert data["prior", "warm"].flatten().tolist() == [True] * 6 + [False] * 6
+        assert left >= 6 and data["history", "forecast"][:left, 1].tolist() == expected.tolist()
+        assert not data["history", "forecast"][left:].any()
 
 
 def test_the_past_is_what_was_handed_out():
@@ -161,15 +160,47 @@ def test_the_past_is_what_was_handed_out():
         policy, prior=PastPrior(8), action_dim=2, execute=5, observation_steps=1, pool=clock
     )
     actions = drive(executor, clock, 36)
-    warm = 0
     for data in policy.given:
-        step = int(data["observation"])
-        assert int(data["prior", "elapsed"]) == step
-        assert bool(data["prior", "warm"].all()) == (step >= 8)
-        if step >= 8:
-            warm += 1
-            assert torch.equal(data["prior", "loc"], actions[step - 8 : step])
-    assert warm >= 5
+        step, history = int(data["observation"]), data["history"]
+        known = min(step, 8)
+        assert int(history["steps"]) == known
+        assert torch.equal(history["actions"][8 - known :], actions[step - known : step])
+        assert not history["actions"][: 8 - known].any()
+    assert len(policy.given) >= 6
+
+
+class Momentum(Prior):
+    """Goes on as the last two actions did."""
+
+    name = "momentum-on-a-robot"
+
+    def mean(self, history):
+        before, last = history["actions"][..., -2:-1, :], history["actions"][..., -1:, :]
+        steps = torch.arange(1, self.prediction_length + 1).view(-1, 1)
+        warm = (history["steps"] >= 2).unsqueeze(-1)
+        return last + steps * (last - before), warm.expand_as(history["forecast"][..., :1])
+
+
+def test_a_users_prior_has_the_mean_of_its_training_windows():
+    """At every decision of an episode, whatever of it was executed."""
+    prior, frames = Momentum(4, sigma=0.2), 12
+    made = actor(prior)
+    found, actions = [], []
+    made.register_forward_hook(lambda module, args, out: found.append(out.clone()))
+    with AsyncExecutor(made, execute=1, latency=0, observation_steps=2) as executor:
+        for tick in range(frames):
+            actions.append(executor.act(torch.full((OBSERVATION_DIM,), tick / frames)))
+    data = {
+        "observation": torch.zeros(frames, OBSERVATION_DIM),
+        "action": torch.stack(actions),
+        "episode": torch.zeros(frames, dtype=torch.int64),
+    }
+    window = ActionWindow(TensorDict(data, [frames]), prior.chunk_length)
+    batch = window(TensorDict({"frame": torch.arange(frames)}, [frames]))
+    loc, _, warm = prior.distribution(batch["history"])
+    assert len(found) == frames and warm[:, 0, 0].tolist() == [False] * 2 + [True] * (frames - 2)
+    assert torch.equal(torch.stack([data["prior", "loc"] for data in found]), loc)
+    assert torch.equal(torch.stack([data["prior", "warm"] for data in found]), warm)
 
 
 def test_an_observation_overwritten_by_the_driver_and_stacks():
@@ -182,16 +213,22 @@ def test_an_observation_overwritten_by_the_driver_and_stacks():
     assert [data["observation"].flatten().tolist() for data in policy.given] == [[0, 0], [2, 3]]
 
 
-def test_several_entries_raw_units_and_means_that_networks_see():
-    """An observation of entries; raw units on the robot's side; a prior that conditions the network."""
+def test_several_entries_raw_units_and_last_actions_that_networks_see():
+    """An observation of entries; raw units on the robot's side; a network that sees the last actions."""
     raw = TensorDict(
         {"observation": 3 * torch.rand(20, OBSERVATION_DIM) + 1, "action": 5 * torch.rand(20, 2)},
         [20],
     )
     normalizer = Normalizer.fit(raw)
-    prior = HistoryPrior(4)
+    prior, width = GaussianPrior(4), HistoryObservation.width(4, ACTION_DIM)
     inside, outside = (
-        AsyncExecutor(actor(prior), execute=3, latency=1, normalizer=n) for n in (None, normalizer)
+        AsyncExecutor(
+            actor(prior, width, observation_key=keys.CONDITIONED),
+            execute=3,
+            latency=1,
+            normalizer=n,
+        )
+        for n in (None, normalizer)
     )
     for i in range(9):
         row = raw[i]
@@ -291,7 +328,8 @@ def test_a_reset_forgets_what_is_under_way():
         assert executor.act(torch.tensor([100.0])).tolist() == [100.0, 100.0]
         assert executor.act(torch.tensor([101.0])).tolist() == [100.0, 101.0]
         last = policy.given[-1]
-        assert not last["rtc", "valid"].any() and int(last["rtc", "delay"]) == 0
+        assert not any(value.any() for value in last["history"].values())
+        assert int(last["rtc", "delay"]) == 0
 
 
 def test_a_loop_in_inference_mode_has_guided_chunks():

@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from warmprior import GaussianPrior, ImageEncoder, VelocityMLP, VisionNetwork, WarmPriorActor
+from warmprior.history import cold_history
 
 H, D_A = 3, 2
 
@@ -23,9 +24,10 @@ class Field(nn.Module):
         return self.function(t.view(-1, 1, 1), a, observation)
 
 
-def policy(function, prior=None, seed=0):
+def policy(function, prior=None, seed=0, **options):
     prior = GaussianPrior(H) if prior is None else prior
-    return WarmPriorActor(Field(function), prior, generator=torch.Generator().manual_seed(seed))
+    generator = torch.Generator().manual_seed(seed)
+    return WarmPriorActor(Field(function), prior, generator=generator, **options)
 
 
 def batch(n=5, length=H, d_a=D_A, **extra):
@@ -33,14 +35,30 @@ def batch(n=5, length=H, d_a=D_A, **extra):
     data = TensorDict(
         {
             "observation": torch.randn(n, 1, 4),
-            "prior": {
-                "loc": torch.zeros(n, length, d_a),
-                "warm": torch.zeros(n, length, 1, dtype=torch.bool),
-            },
+            "history": cold_history([n], min(H, length), length, d_a),
         },
         [n],
     )
     return data.update(extra)
+
+
+def remember(data, loc, warm=True):
+    """Write a history that both WP-Past and WP-Preview make the mean ``loc`` of, where it is warm."""
+    history = data["history"]
+    length = history["actions"].shape[-2]
+    steps = torch.full((len(data), 1), length) * warm
+    forecast = torch.zeros_like(history["forecast"])
+    forecast[:, :length] = loc[:, :length]
+    return data.update(
+        {
+            "history": {
+                "actions": loc[:, :length].clone(),
+                "steps": steps,
+                "forecast": forecast,
+                "forecast_steps": steps.clone(),
+            }
+        }
+    )
 
 
 def seeing_network(d_a, state_dim, length):
@@ -52,15 +70,3 @@ def seeing_network(d_a, state_dim, length):
     for parameter in network.parameters():
         parameter.data += 0.1 * torch.randn_like(parameter)  # the last layer begins at zero
     return network
-
-
-def leftover(n=5):
-    """What real-time chunking reads of the old chunk, one action of which is still played."""
-    return TensorDict(
-        {
-            "leftover": torch.rand(n, H, D_A, generator=torch.Generator().manual_seed(4)),
-            "valid": torch.ones(n, H, 1, dtype=torch.bool),
-            "delay": torch.ones(n, 1, dtype=torch.int64),
-        },
-        [n],
-    )

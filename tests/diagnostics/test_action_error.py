@@ -7,8 +7,9 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from warmprior import GaussianPrior, PreviewPrior, RegressionPrior, WarmPriorActor
+from warmprior import GaussianPrior, PreviewPrior, WarmPriorActor
 from warmprior.diagnostics import action_error
+from warmprior.history import cold_history
 
 H, D_A = 3, 2
 
@@ -33,17 +34,14 @@ def windows(prior, n=5):
         {
             "observation": torch.randn(n, 2, 4, generator=generator),
             "vla_action": {"chunk": torch.randn(shape, generator=generator)},
-            "prior": {
-                "loc": torch.zeros(shape),
-                "warm": torch.zeros(shape, dtype=torch.bool)[..., :1],
-            },
+            "history": cold_history([n], H, *shape[1:]),
             "action_is_pad": pad,
         },
         [n],
     )
 
 
-@pytest.mark.parametrize("prior", [GaussianPrior(H), PreviewPrior(H), RegressionPrior(H)], ids=str)
+@pytest.mark.parametrize("prior", [GaussianPrior(H), PreviewPrior(H)], ids=str)
 @pytest.mark.parametrize("split", [2, 4096])
 def test_by_hand(prior, split):
     batch = windows(prior)
@@ -60,12 +58,12 @@ def test_by_hand(prior, split):
     assert (batch == before).all()
 
 
-def test_clips_as_the_policy_does_and_skips_what_the_prior_refuses():
-    prior = RegressionPrior(H)
+def test_clips_as_the_policy_does_and_skips_what_the_policy_refuses():
+    prior = GaussianPrior(H)
     batch = windows(prior)
     batch["observation"][:] = 5.0
     batch["vla_action", "chunk"][:] = 1.0
-    policy = WarmPriorActor(Towards(), prior, clip=2.0)
+    policy = WarmPriorActor(Towards(), prior, clip=2.0, max_nfe=1)
     assert action_error(policy, batch, nfes=(1, 9)) == {1: pytest.approx(1.0)}
 
 
@@ -85,9 +83,9 @@ def test_same_noise_for_every_call_and_the_global_generator_untouched():
 
 
 def test_what_cannot_be_measured_is_refused():
-    policy = WarmPriorActor(Towards(), RegressionPrior(H))
-    with pytest.raises(ValueError, match="none of 1: add NFE 1"):
-        action_error(policy, windows(RegressionPrior(H)), nfes=(9,))
+    policy = WarmPriorActor(Towards(), GaussianPrior(H), max_nfe=1)
+    with pytest.raises(ValueError, match="has none: add NFE 1"):
+        action_error(policy, windows(GaussianPrior(H)), nfes=(9,))
     policy = WarmPriorActor(Towards(), GaussianPrior(H))
     with torch.no_grad():
         policy.network.unused.fill_(torch.nan)

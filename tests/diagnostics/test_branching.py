@@ -9,16 +9,16 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.diagnostics.fields import H, batch, policy
-from warmprior import GaussianPrior, HistoryPrior, PastPrior, PreviewPrior, RegressionPrior
+from tests.diagnostics.fields import H, batch, policy, remember
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import branching_bound, branching_cost
+from warmprior.experiments.learned_sources import CVAEPrior
 
 
 def windows(mean, target):
     """Warm windows with the given means and targets, each ``[n, P, d_a]``."""
     data = batch(len(target), target.shape[1], target.shape[2])
-    data["prior", "loc"] = mean
-    data["prior", "warm"] = torch.ones_like(data["prior", "warm"])
+    remember(data, mean)
     data["vla_action", "chunk"] = target
     return data
 
@@ -83,8 +83,7 @@ def test_bound_holds_on_random_mixtures(modes, sigma, jitter, spread, seed):
 def test_bound_counts_cold_and_padded_positions():
     prior = PreviewPrior(H, sigma=0.5)
     data = batch(2, 2 * H, 1)
-    data["prior", "loc"] = torch.ones(2, 2 * H, 1)
-    data["prior", "warm"] = torch.arange(2 * H).view(1, -1, 1).expand(2, -1, 1) < H
+    remember(data, torch.ones(2, 2 * H, 1))
     data["vla_action", "chunk"] = torch.full((2, 2 * H, 1), 3.0)
     bound = branching_bound(data, prior)
     assert bound["mismatch"].tolist() == [H * 4.0] * 2
@@ -113,9 +112,10 @@ def test_bad_input_is_named():
     data = windows(torch.zeros(5, H, 2), torch.zeros(5, H, 2))
     with pytest.raises(ValueError, match="no window"):
         branching_bound(data[:0], GaussianPrior(H))
-    with pytest.raises(ValueError, match=r"Eq\. 1"):
-        branching_bound(data, HistoryPrior(H))
+    decoded = CVAEPrior(H).sized(2, 4, 1)
+    with pytest.raises(ValueError, match="of a Gaussian source"):
+        branching_bound(data, decoded)
     with pytest.raises(ValueError, match="no path of 2 steps"):
-        branching_cost(policy(lambda t, a, o: -a, RegressionPrior(H)), data)
+        branching_cost(policy(lambda t, a, o: -a, max_nfe=1), data)
     with pytest.raises(ValueError, match="draws"):
         branching_cost(actor, data, draws=0)

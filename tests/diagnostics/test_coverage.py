@@ -8,8 +8,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.diagnostics.fields import remember
 from warmprior import (
-    CVAEPrior,
     GaussianPrior,
     PastPrior,
     PreviewPrior,
@@ -17,6 +17,8 @@ from warmprior import (
     WarmPriorActor,
 )
 from warmprior.diagnostics import source_coverage
+from warmprior.experiments.learned_sources import CVAEPrior
+from warmprior.history import cold_history
 
 H, D_A, N = 3, 2, 20_000
 
@@ -29,15 +31,16 @@ def windows(prior, spread, warm=True):
     g = torch.Generator().manual_seed(0)
     p = prior.prediction_length
     loc = torch.rand(N, p, D_A, generator=g)
-    return TensorDict(
+    data = TensorDict(
         {
             "observation": torch.zeros(N, 1, 1),
             "vla_action": {"chunk": warm * loc + spread * torch.randn(N, p, D_A, generator=g)},
             "action_is_pad": torch.zeros(N, p, dtype=torch.bool),
-            "prior": {"loc": loc, "warm": torch.full((N, p, 1), warm)},
+            "history": cold_history([N], H, p, D_A),
         },
         [N],
     )
+    return remember(data, loc, warm)
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9])

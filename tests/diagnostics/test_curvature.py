@@ -7,15 +7,8 @@ import warnings
 import pytest
 import torch
 
-from tests.diagnostics.fields import D_A, H, batch, policy
-from warmprior import (
-    HistoryPrior,
-    MeanObservation,
-    PastPrior,
-    PreviewPrior,
-    RegressionPrior,
-    VelocityMLP,
-)
+from tests.diagnostics.fields import D_A, H, batch, policy, remember
+from warmprior import GaussianPrior, HistoryObservation, PastPrior, PreviewPrior, VelocityMLP, keys
 from warmprior.diagnostics import curvature
 from warmprior.modules import WarmPriorActor
 
@@ -32,10 +25,10 @@ def test_a_linear_field_has_the_closed_form(n_steps):
     """v = -a: v_k = -(1 - 1/N)^k a0 at step k, coordinate by coordinate."""
     prior = PastPrior(H, sigma=0.0)  # the source is the mean itself
     data = batch()
-    data["prior", "loc"] = torch.randn(5, H, D_A)
-    data["prior", "warm"] = torch.ones(5, H, 1, dtype=torch.bool)
+    mean = torch.randn(5, H, D_A)
+    remember(data, mean)
     out = curvature(policy(lambda t, a, o: -a, prior), data, n_steps)
-    length = data["prior", "loc"].double().square().sum((-1, -2))
+    length = mean.double().square().sum((-1, -2))
     factors = (1 - 1 / n_steps) ** torch.arange(n_steps, dtype=torch.float64)
     torch.testing.assert_close(
         out["kappa"].double(), length * factors.var(correction=0), rtol=1e-4, atol=1e-7
@@ -73,13 +66,11 @@ def test_executed_positions_and_padding_count_separately():
     assert out["speed_executed"].tolist() == pytest.approx([D_A * 1.0] * 5)
 
 
-def network_policy(prior=None, seed=0):
+def network_policy(prior=None, width=4, **options):
     prior = PastPrior(H) if prior is None else prior
     torch.manual_seed(0)
-    network = VelocityMLP(
-        D_A, 4 + MeanObservation.width(prior, D_A), prior.prediction_length, 1, hidden_dim=8
-    )
-    return WarmPriorActor(network, prior, generator=torch.Generator().manual_seed(seed))
+    network = VelocityMLP(D_A, width, prior.prediction_length, 1, hidden_dim=8)
+    return WarmPriorActor(network, prior, generator=torch.Generator().manual_seed(0), **options)
 
 
 def test_the_split_changes_nothing():
@@ -105,8 +96,9 @@ def test_draws_average_independent_sources():
 
 
 def test_batch_shape_mode_and_generator_are_respected():
-    actor = network_policy(HistoryPrior(H)).train()
-    data = MeanObservation()(batch(6))
+    width = 4 + HistoryObservation.width(H, D_A)
+    actor = network_policy(GaussianPrior(H), width, observation_key=keys.CONDITIONED).train()
+    data = HistoryObservation()(batch(6))
     flat = curvature(actor, data, 10, generator=torch.Generator().manual_seed(0))
     shaped = curvature(actor, data.reshape(2, 3), 10, generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(shaped["kappa"].flatten(), flat["kappa"])
@@ -127,8 +119,7 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
     n = 40
     target = torch.randn(n, 2 * H, D_A, generator=torch.Generator().manual_seed(0))
     data = batch(n, length=2 * H)
-    data["prior", "loc"] = torch.cat([target[:, :H], torch.zeros(n, H, D_A)], 1)
-    data["prior", "warm"] = torch.arange(2 * H).view(1, -1, 1).expand(n, -1, 1) < H
+    remember(data, target)
     data["vla_action", "chunk"] = target
 
     def lazy(t, a, o):  # first half nearly still, second half optimal for normal data
@@ -152,10 +143,10 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
     ("change", "error", "message"),
     [
         (lambda d: d.exclude("observation"), KeyError, "observation"),
-        (lambda d: d.exclude(("prior", "warm")), KeyError, "warm"),
+        (lambda d: d.exclude(("history", "steps")), KeyError, "steps"),
         (lambda d: d[:0], ValueError, "no observation"),
         (lambda d: d.update({"observation": d["observation"] * torch.nan}), ValueError, "NaN"),
-        (lambda d: batch(length=H + 1), ValueError, "positions"),
+        (lambda d: batch(length=H + 1), ValueError, "forecasts of 3"),
     ],
 )
 def test_bad_batches_are_named(change, error, message):
@@ -170,7 +161,7 @@ def test_bad_options_and_policies_are_named():
     with pytest.raises(ValueError, match="executed"):
         curvature(field, batch(), executed=H + 1)
     with pytest.raises(ValueError, match="no path of 100 steps"):
-        curvature(policy(lambda t, a, o: -a, RegressionPrior(H)), batch())
+        curvature(policy(lambda t, a, o: -a, max_nfe=1), batch())
 
     def explodes(t, a, o):
         return torch.where((torch.arange(len(a)) == 2).view(-1, 1, 1), a * torch.inf, -a)

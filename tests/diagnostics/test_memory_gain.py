@@ -8,31 +8,26 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.diagnostics.fields import D_A, Field, H, batch, leftover, policy, seeing_network
+from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember, seeing_network
 from warmprior import (
-    ForecastPrior,
     GaussianPrior,
-    HistoryPrior,
+    HistoryObservation,
     PastPrior,
     PreviewPrior,
     RealTimeChunking,
-    RegressionPrior,
-    StepPrior,
     WarmPriorActor,
+    keys,
 )
 from warmprior.diagnostics import HistoryShift, encoded_windows, memory_gain
-from warmprior.transforms import MeanObservation
+from warmprior.experiments.learned_sources import ForecastPrior, ForecastStart
 
 N = 20_000
 
 
 def windows(prior, n=50, warm=True, **extra):
     length = prior.prediction_length
-    mask = torch.zeros(n, length, 1, dtype=torch.bool)
-    mask[:, :H] = warm
     loc = torch.rand(n, length, D_A, generator=torch.Generator().manual_seed(2))
-    found = batch(n, length).update({"prior": {"loc": loc, "warm": mask}}).update(extra)
-    return MeanObservation()(found) if prior.conditions_network else found
+    return HistoryObservation()(remember(batch(n, length), loc, warm).update(extra))
 
 
 def seen_mean(observation):
@@ -49,17 +44,11 @@ def by_hand(act, data, shift=0.05):
     for sign in (1, -1):
         generator.set_state(state)
         moved = data.clone()
-        moved["prior", "loc"] += sign * shift * direction
+        moved["history", "actions"] += sign * shift * direction
+        moved["history", "forecast"][:, :H] += sign * shift * direction
         with torch.no_grad():
             chunks.append(act(moved, generator))
     return float(((chunks[0] - chunks[1]) * direction).sum(-1).mean()) / (2 * shift)
-
-
-def drawn(draw):
-    """Executes what a prior's ``sample`` or ``start`` gives."""
-    return lambda moved, generator: draw(
-        moved["prior", "loc"], moved["prior", "warm"], generator, moved["observation"]
-    )
 
 
 def repeats(share):
@@ -96,7 +85,7 @@ def test_a_flow_that_branches_has_the_slope_of_its_mean(shift):
     """Actions are the sign of the source: E[a | mu] = erf(mu / (sigma sqrt 2)), whatever the shift."""
     prior = PastPrior(H, sigma=0.5)
     data = windows(prior, 4 * N)
-    data["prior", "loc"].zero_()
+    data["history", "actions"].zero_()
     field = policy(lambda t, a, o: a.sign() - a, prior)
     found = memory_gain(field, data, nfes=(1,), shift=shift)[1]
     along = shift / math.sqrt(D_A)  # per dimension, as good as linear
@@ -106,7 +95,7 @@ def test_a_flow_that_branches_has_the_slope_of_its_mean(shift):
 def test_any_shift_gives_the_slope_between_both_sides():
     prior = PastPrior(H, sigma=0.0)
     data = windows(prior)
-    data["prior", "loc"].zero_()
+    data["history", "actions"].zero_()
     field = policy(lambda t, a, o: torch.where(a > 0, a, 0.0), prior)  # slopes 2 and 1
     for shift in (0.01, 1.0):
         assert memory_gain(field, data, nfes=(1,), shift=shift)[1] == pytest.approx(1.5, rel=1e-4)
@@ -124,7 +113,6 @@ def test_only_executed_positions_inside_the_episode_count():
     pad = torch.zeros(10, 2 * H, dtype=torch.bool)
     pad[0, 1:] = True
     data = windows(prior, 10, action_is_pad=pad)
-    data["prior", "warm"][:] = True
     counted = [0.1] + 9 * [0.1, 0.2, 0.3]
     found = memory_gain(policy(repeats(shares), prior), data, nfes=(1,))
     assert found[1] == pytest.approx(sum(counted) / len(counted), rel=1e-4)
@@ -153,25 +141,23 @@ def test_noise_lowers_the_gain_by_what_averaging_over_the_chunk_leaves(sigma, co
 
 
 def test_a_network_that_sees_the_mean_follows_it_as_well():
-    prior = HistoryPrior(H)
-
-    field = policy(lambda t, a, o: 0.4 * seen_mean(o) - a, prior)
+    prior = GaussianPrior(H)
+    field = policy(lambda t, a, o: 0.4 * seen_mean(o) - a, observation_key=keys.CONDITIONED)
     found = memory_gain(field, windows(prior), nfes=(1,))
     assert found[1] == pytest.approx(0.4, rel=1e-4)
 
 
 def test_a_network_that_sees_images_and_the_mean():
     """Against the same policy without its diagnostics: observations made anew on both sides."""
-    prior, n = HistoryPrior(H), 8
-    width = 4 + MeanObservation.width(prior, D_A)
+    prior, n = GaussianPrior(H), 8
+    width = 4 + HistoryObservation.width(H, D_A)
     network = seeing_network(D_A, width, H)
-    actor = WarmPriorActor(network, prior, nfe=1).eval()
+    actor = WarmPriorActor(network, prior, nfe=1, observation_key=keys.CONDITIONED).eval()
     data = windows(GaussianPrior(H), n)
     images = torch.randint(0, 255, (n, 2, 3, 16, 16), dtype=torch.uint8)
     states = torch.randn(n, 2, 4)
     data["observation"] = TensorDict({"state": states, "cam_image": images}, [n])
-    data["prior", "warm"] = torch.ones(n, H, 1, dtype=torch.bool)
-    whole = MeanObservation()(data.clone())
+    whole = HistoryObservation()(data.clone())
     found = memory_gain(actor, whole, nfes=(1,), shift=0.5)[1]
     with pytest.raises(ValueError, match="images as they are, not encoded"):
         memory_gain(actor, encoded_windows(actor, whole))
@@ -180,7 +166,7 @@ def test_a_network_that_sees_images_and_the_mean():
 
     def act(moved, generator):
         a0 = torch.randn(n, H, D_A, generator=generator)
-        told = MeanObservation()(moved)["prior", "observation"]
+        told = HistoryObservation()(moved)["prior", "observation"]
         return a0 + network(torch.zeros(n), a0, told)
 
     assert abs(found) > 1e-4
@@ -193,33 +179,23 @@ def test_a_learned_source_is_asked_with_the_shifted_history():
     data = windows(prior)
     field = policy(lambda t, a, o: torch.zeros_like(a), prior)  # executes its source
     found = memory_gain(field, data, nfes=(1,), shift=0.05)[1]
-    expected = by_hand(drawn(prior.sample), data)
+    expected = by_hand(lambda m, g: prior.sample(m["history"], m["observation"], g), data)
     assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
-
-
-class SeenByTheSource(PastPrior):
-    """Starts from what the network is told, which tells the mean."""
-
-    conditions_network = True
-
-    def start(self, loc, warm, generator=None, observation=None):
-        return seen_mean(observation)
-
-
-def test_a_start_that_depends_on_the_observation_gets_the_shifted_one():
-    prior = SeenByTheSource(H)
-    found = memory_gain(policy(repeats(0.6), prior), windows(prior), nfes=(1,))
-    assert found[1] == pytest.approx(0.6, rel=1e-4)
 
 
 def test_it_measures_where_samplers_start():
     """STEP starts at a later time, from its forecast of what is remembered and less noise."""
     torch.manual_seed(0)
-    prior = StepPrior(H, start_time=0.5).sized(D_A, 4, 1)
+    prior, start = GaussianPrior(H), ForecastStart(H, start_time=0.5).sized(D_A, 4, 1)
     data = windows(prior)
-    stays = policy(lambda t, a, o: torch.zeros_like(a), prior)
+    stays = policy(lambda t, a, o: torch.zeros_like(a), start=start)
     found = memory_gain(stays, data, nfes=(1,), shift=0.05)[1]
-    expected = by_hand(drawn(prior.start), data)
+
+    def act(moved, generator):
+        noise = torch.randn(len(moved), H, D_A, generator=generator)
+        return start(noise, moved["history"], moved["observation"])
+
+    expected = by_hand(act, data)
     assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
 
 
@@ -234,29 +210,14 @@ def test_dropout_is_off():
     assert found[1] == pytest.approx(0.5, rel=1e-4)
 
 
-def test_keys_may_have_other_names():
-    prior = PastPrior(H)
-    renamed = {"observation_key": "seen", "loc_key": ("m", "loc"), "warm_key": ("m", "warm")}
-    actor = WarmPriorActor(Field(repeats(0.3)), prior, **renamed)
-    data = windows(prior)
-    data = data.rename_key_("observation", "seen").rename_key_("prior", "m")
-    assert memory_gain(actor, data, nfes=(1,))[1] == pytest.approx(0.3, rel=1e-4)
-
-    prior = HistoryPrior(H)
-    field = Field(lambda t, a, o: 0.4 * seen_mean(o) - a)
-    data = windows(prior).rename_key_(("prior", "observation"), "told")
-    found = memory_gain(WarmPriorActor(field, prior, observation_key="told"), data, nfes=(1,))
-    assert found[1] == pytest.approx(0.4, rel=1e-4)
-
-
 def test_nfes_are_those_of_the_prior_in_order_and_batches_may_have_any_shape():
     field = policy(lambda t, a, o: 0.7 * a, PastPrior(H))
     data = windows(PastPrior(H), 48)
     found = memory_gain(field, data, nfes=(9, 1, 3))
     assert list(found) == [1, 3, 9]
     assert memory_gain(field, data.reshape(4, 12), nfes=(1, 3, 9)) == found
-    regression = RegressionPrior(H)
-    assert list(memory_gain(policy(repeats(0.7), regression), windows(regression))) == [1]
+    regression = policy(repeats(0.7), max_nfe=1)
+    assert list(memory_gain(regression, windows(GaussianPrior(H)))) == [1]
 
 
 def test_a_generator_draws_directions_and_noise():
@@ -270,44 +231,27 @@ def test_a_generator_draws_directions_and_noise():
     assert found(1) == found(1) != found(0)
 
 
-def test_a_disturbed_memory_tells_a_network_of_it_whatever_its_keys():
-    """What lies under the usual observation key is another thing here."""
-    prior = HistoryPrior(H)
+def test_a_disturbed_memory_tells_a_network_of_it():
     field = Field(lambda t, a, o: seen_mean(o) - a)
-    actor = WarmPriorActor(field, prior, nfe=1, observation_key="told")
-    data = windows(prior).rename_key_(("prior", "observation"), "told")
-    data["prior", "warm"][:] = True
-    data["observation"] = torch.full((50, 1, 9), 99.0)
-    data = data.to("cpu")  # on the policy's device already: nothing is copied by chance
+    actor = WarmPriorActor(field, GaussianPrior(H), nfe=1, observation_key=keys.CONDITIONED)
+    data = windows(GaussianPrior(H)).to("cpu")  # on the policy's device already
     before = data.clone()
-    shifted = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(3))
-    found = shifted(data).select(actor.chunk_key)
+    disturbed = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(3))
+    found = disturbed(data)[actor.chunk_key]
     data = data.select(*before.keys(True, True))
     assert (data == before).all()
-    noise = torch.randn(50, H, D_A, generator=torch.Generator().manual_seed(3))
-    expected = data["prior", "loc"] + 0.3 * noise
-    torch.testing.assert_close(found[actor.chunk_key], expected)
+    moved = (found - data["history", "actions"]) / 0.3
+    assert 0.8 < float(moved.std()) < 1.2
     assert memory_gain(actor, data, nfes=(1,))[1] == pytest.approx(1.0, rel=1e-4)
     assert (data == before).all()
-    with pytest.raises(KeyError, match="told"):
-        shifted(data.exclude("told"))
+    with pytest.raises(KeyError, match="observation"):
+        disturbed(data.exclude(("prior", "observation")))
 
 
-class Anywhere(PastPrior):
-    """Starts at what the mean holds, on cold positions as well."""
-
-    def start(self, loc, warm, generator=None, observation=None):
-        return loc.clone()
-
-
-def test_cold_positions_stay_and_cold_windows_do_not_count():
-    data = windows(PastPrior(H), 4)
-    data["prior", "warm"][0] = False
-    data["prior", "warm"][1:, 0] = False  # of three positions two are warm
-    found = memory_gain(policy(repeats(1.0), Anywhere(H)), data, nfes=(1,))
-    assert found[1] == pytest.approx(2 / 3, rel=1e-4)
-    data["prior", "warm"][:] = False
-    assert memory_gain(policy(repeats(1.0), Anywhere(H)), data, nfes=(1,)) == {1: 0.0}
+def test_windows_without_a_history_do_not_count():
+    prior, warm = PastPrior(H), torch.arange(50)[:, None] % 2 == 0
+    found = memory_gain(policy(repeats(0.6), prior), windows(prior, warm=warm), nfes=(1,))
+    assert found[1] == pytest.approx(0.6, rel=1e-4)
 
 
 def test_a_guided_policy_is_measured_as_it_acts():
@@ -319,7 +263,7 @@ def test_a_guided_policy_is_measured_as_it_acts():
     data = windows(prior, 20)
     with pytest.raises(KeyError, match=r"or measure policy.replace\(guidance=None\)"):
         memory_gain(guided, data)
-    data["rtc"] = leftover(20)
+    data["rtc", "delay"] = torch.ones(20, 1, dtype=torch.int64)
     found = memory_gain(guided, data, nfes=(4,), shift=0.05)[4]
 
     def act(moved, generator):
@@ -329,11 +273,10 @@ def test_a_guided_policy_is_measured_as_it_acts():
 
 
 def test_what_a_network_is_told_has_to_be_of_the_windows_mean():
-    prior = HistoryPrior(H)
-    data = windows(prior)
+    data = windows(GaussianPrior(H))
     data["prior", "observation"] = data["prior", "observation"] + 1
-    with pytest.raises(ValueError, match="does not end in the windows' mean"):
-        memory_gain(policy(repeats(1.0), prior), data)
+    with pytest.raises(ValueError, match="does not end in the windows' last actions"):
+        memory_gain(policy(repeats(1.0), observation_key=keys.CONDITIONED), data)
 
 
 def test_empty_windows_are_refused():

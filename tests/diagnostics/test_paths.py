@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.diagnostics.fields import D_A, Field, H, batch, leftover, policy
+from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, RealTimeChunking, WarmPriorActor
-from warmprior.diagnostics import flow_paths, forecast_mean
+from warmprior.diagnostics import deployed_history, flow_paths
 
 
 def test_paths_start_at_the_source_and_follow_euler():
@@ -30,19 +30,20 @@ def test_forecast_is_the_previous_prediction(executed):
         goal = torch.arange(2.0 * H).view(1, -1, 1)
         return (goal - a) / (1 - t).clamp_min(1e-6)
 
-    out = forecast_mean(policy(field, prior), batch(length=2 * H), executed=executed)
+    out = deployed_history(policy(field, prior), batch(length=2 * H), executed=executed)
+    loc, _, warm = prior.distribution(out["history"])
     expected = torch.arange(executed, executed + H).float()
-    torch.testing.assert_close(out["prior", "loc"][:, :H, 0], expected.expand(5, -1))
-    assert out["prior", "warm"][:, :H].all() and not out["prior", "warm"][:, H:].any()
+    torch.testing.assert_close(loc[:, :H, 0], expected.expand(5, -1))
+    assert warm[:, :H].all() and not warm[:, H:].any()
 
 
 def test_forecast_of_the_past_needs_a_full_history():
     actor = policy(lambda t, a, o: -a, PastPrior(H))
     data = batch()
-    assert forecast_mean(actor, data)["prior", "warm"].all()
-    assert not forecast_mean(actor, data, executed=1)["prior", "warm"].any()
-    data["prior", "warm"] = torch.ones_like(data["prior", "warm"])
-    assert forecast_mean(actor, data, executed=1)["prior", "warm"].all()
+    assert (deployed_history(actor, data)["history", "steps"] == H).all()
+    assert (deployed_history(actor, data, executed=1)["history", "steps"] == 1).all()
+    remember(data, torch.zeros(5, H, D_A))
+    assert (deployed_history(actor, data, executed=1)["history", "steps"] == H).all()
 
 
 def test_the_forecast_of_a_guided_policy_is_what_it_would_do():
@@ -50,19 +51,19 @@ def test_the_forecast_of_a_guided_policy_is_what_it_would_do():
     prior = PastPrior(H, sigma=0.5)
     field = Field(lambda t, a, o: a.sin())
     actor = WarmPriorActor(field, prior, nfe=4, guidance=RealTimeChunking())
-    data = batch()
-    data["rtc"] = leftover()
-    data["prior", "warm"][:] = True
-    found = forecast_mean(actor, data, generator=torch.Generator().manual_seed(0))
+    data = remember(
+        batch(rtc={"delay": torch.ones(5, 1, dtype=torch.int64)}), torch.rand(5, H, D_A)
+    )
+    found = deployed_history(actor, data, generator=torch.Generator().manual_seed(0))
     acted = actor(data.clone(), generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(found["prior", "loc"], acted[actor.chunk_key].detach())
+    torch.testing.assert_close(found["history", "actions"], acted[actor.chunk_key].detach())
 
 
 def test_bad_input_is_named():
     actor = policy(lambda t, a, o: -a, PreviewPrior(H))
-    with pytest.raises(KeyError, match="loc"):
-        forecast_mean(actor, batch(length=2 * H).exclude(("prior", "loc")))
+    with pytest.raises(KeyError, match="actions"):
+        deployed_history(actor, batch(length=2 * H).exclude(("history", "actions")))
     with pytest.raises(ValueError, match="at most H"):
-        forecast_mean(actor, batch(length=2 * H), executed=H + 1)
+        deployed_history(actor, batch(length=2 * H), executed=H + 1)
     with pytest.raises(ValueError, match="at least 1 step"):
         flow_paths(policy(lambda t, a, o: -a, GaussianPrior(H)), batch(), 0)

@@ -40,18 +40,21 @@ def test_frames_are_those_with_a_full_history(lengths, horizon):
     assert len(shared) == len(expected)
 
 
-def test_windows_hold_the_same_observations_and_each_priors_own_mean():
+def test_windows_hold_the_same_observations_and_each_priors_own_history():
     data = steps([10, 3, 8])
     shared = SharedObservations(data, H, count=6, generator=torch.Generator().manual_seed(0))
     frames = shared.frames
     assert len(frames.unique()) == 6
-    past = shared.windows(PastPrior(H, cold_probability=1.0))  # nothing is withheld here
-    assert past["prior", "warm"].all()
+    past = shared.windows(PastPrior(H))
+    assert (past["history", "steps"] == H).all()
     expected = frames[:, None] + torch.arange(-H, 0)
-    assert torch.equal(past["prior", "loc"][..., 0], expected.float())
+    assert torch.equal(past["history", "actions"][..., 0], expected.float())
     preview = shared.windows(PreviewPrior(H))
     base = shared.windows(GaussianPrior(H))
-    assert not base["prior", "warm"].any()
+    assert torch.equal(
+        preview["history", "forecast"][:, :H, 0], preview["vla_action", "chunk"][:, :H, 0]
+    )
+    assert not base["history", "forecast_steps"].any()
     for windows in (past, preview, base):
         assert torch.equal(windows["observation"][:, 0, 0], frames.float())
     assert torch.equal(shared.windows(PastPrior(H), offset=2)["observation"][:, 0, 0], frames - 2.0)
@@ -90,7 +93,9 @@ def test_the_deployed_mean_is_the_policys_own_prediction():
     met = shared.deployed(actor)
     # Predicted H steps earlier, the chunk's second half forecasts exactly the current one.
     expected = shared.frames[:, None] + torch.arange(H)
-    torch.testing.assert_close(met["prior", "loc"][:, :H, 0], expected.float(), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        met["history", "forecast"][:, :H, 0], expected.float(), atol=1e-4, rtol=0
+    )
     assert torch.equal(met["vla_action", "chunk"], shared.windows(prior)["vla_action", "chunk"])
 
 

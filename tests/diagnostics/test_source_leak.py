@@ -12,15 +12,14 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import nn
 
-from tests.diagnostics.fields import D_A, Field, H, batch, policy
+from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
 from warmprior import (
     GaussianPrior,
-    HistoryPrior,
-    MeanObservation,
+    HistoryObservation,
     PastPrior,
     PreviewPrior,
-    RegressionPrior,
     WarmPriorActor,
+    keys,
 )
 from warmprior.diagnostics import SourceLeak, source_leak
 
@@ -49,8 +48,7 @@ def test_spread_is_the_share_of_the_source_that_passes(share, sigma):
     prior = GaussianPrior(H)
     if sigma is not None:
         prior = PastPrior(H, sigma=sigma)
-        data["prior", "loc"] = torch.randn_like(data["prior", "loc"])  # no spread of its own
-        data["prior", "warm"] = torch.ones_like(data["prior", "warm"])
+        remember(data, torch.randn(len(data), H, D_A))  # no spread of its own
     result = source_leak(policy(passing(share), prior), data, nfes=(9, 1), draws=16)
     assert list(result) == [1, 9]
     assert result[1].spread == pytest.approx(share * (sigma or 1.0), rel=0.02)
@@ -115,8 +113,7 @@ def test_one_exact_step_from_a_telling_source_spreads_less_than_the_data():
     data = windows(500, 2 * H)
     data["vla_action", "chunk"] *= s
     warm = torch.arange(2 * H).view(1, -1, 1) < H
-    data["prior", "warm"] = warm.expand(500, 2 * H, 1)
-    data["prior", "loc"] = data["vla_action", "chunk"] * warm
+    remember(data, data["vla_action", "chunk"])
     # The forecast beyond H is wild, and not executed.
     actor = policy(
         lambda t, a, o: torch.where(warm, gain - 1, 99.0) * a, PreviewPrior(H, sigma=sigma)
@@ -231,32 +228,29 @@ def test_the_warning_names_what_exceeds_its_bound():
     assert "chunks are 1.40 times" in steps and "spread" not in steps
 
 
-def test_a_network_that_sees_the_mean():
-    """History-conditioned: the mean moves the chunk, the source around it does not spread by it."""
-    prior = HistoryPrior(H)
+def test_a_network_that_sees_the_history():
+    """What was done moves the chunk, the source around it does not spread by it."""
     data = windows(100)
-    data["prior", "warm"] = torch.ones_like(data["prior", "warm"])
-    data["prior", "loc"] = torch.randn(100, H, D_A)
-    data = MeanObservation()(data)
+    data = HistoryObservation()(remember(data, torch.randn(100, H, D_A)))
 
     def field(t, a, o):
-        assert o.shape[-1] == 4 + MeanObservation.width(prior, D_A)
+        assert o.shape[-1] == 4 + HistoryObservation.width(H, D_A)
         return goal(o[..., 4:]) + (0.2 - 1) * a
 
-    result = source_leak(policy(field, prior), data, draws=16)[1]
+    actor = policy(field, observation_key=keys.CONDITIONED)
+    result = source_leak(actor, data, draws=16)[1]
     assert result.spread == pytest.approx(0.2, rel=0.03)
     # Neighbours in what the policy alone is shown would be others.
     gaussian = source_leak(policy(passing(0.2)), data)[1]
     assert result.data_spread == gaussian.data_spread
 
 
-def test_a_prior_of_one_evaluation_is_measured_at_that():
-    result = source_leak(policy(lambda t, a, o: goal(o) - a, RegressionPrior(H)), windows(30))
+def test_a_policy_of_one_evaluation_is_measured_at_that():
+    result = source_leak(policy(lambda t, a, o: goal(o) - a, max_nfe=1), windows(30))
     assert list(result) == [1]
-    assert result[1].spread == 0.0
-    assert math.isnan(result[1].ratio_to_last)
-    with pytest.raises(ValueError, match="none of 1"):
-        source_leak(policy(passing(0.5), RegressionPrior(H)), windows(30), nfes=(3, 9))
+    assert result[1].spread < 1e-6
+    with pytest.raises(ValueError, match="has none"):
+        source_leak(policy(passing(0.5), max_nfe=1), windows(30), nfes=(3, 9))
 
 
 class Dropping(Field):
@@ -307,7 +301,7 @@ def test_windows_of_any_batch_shape():
 
 def test_bad_input_is_named():
     actor, data = policy(passing(0.5)), windows(5)
-    for key in ("observation", ("vla_action", "chunk"), ("prior", "loc")):
+    for key in ("observation", ("vla_action", "chunk"), ("history", "actions")):
         with pytest.raises(KeyError, match=key if isinstance(key, str) else key[1]):
             source_leak(actor, data.exclude(key))
     with pytest.raises(ValueError, match="4 other episode"):
@@ -319,7 +313,7 @@ def test_bad_input_is_named():
             source_leak(actor, data, **option)
     with pytest.raises(ValueError, match="network evaluations"):
         source_leak(actor, data, nfes=(0, 1))
-    with pytest.raises(ValueError, match="none of 1"):
+    with pytest.raises(ValueError, match="has none"):
         source_leak(actor, data, nfes=())
     with pytest.raises(FloatingPointError, match="NFE 9"):
         source_leak(policy(lambda t, a, o: a / (t < 0.5)), data)

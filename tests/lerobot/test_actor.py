@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
@@ -12,9 +13,10 @@ from torchrl.envs.utils import check_env_specs
 
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
-from warmprior import PastPrior, PreviewPrior, policy_transforms
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, PriorAnchor, policy_transforms
+from warmprior.history import window_history
 from warmprior.lerobot import LeRobotActor
-from warmprior.rl import PriorDecoder
+from warmprior.rl import PriorDecoder, ResidualSampler
 from warmprior.training import evaluate
 
 
@@ -78,6 +80,12 @@ def told(batch):
     }
 
 
+def history_of(actions):
+    """That of robots which executed these, ``[*B, H, d_a]``."""
+    steps = torch.full((*actions.shape[:-2], 1), actions.shape[-2])
+    return window_history(actions, steps, torch.zeros_like(actions), actions.shape[-2])
+
+
 def actor_of(made, prior, **options):
     generator = torch.Generator().manual_seed(0)
     return LeRobotActor(made, prior, names=NAMES, preprocess=told, generator=generator, **options)
@@ -119,16 +127,14 @@ def test_several_observations_and_the_lead_of_a_chunk(policy):
     data = TensorDict(
         {
             "observation": {"state": torch.randn(3, 2, STATE)},
-            "prior": {
-                "loc": torch.randn(3, LENGTH - 1, ACTION),
-                "warm": torch.ones(3, LENGTH - 1, 1, dtype=torch.bool),
-            },
+            "history": history_of(torch.randn(3, LENGTH - 1, ACTION)),
         },
         [3],
     )
     with watch("multi_task_dit", made) as seen:
         chunk = actor(data)["vla_action", "chunk"]
-    assert torch.equal(seen.x[0][:, 1:], data["prior", "loc"])
+    assert torch.equal(seen.x[0][:, 1:], data["history", "actions"])
+    assert torch.equal(data["prior", "loc"], data["history", "actions"])
     by_hand = seen.x[0] + sum(seen.out) / len(seen.out)
     torch.testing.assert_close(chunk, by_hand[:, 1:])
     short = data.clone().update({"observation": {"state": torch.randn(3, 1, STATE)}})
@@ -143,10 +149,7 @@ def test_the_rest_of_the_source_is_drawn_anew_for_actors_and_fixed_for_decoders(
     actor = actor_of(made, prior)
     observation = torch.randn(1, 2, STATE).expand(2, -1, -1)
     loc = torch.randn(1, LENGTH - 1, ACTION).expand(2, -1, -1)
-    warm = torch.ones(2, LENGTH - 1, 1, dtype=torch.bool)
-    data = TensorDict(
-        {"observation": {"state": observation}, "prior": {"loc": loc, "warm": warm}}, [2]
-    )
+    data = TensorDict({"observation": {"state": observation}, "history": history_of(loc)}, [2])
     with watch("multi_task_dit", made) as seen:
         for _ in range(2):
             actor(data.clone())
@@ -182,16 +185,13 @@ def test_a_single_observation_of_a_policy_that_may_see_several(policy):
     data = TensorDict(
         {
             "observation": {"state": torch.randn(3, 1, STATE)},
-            "prior": {
-                "loc": torch.randn(3, LENGTH, ACTION),
-                "warm": torch.ones(3, LENGTH, 1, dtype=torch.bool),
-            },
+            "history": history_of(torch.randn(3, LENGTH, ACTION)),
         },
         [3],
     )
     with watch("multi_task_dit", made) as seen:
         chunk = actor(data)["vla_action", "chunk"]
-    assert torch.equal(seen.x[0], data["prior", "loc"])
+    assert torch.equal(seen.x[0], data["history", "actions"])
     torch.testing.assert_close(chunk, seen.x[0] + sum(seen.out) / len(seen.out))
 
 
@@ -203,8 +203,8 @@ def test_collectors_and_batched_environments(policy):
     for batch in collector:
         assert batch["vla_action", "chunk"].shape == (2, 4, LENGTH, ACTION)
         # A new episode starts cold.
-        first = batch["prior", "elapsed"][..., 0] == 0
-        assert not batch["prior", "warm"][first].any()
+        first = batch["history", "steps"][..., 0] == 0
+        assert first.any() and not batch["prior", "warm"][first].any()
     collector.shutdown()
 
 
@@ -235,20 +235,33 @@ def test_a_frozen_policy_decodes_what_an_agent_chooses(policy):
     torch.testing.assert_close(decoder(data[1:].clone())["vla_action", "chunk"], chunk[1:])
 
 
+@pytest.mark.parametrize("prior", [PastPrior(LENGTH), GaussianPrior(LENGTH)])
+def test_residuals_around_its_means(policy, prior):
+    """As around those of the library's own policies."""
+    actor = actor_of(policy("pi05"), prior, nfe=1)
+    decoder = PriorDecoder(actor, delta=0.5)
+    env = environment(prior)
+    env.append_transform(PriorAnchor(actor, seed=0))
+    rollout = env.rollout(3, TensorDictSequential(ResidualSampler(decoder), decoder))
+    anchor, executed = rollout["prior", "anchor"], rollout["history", "actions"]
+    assert torch.equal(rollout["prior", "noise"], anchor + rollout["prior", "delta"])
+    assert torch.equal(executed[1:], rollout["vla_action", "chunk"][:-1])
+    assert torch.equal(
+        anchor[1:], executed[1:] if prior.name == "past" else torch.zeros_like(executed[1:])
+    )
+
+
 def test_what_cannot_be_done_is_said(policy):
     prior = PastPrior(LENGTH)
     actor = actor_of(policy("pi05"), prior)
     data = TensorDict(
         {
             "observation": {"state": torch.zeros(1, STATE)},
-            "prior": {
-                "loc": torch.zeros(LENGTH, ACTION),
-                "warm": torch.zeros(LENGTH, 1, dtype=torch.bool),
-            },
+            "history": history_of(torch.zeros(LENGTH, ACTION)),
         },
         [],
     )
-    with pytest.raises(KeyError, match="ActionHistory writes them"):
+    with pytest.raises(KeyError, match=r'needs the history; missing: .*"actions"'):
         actor(data.select("observation"))
     with pytest.raises(ValueError, match=r"what are speed of the observation"):
         actor(data.clone().set(("observation", "speed"), torch.zeros(1, 2)))

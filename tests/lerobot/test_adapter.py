@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import pytest
 import torch
+from tensordict import TensorDict
 
-from tests.lerobot.seen import watch
+from tests.lerobot.seen import at_times, watch
 from tests.lerobot.tiny import ACTION, LENGTH, observations, windows
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior import ActionWindow, GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior.history import window_history
 from warmprior.lerobot import RelativeActions, WarmPriorAdapter, action_std, history_indices
 
 
@@ -148,30 +148,108 @@ def test_one_seed_gives_one_result(policy):
     assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
 
 
-def test_a_prior_of_ones_own(built):
-    class Halved(Prior):
-        """Half of the last action that was executed."""
+class Momentum(Prior):
+    """Goes on as the last two actions did."""
 
-        name: ClassVar[str] = "halved-for-lerobot"
+    name = "momentum-in-lerobot"
 
-        def training_mean(self, history, history_valid, target):
-            warm = history_valid[..., -1:, None].expand(*history.shape[:-1], 1)
-            return 0.5 * history[..., -1:, :].expand_as(history), warm
+    def mean(self, history):
+        before, last = history["actions"][..., -2:-1, :], history["actions"][..., -1:, :]
+        steps = torch.arange(1, self.prediction_length + 1).view(-1, 1)
+        warm = (history["steps"] >= 2).unsqueeze(-1)
+        return last + steps * (last - before), warm.expand_as(history["forecast"][..., :1])
 
-        def next_mean(self, loc, chunk, executed_steps, elapsed_steps):
-            last = chunk.gather(-2, self.positions(executed_steps - 1, chunk, 1))
-            return 0.5 * last.expand_as(chunk), torch.ones_like(chunk[..., :1], dtype=torch.bool)
 
-    made = built("pi0", n_action_steps=4)
-    adapter = WarmPriorAdapter(made, Halved(4, sigma=0.0), generator=generator())
-    batch = observations("pi0", 2)
-    first = adapter.predict_action_chunk(dict(batch))
-    with watch("pi0", made) as seen:
-        adapter.predict_action_chunk(dict(batch), executed_steps=3)
-    expected = (0.5 * first[:, 2:3]).expand(-1, 4, -1)
-    assert torch.equal(seen.x[0][:, :4, :ACTION], expected)
+def test_a_users_prior_has_the_mean_of_its_training_windows(built):
+    """At every decision of an episode, whatever of it was executed."""
+    every, steps, prior = 3, 16, Momentum(4, sigma=0.0)
+    made = built("pi0", n_action_steps=every)
+    adapter = WarmPriorAdapter(made, prior, generator=generator())
+    actions, sources = started(adapter, "pi0", made, observations("pi0", 1), steps)
+    data = {
+        "observation": torch.zeros(steps, 1),
+        "action": actions[0],
+        "episode": torch.zeros(steps, dtype=torch.int64),
+    }
+    decisions = torch.arange(0, steps, every)
+    window = ActionWindow(TensorDict(data, [steps]), prior.chunk_length)
+    batch = window(TensorDict({"frame": decisions}, [len(decisions)]))
+    loc, _, warm = prior.distribution(batch["history"])
+    assert warm[:, 0, 0].tolist() == [False, *[True] * (len(decisions) - 1)]
+    # Without noise the source is the mean.
+    assert torch.equal(torch.cat(sources)[1:, :4], loc[1:])
     made.train()
     assert adapter.loss(windows("pi0", 2, 4))[0].isfinite()
+
+
+def test_a_prior_that_remembers_more_than_a_chunk(built):
+    class Lagged(Prior):
+        """What was executed two chunks ago."""
+
+        name = "lagged-in-lerobot"
+
+        @property
+        def history_length(self):
+            return 2 * self.chunk_length
+
+        def mean(self, history):
+            warm = (history["steps"] >= self.history_length).unsqueeze(-1)
+            return history["actions"][..., : self.chunk_length, :], warm.expand(-1, 4, -1)
+
+    made = built("pi05", n_action_steps=3)
+    adapter = WarmPriorAdapter(made, Lagged(4, sigma=0.0), generator=generator())
+    actions, sources = started(adapter, "pi05", made, observations("pi05", 2), 12)
+    assert torch.equal(sources[3][:, :4], actions[:, 1:5])
+    made.train()
+    assert adapter.loss(windows("pi05", 2, 8))[0].isfinite()
+    with pytest.raises(ValueError, match=r"\[12\] actions, expected \[16\]: 8 before"):
+        adapter.loss(windows("pi05", 2, 4))
+
+
+def test_withheld_histories_start_cold(policy):
+    made = policy("pi05").train()
+    batch, t = windows("pi05", 64, LENGTH), torch.ones(64)  # at the source
+    for probability, cold in ((0.0, 0), (1.0, 64), (0.5, None)):
+        adapter = WarmPriorAdapter(
+            made,
+            PastPrior(LENGTH, sigma=0.0),
+            cold_probability=probability,
+            generator=generator(),
+        )
+        with watch("pi05", made) as seen, at_times("pi05", made, t):
+            adapter.loss(dict(batch))
+        other = (seen.x[0][..., :ACTION] != batch["action"][:, :LENGTH]).flatten(1)
+        assert torch.equal(other.any(1), other.all(1))  # whole windows
+        found = int(other.any(1).sum())
+        assert found == cold if cold is not None else 16 < found < 48
+    with pytest.raises(ValueError, match=r"cold_probability must be in \[0, 1\], got 1.5"):
+        WarmPriorAdapter(made, PastPrior(LENGTH), cold_probability=1.5)
+
+
+def test_sources_and_targets_are_coupled_in_the_models_units(policy):
+    made = policy("pi05").train()
+    batch, std, seen = windows("pi05", 4, LENGTH), torch.linspace(0.1, 3.0, ACTION), []
+    batch["action_is_pad"][1, :2] = True  # a cold source moves with its window's partner
+
+    def flipped(a0, a1, observation):
+        assert observation is None
+        seen.append((a0, a1))
+        return a0.flip(0), a1 + 1.0
+
+    source = WarmPriorAdapter(
+        made, PastPrior(LENGTH, sigma=0.5), sigma_unit="std", action_std=std
+    ).source
+    before, target = batch["action"].split(LENGTH, 1)
+    valid = ~batch["action_is_pad"][:, :LENGTH]
+    plain, same = source.learn(before, valid, target, generator())
+    assert same is target
+    a0, a1 = source.learn(before, valid, target, generator(), coupling=flipped)
+    assert torch.equal(seen[0][0], plain[..., :ACTION]) and torch.equal(seen[0][1], target)
+    assert torch.equal(a0[..., :ACTION], plain[..., :ACTION].flip(0))
+    assert torch.equal(a1, target + 1.0)
+    adapter = WarmPriorAdapter(made, PastPrior(LENGTH), coupling=flipped)
+    adapter.loss(dict(batch))
+    assert len(seen) == 2
 
 
 def test_sigma_in_units_of_the_data(policy):
@@ -184,10 +262,13 @@ def test_sigma_in_units_of_the_data(policy):
         action_std=std,
         generator=generator(),
     )
-    warm, loc = torch.ones(500, LENGTH, 1, dtype=torch.bool), torch.full((500, LENGTH, ACTION), 2.0)
-    drawn = adapter.source.draw(loc, warm, generator(1)) - loc
+    loc = torch.full((500, LENGTH, ACTION), 2.0)
+    warm, cold = (
+        window_history(loc, torch.full((500, 1), steps), loc, LENGTH) for steps in (LENGTH, 0)
+    )
+    drawn = adapter.source.draw(warm, generator(1)) - loc
     torch.testing.assert_close(drawn.flatten(0, 1).std(0), 0.5 * std, rtol=0.1, atol=0)
-    cold = adapter.source.draw(loc, ~warm, generator(1))
+    cold = adapter.source.draw(cold, generator(1))
     torch.testing.assert_close(cold.flatten(0, 1).std(0), torch.ones(ACTION), rtol=0.1, atol=0)
 
 
@@ -210,6 +291,15 @@ def test_the_standard_deviation_in_a_policys_units(policy):
         action_std(policy("xvla"), stats)
     with pytest.raises(ValueError, match="'model' or 'std'"):
         WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit="data")
+
+
+class Looking(GaussianPrior):
+    """It sees the observation."""
+
+    name = "looking-in-lerobot"
+
+    def distribution(self, history, observation=None):
+        return super().distribution(history) if observation.any() else None
 
 
 def pipelines(made, stats):
@@ -270,10 +360,7 @@ def test_relative_actions_follow_the_state(built):
             PreviewPrior(4),
             "n_action_steps=8 of each chunk, .* chunk_length=4: set n_action_steps to 4",
         ),
-        (Prior.make("regression", 8), "trained at t = 0 alone"),
-        (Prior.make("history", 8), "see its mean"),
-        (Prior.make("forecast", 8), "as one vector"),
-        (Prior.make("reflow", 8), "needs a trained policy of gaussian"),
+        (Looking(8), "Looking.* cannot be the source .* history and no observation: 'NoneType'"),
     ],
 )
 def test_priors_that_do_not_fit(policy, prior, told):

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from tests.lerobot.seen import at_times, watch
 from tests.lerobot.tiny import ACTION, LENGTH, N15, STATE, STEPS, observations, windows
 from warmprior import PastPrior, PreviewPrior
+from warmprior.history import window_history
 from warmprior.lerobot import LeRobotActor, WarmPriorAdapter, action_std
 
 if not N15:
@@ -131,19 +132,12 @@ def test_it_acts_in_torchrl(policy):
         return {**observations("groot", len(state)), "state": state[:, None]}
 
     actor = LeRobotActor(made, prior, preprocess=preprocess)
-    data = TensorDict(
-        {
-            "observation": torch.randn(2, 1, STATE),
-            "prior": {
-                "loc": torch.randn(2, LENGTH, ACTION),
-                "warm": torch.ones(2, LENGTH, 1, dtype=torch.bool),
-            },
-        },
-        [2],
-    )
+    executed = torch.randn(2, LENGTH, ACTION)
+    history = window_history(executed, torch.full((2, 1), LENGTH), executed, LENGTH)
+    data = TensorDict({"observation": torch.randn(2, 1, STATE), "history": history}, [2])
     with watch("groot", made) as seen:
         chunk = actor(data)["vla_action", "chunk"]
-    assert torch.equal(seen.x[0][..., :ACTION], data["prior", "loc"])
+    assert torch.equal(seen.x[0][..., :ACTION], executed)
     torch.testing.assert_close(chunk, integrated(seen))
 
 

@@ -26,7 +26,8 @@ from tests.lerobot.tiny import (
     tiny_smolvlm,
     windows,
 )
-from warmprior import RealTimeChunking
+from warmprior import HistoryObservation, PastPrior, RealTimeChunking, StartPoint, keys
+from warmprior.history import cold_history, window_history
 from warmprior.lerobot import LeRobotActor, WarmPriorAdapter
 
 pytest.importorskip("lerobot")
@@ -105,7 +106,7 @@ def test_a_warm_policy_acts_in_torchrl(found, name):
                 "state": seen_by["observation.state"][:, None],
                 "top": seen_by[CAMERA][:, None],
             },
-            "prior": {"loc": loc, "warm": torch.ones(2, LENGTH, 1, dtype=torch.bool)},
+            "history": window_history(loc, torch.full((2, 1), LENGTH), loc, LENGTH),
         },
         [2],
     )
@@ -324,8 +325,9 @@ def test_only_the_extremes_bound_a_flow_policys_actions(found):
 def test_the_flow_policy_remembers(found):
     policy = flow_policy(found, prior="past,sigma=0.0").eval()
     sources = []
-    sample = policy.actor.prior.start
-    policy.actor.prior.start = lambda *args: sources.append(sample(*args)) or sources[-1]
+    policy.actor.sampler.register_forward_hook(
+        lambda module, args, out: sources.append(out["prior", "noise"])
+    )
     batch = {
         "observation.state": torch.randn(2, 3),
         "observation.environment_state": torch.randn(2, 2),
@@ -340,10 +342,31 @@ def test_the_flow_policy_remembers(found):
     assert torch.equal(sources[4], chunks[0])
 
 
+class TrainedPast(PastPrior, torch.nn.Module):
+    name = "trained-in-lerobot"
+
+    def __init__(self, chunk_length):
+        torch.nn.Module.__init__(self)
+        super().__init__(chunk_length)
+
+
 def test_flow_policies_that_lerobot_could_not_train(found):
-    with pytest.raises(ValueError, match="lerobot-train does not"):
-        flow_policy(found, prior="history")
     from warmprior import VelocityMLP
+
+    with pytest.raises(ValueError, match="lerobot-train does not"):
+        flow_policy(found, prior="trained-in-lerobot")
+    for text, told in (
+        (
+            "past,speed=3",
+            r"PastPrior cannot be built from .*speed=3 .*takes chunk_length, sigma, corr",
+        ),
+        ("past,sigma", "written as name,option=value, got 'sigma'"),
+        ("past,sigma=1,sigma=2", "sigma is given twice"),
+    ):
+        with pytest.raises(ValueError, match=told):
+            flow_policy(found, prior=text)
+    with pytest.raises(ValueError, match=r"probability must be in \[0, 1\]"):
+        flow_policy(found, cold_probability=2.0)
 
     network = json.dumps(VelocityMLP(2, 5, 9).config())
     with pytest.raises(ValueError, match=r"'prediction_length': 9.*'prediction_length': 4"):
@@ -351,11 +374,22 @@ def test_flow_policies_that_lerobot_could_not_train(found):
     assert flow_policy(found, network=json.dumps(VelocityMLP(2, 5, 4).config())).actor is not None
 
 
+class Halfway(StartPoint):
+    """Half of the source's noise, at half of the time."""
+
+    name = "halfway-in-lerobot"
+    time, noise_share = 0.5, 0.5
+
+    def forward(self, noise, history, observation):
+        return self.noise_share * noise
+
+
 def saved_policy(folder, **options):
     """A policy of lift's widths, with the environment that it was made for."""
-    from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor
+    from warmprior import Normalizer, VelocityMLP, WarmPriorActor
     from warmprior.envs.description import environment_description
     from warmprior.envs.simulator import task_env_args
+    from warmprior.training import save_policy
 
     torch.manual_seed(0)
     data = torch.rand(2, 50, OBJECT + STATE), torch.rand(2, 50, 7)
@@ -364,14 +398,16 @@ def saved_policy(folder, **options):
     normalizer = Normalizer(
         {"observation": low[0], "action": least[0]}, {"observation": high[0], "action": most[0]}
     )
-    network = VelocityMLP(7, OBJECT + STATE, 8)
+    seen = options.get("observation_key") == keys.CONDITIONED
+    width = HistoryObservation.width(8, 7) if seen else 0
+    network = VelocityMLP(7, OBJECT + STATE + width, 8)
     with torch.no_grad():  # fresh ones predict nothing
         for weight in network.parameters():
             weight.add_(0.05 * torch.randn_like(weight))
     environment = environment_description(task_env_args("lift"), "ph", 2, "delta", None)
     chosen = {"nfe": 3, "clip": 1.0, "normalizer": normalizer, "environment": environment} | options
     actor = WarmPriorActor(network, PastPrior(8, sigma=0.3, correlation=0.5), **chosen)
-    actor.save_pretrained(folder)
+    save_policy(actor, folder)
     return actor
 
 
@@ -393,8 +429,7 @@ def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
     # The same by this library: normalised, the observation twice, cold, and back.
     data = TensorDict({"observation": raw.expand(1, 2, -1)}, [1])
     data = actor.normalizer.normalize(data)
-    data.set(("prior", "loc"), torch.zeros(1, 8, 7))
-    data.set(("prior", "warm"), torch.zeros(1, 8, 1, dtype=torch.bool))
+    data.set("history", cold_history([1], 8, 8, 7))
     torch.manual_seed(7)
     chunk = actor(data)["vla_action", "chunk"]
     expected = actor.normalizer.denormalize(TensorDict({"action": chunk[:, 0]}, [1]))["action"]
@@ -406,11 +441,19 @@ def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
     with pytest.raises(ValueError, match=r"the bound clip=1\.0"):
         export_policy(tmp_path / "unbounded", tmp_path / "none")
     for i, option in enumerate(
-        ({"solver": "midpoint", "nfe": 4}, {"grid": "dense-jump"}, {"guidance": RealTimeChunking()})
+        (
+            {"solver": "midpoint", "nfe": 4},
+            {"grid": "dense-jump"},
+            {"guidance": RealTimeChunking()},
+            {"start": Halfway()},
+        )
     ):
         saved_policy(tmp_path / f"sampler{i}", **option)
         with pytest.raises(ValueError, match="Euler's method in uniform steps, without guidance"):
             export_policy(tmp_path / f"sampler{i}", tmp_path / "none")
+    saved_policy(tmp_path / "seen", observation_key=keys.CONDITIONED)
+    with pytest.raises(ValueError, match="observed last actions"):
+        export_policy(tmp_path / "seen", tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 

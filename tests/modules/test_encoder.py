@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.toy_env import random_history
 from warmprior import (
     FlowMatchingLoss,
     ImageEncoder,
@@ -20,6 +21,7 @@ from warmprior import (
     window_replay_buffer,
 )
 from warmprior.modules import load_imagenet
+from warmprior.training.saved import load_policy, save_policy
 
 CAMERAS = ("agentview_image", "robot0_eye_in_hand_image")
 SIZE, CROP, STATE = 12, 8, 3
@@ -201,8 +203,8 @@ def policy_of(network: nn.Module) -> WarmPriorActor:
 
 
 def decision_of(*batch: int) -> TensorDict:
-    mean = {"loc": torch.zeros(*batch, 4, 2), "warm": torch.ones(*batch, 4, 1, dtype=torch.bool)}
-    return TensorDict({"observation": observation_of(*batch), "prior": mean}, batch)
+    history = random_history(PastPrior(4), *batch, cold=0.0)
+    return TensorDict({"observation": observation_of(*batch), "history": history}, batch)
 
 
 class Counted(ImageEncoder):
@@ -260,8 +262,8 @@ def test_features_take_the_place_of_the_observation():
 @pytest.mark.parametrize("options", [{}, {"share": True}, {"backbone": "resnet18"}])
 def test_a_saved_policy_returns_the_same_chunks(tmp_path, options):
     policy = policy_of(PreconditionedNetwork(network_of(**options))).eval()
-    policy.save_pretrained(tmp_path)
-    again = WarmPriorActor.from_pretrained(tmp_path, generator=torch.Generator().manual_seed(0))
+    save_policy(policy, tmp_path)
+    again = load_policy(tmp_path, generator=torch.Generator().manual_seed(0))
     one, two = policy(decision_of(3)), again.eval()(decision_of(3))
     assert torch.equal(one["vla_action", "chunk"], two["vla_action", "chunk"])
     assert again.network.config() == policy.network.config()

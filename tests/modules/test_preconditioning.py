@@ -22,7 +22,6 @@ from warmprior import (
     PolynomialInterpolant,
     PreconditionedNetwork,
     PreviewPrior,
-    RegressionPrior,
     SourceMoments,
     TrigonometricInterpolant,
     VelocityMLP,
@@ -30,6 +29,7 @@ from warmprior import (
     WarmPriorActor,
     window_replay_buffer,
 )
+from warmprior.training.saved import load_policy, save_policy
 
 PATHS = [LinearInterpolant(), TrigonometricInterpolant(), PolynomialInterpolant(3.0)]
 
@@ -76,9 +76,14 @@ def gaussian_steps(episodes=400, length=30, dim=2, keep=0.0, seed=0):
     )
 
 
-def buffer_of(data, prior, batch_size=4096, seed=0):
+def buffer_of(data, prior, batch_size=4096, seed=0, **options):
     generator = torch.Generator().manual_seed(seed)
-    return window_replay_buffer(data, prior, batch_size=batch_size, generator=generator)
+    options = {"batch_size": batch_size, "generator": generator, **options}
+    return window_replay_buffer(data, prior, **options)
+
+
+def is_warm(prior, windows):
+    return prior.distribution(windows["history"]).warm.any(1).squeeze(-1)
 
 
 def observations(a):
@@ -134,38 +139,34 @@ def test_ends_are_exact():
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.name)
 @pytest.mark.parametrize(
-    ("prior", "keep"),
+    ("prior", "keep", "withhold"),
     [
-        (GaussianPrior(3), 0.0),
-        (PastPrior(1), 0.9),
-        (PastPrior(2), 0.0),
-        (PreviewPrior(2), 0.0),
-        (PreviewPrior(2, sigma=0.3, cold_probability=0.5), 0.0),
-        (GaussianPrior(1), 0.9),
+        (GaussianPrior(3), 0.0, 0.0),
+        (PastPrior(1), 0.9, 0.0),
+        (PastPrior(2), 0.0, 0.0),
+        (PreviewPrior(2), 0.0, 0.0),
+        (PreviewPrior(2, sigma=0.3), 0.0, 0.5),
+        (GaussianPrior(1), 0.9, 0.0),
     ],
     ids=str,
 )
-def test_zero_network_is_optimal_for_gaussian_data(prior, keep, path):
+def test_zero_network_is_optimal_for_gaussian_data(prior, keep, withhold, path):
     """Brute force: least squares of the velocity on the whole point finds nothing that it misses."""
     dim, length = 2, prior.prediction_length
     data = gaussian_steps(keep=keep)
-    windows = buffer_of(data, prior)
+    windows = buffer_of(data, prior, withhold=withhold)
     moments = SourceMoments.fit(
         windows, prior, samples=80_000, generator=torch.Generator().manual_seed(1)
     )
     network = PreconditionedNetwork(Nothing(dim, 3, length), moments=moments, interpolant=path)
     batch = torch.cat([windows.sample() for _ in range(20)])
     batch = batch[~batch["action_is_pad"].any(1)]
-    if not isinstance(prior, GaussianPrior) and prior.cold_probability == 0:
-        batch = batch[
-            batch["prior", "warm"].any(1).squeeze(-1)
-        ]  # of one Gaussian, not of a mixture
+    if not isinstance(prior, GaussianPrior) and not withhold:
+        batch = batch[is_warm(prior, batch)]  # of one Gaussian, not of a mixture
         moments = SourceMoments.fit(batch, prior, generator=torch.Generator().manual_seed(1))
         network = PreconditionedNetwork(Nothing(dim, 3, length), moments=moments, interpolant=path)
     a1 = batch["vla_action", "chunk"]
-    a0 = prior.sample(
-        batch["prior", "loc"], batch["prior", "warm"], torch.Generator().manual_seed(2)
-    )
+    a0 = prior.sample(batch["history"], generator=torch.Generator().manual_seed(2))
     for t in (0.0, 0.3, 0.8, 1.0):
         times = torch.full((len(a1),), t)
         a_t, u = path(a0, a1, times)
@@ -204,7 +205,7 @@ def test_moments_against_monte_carlo():
     keep, sigma, chunk = 0.8, 0.5, 2
     prior = PastPrior(chunk, sigma=sigma)
     windows = buffer_of(gaussian_steps(episodes=3000, keep=keep), prior, 60_000).sample()
-    warm = windows["prior", "warm"].any(1).squeeze(-1) & ~windows["action_is_pad"].any(1)
+    warm = is_warm(prior, windows) & ~windows["action_is_pad"].any(1)
     moments = SourceMoments.fit(windows[warm], prior, generator=torch.Generator().manual_seed(0))
     mean = torch.tensor([0.3, -0.2]).expand(chunk, 2)
     one = torch.ones(chunk, 2)
@@ -241,7 +242,7 @@ def test_padded_positions_do_not_count():
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.name)
 @pytest.mark.parametrize(
     "prior",
-    [PreviewPrior(2, sigma=0.0), PastPrior(2, sigma=0.0), GaussianPrior(2), RegressionPrior(2)],
+    [PreviewPrior(2, sigma=0.0), PastPrior(2, sigma=0.0), GaussianPrior(2)],
     ids=str,
 )
 def test_degenerate_ends_stay_finite(prior, path):
@@ -254,7 +255,7 @@ def test_degenerate_ends_stay_finite(prior, path):
     network = PreconditionedNetwork(inner, moments=moments, interpolant=path)
     batch = windows.sample()
     a1 = batch["vla_action", "chunk"]
-    a0 = prior.sample(batch["prior", "loc"], batch["prior", "warm"])
+    a0 = prior.sample(batch["history"])
     for t in (0.0, 1e-6, 0.5, 1.0):
         times = torch.full((len(a1),), t)
         a_t, _ = path(a0, a1, times)
@@ -332,9 +333,8 @@ def test_saved_with_the_policy(tmp_path):
         interpolant=PolynomialInterpolant(1.5),
     )
     actor = WarmPriorActor(network, prior, nfe=3).eval()
-    actor.save_pretrained(tmp_path)
-    json.loads((tmp_path / "config.json").read_text())
-    again = WarmPriorActor.from_pretrained(tmp_path)
+    save_policy(actor, tmp_path)
+    again = load_policy(tmp_path)
     assert again.network.config() == network.config()
     assert again.network.interpolant.n == 1.5
     for key, value in network.moments.state_dict().items():

@@ -12,12 +12,15 @@ from tensordict import TensorDict
 from warmprior import (
     GaussianPrior,
     PastPrior,
+    PreviewPrior,
     PriorDecoder,
     RealTimeChunking,
     VelocityMLP,
     WarmPriorActor,
 )
-from warmprior.modules import RegressionPrior, with_leftover
+from warmprior.history import advance, cold_history, without
+from warmprior.modules import with_leftover
+from warmprior.training.saved import load_policy, policy_config, save_policy
 
 B, P, D = 3, 10, 4
 
@@ -73,9 +76,8 @@ def network():
 def batch(dtype=torch.float64):
     generator = torch.Generator().manual_seed(1)
     a, y = (torch.randn(B, P, D, generator=generator, dtype=dtype) for _ in range(2))
-    left, delay = torch.tensor([7, 4, 10]), torch.tensor([[3], [0], [4]])
-    valid = (torch.arange(P) < left[:, None]).unsqueeze(-1)
-    return a, torch.where(valid, y, 0.0), valid, delay, left
+    left, delay = torch.tensor([[7], [4], [10]]), torch.tensor([[3], [0], [4]])
+    return a, torch.where((torch.arange(P) < left).unsqueeze(-1), y, 0.0), left, delay
 
 
 def at(t, a):
@@ -86,8 +88,8 @@ def at(t, a):
 def test_the_official_formula(t):
     """With the Jacobian written out: v + min(c / r^2, beta) J^T W (Y - a_hat)."""
     velocity = network()
-    a, y, valid, delay, left = batch()
-    found = RealTimeChunking().guided(velocity, y, valid, delay)(at(t, a), a)
+    a, y, left, delay = batch()
+    found = RealTimeChunking().guided(velocity, y, left, delay)(at(t, a), a)
     for row in range(B):
 
         def clean(x):
@@ -127,8 +129,7 @@ def test_without_the_jacobian_it_is_lerobots(time):
     ours = RealTimeChunking(
         schedule="linear", max_guidance_weight=10.0, horizon=7, jacobian=False, sigma=1.0
     )
-    everything = torch.ones(B, P, 1, dtype=torch.bool)
-    delay = torch.full((B, 1), 3)
+    everything, delay = torch.full((B, 1), P), torch.full((B, 1), 3)
     guided = ours.guided(velocity, y, everything, delay, sigma=torch.tensor(0.3))
     # Theirs computes the weight in single precision.
     torch.testing.assert_close(guided(at(1 - time, a), a), -theirs, rtol=1e-5, atol=1e-5)
@@ -163,14 +164,14 @@ def test_known_posteriors_of_gaussians(t, std):
     velocity = gaussian_velocity(mean, std, mu, sigma)
     left = torch.arange(P) % 2 == 0  # of the leftover every second position is made to count
     rtc = RealTimeChunking(schedule="ones", max_guidance_weight=1e9, data_std=std)
-    valid, delay = torch.ones(B, P, 1, dtype=torch.bool), torch.zeros(B, 1, dtype=torch.int64)
+    everything, delay = torch.full((B, 1), P), torch.zeros(B, 1, dtype=torch.int64)
     target = torch.where(left.view(1, P, 1), y, a + (1 - t) * velocity(at(t, a), a))
-    found = rtc.guided(velocity, target, valid, delay, sigma)(at(t, a), a)
+    found = rtc.guided(velocity, target, everything, delay, sigma)(at(t, a), a)
     expected = torch.where(left.view(1, P, 1), (y - a) / (1 - t), velocity(at(t, a), a))
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
     published = RealTimeChunking(
         schedule="ones", max_guidance_weight=1e9, data_std=std, sigma=1.0
-    ).guided(velocity, target, valid, delay, sigma)(at(t, a), a)
+    ).guided(velocity, target, everything, delay, sigma)(at(t, a), a)
     warm = torch.arange(P) < P // 2
     assert (published - expected)[:, left & warm].abs().max() > 0.01
     torch.testing.assert_close(published[:, ~warm], expected[:, ~warm], rtol=1e-9, atol=1e-9)
@@ -189,39 +190,37 @@ def test_the_published_weight_and_its_limits():
 
 def test_rows_without_a_leftover_are_not_guided():
     velocity = network()
-    a, y, valid, delay, _ = batch()
-    valid, delay = valid.clone(), delay.clone()
-    valid[1] = False
-    delay[1] = 0
+    a, y, left, delay = batch()
+    left[1] = 0
     plain = velocity(at(0.3, a), a)
-    guided = RealTimeChunking().guided(velocity, y, valid, delay)(at(0.3, a), a)
+    guided = RealTimeChunking().guided(velocity, y, left, delay)(at(0.3, a), a)
     assert torch.equal(guided[1], plain[1].detach()) and not torch.equal(guided[0], plain[0])
-    assert RealTimeChunking().guided(velocity, y, valid & False, delay) is velocity
+    assert RealTimeChunking().guided(velocity, y, 0 * left, delay) is velocity
 
 
 def test_gradients_are_its_own_affair():
     velocity = network()
-    a, y, valid, delay, _ = batch()
+    a, y, left, delay = batch()
     rtc = RealTimeChunking()
-    expected = rtc.guided(velocity, y, valid, delay)(at(0.3, a), a)
+    expected = rtc.guided(velocity, y, left, delay)(at(0.3, a), a)
     with torch.no_grad():
-        found = rtc.guided(velocity, y, valid, delay)(at(0.3, a), a)
+        found = rtc.guided(velocity, y, left, delay)(at(0.3, a), a)
     assert torch.equal(found, expected) and not found.requires_grad
     with torch.inference_mode():
         with pytest.raises(RuntimeError, match=r"torch\.no_grad.*jacobian=False"):
-            rtc.guided(velocity, y, valid, delay)(at(0.3, a), a)
+            rtc.guided(velocity, y, left, delay)(at(0.3, a), a)
         free = RealTimeChunking(jacobian=False)
-        assert free.guided(velocity, y, valid, delay)(at(0.3, a), a).isfinite().all()
+        assert free.guided(velocity, y, left, delay)(at(0.3, a), a).isfinite().all()
 
 
 def test_trust_region_bounds_what_is_perpendicular_to_the_velocity():
     velocity = network()
-    a, y, valid, delay, _ = batch()
+    a, y, left, delay = batch()
     t = at(0.1, a)
     v = velocity(t, a).detach().flatten(1)
     unit = v / v.norm(dim=1, keepdim=True)
     plain, bounded = (
-        RealTimeChunking(trust_region=bound).guided(velocity, y, valid, delay)(t, a).flatten(1) - v
+        RealTimeChunking(trust_region=bound).guided(velocity, y, left, delay)(t, a).flatten(1) - v
         for bound in (None, 0.2)
     )
     (along, across), (bounded_along, bounded_across) = (
@@ -251,35 +250,32 @@ def test_options_that_cannot_be(options, told):
 
 
 def test_delays_that_cannot_be():
-    _, y, valid, delay, _ = batch()
+    _, y, left, delay = batch()
     late = delay + torch.tensor([[5], [0], [0]])
     with pytest.raises(ValueError, match=r"a delay of 8 control steps.*7 are left"):
-        RealTimeChunking().guided(network(), y, valid, late)
+        RealTimeChunking().guided(network(), y, left, late)
     with pytest.raises(ValueError, match="horizon=2, before the delay of 3"):
-        RealTimeChunking(horizon=2).guided(network(), y, valid, delay)
-    with pytest.raises(ValueError, match=r"valid has to be \[B, P, 1\]"):
-        RealTimeChunking().guided(network(), y, valid[:, :4], delay)
+        RealTimeChunking(horizon=2).guided(network(), y, left, delay)
+    for wrong in ((left[:2], delay), (left, delay.squeeze(1))):
+        with pytest.raises(ValueError, match=r"left and delay have to be \[B, 1\], got \("):
+            RealTimeChunking().guided(network(), y, *wrong)
 
 
 # ---------------------------------------------------------------------------------------------- the actor
 
 
 def decision(prior, *batch):
+    """Three actions are left of the chunk before."""
     generator = torch.Generator().manual_seed(3)
-    chunk = torch.randn(*batch, prior.prediction_length, 2, generator=generator)
-    valid = torch.arange(prior.prediction_length).view(-1, 1) < 3
+    sizes = prior.chunk_length, prior.prediction_length, 2
+    chunk = torch.randn(*batch, *sizes[1:], generator=generator)
+    executed = torch.full((*batch, 1), prior.prediction_length - 3)
+    history = advance(cold_history(batch, *sizes), chunk, executed)
     return TensorDict(
         {
             "observation": torch.randn(*batch, 2, 3, generator=generator),
-            "prior": {
-                "loc": torch.randn(chunk.shape, generator=generator),
-                "warm": torch.ones_like(chunk[..., :1], dtype=torch.bool),
-            },
-            "rtc": {
-                "leftover": torch.where(valid, chunk, 0.0),
-                "valid": valid.expand(*batch, -1, 1).clone(),
-                "delay": torch.full((*batch, 1), 2),
-            },
+            "history": history,
+            "rtc": {"delay": torch.full((*batch, 1), 2)},
         },
         batch,
     )
@@ -296,17 +292,19 @@ def actor(prior, **options):
 
 def test_the_actor_knows_the_sigma_of_its_source():
     """Positions that are cold have 1; the chunk is that of the guided integration by hand."""
-    prior, rtc = PastPrior(4, sigma=0.5), RealTimeChunking(schedule="linear")
-    policy, data = actor(prior, guidance=rtc), decision(PastPrior(4), 5)
-    data["prior", "warm"][:, 2:] = False
+    prior, rtc = PreviewPrior(2, sigma=0.5), RealTimeChunking(schedule="linear")
+    policy, data = actor(prior, guidance=rtc), decision(prior, 5)
+    data["history"] = without(data["history"], torch.arange(5) == 4)
+    data["rtc", "delay"][4] = 0
     with torch.no_grad():
         found = policy(data.clone(), generator=torch.Generator().manual_seed(7))
         a = found["prior", "noise"]
-        sigma = torch.tensor([0.5, 0.5, 1.0, 1.0]).view(1, 4, 1)
+        sigma = torch.tensor([0.5, 0.5, 1.0, 1.0]).view(1, 4, 1).repeat(5, 1, 1)
+        sigma[4] = 1.0
         guided = rtc.guided(
             lambda t, x: policy.network(t, x, data["observation"]),
-            data["rtc", "leftover"],
-            data["rtc", "valid"],
+            data["history", "forecast"],
+            torch.tensor([[3]] * 4 + [[0]]),
             data["rtc", "delay"],
             sigma,
         )
@@ -324,7 +322,7 @@ def test_guidance_brings_the_chunk_to_the_leftover():
             chunk = policy(data.clone(), nfe=16, generator=torch.Generator().manual_seed(7))[
                 "vla_action", "chunk"
             ]
-        distances.append((chunk - data["rtc", "leftover"])[:, :2].abs().mean())
+        distances.append((chunk - data["history", "forecast"])[:, :2].abs().mean())
     assert distances[1] < 0.2 * distances[0]
 
 
@@ -336,8 +334,8 @@ def test_one_environment_and_a_batch_of_none():
 def test_it_is_saved_with_the_policy(tmp_path):
     rtc = RealTimeChunking(horizon=3, schedule="ones", jacobian=False, sigma=1.0, trust_region=0.5)
     policy = actor(PastPrior(4), guidance=rtc)
-    policy.save_pretrained(tmp_path)
-    again = WarmPriorActor.from_pretrained(tmp_path)
+    save_policy(policy, tmp_path)
+    again = load_policy(tmp_path)
     assert again.ode.guidance == rtc
     data = decision(PastPrior(4), 2)
     one, two = (
@@ -346,18 +344,16 @@ def test_it_is_saved_with_the_policy(tmp_path):
     )
     assert torch.equal(one, two)
     plain = policy.replace(guidance=None)
-    assert plain.ode.guidance is None and "guidance" not in plain.config()["actor"]
+    assert plain.ode.guidance is None and policy_config(plain)["actor"]["guidance"] is None
     assert policy.replace(nfe=1).ode.guidance == rtc
     config = json.loads((tmp_path / "config.json").read_text())
     assert config["actor"]["guidance"]["schedule"] == "ones"
 
 
-def test_missing_keys_and_sources_without_a_flow():
+def test_missing_keys_and_agents():
     data = decision(PastPrior(4), 2).exclude("rtc")
     with pytest.raises(KeyError, match=r"InferenceDelay.*AsyncExecutor"):
         actor(PastPrior(4), guidance=RealTimeChunking())(data)
-    with pytest.raises(ValueError, match="no flow to guide"):
-        WarmPriorActor(VelocityMLP(2, 3, 4), RegressionPrior(4), guidance=RealTimeChunking())
     with pytest.raises(ValueError, match="replace\\(guidance=None\\)"):
         PriorDecoder(actor(PastPrior(4), guidance=RealTimeChunking()), delta=0.5)
 

@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.toy_env import random_history
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
@@ -82,7 +83,7 @@ def algorithm_one(data, frames, prior, network, generator, coefficients):
 @pytest.mark.parametrize("prior_class", PRIORS)
 def test_training_of_algorithm_one(prior_class, interpolant):
     data = dataset()
-    prior = prior_class(H, sigma=0.4)
+    prior = prior_class(H, **({} if prior_class is GaussianPrior else {"sigma": 0.4}))
     actor = actor_for(prior)
     generator = torch.Generator().manual_seed(1)
     batch = window_replay_buffer(data, prior, batch_size=40, generator=generator).sample()
@@ -124,10 +125,7 @@ def sample(prior, *shape):
             "observation": torch.randn(*shape, 2, D_O),
             "vla_action": {"chunk": torch.randn(*shape, length, D_A)},
             "action_is_pad": torch.rand(*shape, length) < 0.3,
-            "prior": {
-                "loc": torch.randn(*shape, length, D_A),
-                "warm": torch.rand(*shape, length, 1) < 0.5,
-            },
+            "history": random_history(prior, *shape, action_dim=D_A, seed=4),
         },
         shape,
     )
@@ -226,8 +224,7 @@ def test_set_keys(nested):
         "observation": "observation",
         "chunk": ("vla_action", "chunk"),
         "pad_mask": "action_is_pad",
-        "loc": ("prior", "loc"),
-        "warm": ("prior", "warm"),
+        "history": "history",
     }
     new = {name: ("deep", "er", name) if nested else f"my_{name}" for name in old}
     renamed = TensorDict({}, [6])
@@ -241,9 +238,9 @@ def test_set_keys(nested):
 
 def test_in_keys_follow_set_keys_after_they_were_read():
     loss = FlowMatchingLoss(actor_for(PastPrior(H)))
-    assert ("prior", "loc") in loss.in_keys
-    loss.set_keys(loc="elsewhere")
-    assert "elsewhere" in loss.in_keys and ("prior", "loc") not in loss.in_keys
+    assert "history" in loss.in_keys
+    loss.set_keys(history="elsewhere")
+    assert "elsewhere" in loss.in_keys and "history" not in loss.in_keys
     assert loss.out_keys == ["loss_flow_matching"]
 
 
@@ -256,15 +253,34 @@ def test_observation_key_of_the_actor():
 
 
 @pytest.mark.parametrize(
-    "missing", [("vla_action", "chunk"), ("prior", "loc"), ("prior", "warm"), "observation"]
+    "missing", [("vla_action", "chunk"), "history", ("history", "steps"), "observation"]
 )
 def test_missing_key(missing):
     prior = PastPrior(H)
     data = sample(prior, 6)
     del data[missing]
     name = missing if isinstance(missing, str) else missing[-1]
-    with pytest.raises(KeyError, match=f"missing: .*{name}"):
+    with pytest.raises(KeyError, match=rf"missing: .*{name}.*(window_replay_buffer|ActionWindow)"):
         loss_of(actor_for(prior), data)
+
+
+@pytest.mark.parametrize(
+    ("made_for", "told"),
+    [
+        (
+            PreviewPrior(H),
+            r"\('vla_action', 'chunk'\) has 6 positions, but Past.* predicts 3: make",
+        ),
+        (PastPrior(H - 1), r"has 2 positions, but PastPrior.* predicts 3: make the windows"),
+    ],
+)
+def test_windows_of_other_lengths(made_for, told):
+    with pytest.raises(ValueError, match=told):
+        loss_of(actor_for(PastPrior(H)), sample(made_for, 6))
+    data = sample(PastPrior(H), 6)
+    data["history"] = sample(made_for, 6)["history"]
+    with pytest.raises(ValueError, match=r"PastPrior.* needs 3 remembered .* of 3, but .* has "):
+        loss_of(actor_for(PastPrior(H)), data)
 
 
 def test_unknown_reduction():
@@ -277,21 +293,25 @@ def test_any_callable_module_and_any_prior():
 
     class Double(Prior):
         name = "double-for-this-test"
+        prediction_chunks = 2
 
-        def training_mean(self, history, history_valid, target):
-            return 2 * target, torch.ones_like(target[..., :1], dtype=torch.bool)
+        def mean(self, history):
+            loc = history["forecast"]
+            return 2 * loc, torch.ones_like(loc[..., :1], dtype=torch.bool)
 
     class Exact(nn.Module):
-        """The true velocity of the flow from 2a to a: -a = -a_t / (2 - t)."""
+        """The true velocity of the flow from 2a to a, -a = -a_t / (2 - t), and for what is unknown none."""
 
         def forward(self, t, a, observation):
-            return -a / (2 - t)[:, None, None]
+            known = torch.arange(2 * H)[:, None] < H
+            return torch.where(known, -a / (2 - t)[:, None, None], 0.0)
 
     prior = Double(H, sigma=0.0)
     batch = window_replay_buffer(dataset(), prior, batch_size=32).sample()
-    loss = FlowMatchingLoss(WarmPriorActor(Exact(), prior))(batch)["loss_flow_matching"]
-    del Prior._registry["double-for-this-test"]
-    assert loss < 1e-10
+    loss = FlowMatchingLoss(WarmPriorActor(Exact(), prior), reduction="none")
+    error = loss(batch)["loss_flow_matching"]
+    del Prior._classes["double-for-this-test"]
+    assert error[:, :H].max() < 1e-10 and error[:, H:].max() > 0.1  # the second half is not told
 
 
 def test_ctrl_c_in_the_network_is_one():
@@ -299,15 +319,7 @@ def test_ctrl_c_in_the_network_is_one():
     network = VelocityMLP(2, 5, 3, 2, hidden_dim=8)
     loss = FlowMatchingLoss(WarmPriorActor(network, prior))
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    data = TensorDict(
-        {
-            "observation": torch.zeros(4, 2, 5),
-            "vla_action": {"chunk": torch.zeros(4, 3, 2)},
-            "action_is_pad": torch.zeros(4, 3, dtype=torch.bool),
-            "prior": {"loc": torch.zeros(4, 3, 2), "warm": torch.ones(4, 3, 1, dtype=torch.bool)},
-        },
-        [4],
-    )
+    data = sample(prior, 4)
 
     def interrupt(*args):
         raise KeyboardInterrupt

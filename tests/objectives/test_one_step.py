@@ -16,23 +16,20 @@ from warmprior import (
     PastPrior,
     PolynomialInterpolant,
     PreviewPrior,
-    Prior,
-    RegressionPrior,
     WarmPriorActor,
 )
+from warmprior.history import cold_history
+from warmprior.modules import StartPoint
 
 H = 3
 PRIORS = [GaussianPrior(H), PastPrior(H, sigma=0.4), PreviewPrior(H)]
 
 
-class LatePrior(GaussianPrior):
-    """One whose samplers start on the way."""
+class Late(StartPoint):
+    """Samplers enter the flow on the way."""
 
-    name = "late-for-this-test"
-    start_time = 0.4
-
-
-del Prior._registry[LatePrior.name]
+    name = "late-of-the-tests"
+    time, noise_share = 0.4, 0.6
 
 
 def losses_of(actor, data, **options):
@@ -43,7 +40,7 @@ def losses_of(actor, data, **options):
 def ends(prior, data):
     """The source and target that the loss draws first, and the times after them."""
     generator = torch.Generator().manual_seed(2)
-    a0 = prior.sample(data["prior", "loc"], data["prior", "warm"], generator)
+    a0 = prior.sample(data["history"], generator=generator)
     return a0, data["vla_action", "chunk"], torch.rand(len(data), generator=generator)
 
 
@@ -77,29 +74,30 @@ def test_two_euler_steps_are_the_sampler_of_l1_flow():
     torch.testing.assert_close(found, predicted_sample(0.5, half))
 
 
-@pytest.mark.parametrize("prior", [*PRIORS, LatePrior(H)], ids=lambda prior: prior.name)
+@pytest.mark.parametrize("start", [None, Late()])
+@pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: prior.name)
 @pytest.mark.parametrize("objective", ["velocity", "l1"])
-def test_self_distillation_by_hand(prior, objective):
+def test_self_distillation_by_hand(prior, objective, start):
     """One step to where one of the data's and eight of the teacher's lead, of the first quarter."""
-    actor, data = actor_for(prior), sample(prior, 12)
+    actor, data = actor_for(prior, start=start), sample(prior, 12)
     teacher = copy.deepcopy(actor.network)
     with torch.no_grad():
         for p in teacher.parameters():
             p.add_(0.05 * torch.randn_like(p))
     a0, a1, _ = ends(prior, data)
-    s, n = prior.start_time, 3
-    start = (1 - s) * a0[:n] + s * a1[:n]
+    s, n = 0.4 if start else 0.0, 3
+    begin = (1 - s) * a0[:n] + s * a1[:n]
     h = (1 - s) / 9
     observation = data["observation"][:n]
-    a = start + h * (a1 - a0)[:n]
+    a = begin + h * (a1 - a0)[:n]
     with torch.no_grad():
         for k in range(1, 9):
             a = a + h * teacher(torch.full((n,), s + k * h), a, observation)
-    jump = actor.network(torch.full((n,), s), start, observation)
+    jump = actor.network(torch.full((n,), s), begin, observation)
     if objective == "l1":
-        errors = (start + (1 - s) * jump - a).abs()
+        errors = (begin + (1 - s) * jump - a).abs()
     else:
-        errors = (jump - (a - start) / (1 - s)).square()
+        errors = (jump - (a - begin) / (1 - s)).square()
     counted = ~data["action_is_pad"][:n]
     expected = 0.7 * errors[counted].mean()
     gradients = torch.autograd.grad(expected, list(actor.network.parameters()))
@@ -188,8 +186,7 @@ def test_one_step_learns_to_reach_one_of_two_modes():
         loss = FlowMatchingLoss(actor, generator=generator, **options)
         optimizer = torch.optim.Adam(loss.parameters(), 5e-3)
         data = TensorDict({"observation": torch.zeros(256, 1, 1)}, [256])
-        data["prior", "loc"] = torch.zeros(256, 1, 1)
-        data["prior", "warm"] = torch.zeros(256, 1, 1, dtype=torch.bool)
+        data["history"] = cold_history([256], 1, 1, 1)
         for _ in range(300):
             side = torch.randint(0, 2, (256, 1, 1), generator=generator)
             data["vla_action", "chunk"] = 2.0 * side - 1.0
@@ -218,7 +215,7 @@ def test_one_step_learns_to_reach_one_of_two_modes():
     [
         (
             {"times": "nobodys"},
-            "times must be one of uniform, u-shaped, logit-normal, got 'nobodys'",
+            "times must be one of uniform, u-shaped, logit-normal, start, got 'nobodys'",
         ),
         ({"objective": "l2"}, "objective must be one of velocity, l1, got 'l2'"),
         ({"self_distillation": -1.0}, "self_distillation must be a finite weight >= 0, got -1.0"),
@@ -235,11 +232,24 @@ def test_bad_options(options, message):
         FlowMatchingLoss(actor_for(PastPrior(H)), **options)
 
 
-@pytest.mark.parametrize("options", [{"objective": "l1"}, {"self_distillation": 0.5}])
-def test_regression_has_no_flow_for_them(options):
-    actor = actor_for(RegressionPrior(H))
-    FlowMatchingLoss(actor, times="u-shaped")  # of no effect beside others
-    with pytest.raises(
-        ValueError, match=r"regression is trained at t = 0 alone.*leave out regression"
-    ):
-        FlowMatchingLoss(actor, **options)
+@pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: prior.name)
+def test_regression_is_the_error_of_one_step_from_the_source(prior):
+    actor, data = actor_for(prior, max_nfe=1), sample(prior, 10)
+    a0, a1, _ = ends(prior, data)
+    reached = a0 + actor.network(torch.zeros(10), a0, data["observation"])
+    expected = (reached - a1).square()[~data["action_is_pad"]].mean()
+    found = losses_of(actor, data, times="start")["loss_flow_matching"]
+    torch.testing.assert_close(found, expected)
+    chunk = actor(data, generator=torch.Generator().manual_seed(2))["vla_action", "chunk"]
+    torch.testing.assert_close(chunk, reached)
+
+
+def test_regression_has_no_flow():
+    actor = actor_for(PastPrior(H), max_nfe=1)
+    for name, value in (("objective", "l1"), ("self_distillation", 0.5)):
+        with pytest.raises(ValueError, match=f"{name} = {value} needs a flow.*times = 'start'"):
+            FlowMatchingLoss(actor, times="start", **{name: value})
+    with pytest.raises(ValueError, match="build the policy with max_nfe=1"):
+        FlowMatchingLoss(actor_for(PastPrior(H)), times="start")
+    with pytest.raises(ValueError, match="use LinearInterpolant, not PolynomialInterpolant"):
+        FlowMatchingLoss(actor, times="start", interpolant=PolynomialInterpolant())

@@ -28,7 +28,10 @@ def density(name, t):
     return torch.exp(-(z**2) / 2) / (t * (1 - t)) / math.sqrt(2 * math.pi)
 
 
-@pytest.mark.parametrize("name", TIMES)
+RANDOM = [name for name in TIMES if name != "start"]
+
+
+@pytest.mark.parametrize("name", RANDOM)
 def test_distribution_and_moments(name):
     width = 1e-5
     centres = torch.arange(width / 2, 1, width, dtype=torch.float64)
@@ -60,8 +63,14 @@ def test_uniform_is_the_draw_that_it_was():
     assert torch.equal(draw("uniform", 4, 5, seed=3, dtype=torch.float32), expected)
 
 
+def test_the_start_is_no_draw():
+    state = torch.get_rng_state()
+    assert torch.equal(draw("start", 2, 3), torch.zeros(2, 3, dtype=torch.float64))
+    assert torch.equal(torch.get_rng_state(), state)
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", TIMES)
+@pytest.mark.parametrize("name", RANDOM)
 def test_shape_type_and_generator(name, dtype):
     t = draw(name, 2, 3, dtype=dtype)
     assert t.shape == (2, 3) and t.dtype == dtype
@@ -82,7 +91,7 @@ def test_rounding_stays_in_the_interval(monkeypatch):
 def test_the_loss_is_given_them():
     prior = PastPrior(3)
     actor, data = actor_for(prior), sample(prior, 6)
-    losses = {name: loss_of(actor, data, times=name) for name in TIMES}
+    losses = {name: loss_of(actor, data, times=name) for name in RANDOM}
     assert torch.equal(losses["uniform"], loss_of(actor, data))
     assert len({loss.item() for loss in losses.values()}) == 3
 
@@ -92,7 +101,7 @@ def test_the_loss_is_given_them():
     # By hand: the same source, at that time.
     loss = FlowMatchingLoss(actor, times=constant, generator=torch.Generator().manual_seed(2))
     a1 = data["vla_action", "chunk"]
-    a0 = prior.sample(data["prior", "loc"], data["prior", "warm"], torch.Generator().manual_seed(2))
+    a0 = prior.sample(data["history"], generator=torch.Generator().manual_seed(2))
     predicted = actor.network(torch.full((6,), 0.25), 0.75 * a0 + 0.25 * a1, data["observation"])
     counted = ~data["action_is_pad"]
     expected = (predicted - (a1 - a0)).square()[counted].mean()

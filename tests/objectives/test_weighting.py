@@ -18,6 +18,7 @@ from warmprior import (
     VelocityMLP,
     WarmPriorActor,
 )
+from warmprior.history import window_history
 from warmprior.modules.network import VelocityNetwork
 
 H, D_A, N = 2, 1, 40_000
@@ -34,27 +35,26 @@ class Nothing(VelocityNetwork):
         return self.weight * a
 
 
-def batch(prior, n=N, seed=0):
+def batch(n=N, seed=0):
     """Jointly Gaussian past and target, with another correlation and spread at each position."""
     g = torch.Generator().manual_seed(seed)
     past = torch.randn(n, H, D_A, generator=g) * torch.tensor([[0.5], [1.5]]) + 0.3
     a1 = torch.tensor([[0.9], [0.2]]) * past + torch.tensor([[0.1], [0.7]]) * torch.randn(
         n, H, D_A, generator=g
     )
-    warm = torch.full((n, H, 1), prior.ever_warm)
     return TensorDict(
         {
             "observation": torch.zeros(n, 1, 1),
             "vla_action": {"chunk": a1},
             "action_is_pad": torch.zeros(n, H, dtype=torch.bool),
-            "prior": {"loc": past, "warm": warm},
+            "history": window_history(past, torch.full((n, 1), H), a1, H),
         },
         [n],
     )
 
 
 def policy(prior, interpolant=None, network=Nothing):
-    windows = batch(prior)
+    windows = batch()
     moments = SourceMoments.fit(windows, prior, generator=torch.Generator().manual_seed(1))
     inside = network(D_A, 1, H, 1)
     return WarmPriorActor(
@@ -67,8 +67,8 @@ def policy(prior, interpolant=None, network=Nothing):
 @pytest.mark.parametrize("time", [0.0, 0.3, 0.9, 1.0])
 def test_the_unit_is_what_least_squares_leave(prior, path, time):
     network = policy(prior, path).network
-    windows, g = batch(prior, seed=5), torch.Generator().manual_seed(6)
-    a0 = prior.sample(windows["prior", "loc"], windows["prior", "warm"], g).double()
+    windows, g = batch(seed=5), torch.Generator().manual_seed(6)
+    a0 = prior.sample(windows["history"], generator=g).double()
     a1 = windows["vla_action", "chunk"].double()
     a_t, velocity = path(a0, a1, torch.full((N,), time).double())
     unit = network.remainder(torch.tensor([time]))[0]
@@ -81,7 +81,7 @@ def test_the_unit_is_what_least_squares_leave(prior, path, time):
 
 @pytest.mark.parametrize("prior", [GaussianPrior(H), PastPrior(H, sigma=0.4)])
 def test_a_network_that_has_learnt_nothing_has_a_loss_of_one_at_every_time(prior):
-    windows = batch(prior, seed=7)
+    windows = batch(seed=7)
 
     def loss(time, **options):
         def times(shape, generator, dtype, device):
@@ -99,7 +99,7 @@ def test_a_network_that_has_learnt_nothing_has_a_loss_of_one_at_every_time(prior
 def test_errors_are_divided_coordinate_by_coordinate():
     prior = PastPrior(H, sigma=0.4)
     actor = policy(prior, network=lambda *sizes: VelocityMLP(*sizes, hidden_dim=8))
-    windows = batch(prior, 6)
+    windows = batch(6)
     windows["action_is_pad"][0, 1] = True
     times = torch.rand(6)
 
@@ -139,7 +139,7 @@ def test_the_best_field_is_the_same():
         module = FlowMatchingLoss(actor, weighting=weighting, generator=generator)
         optimizer = torch.optim.Adam(module.parameters(), lr=0.02)
         for i in range(150):
-            loss = module(batch(prior, 2000, seed=i))["loss_flow_matching"]
+            loss = module(batch(2000, seed=i))["loss_flow_matching"]
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()

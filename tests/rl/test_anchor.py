@@ -9,6 +9,7 @@ from functools import partial
 
 import pytest
 import torch
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -17,31 +18,40 @@ from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
     ActionHistory,
     ChunkStep,
-    ForecastPrior,
     GaussianPrior,
-    HistoryPrior,
     ObservationStack,
     PastPrior,
     PreviewPrior,
     PriorAnchor,
-    StepPrior,
+    StartPoint,
+    VelocityMLP,
+    WarmPriorActor,
 )
+from warmprior.modules.prior import Source
 
 H = 3
 LENGTHS = (7, 4)
 PLACES = ("single", "serial-outside", "serial-inside", "parallel-outside", "parallel-inside")
-PRIORS = [GaussianPrior, PastPrior, PreviewPrior, HistoryPrior]
+PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
+WIDTH = 2 + ACTION_DIM
+
+
+def actor_for(prior, **options):
+    network = VelocityMLP(ACTION_DIM, WIDTH, prior.prediction_length, 1, hidden_dim=8)
+    return WarmPriorActor(network, prior, **options)
 
 
 def history(prior, execute=None):
     chunk = ChunkStep(
         prior.chunk_length, execute=execute, prediction_length=prior.prediction_length
     )
-    return [chunk, ActionHistory(prior)]
+    return [chunk, ActionHistory(prior.history_length)]
 
 
 def anchored(env, prior, execute=None, **options):
-    return TransformedEnv(env, Compose(*history(prior, execute), PriorAnchor(prior, **options)))
+    return TransformedEnv(
+        env, Compose(*history(prior, execute), PriorAnchor(actor_for(prior), **options))
+    )
 
 
 def single(prior, length, **options):
@@ -84,8 +94,8 @@ def test_everywhere(place, prior_class, execute):
         new = env.rollout(9, break_when_any_done=False)
         assert not torch.equal(new["prior", "anchor"], data["prior", "anchor"])
         for part in (data, data["next"]):
-            anchor, loc, warm = (part["prior", k] for k in ("anchor", "loc", "warm"))
-            centred = warm & (prior_class in (PastPrior, PreviewPrior))
+            anchor = part["prior", "anchor"]
+            loc, _, centred = prior.distribution(part["history"])
             assert torch.equal(anchor[centred.expand_as(anchor)], loc[centred.expand_as(loc)])
             noise = anchor[~centred.expand_as(anchor)]
             assert len(noise) == len(noise.unique())
@@ -99,42 +109,72 @@ def test_everywhere(place, prior_class, execute):
         again.close(raise_if_closed=False)
 
 
+class Learned(PastPrior, nn.Module):
+    """Warm everywhere, around what a network makes of the observation."""
+
+    name = "learned-of-the-anchor"
+
+    def __init__(self, chunk_length):
+        nn.Module.__init__(self)
+        super().__init__(chunk_length)
+        self.network = nn.Linear(WIDTH, ACTION_DIM)
+
+    def distribution(self, history, observation=None):
+        loc = self.network(observation[..., -1:, :]).expand_as(history["forecast"])
+        return Source(loc, torch.full_like(loc, 0.5), torch.ones_like(loc[..., :1]).bool())
+
+
+class Halved(StartPoint):
+    """Half-way from noise to the observation."""
+
+    name = "halved-of-the-anchor"
+    time = 0.5
+    noise_share = 0.4
+
+    def centre(self, history, observation):
+        return 0.5 * observation[..., -1:, -ACTION_DIM:].expand_as(history["forecast"]) + 0.25
+
+    def forward(self, noise, history, observation):
+        return self.centre(history, observation) + self.noise_share * noise
+
+
+def observing(actor):
+    parts = Compose(ObservationStack(1), *history(actor.prior), PriorAnchor(actor))
+    env = TransformedEnv(CountingEnv(LENGTHS[0]), parts)
+    check_env_specs(env)
+    return env.rollout(3)
+
+
 def test_a_learned_mean_is_the_anchor_from_the_first_decision_on():
-    width = CountingEnv(LENGTHS[0]).reset()["observation"].shape[-1]
-    prior = ForecastPrior(H).sized(ACTION_DIM, width, 1)
-    parts = Compose(ObservationStack(1), *history(prior), PriorAnchor(prior))
-    env = TransformedEnv(CountingEnv(LENGTHS[0]), parts)
-    check_env_specs(env)
-    data = env.rollout(3)
+    prior = Learned(H)
+    data = observing(actor_for(prior))
     for part in (data, data["next"]):
-        loc, warm = part["prior", "loc"], part["prior", "warm"]
-        mean, _ = prior.distribution(loc, warm, part["observation"])
-        torch.testing.assert_close(part["prior", "anchor"], mean)
-        assert mean.any()
+        mean, _, _ = prior.distribution(part["history"], part["observation"])
+        torch.testing.assert_close(part["prior", "anchor"], mean.detach())
+        assert mean.any() and not part["prior", "anchor"].requires_grad
 
 
-def test_the_centre_of_a_start_from_a_forecast_is_its_share_of_the_forecast():
-    width = CountingEnv(LENGTHS[0]).reset()["observation"].shape[-1]
-    prior = StepPrior(H, start_time=0.75, stall=0.0).sized(ACTION_DIM, width, 1)
-    parts = Compose(ObservationStack(1), *history(prior), PriorAnchor(prior))
-    env = TransformedEnv(CountingEnv(LENGTHS[0]), parts)
-    check_env_specs(env)
-    data = env.rollout(3)
-    mean = data["prior", "loc"], data["prior", "warm"]
-    forecast = prior.forecast(*mean, data["observation"])
-    torch.testing.assert_close(data["prior", "anchor"], 0.75 * forecast)
-    start = prior.start(*mean, torch.Generator().manual_seed(0), data["observation"])
-    eps = torch.randn(start.shape, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(data["prior", "anchor"] + prior.residual_sigma * eps, start)
+@pytest.mark.parametrize("prior_class", PRIORS)
+def test_the_anchor_of_a_policy_that_starts_on_the_way_is_the_centre_there(prior_class):
+    actor = actor_for(prior_class(H), start=Halved())
+    data = observing(actor)
+    centre = actor.start.centre(data["history"], data["observation"])
+    assert torch.equal(data["prior", "anchor"], centre)
+    actor.sampler(data)
+    eps = (data["prior", "noise"] - centre - 0.4 * data["prior", "loc"]) / 0.4
+    assert data["prior", "noise"].isfinite().all() and 0.2 < eps.std() < 2
 
 
 def test_a_learned_prior_is_the_anchor_s_own():
-    """What moves the environment leaves the policy's weights where they are."""
-    prior = ForecastPrior(H).sized(ACTION_DIM, 3, 1)
-    anchor = PriorAnchor(prior).to("meta")
-    assert anchor.prior.calibration.is_meta and not prior.calibration.is_meta
+    """What moves the environment leaves the policy's weights where they are, and trainable."""
+    prior = Learned(H)
+    anchor = PriorAnchor(actor_for(prior)).to("meta")
+    assert anchor.prior.network.weight.is_meta and not prior.network.weight.is_meta
+    assert prior.network.weight.requires_grad and not list(
+        p for p in anchor.parameters() if p.requires_grad
+    )
     paper = PastPrior(H)
-    assert PriorAnchor(paper).prior is paper
+    assert PriorAnchor(actor_for(paper)).prior is paper
 
 
 def test_noise_is_standard_normal():
@@ -145,9 +185,8 @@ def test_noise_is_standard_normal():
     assert abs(float(noise.mean())) < 0.03 and abs(float(noise.std()) - 1) < 0.03
 
 
-@pytest.mark.parametrize("prior_class", [GaussianPrior, HistoryPrior])
-def test_vanilla_dsrl_is_the_default_without_a_mean(prior_class):
-    data = build("single", prior_class(H)).rollout(3)
+def test_vanilla_dsrl_is_the_default_without_a_mean():
+    data = build("single", GaussianPrior(H)).rollout(3)
     assert not data["prior", "anchor"].any() and not data["next", "prior", "anchor"].any()
 
 
@@ -157,9 +196,9 @@ def test_zero_on_request():
 
 
 def test_a_partly_collected_history_is_not_an_anchor():
-    """Past collects its mean before it is warm: what is there must not leak into the box's centre."""
+    """Actions are there before the mean is warm: they must not leak into the box's centre."""
     data = build("single", PastPrior(H), execute=2, cold="zero").rollout(2)
-    assert data["prior", "loc"][1].any() and not data["prior", "warm"][1].any()
+    assert data["history", "actions"][1].any() and data["history", "steps"][1] < H
     assert not data["prior", "anchor"][1].any()
 
 
@@ -222,7 +261,7 @@ def test_nested_and_extended_environments_are_seeded():
         env.set_seed(8)
         anchors.append(env.reset()["prior", "anchor"])
     late = TransformedEnv(SerialEnv(2, [partial(CountingEnv, n) for n in LENGTHS]))
-    for transform in (*history(PastPrior(H)), PriorAnchor(PastPrior(H))):
+    for transform in (*history(PastPrior(H)), PriorAnchor(actor_for(PastPrior(H)))):
         late.append_transform(transform)
     late.set_seed(8)
     anchors.append(late.reset()["prior", "anchor"])
@@ -231,7 +270,7 @@ def test_nested_and_extended_environments_are_seeded():
 
 def test_every_anchor_of_an_environment_is_seeded():
     prior = PastPrior(H)
-    anchors = [PriorAnchor(prior, seed_offset=i, anchor_key=str(i)) for i in range(2)]
+    anchors = [PriorAnchor(actor_for(prior), seed_offset=i, anchor_key=str(i)) for i in range(2)]
     env = TransformedEnv(CountingEnv(7), Compose(*history(prior), *anchors))
     env.set_seed(4)
     first = env.reset()
@@ -287,37 +326,34 @@ def test_in_a_collector():
     )
     collector.set_seed(1)
     for batch in collector:
-        warm = batch["prior", "warm"].expand_as(batch["prior", "loc"])
-        assert torch.equal(batch["prior", "anchor"][warm], batch["prior", "loc"][warm])
+        loc, _, warm = PreviewPrior(H).distribution(batch["history"])
+        warm = warm.expand_as(loc)
+        assert torch.equal(batch["prior", "anchor"][warm], loc[warm])
     collector.shutdown()
 
 
 def test_wrong_places_and_options():
     with pytest.raises(ValueError, match="cold must be 'noise' or 'zero'"):
-        PriorAnchor(PastPrior(H), cold="warm")
+        PriorAnchor(actor_for(PastPrior(H)), cold="warm")
+    bare = TransformedEnv(
+        CountingEnv(5), Compose(ChunkStep(H), PriorAnchor(actor_for(PastPrior(H))))
+    )
+    with pytest.raises(KeyError, match="ActionHistory writes it in an environment"):
+        bare.reset()
     with pytest.raises(KeyError, match="append it after ActionHistory"):
-        TransformedEnv(CountingEnv(5), Compose(ChunkStep(H), PriorAnchor(PastPrior(H)))).reset()
-    with pytest.raises(KeyError, match="append it after ActionHistory"):
-        env = TransformedEnv(CountingEnv(5), Compose(ChunkStep(H), PriorAnchor(PastPrior(H))))
-        env.observation_spec  # noqa: B018
-    with pytest.raises(ValueError, match=r"PreviewPrior.* predicts 6 .*must carry the same prior"):
+        bare.observation_spec  # noqa: B018
+    with pytest.raises(ValueError, match=r"PreviewPrior.* forecasts of 6, but .* has 3"):
         inside = SerialEnv(
             1, [lambda: TransformedEnv(CountingEnv(5), Compose(*history(PastPrior(H))))]
         )
-        TransformedEnv(inside, PriorAnchor(PreviewPrior(H))).reset()
-    with pytest.raises(
-        ValueError, match=r"PriorAnchor.* Gaussian.*ActionHistory carries PastPrior"
-    ):
-        chain = Compose(*history(PastPrior(H)), PriorAnchor(GaussianPrior(H)))
-        TransformedEnv(CountingEnv(5), chain).reset()
+        TransformedEnv(inside, PriorAnchor(actor_for(PreviewPrior(H)))).reset()
 
 
-def test_renamed_keys():
+def test_a_renamed_anchor():
     prior = PastPrior(H)
-    anchor = PriorAnchor(prior, loc_key="mean", warm_key="is_warm", anchor_key="centre")
-    chain = Compose(ChunkStep(H), ActionHistory(prior, loc_key="mean", warm_key="is_warm"), anchor)
-    env = TransformedEnv(CountingEnv(7), chain)
+    anchor = PriorAnchor(actor_for(prior), anchor_key="centre")
+    env = TransformedEnv(CountingEnv(7), Compose(*history(prior), anchor))
     check_env_specs(env)
     data = env.rollout(2)
     assert data["centre"].shape == (2, H, ACTION_DIM)
-    assert torch.equal(data["centre"][1], data["mean"][1])
+    assert torch.equal(data["centre"][1], data["history", "actions"][1])

@@ -56,44 +56,46 @@ def test_target_updates_and_saved_state():
     assert torch.equal(a["loss_qvalue"], b["loss_qvalue"])
 
 
-def rollout(decoder, inside, frames=40):
+def rollout(policy, decoder, inside, frames=40):
     transforms = policy_transforms(decoder.prior, observation_steps=1)
-    transforms.append(PriorAnchor(decoder.prior))
+    transforms.append(PriorAnchor(policy))
     if inside:
         transforms.append(PriorSpace(decoder))
     env = TransformedEnv(NavigationEnv(batch_size=[4]), transforms)
     env.set_seed(0)
     torch.manual_seed(0)
     sampler = ResidualSampler(decoder)
-    policy = sampler if inside else TensorDictSequential(sampler, decoder)
-    return env.rollout(frames, policy, break_when_any_done=False)
+    acting = sampler if inside else TensorDictSequential(sampler, decoder)
+    return env.rollout(frames, acting, break_when_any_done=False)
 
 
 def navigation_loss(prior):
+    """And the policy in it."""
     torch.manual_seed(0)
     network = VelocityMLP(1, 9, prior.prediction_length, 1, hidden_dim=8)
     data = TensorDict({"observation": torch.randn(9, 9), "action": torch.randn(9, 1)}, [9])
     actor = WarmPriorActor(network, prior, nfe=1, normalizer=Normalizer.fit(data))
     decoder = PriorDecoder(actor, delta=0.5)
     sizes = (1, 9, prior.prediction_length, 1)
-    return DSRLNALoss(
+    loss = DSRLNALoss(
         make_prior_space_actor(*sizes, delta=0.5, hidden_dim=8),
         make_prior_space_critic(*sizes, in_keys=(keys.OBSERVATION, keys.CHUNK), hidden_dim=8),
         make_prior_space_critic(*sizes, delta=0.5, hidden_dim=8),
         decoder,
         generator=torch.Generator().manual_seed(0),
     )
+    return loss, actor
 
 
 @pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
 def test_either_wiring_gives_the_same_losses(prior_class):
     results = []
     for inside in (False, True):
-        loss = navigation_loss(prior_class(4))
+        loss, policy = navigation_loss(prior_class(4))
         SoftUpdate(loss, tau=0.1)
         if inside:
             loss.set_keys(chunk=("next", *keys.DECODED_CHUNK))
-        data = rollout(loss.decoder, inside).reshape(-1)
+        data = rollout(policy, loss.decoder, inside).reshape(-1)
         torch.manual_seed(2)
         results.append(loss(data.select(*loss.in_keys)))
     assert all(torch.equal(results[0][key], results[1][key]) for key in results[0].keys())  # noqa: SIM118
@@ -102,7 +104,7 @@ def test_either_wiring_gives_the_same_losses(prior_class):
 @pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
 def test_frozen_through_training(prior_class):
     """Collect, store, sample, optimise, update targets, save, move: the decoder does not change."""
-    loss = navigation_loss(prior_class(4))
+    loss, policy = navigation_loss(prior_class(4))
     decoder = loss.decoder
     before = {name: tensor.clone() for name, tensor in decoder.state_dict().items()}
     assert any("normalizer" in name for name in before)
@@ -111,7 +113,7 @@ def test_frozen_through_training(prior_class):
     updater = HardUpdate(loss, value_network_update_interval=1)
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, weight_decay=0.1)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=16)
-    buffer.extend(rollout(decoder, inside=False).reshape(-1).select(*loss.in_keys))
+    buffer.extend(rollout(policy, decoder, inside=False).reshape(-1).select(*loss.in_keys))
     for compute in loss.schedule(updates=3):
         losses = compute(buffer.sample())
         optimizer.zero_grad()

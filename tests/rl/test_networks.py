@@ -11,20 +11,17 @@ from torch import nn
 
 from warmprior import (
     BoxTanhNormal,
-    CVAEPrior,
-    ForecastPrior,
     GaussianPrior,
-    HistoryPrior,
-    MeanObservation,
     PastPrior,
     PriorDecoder,
     ResidualSampler,
-    StepPrior,
+    StartPoint,
     VelocityMLP,
     WarmPriorActor,
     make_prior_space_actor,
     make_prior_space_critic,
 )
+from warmprior.rl.anchor import residual_sigma
 
 stats = pytest.importorskip("scipy.stats")
 
@@ -43,11 +40,12 @@ def batch(n):
     )
 
 
-def make_decoder(prior, delta):
-    return PriorDecoder(
-        WarmPriorActor(VelocityMLP(D_A, D_O + MeanObservation.width(prior, D_A), P), prior),
-        delta=delta,
-    )
+def make_actor(prior, **options):
+    return WarmPriorActor(VelocityMLP(D_A, D_O, P), prior, **options)
+
+
+def make_decoder(prior, delta, **options):
+    return PriorDecoder(make_actor(prior, **options), delta=delta)
 
 
 @pytest.mark.parametrize("delta", [0.1, 1.0, 1.5])
@@ -151,7 +149,6 @@ def test_bad_sizes(make):
     ("prior", "delta", "options", "distribution"),
     [
         (GaussianPrior(P), 1.5, {}, stats.norm()),
-        (HistoryPrior(P), 1.5, {}, stats.norm()),
         (PastPrior(P), 0.5, {"distribution": "normal"}, stats.norm(scale=0.5)),
         (PastPrior(P), 0.5, {"distribution": "uniform"}, stats.uniform(-0.5, 1.0)),
         (PastPrior(P), 0.5, {"distribution": "normal", "sigma": 2.0}, stats.norm(scale=2.0)),
@@ -178,21 +175,45 @@ def test_clipped_is_the_default_around_a_mean():
     assert stats.kstest(inside, stats.truncnorm(-0.5, 0.5).cdf).pvalue > 1e-3
 
 
+class Halved(StartPoint):
+    """Half-way from noise to a quarter."""
+
+    name = "halved-of-the-residuals"
+    time = 0.5
+    noise_share = 0.4
+
+    def centre(self, history, observation):
+        return torch.full_like(history["forecast"], 0.25)
+
+    def forward(self, noise, history, observation):
+        return self.centre(history, observation) + self.noise_share * noise
+
+
 def test_residuals_are_as_large_as_the_source_deviates_from_the_anchor():
-    learned = ForecastPrior(P, sigma=0.5).sized(D_A, D_O, TO)
-    learned.typical_scale.fill_(0.2)
-    step = StepPrior(P, start_time=0.75).sized(D_A, D_O, TO)
-    for prior, sigma in ((learned, 0.1), (step, 0.25), (PastPrior(P, sigma=0.3), 0.3)):
-        sampler = ResidualSampler(make_decoder(prior, 0.5))
+    cases = (
+        (PastPrior(P, sigma=0.3), None, 0.3),
+        (PastPrior(P, sigma=0.3), Halved(), 0.4),
+        (GaussianPrior(P), Halved(), 0.4),
+    )
+    for prior, start, sigma in cases:
+        sampler = ResidualSampler(make_decoder(prior, 0.5, start=start))
         assert sampler.sigma == pytest.approx(sigma) and sampler.distribution == "clipped"
 
 
-@pytest.mark.parametrize("kind", [GaussianPrior, CVAEPrior])
-def test_around_zero_residuals_are_standard_normal_whatever_the_noise_of_the_source(kind):
-    """Of Gaussian sources without a mean, and of draws of a decoder, ``sigma`` is not the width."""
-    prior = kind(P, sigma=0.1).sized(D_A, D_O, TO)
-    sampler = ResidualSampler(make_decoder(prior, 1.5))
-    assert prior.residual_sigma == sampler.sigma == 1.0 and sampler.distribution == "normal"
+def test_around_zero_residuals_are_standard_normal_whatever_the_noise_of_the_source():
+    """Of sources without a mean, ``sigma`` is not the width."""
+
+    class Cold(PastPrior):
+        name = "cold-of-the-residuals"
+
+        def mean(self, history):
+            loc, warm = super().mean(history)
+            return loc, torch.zeros_like(warm)
+
+    for prior in (GaussianPrior(P), Cold(P, sigma=0.1)):
+        actor = make_actor(prior)
+        sampler = ResidualSampler(PriorDecoder(actor, delta=1.5))
+        assert residual_sigma(actor) == sampler.sigma == 1.0 and sampler.distribution == "normal"
 
 
 def test_sampler_options():

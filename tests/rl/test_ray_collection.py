@@ -43,7 +43,6 @@ def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp
     training = make_training(
         tmp_path,
         actor,
-        {"prior": actor.prior},
         warmup_steps=40,
         collection={"collectors": 2, "ray_address": ray_address},
     )
@@ -62,7 +61,7 @@ def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp
     assert not torch.isclose(rounds[:, 0], rounds[:, 1]).all(-1).any()
     state = training.agent.state()
     assert not all(torch.equal(fresh[name], state[name]) for name in fresh)
-    again = make_training(tmp_path, actor, {"prior": actor.prior}, warmup_steps=40)
+    again = make_training(tmp_path, actor, warmup_steps=40)
     assert again.steps == training.steps and again.curve == training.curve
 
 

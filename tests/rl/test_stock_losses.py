@@ -41,15 +41,18 @@ LOG_PROB = ("prior", "delta_log_prob")
 LOSSES = [SACLoss, REDQLoss, CrossQLoss, TQCLoss]
 
 
-def make_decoder():
+def make_policy():
     torch.manual_seed(0)
-    network = VelocityMLP(*SIZES, hidden_dim=8)
-    return PriorDecoder(WarmPriorActor(network, PRIOR, nfe=2, clip=1.0), delta=DELTA)
+    return WarmPriorActor(VelocityMLP(*SIZES, hidden_dim=8), PRIOR, nfe=2, clip=1.0)
+
+
+def make_decoder():
+    return PriorDecoder(make_policy(), delta=DELTA)
 
 
 def make_env(decoder=None, truncate=False):
     transforms = policy_transforms(PRIOR, observation_steps=TO, gamma=GAMMA)
-    transforms.append(PriorAnchor(PRIOR))
+    transforms.append(PriorAnchor(make_policy()))
     if decoder is not None:
         transforms.append(PriorSpace(decoder))
     base = SerialEnv(2, [partial(CountingEnv, n, truncate=truncate) for n in LENGTHS])

@@ -16,7 +16,6 @@ from tests.rl.training_parts import (
 )
 from warmprior import (
     GaussianPrior,
-    HistoryPrior,
     PastPrior,
     PreviewPrior,
     keys,
@@ -57,7 +56,7 @@ def test_transitions_are_those_of_a_rollout_by_hand(tmp_path, offset, truncate, 
 
 def test_the_warm_up_draws_from_the_prior_and_learns_nothing(tmp_path):
     actor = make_actor(PastPrior(H, sigma=0.01))
-    options = {"actor": actor, "env": {"prior": actor.prior}, "warmup_steps": 40}
+    options = {"actor": actor, "warmup_steps": 40}
     training = make_training(tmp_path, **options, environment_steps=40)
     fresh = {name: value.clone() for name, value in training.agent.state().items()}
     training.run()
@@ -72,12 +71,19 @@ def test_the_warm_up_draws_from_the_prior_and_learns_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-@pytest.mark.parametrize("prior_class", [GaussianPrior, HistoryPrior, PastPrior, PreviewPrior])
-def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, prior_class):
-    prior = prior_class(H)
-    actor = make_actor(prior)
+@pytest.mark.parametrize(
+    ("prior", "see_history"),
+    [
+        (GaussianPrior(H), False),
+        (GaussianPrior(H), True),
+        (PastPrior(H), False),
+        (PreviewPrior(H), False),
+    ],
+)
+def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, prior, see_history):
+    actor = make_actor(prior, see_history=see_history)
     before = {name: value.clone() for name, value in actor.state_dict().items()}
-    training = make_training(tmp_path, actor, {"prior": prior}, algorithm=algorithm)
+    training = make_training(tmp_path, actor, algorithm=algorithm)
     decoder = {name: value.clone() for name, value in training.decoder.state_dict().items()}
     agent = {name: value.clone() for name, value in training.agent.state().items()}
     curve = training.run()
@@ -93,7 +99,7 @@ def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, 
     critics = {"qvalue_network_params", "target_qvalue_network_params"}
     distilled = {"noise_qvalue_network_params"} if algorithm == "dsrl-na" else set()
     assert moved >= {"actor_network_params", "log_alpha"} | critics | distilled
-    delta = {"gaussian": 1.5, "history": 1.5}.get(prior.name, 0.5)
+    delta = 1.5 if prior.name == "gaussian" else 0.5
     assert training.decoder.delta == delta
     assert training.buffer[:]["prior", "delta"].abs().max() <= delta
 
@@ -108,12 +114,10 @@ def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, 
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_agent_sees_a_mean_that_conditions_the_policy(tmp_path, algorithm):
-    """Its anchor is zero, so that without the mean the agent could not tell what is decoded."""
-    prior = HistoryPrior(H)
-    training = make_training(
-        tmp_path, make_actor(prior), {"prior": prior}, algorithm=algorithm, environment_steps=30
-    )
+def test_the_agent_sees_the_actions_that_condition_the_policy(tmp_path, algorithm):
+    """Its anchor is zero, so that without them the agent could not tell what is decoded."""
+    actor = make_actor(GaussianPrior(H), see_history=True)
+    training = make_training(tmp_path, actor, algorithm=algorithm, environment_steps=30)
     training.run()
     data = training.buffer[:][:1].clone()
     residuals = []
@@ -227,7 +231,7 @@ def test_the_environment_may_live_anywhere(tmp_path):
 
 def test_a_prior_without_noise_warms_up_in_its_box(tmp_path):
     prior = PastPrior(H, sigma=0.0)
-    training = make_training(tmp_path, make_actor(prior), {"prior": prior}, environment_steps=30)
+    training = make_training(tmp_path, make_actor(prior), environment_steps=30)
     training.run()
     delta = training.buffer[:][keys.DELTA]
     assert 0.2 < delta.std() < 0.4 and delta.abs().max() <= 0.5

@@ -11,11 +11,12 @@ from torchrl.envs import SerialEnv, TransformedEnv
 
 from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
-    MeanObservation,
+    HistoryObservation,
     PastPrior,
     PriorAnchor,
     VelocityMLP,
     WarmPriorActor,
+    keys,
     policy_transforms,
 )
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
@@ -45,22 +46,28 @@ class SolvableEnv(CountingEnv):
         return out if self.before_step is None else self.before_step(out)
 
 
-def make_actor(prior=None, seed=0, action_dim=ACTION_DIM):
+def make_actor(prior=None, seed=0, action_dim=ACTION_DIM, see_history=False):
     prior = PastPrior(H) if prior is None else prior
     torch.manual_seed(seed)
-    observation_dim = 2 + ACTION_DIM + MeanObservation.width(prior, action_dim)
+    observation_dim = 2 + ACTION_DIM + see_history * HistoryObservation.width(H, action_dim)
     network = VelocityMLP(action_dim, observation_dim, prior.prediction_length, 1, hidden_dim=8)
-    return WarmPriorActor(network, prior, nfe=2, clip=1.0)
+    key = keys.CONDITIONED if see_history else keys.OBSERVATION
+    return WarmPriorActor(network, prior, nfe=2, clip=1.0, observation_key=key)
 
 
-def make_env(seed, prior=None, truncate=True, hook=None, device="cpu", **chunking):
+def make_env(seed, actor=None, truncate=True, hook=None, device="cpu", **chunking):
     """Two environments; the hook gets what those of the training (and not of evaluations) return."""
-    prior = PastPrior(H) if prior is None else prior
+    actor = make_actor() if actor is None else actor
     bases = [SolvableEnv(length, truncate, device) for length in LENGTHS]
     for base in bases:
         base.before_step = None if seed == 0 else hook
-    transforms = policy_transforms(prior, observation_steps=1, **chunking)
-    transforms.append(PriorAnchor(prior, seed=seed))
+    transforms = policy_transforms(
+        actor.prior,
+        observation_steps=1,
+        see_history=actor.in_keys[0] == keys.CONDITIONED,
+        **chunking,
+    )
+    transforms.append(PriorAnchor(actor, seed=seed))
     return TransformedEnv(SerialEnv(2, [lambda base=base: base for base in bases]), transforms)
 
 
@@ -139,9 +146,10 @@ def make_training(
     directory, actor=None, env=None, training_class=PriorSpaceTraining, collection=None, **options
 ):
     env = {} if env is None else env
+    actor = make_actor() if actor is None else actor
     return training_class(
-        make_actor() if actor is None else actor,
-        partial(make_env, **env),
+        actor,
+        partial(make_env, **{"actor": actor} | env),
         make_config(**options),
         directory,
         evaluation_seed=EVALUATION_SEED,

@@ -9,7 +9,13 @@ from warmprior import ChiTransformer, PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.training import BehaviourCloning, TrainingConfig
 
 CONFIG = TrainingConfig(
-    iterations=40, batch_size=16, learning_rate=1e-2, checkpoints=2, save_every=7, log_every=10
+    iterations=40,
+    batch_size=16,
+    learning_rate=1e-2,
+    checkpoints=2,
+    save_every=7,
+    log_every=10,
+    cold_probability=0.25,
 )
 
 
@@ -26,7 +32,7 @@ def dataset():
 
 
 def actor_for(prior=None, network=None):
-    prior = PastPrior(4, cold_probability=0.25) if prior is None else prior
+    prior = PastPrior(4) if prior is None else prior
     torch.manual_seed(7)
     if network is None:  # with dropout: the global generator has to be restored too
         network = ChiTransformer(

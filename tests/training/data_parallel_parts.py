@@ -10,29 +10,35 @@ import signal
 import torch
 from torch import nn
 
-from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, training, weights
+from tests.training.cloning_parts import CONFIG, actor_for, mlp, training, weights
 from warmprior import PastPrior, PreconditionedNetwork, SourceMoments, VelocityMLP
 from warmprior.io.distributed import rank
 from warmprior.io.workers import WorkerError
-from warmprior.modules import OTPrior
+from warmprior.objectives import OTCoupling
 
 STEPS = dataclasses.replace(
-    CONFIG, iterations=20, batch_size=15, learning_rate=1e-3, save_every=5, checkpoints=1
+    CONFIG,
+    iterations=20,
+    learning_rate=1e-3,
+    save_every=5,
+    checkpoints=1,
+    cold_probability=0.0,
 )
 
 
-class LearningPrior(nn.Module, PastPrior):
+class LearningPrior(PastPrior, nn.Module):
     """It learns how far to trust the past, with the flow."""
 
     name = "learning-past"
 
     def __init__(self, chunk_length: int) -> None:
         nn.Module.__init__(self)
-        PastPrior.__init__(self, chunk_length)
+        super().__init__(chunk_length)
         self.trust = nn.Parameter(torch.ones(2))
 
-    def distribution(self, loc, warm, observation=None):
-        return super().distribution(self.trust * loc, warm)
+    def mean(self, history):
+        loc, warm = super().mean(history)
+        return self.trust * loc, warm
 
 
 class IdleMLP(VelocityMLP):
@@ -49,55 +55,54 @@ def standardised():
 
 
 CASES = {
-    "plain": ({}, lambda: actor_for(PastPrior(4), mlp())),
-    "withheld": ({}, lambda: actor_for(PastPrior(4, cold_probability=0.5), mlp())),
-    "coupled": ({}, lambda: actor_for(OTPrior(4), mlp())),
-    "learning prior": ({}, lambda: actor_for(LearningPrior(4), mlp())),
+    "plain": ({}, {}, lambda: actor_for(PastPrior(4), mlp())),
+    "dropout, withheld": ({"cold_probability": 0.5}, {}, actor_for),
+    "prefetched": ({}, {"prefetch": True}, lambda: actor_for(PastPrior(4), mlp())),
+    "coupled": ({}, {"coupling": OTCoupling()}, lambda: actor_for(PastPrior(4), mlp())),
+    "learning prior": ({}, {}, lambda: actor_for(LearningPrior(4), mlp())),
     "distilled, standardised": (
         {"self_distillation": 0.5, "weighting": "standardised"},
+        {},
         lambda: actor_for(PastPrior(4), standardised()),
     ),
-    "bf16": ({"precision": "bf16"}, lambda: actor_for(PastPrior(4), mlp())),
+    "bf16": ({"precision": "bf16"}, {}, lambda: actor_for(PastPrior(4), mlp())),
 }
-"""Options and policies; none draws anything itself. 15 windows are no multiple of two processes."""
-
-
-def short_episodes():
-    """Where a chunk of four is padded more often than not."""
-    return dataset().set("episode", torch.arange(120) // 5)
+"""Recipes, options and policies."""
 
 
 def cloning(folder, case, **changes):
-    options, make = CASES[case]
-    config = dataclasses.replace(STEPS, **options, **changes)
-    return training(folder, config, actor=make(), data=short_episodes())
+    recipe, options, make = CASES[case]
+    config = dataclasses.replace(STEPS, **recipe, **changes)
+    return training(folder, config, actor=make(), **options)
 
 
-def gradients(folder, case):
-    """Of the first step, with the loss and the points at which the network was evaluated."""
+def first_step(folder, case):
+    """Its loss and gradients, and the points at which the network was evaluated."""
     points = []
     part = cloning(folder / "first" / f"{case} {rank()}", case)
     part.loss_module.velocity_network.register_forward_pre_hook(
         lambda network, inputs: points.append(inputs[1].detach().clone())
     )
     loss = part.step()
+    if part._prefetch is not None:
+        part._prefetch.close()
     return loss, {n: p.grad.clone() for n, p in part.trained.named_parameters()}, points
 
 
-def trained(folder, case, **changes):
-    part = cloning(folder / case, case, **changes)
+def trained(folder, case):
+    part = cloning(folder / case, case)
     part.run(None)
-    if not rank():
-        torch.save((weights(part), part.losses), folder / f"{case}.pt")
+    torch.save((weights(part), part.losses), folder / f"{case} {rank()}.pt")
 
 
 def whole(folder):
     """Everything that ends well, in one go: processes start slowly."""
-    torch.save({case: gradients(folder, case) for case in CASES}, folder / f"first {rank()}.pt")
+    torch.save({case: first_step(folder, case) for case in CASES}, folder / f"first {rank()}.pt")
     for case in CASES:
         trained(folder, case)
-    stopped_at(folder / "two then one", 12)
-    trained(folder / "one then two", "plain")
+    for name in ("one", "two"):  # the same from the same state
+        stopped_at(folder / name, 12)
+        trained(folder / name, "plain")
     diverges(folder)
     refuses(folder)
 
@@ -151,7 +156,7 @@ def refuses(folder):
     told = []
     idle = actor_for(PastPrior(4), IdleMLP(2, 3, 4, hidden_dim=8))
     for start in (
-        lambda: cloning(folder / "small", "plain", batch_size=1),
+        lambda: cloning(folder / "odd", "plain", batch_size=15),
         lambda: training(folder / "idle", STEPS, actor=idle).run(None),
     ):
         try:

@@ -24,7 +24,13 @@ from warmprior import (
     WarmPriorActor,
     window_replay_buffer,
 )
-from warmprior.training import BehaviourCloning, TrainingConfig, ema_of, make_optimizer
+from warmprior.training import (
+    BehaviourCloning,
+    TrainingConfig,
+    ema_of,
+    load_policy,
+    make_optimizer,
+)
 from warmprior.training.checkpoint import load_state
 
 
@@ -40,7 +46,9 @@ def test_the_loop_by_hand(tmp_path):
     other.load_state_dict(start)
     actor = actor_for(network=other)
     generator = torch.Generator().manual_seed(config.seed)
-    buffer = window_replay_buffer(dataset(), actor.prior, batch_size=16, generator=generator)
+    buffer = window_replay_buffer(
+        dataset(), actor.prior, batch_size=16, withhold=0.25, generator=generator
+    )
     loss = FlowMatchingLoss(actor, generator=generator)
     optimizer = make_optimizer(other, learning_rate=config.learning_rate)
     average, losses = None, []
@@ -58,7 +66,7 @@ def test_the_loop_by_hand(tmp_path):
         average = now if average is None else {n: 0.995 * average[n] + 0.005 * now[n] for n in now}
     for name, value in other.state_dict().items():
         torch.testing.assert_close(cloning.actor.network.state_dict()[name], value)
-    kept = WarmPriorActor.from_pretrained(cloning.policy_path(12)).network
+    kept = load_policy(cloning.policy_path(12)).network
     for name, p in kept.named_parameters():
         torch.testing.assert_close(p.detach(), average[name])
     assert [i for i, _ in cloning.losses] == [10, 12]
@@ -79,7 +87,7 @@ def test_normalizer_is_kept_with_the_policy(tmp_path):
     actor.normalizer = Normalizer.fit(dataset())
     cloning = training(tmp_path, actor=actor)
     cloning.run()
-    kept = WarmPriorActor.from_pretrained(cloning.policy_path(40))
+    kept = load_policy(cloning.policy_path(40))
     assert torch.equal(kept.normalizer.loc("action"), actor.normalizer.loc("action"))
     assert kept.ode.nfe == actor.ode.nfe
 
@@ -244,8 +252,8 @@ def test_compiled_training_is_close(tmp_path):
     compiled = training(tmp_path / "b", config, actor=actor_for(network=mlp()))
     compiled.loss_module.velocity_network.compile(backend="eager")
     compiled.run()
-    one = WarmPriorActor.from_pretrained(plain.policy_path(2)).state_dict()
-    two = WarmPriorActor.from_pretrained(compiled.policy_path(2)).state_dict()
+    one = load_policy(plain.policy_path(2)).state_dict()
+    two = load_policy(compiled.policy_path(2)).state_dict()
     assert one.keys() == two.keys()
     for name in one:
         torch.testing.assert_close(one[name], two[name])
@@ -290,6 +298,6 @@ def test_data_and_actor_may_name_their_keys(tmp_path):
         training = BehaviourCloning(actor, data, config, tmp_path / str(len(losses)))
         training.run(None)
         losses.append(training.losses)
-        loaded = WarmPriorActor.from_pretrained(training.policy_path(4))
+        loaded = load_policy(training.policy_path(4))
         assert loaded.in_keys[0] == name
     assert losses[0] == losses[1]

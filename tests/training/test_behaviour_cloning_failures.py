@@ -19,16 +19,12 @@ from tests.training.cloning_parts import (
     weights,
 )
 from warmprior import (
-    HistoryPrior,
-    MeanObservation,
     PastPrior,
     PreconditionedNetwork,
     PreviewPrior,
     SourceMoments,
-    VelocityMLP,
-    WarmPriorActor,
 )
-from warmprior.training import TrainingConfig
+from warmprior.training import TrainingConfig, load_policy
 from warmprior.training.checkpoint import load_state
 
 
@@ -40,7 +36,7 @@ from warmprior.training.checkpoint import load_state
         ("config", {"config": dataclasses.replace(CONFIG, iterations=80)}),
         ("prior", {"actor": lambda: actor_for(PastPrior(4, sigma=0.1))}),
         ("prior", {"actor": lambda: actor_for(PreviewPrior(4))}),
-        ("network", {"actor": lambda: actor_for(PastPrior(4, cold_probability=0.25), mlp())}),
+        ("network", {"actor": lambda: actor_for(network=mlp())}),
         ("data", {"data": lambda: dataset().set("action", torch.zeros(120, 2))}),
     ],
 )
@@ -121,7 +117,7 @@ def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
     assert facts["iteration"] < bad
     assert all(torch.isfinite(v).all() for v in tensors.values() if v.is_floating_point())
     for folder in tmp_path.glob("policy_*"):
-        network = WarmPriorActor.from_pretrained(folder).network
+        network = load_policy(folder).network
         assert all(torch.isfinite(p).all() for p in network.parameters())
     whole = training(tmp_path / "whole")
     whole.run()
@@ -160,13 +156,3 @@ def test_infinite_weights_are_not_saved(tmp_path):
 def test_bad_config(options, message):
     with pytest.raises(ValueError, match=message):
         TrainingConfig(**options)
-
-
-def test_a_conditioned_network_that_reads_another_key(tmp_path):
-    prior = HistoryPrior(4)
-    network = VelocityMLP(2, 3 + MeanObservation.width(prior, 2), 4, hidden_dim=8)
-    actor = WarmPriorActor(network, prior, observation_key="state")
-    with pytest.raises(ValueError, match=r"\('prior', 'observation'\).*this policy reads 'state'"):
-        training(tmp_path, actor=actor)
-    assert not list(tmp_path.iterdir())
-    training(tmp_path, actor=actor.replace(observation_key=None)).step()

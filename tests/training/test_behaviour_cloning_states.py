@@ -12,7 +12,8 @@ import torch
 from torch import nn
 
 from tests.training.cloning_parts import CONFIG, actor_for, mlp, same, training, weights
-from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor
+from warmprior import Normalizer, PastPrior, VelocityMLP
+from warmprior.training import load_policy
 from warmprior.training.checkpoint import load_state, save_state
 from warmprior.training.threads import torch_threads
 
@@ -295,7 +296,7 @@ def test_a_normaliser_of_other_keys_is_kept_with_the_policy(tmp_path, key):
     actor.normalizer = Normalizer({k: -v for k, v in limits.items()}, limits)
     cloning = training(tmp_path / "run", actor=actor)
     cloning.run(None)
-    loaded = WarmPriorActor.from_pretrained(cloning.policy_path())
+    loaded = load_policy(cloning.policy_path())
     assert loaded.normalizer.config() == actor.normalizer.config()
 
 
@@ -334,7 +335,7 @@ def test_users_networks_are_saved_resumed_and_loaded(tmp_path, network):
     assert again.iteration == 21
     again.run()
     assert same(weights(again), weights(whole))
-    policy = WarmPriorActor.from_pretrained(whole.policy_path(CONFIG.iterations))
+    policy = load_policy(whole.policy_path(CONFIG.iterations))
     assert not any("_orig_mod" in name for name in policy.state_dict())
     expected = [value for value in whole.ema.module.state_dict().values()]
     for one, two in zip(policy.network.state_dict().values(), expected, strict=True):
@@ -361,7 +362,7 @@ def test_other_precisions_are_saved_resumed_and_loaded(tmp_path, dtype):
     resumed.run(None)
     assert same(weights(whole), weights(resumed))
     assert all(p.dtype == dtype for p in whole.trained.parameters())
-    loaded = WarmPriorActor.from_pretrained(whole.policy_path(40)).network.state_dict()
+    loaded = load_policy(whole.policy_path(40)).network.state_dict()
     averaged = whole.ema.module["network"].state_dict()
     assert all(torch.equal(loaded[name], value) for name, value in averaged.items())
     assert all(value.dtype == dtype for value in loaded.values())

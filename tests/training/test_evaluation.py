@@ -344,11 +344,12 @@ def test_workers_end_with_a_killed_parent():
 def test_any_policy_that_writes_chunks():
     """An agent, or residuals alone: seeded, and without a trace in PyTorch's global generator."""
     prior = PastPrior(H)
-    decoder = PriorDecoder(actor_for(prior), delta=0.5)
+    actor = actor_for(prior)
+    decoder = PriorDecoder(actor, delta=0.5)
     policy = TensorDictSequential(ResidualSampler(decoder), decoder)
     assert not list(policy.parameters())
     transforms = partial(policy_transforms, prior)
-    env = TransformedEnv(parallel_env(NoiseSuccess, transforms, 2), PriorAnchor(prior))
+    env = TransformedEnv(parallel_env(NoiseSuccess, transforms, 2), PriorAnchor(actor))
     play = partial(evaluate, policy, env, episodes=6, first_seed=3)
     try:
         torch.manual_seed(0)

@@ -11,7 +11,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, training
 from warmprior import (
-    ForecastPrior,
     ImageEncoder,
     PastPrior,
     PreviewPrior,
@@ -19,6 +18,7 @@ from warmprior import (
     VisionNetwork,
     WarmPriorActor,
 )
+from warmprior.experiments.learned_sources import ForecastPrior
 from warmprior.training import precondition
 
 READS = ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "lift_fresh")
@@ -96,15 +96,13 @@ def test_a_step_reads_no_tensor(tmp_path, case):
 
 
 def test_what_reads_is_found(tmp_path):
-    """A prior of a user's own, which looks at its sources in every way."""
-    cloning = training(tmp_path, actor=actor_for(network=mlp()))
-    couple = cloning.loss_module.prior.couple
+    """A coupling of a user's own, which looks at its sources in every way."""
 
-    def reading(a0, a1, *args):
+    def reading(a0, a1, observation):
         assert a0.sum().item() and len((a0 > 0).nonzero()) and len(a0[a0 > 0])
-        return couple(a0, a1, *args)
+        return a0, a1
 
-    cloning.loss_module.prior.couple = reading
+    cloning = training(tmp_path, actor=actor_for(network=mlp()), coupling=reading)
     with Reads(cloning.ema.n_averaged) as seen:
         cloning.step()
     assert {"_local_scalar_dense", "nonzero", "index"} <= set(seen.found)

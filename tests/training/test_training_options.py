@@ -1,4 +1,4 @@
-"""Training options that came later: what they do to the loop, and that nothing changes without them."""
+"""Options of the training beside Algorithm 1's: what they do to the loop."""
 
 from __future__ import annotations
 
@@ -11,28 +11,16 @@ from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, same, 
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
-    RegressionPrior,
+    HistoryObservation,
+    PastPrior,
+    VelocityMLP,
     WarmPriorActor,
+    keys,
     window_replay_buffer,
 )
-from warmprior.training import TrainingConfig, ema_of, make_optimizer
+from warmprior.training import TrainingConfig, ema_of, load_policy, make_optimizer
 
 LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}
-EARLIER = {
-    "iterations": 40,
-    "batch_size": 16,
-    "learning_rate": 1e-2,
-    "weight_decay": 1e-5,
-    "betas": [0.9, 0.999],
-    "eps": 1e-8,
-    "warmup_ratio": 0.2,
-    "ema_rate": 0.995,
-    "checkpoints": 2,
-    "save_every": 7,
-    "log_every": 10,
-    "seed": 0,
-}
-"""The identity of CONFIG from before there were others."""
 
 
 def test_the_loop_by_hand_with_the_average_as_teacher(tmp_path):
@@ -42,7 +30,9 @@ def test_the_loop_by_hand_with_the_average_as_teacher(tmp_path):
     actor = actor_for(GaussianPrior(4), mlp())
     teacher = ema_of(actor.network, 0.8)
     generator = torch.Generator().manual_seed(config.seed)
-    buffer = window_replay_buffer(dataset(), actor.prior, batch_size=16, generator=generator)
+    buffer = window_replay_buffer(
+        dataset(), actor.prior, batch_size=16, withhold=0.25, generator=generator
+    )
     loss = FlowMatchingLoss(actor, generator=generator, teacher=teacher.module, **LATER)
     optimizer = make_optimizer(actor.network, learning_rate=config.learning_rate)
     seen = []
@@ -87,13 +77,6 @@ def test_stopping_with_a_teacher_changes_nothing(tmp_path):
     assert not same(weights(plain), weights(whole))
 
 
-def test_the_identity_is_that_of_before_until_an_option_is_used(tmp_path):
-    assert training(tmp_path / "plain").identity["config"] == EARLIER
-    for name, value in LATER.items():
-        config = replace(CONFIG, **{name: value})
-        assert training(tmp_path / name, config).identity["config"] == EARLIER | {name: value}
-
-
 @pytest.mark.parametrize("name", LATER)
 def test_a_state_is_not_continued_with_another_option(tmp_path, name):
     config = replace(CONFIG, iterations=8, checkpoints=1)
@@ -107,8 +90,13 @@ def test_a_state_is_not_continued_with_another_option(tmp_path, name):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"times": "late"}, "times must be one of uniform, u-shaped, logit-normal, got 'late'"),
+        (
+            {"times": "late"},
+            "times must be one of uniform, u-shaped, logit-normal, start, got 'late'",
+        ),
         ({"objective": "huber"}, "objective must be one of velocity, l1"),
+        ({"times": "start", "objective": "l1"}, "objective = l1 needs a flow"),
+        ({"cold_probability": 1.5}, r"cold_probability must lie in \[0, 1\], got 1.5"),
         ({"self_distillation": -0.1}, "self_distillation must be a finite weight >= 0"),
         ({"self_distillation": float("inf")}, "self_distillation must be a finite weight >= 0"),
     ],
@@ -118,8 +106,23 @@ def test_bad_options(options, message):
         TrainingConfig(**options)
 
 
-def test_a_prior_without_a_flow_is_refused_before_training(tmp_path):
-    actor = WarmPriorActor(mlp(), RegressionPrior(4))
-    with pytest.raises(ValueError, match="regression is trained at t = 0 alone"):
-        training(tmp_path, replace(CONFIG, objective="l1"), actor=actor)
+def test_regression_needs_a_policy_of_one_evaluation_before_training(tmp_path):
+    config = replace(CONFIG, times="start")
+    with pytest.raises(ValueError, match="build the policy with max_nfe=1"):
+        training(tmp_path, config, actor=WarmPriorActor(mlp(), PastPrior(4)))
     assert not list(tmp_path.iterdir())
+    actor = WarmPriorActor(mlp(), GaussianPrior(4), max_nfe=1)
+    cloning = training(tmp_path, replace(config, iterations=2, checkpoints=1), actor=actor)
+    cloning.run(None)
+    assert load_policy(cloning.policy_path()).ode.max_nfe == 1
+
+
+def test_a_network_that_sees_the_last_actions(tmp_path):
+    """The windows are made with them, of the data's own observation."""
+    width = 3 + HistoryObservation.width(4, 2)
+    network = VelocityMLP(2, width, 4, hidden_dim=8)
+    actor = WarmPriorActor(network, GaussianPrior(4), observation_key=keys.CONDITIONED)
+    cloning = training(tmp_path, replace(CONFIG, iterations=2, checkpoints=1), actor=actor)
+    assert cloning.replay_buffer.sample()[keys.CONDITIONED].shape == (16, 2, width)
+    cloning.run(None)
+    assert load_policy(cloning.policy_path()).in_keys[0] == keys.CONDITIONED

@@ -30,7 +30,7 @@ from torchrl.envs import (
 from torchrl.envs.utils import check_env_specs
 
 from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
-from warmprior import ActionHistory, ChunkStep, PastPrior
+from warmprior import ActionHistory, ChunkStep
 
 
 def ones(length):
@@ -212,11 +212,10 @@ def test_outside_environments_nothing_happens():
 
 
 def test_collector_fills_a_replay_buffer():
-    """Decisions, discounts by executed steps and the next mean come back out as they went in."""
-    prior = PastPrior(3)
+    """Decisions, discounts by executed steps and the next history come back out as they went in."""
     base = SerialEnv(2, [partial(CountingEnv, n) for n in (7, 4)])
     env = TransformedEnv(
-        base, Compose(StepCounter(), ChunkStep(3, gamma=0.9), ActionHistory(prior), InitTracker())
+        base, Compose(StepCounter(), ChunkStep(3, gamma=0.9), ActionHistory(3), InitTracker())
     )
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(1000), batch_size=500)
     collector = Collector(env, ones(3), frames_per_batch=24, total_frames=96)
@@ -230,9 +229,9 @@ def test_collector_fills_a_replay_buffer():
     torch.testing.assert_close(sample["next", "reward"].squeeze(-1), torch.tensor(expected))
     whole = k == 3
     torch.testing.assert_close(
-        sample["next", "prior", "loc"][whole], sample["vla_action", "chunk"][whole]
+        sample["next", "history", "actions"][whole], sample["vla_action", "chunk"][whole]
     )
-    assert (sample["prior", "warm"].all(1).squeeze(-1) == (start >= 3)).all()
+    assert (sample["history", "steps"].squeeze(-1) == start.clamp(max=3)).all()
     collector.shutdown()
 
 

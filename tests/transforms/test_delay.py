@@ -20,11 +20,13 @@ from warmprior import (
     RealTimeChunking,
     VelocityMLP,
     WarmPriorActor,
+    keys,
     policy_transforms,
 )
 from warmprior.diagnostics import executed_actions, mean_revision, smoothness
+from warmprior.history import ENTRIES
 from warmprior.training import play_episode
-from warmprior.transforms import executed_chunk, shift_chunk
+from warmprior.transforms import executed_chunk
 
 PRIORS = {prior.name: prior for prior in (GaussianPrior(6), PastPrior(6), PreviewPrior(6))}
 
@@ -118,11 +120,11 @@ def test_the_past_is_what_was_executed(execute, delay):
     for row in range(2):
         for decision in range(9):
             before = history(rollout, row, decision)
-            is_warm = rollout["prior", "warm"][row, decision].all()
-            assert is_warm == (len(before) >= 6)
-            if is_warm:
+            loc, _, is_warm = prior.distribution(rollout["history"][row, decision])
+            assert is_warm.all() == is_warm.any() == (len(before) >= 6)
+            if is_warm.all():
                 warm += 1
-                assert torch.equal(rollout["prior", "loc"][row, decision], before[-6:])
+                assert torch.equal(loc, before[-6:])
     assert warm > 6
 
 
@@ -135,15 +137,15 @@ def test_the_preview_is_the_forecast_of_the_same_steps(execute, delay):
     rollout = env.rollout(8, told(12))
     for decision in range(1, len(rollout)):
         step = decision * execute
-        loc = rollout["prior", "loc"][decision, :6] * 1000
+        loc = prior.distribution(rollout["history"][decision]).loc[:6] * 1000
         # Made by the decision before, for the six steps from here on.
         torch.testing.assert_close(loc[:, 0], torch.full((6,), float(step - execute)))
         torch.testing.assert_close(loc[:, 1], step + torch.arange(6.0))
-        # The leftover is the same forecast, and reaches as far as the chunk did.
-        leftover, valid = rollout["rtc", "leftover"][decision], rollout["rtc", "valid"][decision]
-        assert valid.flatten().tolist() == [i < 12 - execute for i in range(12)]
-        assert torch.equal(leftover[:6], rollout["prior", "loc"][decision, :6])
-        assert not leftover[12 - execute :].any()
+        # What is left of the chunk is the same forecast, and reaches as far as that did.
+        assert rollout["history", "forecast_steps"][decision] == 12 - execute
+        forecast = rollout["history", "forecast"][decision]
+        assert torch.equal(forecast[:6] * 1000, loc)
+        assert not forecast[12 - execute :].any()
 
 
 def late(length):
@@ -181,16 +183,15 @@ def test_only_the_rows_of_a_partial_step_change():
     data = env.step_mdp(env.step(policy(env.reset())))
     data.set("_step", torch.tensor([True, False]))
     after = env.step(policy(data))["next"]
-    for key in ("leftover", "valid", "delay"):
-        before, now = data["rtc", key], after["rtc", key]
-        assert torch.equal(before[1], now[1]), key
-    assert not torch.equal(data["rtc", "leftover"][0], after["rtc", "leftover"][0])
+    for key in (*((keys.HISTORY, name) for name in ENTRIES), keys.DELAY):
+        assert torch.equal(data[key][1], after[key][1]), key
+    assert not torch.equal(data[keys.FORECAST][0], after[keys.FORECAST][0])
     # A reset of the other row leaves the first one as it is.
     fresh = env.reset(
         env.step_mdp(env.step(policy(data))).set("_reset", torch.tensor([[False], [True]]))
     )
     assert fresh["rtc", "delay"].tolist() == [[2], [0]]
-    assert fresh["rtc", "valid"].any((1, 2)).tolist() == [True, False]
+    assert fresh[keys.FORECAST_STEPS].tolist() == [[2], [0]]
 
 
 def test_specs_and_jumps_where_chunks_take_effect():
@@ -214,7 +215,8 @@ def test_specs_and_jumps_where_chunks_take_effect():
         squares.append((made[d] - loc).square())
         loc = torch.cat([loc, played[d, :4]])[4:]
     expected = torch.cat(squares).mean().sqrt()
-    assert mean_revision(rollout, PRIORS["past"]) == pytest.approx(float(expected), rel=1e-5)
+    rollout[keys.LOC], _, rollout[keys.WARM] = PRIORS["past"].distribution(rollout["history"])
+    assert mean_revision(rollout) == pytest.approx(float(expected), rel=1e-5)
 
 
 class Judged(CountingEnv):
@@ -244,8 +246,7 @@ def test_episodes_keep_what_was_executed():
     assert decisions["rtc", "delay"].flatten().tolist() == [0, 2, 2, 2, 2]
     played = executed_chunk(decisions)
     for d in range(1, len(decisions)):
-        left, valid = shift_chunk(played[d - 1], decisions["next", "executed_steps"][d - 1])
-        assert torch.equal(left, decisions["rtc", "leftover"][d]) and valid.sum() == 2
+        assert torch.equal(decisions[keys.FORECAST][d, :2], played[d - 1, 4:])
         assert torch.equal(played[d, :2], played[d - 1, 4:])
 
 
@@ -263,17 +264,17 @@ def test_numbers_that_do_not_go_together():
         with pytest.raises(ValueError, match=rf"delay of {delay}.*too long for.* 6 .*at most 3"):
             policy_transforms(PRIORS["past"], delay=delay)
     alone = TransformedEnv(CountingEnv(9), InferenceDelay(1, execute=2))
-    with pytest.raises(KeyError, match="append it after ChunkStep"):
+    with pytest.raises(KeyError, match=r"'forecast'.*append it after ActionHistory"):
         alone.reset()
     whole = TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], delay=2))
     data = told(6)(whole.reset())
-    with pytest.raises(KeyError, match=r"leftover.*delay.*hand over"):
+    with pytest.raises(KeyError, match=r"delay.*hand over"):
         whole.step(data.exclude("rtc"))
     with pytest.raises(ValueError, match=r"expects a chunk \[\*B, 6, d_a\]"):
         whole.step(whole.reset())
     wrong = TransformedEnv(
         CountingEnv(9),
-        Compose(ChunkStep(6), ActionHistory(PRIORS["past"]), InferenceDelay(1, execute=4)),
+        Compose(ChunkStep(6), ActionHistory(6), InferenceDelay(1, execute=4)),
     )
     with pytest.raises(RuntimeError, match=r"executed 6 actions.*execute=4"):
         wrong.rollout(2)

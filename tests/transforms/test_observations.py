@@ -16,7 +16,7 @@ from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
     ActionWindow,
     FlowMatchingLoss,
-    HistoryPrior,
+    GaussianPrior,
     Normalizer,
     ObservationStack,
     PastPrior,
@@ -27,6 +27,7 @@ from warmprior import (
     policy_transforms,
     window_replay_buffer,
 )
+from warmprior.training.saved import load_policy, save_policy
 
 H, TO = 3, 2
 LENGTHS = (7, 4)
@@ -69,8 +70,6 @@ NAMES = {
     "nested": {},
     "named": {
         "observation_key": ("sensors", "low", "joints"),
-        "loc_key": ("source", "mean"),
-        "warm_key": "known",
         "chunk_key": "plan",
     },
 }
@@ -95,8 +94,9 @@ class Encoder(VelocityNetwork):
         return self.weight * code / 100 - 0.1 * a
 
 
-def build(place, layout, prior):
-    transforms = partial(policy_transforms, prior, observation_steps=TO, **NAMES[layout])
+def build(place, layout, prior, **options):
+    options = {"observation_steps": TO, **NAMES[layout], **options}
+    transforms = partial(policy_transforms, prior, **options)
 
     def one(length):
         return TransformedEnv(CameraEnv(length, layout), transforms())
@@ -128,8 +128,8 @@ def test_a_decision_in_the_environment_is_a_window_of_its_recording(place, layou
     prior, names = PastPrior(H), NAMES[layout]
     torch.manual_seed(0)
     actor = WarmPriorActor(Encoder(ACTION_DIM, 4, H, TO), prior, nfe=2, clip=1.0, **names)
-    actor.save_pretrained(tmp_path)
-    actor = WarmPriorActor.from_pretrained(tmp_path)
+    save_policy(actor, tmp_path)
+    actor = load_policy(tmp_path)
     chunk_key = names.get("chunk_key", ("vla_action", "chunk"))
     env = build(place, layout, prior)
     try:
@@ -146,7 +146,7 @@ def test_a_decision_in_the_environment_is_a_window_of_its_recording(place, layou
         decisions = -(-length // H)
         row = row[:decisions]
         data = replay(layout, row[chunk_key], length)
-        window = ActionWindow(data, prior, observation_steps=TO, **names)
+        window = ActionWindow(data, H, observation_steps=TO, **names)
         frames = torch.arange(decisions) * H
         windows = window(TensorDict({"frame": frames}, [decisions]))
         wanted = [*actor.in_keys[1:]]
@@ -217,23 +217,23 @@ def test_a_preconditioned_network_may_take_several():
 
 
 @pytest.mark.parametrize("place", ["single", "serial-inside", "parallel-outside"])
-def test_a_mean_is_appended_to_the_vector_among_several(place):
-    prior = HistoryPrior(H)
-    env = build(place, "nested", prior)
+def test_the_last_actions_are_appended_to_the_vector_among_several(place):
+    env = build(place, "nested", GaussianPrior(H), see_history=True)
     check_env_specs(env, break_when_any_done="both")
     rollout = env.rollout(3, break_when_any_done=False)
     seen, own = rollout["prior", "observation"], rollout["observation"]
     assert torch.equal(seen["pixels"], own["pixels"])
-    mean = (rollout["prior", "loc"] * rollout["prior", "warm"]).flatten(-2)
-    added = torch.cat([mean, rollout["prior", "warm"].any(-2).float()], -1).unsqueeze(-2)
+    known = (rollout["history", "steps"] >= H).float()
+    actions = rollout["history", "actions"].flatten(-2)
+    added = torch.cat([known * actions, known], -1).unsqueeze(-2)
     expected = torch.cat([own["state"], added.expand(*own["state"].shape[:-1], -1)], -1)
     assert torch.equal(seen["state"], expected) and bool(added.any())
     env.close()
 
 
-def test_a_mean_cannot_be_appended_where_there_is_no_vector():
-    transforms = policy_transforms(HistoryPrior(H), observation_key="sensors")
-    with pytest.raises(ValueError, match=r"appends its mean to an observation vector.*'state'"):
+def test_the_last_actions_cannot_be_appended_where_there_is_no_vector():
+    transforms = policy_transforms(GaussianPrior(H), observation_key="sensors", see_history=True)
+    with pytest.raises(ValueError, match=r"appends the last actions to an .* vector.*'state'"):
         TransformedEnv(CameraEnv(layout="named"), transforms).rollout(1)
 
 
@@ -269,4 +269,4 @@ def test_windows_refuse_actions_that_are_no_vector(shape):
     data = TensorDict({"observation": torch.zeros(9, 3), "action": torch.zeros(shape)}, [9])
     data["episode"] = torch.zeros(9, dtype=torch.int64)
     with pytest.raises(ValueError, match=r"one vector, 'action' \[N, d_a\], got \(9"):
-        ActionWindow(data, PastPrior(H))
+        ActionWindow(data, H)

@@ -34,7 +34,7 @@ def transforms(prior, execute):
         prediction_length=prior.prediction_length,
         gamma=GAMMA,
     )
-    return Compose(StepCounter(), chunk, ActionHistory(prior), InitTracker())
+    return Compose(StepCounter(), chunk, ActionHistory(H), InitTracker())
 
 
 def single(prior, execute, length):

@@ -83,20 +83,20 @@ def test_environments_keep_their_precision(prior_class, env_class, network):
     check_env_specs(env)
     rollout = env.rollout(5, actor_of(prior, network), break_when_any_done=False)
     dtype = torch.float64 if env_class is DoubleEnv else torch.float32
-    for key in ("observation", ("prior", "loc"), ("vla_action", "chunk")):
+    for key in ("observation", ("history", "actions"), ("prior", "loc"), ("vla_action", "chunk")):
         assert rollout[key].dtype == dtype, key
     warm = rollout["prior", "warm"]
     assert warm[:, 1:].any() and rollout["vla_action", "chunk"].isfinite().all()
 
 
 def test_a_policy_of_another_precision_than_the_environment():
-    """One that casts nothing itself: the mean keeps the environment's dtype from reset to step."""
+    """One that casts nothing itself: the history keeps the environment's dtype from reset to step."""
     prior = PastPrior(H)
     env = TransformedEnv(DoubleEnv(), policy_transforms(prior))
     policy = ChunkPolicy(lambda data: torch.full((H, ACTION_DIM), 0.5, dtype=torch.float32))
     rollout = env.rollout(2, policy)
-    assert rollout["prior", "loc"].dtype == torch.float64
-    assert (rollout["prior", "loc"][1] == 0.5).all()
+    assert rollout["history", "actions"].dtype == torch.float64
+    assert (rollout["history", "actions"][1] == 0.5).all()
 
 
 def test_normalised_data_keep_their_precision():

@@ -16,6 +16,7 @@ from torchrl.data import (
 )
 from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 
+from tests.toy_env import random_history
 from warmprior import (
     ActionWindow,
     GaussianPrior,
@@ -23,11 +24,10 @@ from warmprior import (
     PastPrior,
     PreviewPrior,
     Prior,
+    WithheldHistory,
     window_replay_buffer,
 )
 from warmprior.transforms.window import check_finite
-
-PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 
 
 def steps(lengths, numbers=None):
@@ -45,83 +45,65 @@ def steps(lengths, numbers=None):
     )
 
 
-def reference(data, prior, observation_steps, i):
+def reference(data, window, i):
     """Section 3 for one step, with Python's own lists."""
     episode = data["episode"].tolist()
     inside = [j for j in range(len(data)) if episode[j] == episode[i]]
     first, last = inside[0], inside[-1]
-    horizon, length = prior.chunk_length, prior.prediction_length
+    seen, remembered = len(window.observation_offsets), window.history_length
+    length = len(window.action_offsets) - remembered
+    known = length - window.chunk_length
     action, observation = data["action"], data["observation"]
-    recent = [max(i - back, first) for back in reversed(range(observation_steps))]
-    future = range(i, i + length)
-    target = torch.stack([action[min(j, last)] for j in future])
-    mean: list[torch.Tensor | None] = [None] * length
-    if isinstance(prior, PastPrior) and i - horizon >= first:
-        mean = [action[i - horizon + tau] for tau in range(horizon)]
-    if isinstance(prior, PreviewPrior):
-        mean = [target[tau] if tau < horizon else None for tau in range(length)]
-    return (
-        torch.stack([observation[j] for j in recent]),
-        target,
-        torch.tensor([j > last for j in future]),
-        mean,
-    )
+    target = [action[min(j, last)] for j in range(i, i + length)]
+    before = [action[j] if j >= first else torch.zeros(2) for j in range(i - remembered, i)]
+    forecast = target[:known] + [torch.zeros(2)] * window.chunk_length  # nothing else of the target
+    return {
+        "observation": torch.stack([observation[max(i - n, first)] for n in reversed(range(seen))]),
+        ("vla_action", "chunk"): torch.stack(target),
+        "action_is_pad": torch.tensor([j > last for j in range(i, i + length)]),
+        ("history", "actions"): torch.stack(before),
+        ("history", "steps"): torch.tensor([min(i - first, remembered)]),
+        ("history", "forecast"): torch.stack(forecast),
+        ("history", "forecast_steps"): torch.tensor([known]),
+    }
 
 
-def check(batch, data, prior, observation_steps):
+def check(batch, data, window):
     for row in batch:
-        observation, target, pad, mean = reference(
-            data, prior, observation_steps, int(row["frame"])
-        )
-        assert torch.equal(row["observation"], observation)
-        assert torch.equal(row["vla_action", "chunk"], target)
-        assert torch.equal(row["action_is_pad"], pad)
-        warm, loc = row["prior", "warm"], row["prior", "loc"]
-        assert warm.dtype == torch.bool and warm.shape == (prior.prediction_length, 1)
-        assert warm.squeeze(-1).tolist() == [m is not None for m in mean]
-        for tau, expected in enumerate(mean):
-            if expected is not None:
-                assert torch.equal(loc[tau], expected)
-            else:
-                assert (loc[tau] == 0).all()  # nothing leaks through cold positions
+        for key, expected in reference(data, window, int(row["frame"])).items():
+            assert row[key].dtype == expected.dtype and torch.equal(row[key], expected), key
 
 
-@pytest.mark.parametrize("horizon", [1, 3, 8])
-@pytest.mark.parametrize("prior_class", PRIORS)
-def test_every_step_of_short_episodes(prior_class, horizon):
-    data = steps([1, 2, 3, 5, 9, 17], numbers=[4, 0, 7, 2, 11, 3])
-    prior = prior_class(horizon)
-    window = ActionWindow(data, prior)
-    check(window(TensorDict({"frame": torch.arange(len(data))}, [len(data)])), data, prior, 2)
+def every_step(data):
+    return TensorDict({"frame": torch.arange(len(data))}, [len(data)])
 
 
 @settings(max_examples=60, deadline=None)
 @given(
-    lengths=st.lists(st.integers(1, 12), min_size=1, max_size=6),
-    horizon=st.integers(1, 6),
+    lengths=st.lists(st.integers(1, 17), min_size=1, max_size=6),
+    horizon=st.integers(1, 8),
+    further=st.integers(0, 8),
+    longer=st.integers(0, 3),
     observation_steps=st.integers(1, 4),
-    prior_class=st.sampled_from(PRIORS),
+    numbers=st.permutations(range(6)),
 )
-def test_random_episodes(lengths, horizon, observation_steps, prior_class):
-    data = steps(lengths)
-    prior = prior_class(horizon)
-    window = ActionWindow(data, prior, observation_steps=observation_steps)
-    batch = window(TensorDict({"frame": torch.arange(len(data))}, [len(data)]))
-    check(batch, data, prior, observation_steps)
+def test_random_episodes(lengths, horizon, further, longer, observation_steps, numbers):
+    data = steps(lengths, numbers[: len(lengths)])
+    sizes = {"prediction_length": horizon + further, "history_length": horizon + longer}
+    window = ActionWindow(data, horizon, observation_steps=observation_steps, **sizes)
+    check(window(every_step(data)), data, window)
 
 
 @pytest.mark.parametrize("shape", [(), (6,), (6, 1), (2, 3)])
 def test_shapes_of_the_sample(shape):
     data = steps([4, 5])
-    prior = PastPrior(2)
-    frame = torch.randint(0, 9, shape)
+    frame, window = torch.randint(0, 9, shape), ActionWindow(data, 2, prediction_length=3)
     batch_size = shape[:1] if shape == (6, 1) else shape
-    out = ActionWindow(data, prior)(TensorDict({"frame": frame}, batch_size))
-    assert out["vla_action", "chunk"].shape == (*batch_size, 2, 2)
+    out = window(TensorDict({"frame": frame}, batch_size))
+    assert out["vla_action", "chunk"].shape == (*batch_size, 3, 2)
     assert out["observation"].shape == (*batch_size, 2, 3)
-    assert out["action_is_pad"].shape == (*batch_size, 2)
-    assert out["prior", "warm"].shape == (*batch_size, 2, 1)
-    check(out.reshape(-1), data, prior, 2)
+    assert out["history"].batch_size == batch_size
+    check(out.reshape(-1), data, window)
 
 
 @pytest.mark.parametrize("horizon", [1, 4])
@@ -146,18 +128,17 @@ def test_agrees_with_torchrl_s_sequences(horizon):
     valid = sample["validity_mask"].reshape(sample.shape)
     anchor = sample["anchor_index"][:, 0].reshape(-1)
     assert len(set(anchor.tolist())) > 20
-    preview = ActionWindow(data, PreviewPrior(horizon))(
+    found = ActionWindow(data, horizon, prediction_length=2 * horizon)(
         TensorDict({"frame": anchor}, [len(anchor)])
     )
-    past = ActionWindow(data, PastPrior(horizon))(TensorDict({"frame": anchor}, [len(anchor)]))
     future = valid[:, horizon:]
-    assert torch.equal(future, ~preview["action_is_pad"])
-    target = preview["vla_action", "chunk"]
-    assert torch.equal(target[future], sample["action"][:, horizon:][future])
-    history = valid[:, :horizon].all(-1)
-    assert torch.equal(history, past["prior", "warm"].squeeze(-1).all(-1))
-    assert torch.equal(past["prior", "loc"][history], sample["action"][:, :horizon][history])
-    assert torch.equal(past["prior", "warm"].any(1), past["prior", "warm"].all(1))
+    assert torch.equal(future, ~found["action_is_pad"])
+    target, action = found["vla_action", "chunk"], sample["action"]
+    assert torch.equal(target[future], action[:, horizon:][future])
+    before = valid[:, :horizon]
+    assert torch.equal(found["history", "steps"].squeeze(-1), before.sum(-1))
+    assert torch.equal(found["history", "actions"][before], action[:, :horizon][before])
+    assert not found["history", "actions"][~before].any()
 
 
 def stored(kind, data, folder):
@@ -171,13 +152,12 @@ def stored(kind, data, folder):
     return buffer
 
 
-@pytest.mark.parametrize("kind", ["tensor", "memmap"])
+@pytest.mark.parametrize("kind", ["tensor", "memmap", "mapped"])
 def test_data_out_of_a_replay_buffer(kind, tmp_path):
     data = steps([3, 7, 2])
-    prior = PastPrior(2)
-    source = stored(kind, data, tmp_path)[:]
-    batch = window_replay_buffer(source, prior, batch_size=64).sample()
-    check(batch, data, prior, 2)
+    source = data.memmap(tmp_path) if kind == "mapped" else stored(kind, data, tmp_path)[:]
+    buffer = window_replay_buffer(source, PreviewPrior(2), batch_size=64)
+    check(buffer.sample(), data, ActionWindow(data, 2, prediction_length=4))
 
 
 @pytest.mark.parametrize("kind", ["tensor", "memmap"])
@@ -186,17 +166,11 @@ def test_window_as_the_transform_of_another_buffer(kind, tmp_path):
     data["frame"] = torch.arange(len(data))
     data["weight"] = torch.rand(len(data))
     buffer = stored(kind, data, tmp_path)
-    prior = PreviewPrior(2)
-    buffer.append_transform(ActionWindow(data, prior))
+    window = ActionWindow(data, 2)
+    buffer.append_transform(window)
     batch = buffer.sample()
-    check(batch, data, prior, 2)
+    check(batch, data, window)
     assert torch.equal(batch["weight"], data["weight"][batch["frame"]])  # the rest stays
-
-
-def test_memmapped_tensordict(tmp_path):
-    data = steps([3, 7, 2])
-    mapped = data.memmap(tmp_path)
-    check(window_replay_buffer(mapped, PastPrior(2), batch_size=64).sample(), data, PastPrior(2), 2)
 
 
 def test_epochs_visit_every_step_once():
@@ -217,58 +191,102 @@ def test_border_windows_are_sampled_like_all_others():
     assert counts.min() > 200 - 5 * 14.1 and counts.max() < 200 + 5 * 14.1
 
 
-def test_generator_fixes_steps_and_withheld_means():
+def test_generator_fixes_steps_and_what_is_withheld():
     data = steps([20, 30])
-    prior = PastPrior(2, cold_probability=0.5)
 
     def draw(seed):
         generator = torch.Generator().manual_seed(seed)
-        buffer = window_replay_buffer(data, prior, batch_size=50, generator=generator)
+        buffer = window_replay_buffer(
+            data, PastPrior(2), batch_size=50, withhold=0.5, generator=generator
+        )
         return torch.cat([buffer.sample() for _ in range(3)])
 
     one, same, other = draw(1), draw(1), draw(2)
     assert torch.equal(one["frame"], same["frame"])
-    assert torch.equal(one["prior", "warm"], same["prior", "warm"])
+    assert (one["history"] == same["history"]).all()
     assert not torch.equal(one["frame"], other["frame"])
 
 
-def test_cold_probability_withholds_whole_windows():
-    data = steps([60] * 5)
-    share = 0.25
-    prior = PreviewPrior(4, cold_probability=share)
+def test_without_withholding_nothing_is_drawn_but_the_steps():
+    """The generator's stream is that of Algorithm 1."""
+    streams = []
+    for withhold in (0.0, 0.5):
+        generator = torch.Generator().manual_seed(0)
+        options = {"batch_size": 9, "withhold": withhold, "generator": generator}
+        frames = window_replay_buffer(steps([20]), PastPrior(2), **options).sample()["frame"]
+        streams.append((frames, generator.get_state()))
+    frames = torch.randint(0, 20, (9,), generator=(g := torch.Generator().manual_seed(0)))
+    assert torch.equal(streams[0][0], frames) and torch.equal(streams[0][1], g.get_state())
+    assert not torch.equal(streams[1][1], g.get_state())
+
+
+def test_withholding_takes_whole_histories():
+    """Of a share of the windows, all four entries; targets and observations stay."""
+    data, share = steps([60] * 5), 0.25
     generator = torch.Generator().manual_seed(0)
-    batch = window_replay_buffer(data, prior, batch_size=10_000, generator=generator).sample()
-    warm = batch["prior", "warm"][:, :4, 0]
-    assert torch.equal(warm.any(1), warm.all(1)) and not batch["prior", "warm"][:, 4:].any()
-    assert abs((~warm[:, 0]).float().mean() - share) < 0.025  # five standard errors
+    buffer = window_replay_buffer(
+        data, PreviewPrior(4), batch_size=10_000, withhold=share, generator=generator
+    )
+    batch, window = buffer.sample(), ActionWindow(data, 4, prediction_length=8)
+    cold = batch["history", "forecast_steps"].squeeze(-1) == 0
+    assert all(not value[cold].any() for value in batch["history"].values())
+    assert abs(cold.float().mean() - share) < 0.025  # five standard errors
+    check(batch[~cold][:300], data, window)
+    twin = window(batch[cold].select("frame"))
+    assert torch.equal(batch["vla_action", "chunk"][cold], twin["vla_action", "chunk"])
+    assert torch.equal(batch["observation"][cold], twin["observation"])
 
 
-def test_a_user_s_prior_sees_only_its_own_episode():
-    """What a subclass may read: the history inside the episode, zeros where there is none."""
-    seen = []
+@pytest.mark.parametrize(("probability", "share"), [(0.0, 1.0), (1.0, 0.0)])
+def test_limits_of_withholding(probability, share):
+    batch = TensorDict({"history": random_history(PastPrior(2), 500, cold=0.0)}, [500])
+    kept = WithheldHistory(probability)(batch)["history", "steps"] > 0
+    assert kept.float().mean() == share
 
-    class Spy(PastPrior):
-        name = "spy-for-this-test"
 
-        def training_mean(self, history, history_valid, target):
-            seen.append((history.clone(), history_valid.clone()))
-            return super().training_mean(history, history_valid, target)
+def test_a_share_that_is_none_and_a_history_that_is_missing():
+    for wrong in (-0.1, 1.1, float("nan"), True, "abc"):
+        with pytest.raises(ValueError, match="probability"):
+            WithheldHistory(wrong)
+    with pytest.raises(KeyError, match="append it after ActionWindow"):
+        WithheldHistory(0.5)(TensorDict({}, [3]))
 
-    data = steps([3, 4])
-    ActionWindow(data, Spy(2))(TensorDict({"frame": torch.arange(7)}, [7]))
-    del Prior._registry["spy-for-this-test"]
-    history, valid = seen[0]
-    assert valid.tolist() == [
-        [False, False],
-        [False, True],
-        [True, True],
-        [False, False],
-        [False, True],
-        [True, True],
-        [True, True],
-    ]
-    assert (history[~valid] == 0).all()
-    assert torch.equal(history[5], data["action"][3:5])
+
+def test_one_buffer_serves_every_prior_of_its_lengths():
+    class Momentum(Prior):
+        name = "momentum-of-the-windows"
+
+        def mean(self, history):
+            actions, warm = history["actions"], (history["steps"] >= 2).unsqueeze(-1)
+            return 2 * actions[..., -1:, :] - actions[..., -2:-1, :] + 0 * actions, warm.expand(
+                *actions.shape[:-1], 1
+            )
+
+    data = steps([3, 7, 12])
+    batch = window_replay_buffer(data, GaussianPrior(3), batch_size=200).sample()
+    place = batch["frame"] - torch.tensor([0] * 3 + [3] * 7 + [10] * 12)[batch["frame"]]
+    for prior, needed in ((PastPrior(3), 3), (GaussianPrior(3), 99), (Momentum(3), 2)):
+        warm = prior.distribution(batch["history"]).warm
+        assert torch.equal(warm.squeeze(-1).all(1), place >= needed)
+    last = data["action"][batch["frame"] - 1], data["action"][batch["frame"] - 2]
+    expected = torch.where((place >= 2)[:, None], 2 * last[0] - last[1], 0.0)
+    torch.testing.assert_close(prior.distribution(batch["history"]).loc[:, 2], expected)
+    with pytest.raises(ValueError, match=r"PreviewPrior.*needs 3 .* of 6.*\"forecast\"\) has 3"):
+        PreviewPrior(3).distribution(batch["history"])
+    del Prior._classes[Momentum.name]
+
+
+def test_a_prior_may_need_more_than_a_chunk():
+    class Longer(PastPrior):
+        name = "longer-of-the-windows"
+        history_length = 7
+
+    prior, data = Longer(2), steps([20])
+    batch = window_replay_buffer(data, prior, batch_size=9).sample()
+    assert batch["history", "actions"].shape == (9, 7, 2)
+    check(batch, data, ActionWindow(data, 2, history_length=7))
+    prior.distribution(batch["history"])
+    del Prior._classes[Longer.name]
 
 
 def test_renamed_keys_and_nested_observation():
@@ -283,14 +301,14 @@ def test_renamed_keys_and_nested_observation():
     )
     window = ActionWindow(
         renamed,
-        PastPrior(2),
+        2,
         frame_key="step",
         observation_key=("state", "low"),
         action_key="move",
         episode_key="demo",
     )
     out = window(TensorDict({"step": torch.arange(7)}, [7]))
-    expected = ActionWindow(data, PastPrior(2))(TensorDict({"frame": torch.arange(7)}, [7]))
+    expected = ActionWindow(data, 2)(TensorDict({"frame": torch.arange(7)}, [7]))
     assert torch.equal(out["state", "low"], expected["observation"])
     assert torch.equal(out["vla_action", "chunk"], expected["vla_action", "chunk"])
 
@@ -301,7 +319,7 @@ def test_bad_values_are_located(key, value):
     data = steps([3, 4])
     data[key][4, 1] = value
     with pytest.raises(ValueError, match=f"'{key}' holds NaN or Inf, first at step 4"):
-        ActionWindow(data, PastPrior(2))
+        ActionWindow(data, 2)
 
 
 @pytest.mark.parametrize("key", ["observation", "action", "episode"])
@@ -309,34 +327,42 @@ def test_missing_entry(key):
     data = steps([3, 4])
     del data[key]
     with pytest.raises(KeyError, match=f"the data lack '{key}'"):
-        ActionWindow(data, PastPrior(2))
+        ActionWindow(data, 2)
 
 
 def test_episodes_in_pieces():
     data = steps([3, 4])
     data["episode"] = torch.tensor([0, 0, 1, 1, 0, 2, 2])
     with pytest.raises(ValueError, match="steps of episode 0 are not contiguous"):
-        ActionWindow(data, PastPrior(2))
+        ActionWindow(data, 2)
 
 
 def test_empty_or_batched_data():
     data = steps([3, 4])
     with pytest.raises(ValueError, match=r"flat steps \[N\] with N > 0"):
-        ActionWindow(data[:0], PastPrior(2))
+        ActionWindow(data[:0], 2)
     with pytest.raises(ValueError, match="flat steps"):
-        ActionWindow(steps([3, 3]).reshape(2, 3), PastPrior(2))
+        ActionWindow(steps([3, 3]).reshape(2, 3), 2)
 
 
 def test_no_frame():
-    window = ActionWindow(steps([3, 4]), PastPrior(2))
+    window = ActionWindow(steps([3, 4]), 2)
     with pytest.raises(KeyError, match="index of each sampled step under 'frame'"):
         window(TensorDict({"other": torch.arange(3)}, [3]))
 
 
-@pytest.mark.parametrize("steps_", [0, -1])
-def test_bad_observation_steps(steps_):
-    with pytest.raises(ValueError, match="observation_steps"):
-        ActionWindow(steps([3]), PastPrior(2), observation_steps=steps_)
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"observation_steps": 0}, "observation_steps must be at least 1, got 0"),
+        ({"chunk_length": 0}, r"need 1 <= chunk_length <= .*chunk_length=0"),
+        ({"prediction_length": 1}, "prediction_length=1"),
+        ({"history_length": 1}, "history_length=1"),
+    ],
+)
+def test_lengths_that_cannot_be(options, told):
+    with pytest.raises(ValueError, match=told):
+        ActionWindow(steps([3]), **({"chunk_length": 2} | options))
 
 
 def test_data_larger_than_memory_are_never_copied(tmp_path):

@@ -17,13 +17,14 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.history import advance, cold_history
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import with_leftover
-from warmprior.transforms.delay import check_delay, shift_chunk
-from warmprior.transforms.mean_observation import mean_observation
+from warmprior.transforms.delay import check_delay
+from warmprior.transforms.history_observation import HistoryObservation
 
 __all__ = ["AsyncExecutor"]
 
@@ -34,23 +35,24 @@ class AsyncExecutor:
     Every ``execute`` control steps a decision is begun with the observation of that step, in a thread of its
     own. Until its chunk is there the robot goes on with the one before; the new one then takes effect at
     the position of the step that has been reached. How many steps that took is counted, and the largest of
-    the last decisions' is what the policy is told of the next (``("rtc", "delay")``, with what is left of the
-    chunk, for :class:`~warmprior.RealTimeChunking`). The prior's mean is made of what was executed. All of
-    it is what :class:`~warmprior.InferenceDelay` does in simulation: with ``latency`` given, the actions are
-    the same.
+    the last decisions' is what the policy is told of the next (``("rtc", "delay")``, for
+    :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) holds what was executed, and
+    what is left of the chunk. All of it is what :class:`~warmprior.InferenceDelay` does in simulation: with
+    ``latency`` given, the actions are the same.
 
     Only the first step of an episode waits for its chunk. Later ones wait at most ``timeout`` seconds, where
     no action is left; :meth:`act` then raises ``TimeoutError``, and may be called again, with the robot held
     meanwhile.
 
     Args:
-        actor: a :class:`~warmprior.WarmPriorActor`, or any module that reads ``"observation"``, the mean
-            under ``"prior"`` and what it needs under ``"rtc"`` (see :mod:`warmprior.keys`), and writes a
-            chunk ``[P, d_a]``; set to evaluation mode. It is called without batch dimensions, one call at a
-            time.
+        actor: a :class:`~warmprior.WarmPriorActor`, or any module that reads what it needs of
+            ``"observation"`` (``("prior", "observation")``, if the last actions are to be in it),
+            ``"history"`` and ``("rtc", "delay")`` (see :mod:`warmprior.keys`), and writes a chunk
+            ``[P, d_a]``; set to evaluation mode. It is called without batch dimensions, one call at a time.
 
     Keyword Args:
-        prior: of the policy; that of a :class:`~warmprior.WarmPriorActor` by default.
+        prior: of the policy, whose lengths alone are used; that of a :class:`~warmprior.WarmPriorActor` by
+            default.
         execute: control steps from one decision to the next; by default all ``H``, or as many as a chunk
             allows with ``delay``.
         delay: control steps that decisions are expected to take until some were measured.
@@ -125,7 +127,7 @@ class AsyncExecutor:
             torch.device("cpu"),
         )
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
-        self._conditioned = mean_observation(prior)
+        self._sees_history = keys.CONDITIONED in actor.in_keys
         self._owned = None
         if pool is None and latency is None:
             self._owned = pool = ThreadPoolExecutor(1, thread_name_prefix="warmprior-policy")
@@ -156,11 +158,9 @@ class AsyncExecutor:
             pending.cancel()
         self._pending: Future[Tensor] | None = None
         self._frames.clear()
-        self._loc = torch.zeros(self._shape)
-        self._warm = torch.zeros(self._shape[0], 1, dtype=torch.bool)
-        self._elapsed = torch.zeros(1, dtype=torch.int64)
+        self._history = cold_history([], self.prior.history_length, *self._shape)
         # The chunk as it is executed from the last decision on, and how much of it there is.
-        self._chunk, self._left, self._executed = torch.zeros(self._shape), 0, 0
+        self._chunk, self._left, self._executed = self._history["forecast"], 0, 0
 
     def act(self, observation: Tensor | TensorDictBase) -> Tensor:
         """The action of this control step.
@@ -192,9 +192,14 @@ class AsyncExecutor:
         return self._normalizer.denormalize(TensorDict({keys.ACTION: action}))[keys.ACTION]
 
     @property
+    def _first(self) -> bool:
+        """Whether the decision under way is the first of its episode."""
+        return not self._history["steps"]
+
+    @property
     def _usable(self) -> int:
         """Actions that can be executed before another chunk is needed."""
-        # Means are defined for at most H executed actions per decision.
+        # A forecast has to reach the P - H steps that it has in training.
         return self._left if self._pending is None else min(self._left, self.prior.chunk_length)
 
     def _see(self, observation: Tensor | TensorDictBase) -> None:
@@ -208,28 +213,16 @@ class AsyncExecutor:
 
     def _decide(self) -> None:
         """Begin a decision; what is left of the chunk is at the positions of the new one from here on."""
-        steps = torch.tensor([self._executed])
         if self._left:
-            self._elapsed = self._elapsed + steps
-            means = self.prior.next_mean(self._loc, self._chunk, steps, self._elapsed)
-            self._loc, self._warm = (value.cpu() for value in means)
-        left = self._left - self._executed
-        self._chunk, valid = shift_chunk(self._chunk, steps)
-        valid &= torch.arange(len(valid)).unsqueeze(-1) < left
-        self._left, self._executed = left, 0
+            self._history = advance(self._history, self._chunk, torch.tensor([self._executed]))
+        self._chunk, self._executed = self._history["forecast"], 0
+        self._left = int(self._history["forecast_steps"])
         frames = torch.stack(list(self._frames))
         if isinstance(frames, TensorDictBase):
             frames.batch_size = []  # the steps belong to the entries
+        delay = torch.tensor([min(self.expected_delay, self._left)])
         data = TensorDict(
-            {
-                keys.OBSERVATION: frames,
-                "prior": {"loc": self._loc, "warm": self._warm, "elapsed": self._elapsed},
-                "rtc": {
-                    "leftover": self._chunk,
-                    "valid": valid,
-                    "delay": torch.tensor([min(self.expected_delay, left)]),
-                },
-            }
+            {keys.OBSERVATION: frames, keys.HISTORY: self._history, keys.DELAY: delay}
         )
         if self._pool is None:
             self._pending = Future()
@@ -245,8 +238,8 @@ class AsyncExecutor:
         """The policy's chunk, in whichever thread."""
         # Tensors of its own: those of a loop under torch.inference_mode() have no gradients for guidance.
         data = data.clone()
-        for transform in self._conditioned:
-            data = transform(data)
+        if self._sees_history:
+            data = HistoryObservation()(data)
         chunk = self.actor(data.to(self._device)).get(self._chunk_key)
         if chunk is None or tuple(chunk.shape) != self._shape:
             found = "nothing" if chunk is None else f"shape {tuple(chunk.shape)}"
@@ -261,21 +254,19 @@ class AsyncExecutor:
         """Let the chunk under way take effect, if it is there."""
         if self._pending is None or not self._pending.done():
             return
-        first = self._left == 0 and not self._elapsed
-        if self.latency is not None and not first and self._executed < self.latency:
+        if self.latency is not None and not self._first and self._executed < self.latency:
             return
         chunk = self._pending.result()
         self._chunk = with_leftover(chunk, self._chunk, torch.tensor([self._executed]))
         self._left, self._pending = self._shape[0], None
-        if not first:
+        if not self._first:
             self._delays.append(self._executed)
 
     def _wait(self) -> None:
         """Wait for the chunk under way: without it there is no action."""
-        first = not self._elapsed
         if self._pending is not None:
             try:
-                self._pending.exception(None if first else self.timeout)
+                self._pending.exception(None if self._first else self.timeout)
             except NotDone as late:
                 raise TimeoutError(
                     f"the next chunk is not there after {self._executed} control steps and {self.timeout} s: "

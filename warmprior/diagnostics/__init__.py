@@ -8,7 +8,7 @@ from warmprior.diagnostics.flow import encoded_windows
 from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revision
 from warmprior.diagnostics.memory_gain import memory_gain
-from warmprior.diagnostics.paths import flow_paths, forecast_mean
+from warmprior.diagnostics.paths import deployed_history, flow_paths
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.smoothness import (
     Smoothness,
@@ -41,11 +41,11 @@ __all__ = [
     "branching_cost",
     "compare_smoothness",
     "curvature",
+    "deployed_history",
     "encoded_windows",
     "exceeds_one_sigma",
     "executed_actions",
     "flow_paths",
-    "forecast_mean",
     "mean_error",
     "mean_revision",
     "memory_gain",

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 
-from warmprior.diagnostics.flow import allowed_nfes, evaluation_mode, flat_windows, predict
+from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, flat_windows, predict
 from warmprior.modules.actor import WarmPriorActor
 
 __all__ = ["action_error"]
@@ -63,10 +63,10 @@ def action_error(
     if generator is None:
         generator = torch.Generator(flat.loc.device).manual_seed(0)
     rows = windows.select(*policy.in_keys).reshape(len(flat)).to(flat.loc.device)
-    a0 = prior.start(flat.loc, flat.warm, generator, flat.observation)
     counted = flat.counted[:, : prior.chunk_length, 0]
     errors = {}
     with evaluation_mode(policy):
+        a0 = drawn(policy, rows, generator)
         for nfe in allowed:
             chunk = predict(policy, rows, a0, nfe=nfe, split=split)
             error = (chunk - flat.target)[:, : prior.chunk_length].square()

@@ -10,7 +10,7 @@ from warmprior import keys
 from warmprior.diagnostics.flow import check_flow, evaluation_mode, field_of, flat_windows
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
-from warmprior.modules.prior import Prior
+from warmprior.modules.prior import Prior, Source
 
 __all__ = ["branching_bound", "branching_cost"]
 
@@ -77,7 +77,7 @@ def branching_cost(
     generator = policy.sampler.generator if generator is None else generator
     assert rows.target is not None
     with evaluation_mode(policy):
-        a0 = policy.prior.sample(rows.loc, rows.warm, generator, rows.observation)
+        a0 = policy.prior.sample(rows.history, rows.observation, generator)
         within = torch.rand(n, generator=generator, dtype=a0.dtype, device=a0.device)
         stratum = torch.arange(draws, dtype=a0.dtype, device=a0.device).repeat_interleave(n)
         t = (stratum + within.repeat(draws)) / draws
@@ -113,7 +113,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
     branching cost itself may be far below.
 
     Args:
-        batch: windows ``[*B]`` of the prior, see :func:`~warmprior.window_replay_buffer`.
+        batch: windows ``[*B]`` of the prior's lengths, see :func:`~warmprior.window_replay_buffer`.
         prior: the source distribution.
 
     Returns:
@@ -123,7 +123,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
 
     Raises:
         KeyError: if the batch lacks a key.
-        ValueError: if the batch is empty or the prior's source is not that of Eq. 1.
+        ValueError: if the batch is empty or the source is not Gaussian.
 
     Examples:
         >>> import torch
@@ -137,25 +137,27 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
         >>> float(bound["mismatch"]), float(bound["noise"])  # both actions are 2 ahead of the mean
         (8.0, 0.5)
     """
-    if not prior.is_gaussian:
-        raise ValueError(f"the bound is that of the Gaussian source of Eq. 1, which {prior} is not")
-    needed = (keys.CHUNK, keys.LOC, keys.WARM)
+    needed = (keys.CHUNK, keys.HISTORY)
     missing = [key for key in needed if batch.get(key, None) is None]
     if missing:
         raise KeyError(f"branching_bound needs the keys {list(needed)}; missing: {missing}")
     if batch.batch_size.numel() == 0:
         raise ValueError("the batch holds no window")
-    target, loc, warm = (batch.get(key) for key in needed)
+    with torch.no_grad():
+        source = prior.distribution(batch.get(keys.HISTORY), batch.get(keys.OBSERVATION, None))
+    if type(source) is not Source:
+        raise ValueError(f"the bound is that of a Gaussian source, which {prior} is not")
+    target, warm = batch.get(keys.CHUNK), source.warm
     pad = batch.get(keys.IS_PAD, None)
     counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
     warm = (warm & counted).expand_as(target)
     cold = counted.expand_as(target) & ~warm
-    squared = (target - loc).square() * warm
-    unknown = (target.square() + 1.0) * cold
-    mismatch = squared.sum((-1, -2))
-    noise = prior.sigma**2 * warm.sum((-1, -2)).to(target.dtype)
+    squared = (target - source.loc).square() * warm
+    variance = source.scale.square() * warm
+    unknown = ((target - source.loc).square() + source.scale.square()) * cold
+    mismatch, noise = squared.sum((-1, -2)), variance.sum((-1, -2))
     rest = unknown.sum((-1, -2))
-    per_position = (squared + prior.sigma**2 * warm + unknown).sum(-1)
+    per_position = (squared + variance + unknown).sum(-1)
     return TensorDict(
         {
             "mismatch": mismatch,

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 
 from warmprior.diagnostics.flow import evaluation_mode, flat_windows
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
+from warmprior.modules.prior import Source
 
 __all__ = ["source_coverage"]
 
@@ -49,12 +49,12 @@ def source_coverage(
         raise ValueError(f"level must be in (0, 1), got {level}")
     flat, prior = flat_windows(policy, windows, target_needed=True), policy.prior
     assert flat.target is not None
-    if type(prior).sample is not Prior.sample:
-        return math.nan
     with evaluation_mode(policy):
-        mean, scale = prior.distribution(flat.loc, flat.warm, flat.observation)
+        source = prior.distribution(flat.history, flat.observation)
+    if type(source) is not Source:
+        return math.nan
     z = math.sqrt(2.0) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
-    inside = (flat.target - mean).abs() <= z * scale
+    inside = (flat.target - source.loc).abs() <= z * source.scale
     executed = slice(prior.chunk_length)
     return float(
         inside[:, executed][flat.counted[:, executed].expand_as(inside[:, executed])]

@@ -58,9 +58,9 @@ def curvature(
 
     Args:
         policy: the policy; its ``nfe`` and solver play no role.
-        batch: ``[*B]`` with observation, ``loc`` and ``warm``: windows of the policy's own prior or a
+        batch: ``[*B]`` with observation and history: windows of the policy's own lengths or a
             rollout. In windows WP-Preview's mean is the target itself; see
-            :func:`~warmprior.diagnostics.forecast_mean` for the mean that deployment meets.
+            :func:`~warmprior.diagnostics.deployed_history` for the history that deployment meets.
         n_steps: Euler steps.
 
     Keyword Args:
@@ -89,9 +89,10 @@ def curvature(
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.history import cold_history
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), GaussianPrior(8))
-        >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3), "prior": {
-        ...     "loc": torch.zeros(5, 8, 2), "warm": torch.zeros(5, 8, 1, dtype=torch.bool)}}, [5])
+        >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3),
+        ...                     "history": cold_history([5], 8, 8, action_dim=2)}, [5])
         >>> curvature(actor, batch)["kappa"].shape
         torch.Size([5])
     """
@@ -107,7 +108,7 @@ def curvature(
     with evaluation_mode(policy):
         # All sources are drawn at once: how the batch is split must not change them.
         generator = policy.sampler.generator if generator is None else generator
-        a0 = policy.prior.sample(rows.loc, rows.warm, generator, rows.observation)
+        a0 = policy.prior.sample(rows.history, rows.observation, generator)
         for i in range(0, len(rows), split):
             s = slice(i, i + split)
             parts.append(_measure(policy, a0[s], rows.observation[s], n_steps))

@@ -9,12 +9,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded
-from warmprior.transforms.mean_observation import MeanObservation
+from warmprior.transforms.history_observation import HistoryObservation
 
 Field = Callable[[Tensor, Tensor], Tensor]
 
@@ -26,14 +27,16 @@ class Windows:
     Attributes:
         shape: the batch's own shape.
         observation: what the network sees, ``[N, To, d_o]``.
-        loc: ``[N, P, d_a]``.
-        warm: bool ``[N, P, 1]``.
+        history: ``[N]``, see :mod:`warmprior.history`.
+        loc: mean of the source, ``[N, P, d_a]``.
+        warm: where it is one, bool ``[N, P, 1]``.
         counted: positions inside the episode, bool ``[N, P, 1]``.
         target: ``[N, P, d_a]``, if there is one.
     """
 
     shape: torch.Size
     observation: Tensor
+    history: TensorDictBase
     loc: Tensor
     warm: Tensor
     counted: Tensor
@@ -44,7 +47,7 @@ class Windows:
 
     def repeat(self, draws: int) -> Windows:
         """The windows ``draws`` times in a row, for as many samples of the source each."""
-        parts = (self.observation, self.loc, self.warm, self.counted, self.target)
+        parts = (self.observation, self.history, self.loc, self.warm, self.counted, self.target)
         repeated = [None if p is None else p.repeat(draws, *[1] * (p.ndim - 1)) for p in parts]
         return Windows(self.shape, *repeated)  # type: ignore[arg-type]
 
@@ -58,7 +61,7 @@ def flat_windows(
         KeyError: if a needed key is missing.
         ValueError: if the batch is empty, holds NaN or Inf, or belongs to another prediction length.
     """
-    observation_key, loc_key, warm_key = policy.in_keys[:3]
+    observation_key = policy.in_keys[0]
     needed = [*policy.in_keys, *([policy.chunk_key] if target_needed else [])]
     missing = [key for key in needed if batch.get(key, None) is None]
     if missing:
@@ -76,32 +79,50 @@ def flat_windows(
     device = next(policy.parameters()).device
     prior, ndim = policy.prior, batch.ndim
 
-    def flat(key: object) -> Tensor | None:
+    def flat(key: NestedKey) -> Tensor | None:
         value = batch.get(key, None)
         return None if value is None else value.reshape(-1, *value.shape[ndim:]).to(device)
 
-    observation, loc, warm = flat(observation_key), flat(loc_key), flat(warm_key)
-    target, pad = flat(policy.chunk_key), flat(keys.IS_PAD)
-    assert observation is not None and loc is not None and warm is not None
-    for key, value in ((observation_key, observation), (loc_key, loc), (policy.chunk_key, target)):
-        if value is None:
-            continue
-        if key != observation_key and value.shape[-2] != prior.prediction_length:
-            raise ValueError(
-                f"{key} has {value.shape[-2]} positions, but {prior} predicts "
-                f"{prior.prediction_length}: sample the windows with the policy's own prior"
-            )
-        if not torch.isfinite(value).all():
+    observation, target, pad = map(flat, (observation_key, policy.chunk_key, keys.IS_PAD))
+    assert observation is not None
+    if target is not None and target.shape[-2] != prior.prediction_length:
+        raise ValueError(
+            f"{policy.chunk_key} has {target.shape[-2]} positions, but {prior} predicts "
+            f"{prior.prediction_length}: make the windows for this length"
+        )
+    history = batch.get(keys.HISTORY).reshape(-1).to(device)
+    entries = {
+        observation_key: observation,
+        policy.chunk_key: target,
+        keys.ACTIONS: history["actions"],
+        keys.FORECAST: history["forecast"],
+    }
+    for key, value in entries.items():
+        if value is not None and not torch.isfinite(value).all():
             raise ValueError(f"{key} holds NaN or Inf")
+    with torch.no_grad():
+        loc, _, warm = prior.distribution(history, observation)
     counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)
-    return Windows(
-        batch.batch_size,
-        observation,
-        loc,
-        warm,
-        counted,
-        target,
-    )
+    return Windows(batch.batch_size, observation, history, loc, warm, counted, target)
+
+
+def sees_history(policy: WarmPriorActor) -> bool:
+    """Whether the network sees the last actions beside the observation."""
+    return policy.in_keys[0] == keys.CONDITIONED
+
+
+def depends_on_history(policy: WarmPriorActor, windows: TensorDictBase) -> bool:
+    """Whether a policy's chunks depend on the history of windows ``[*B]``, whose images are encoded."""
+    sees = sees_history(policy) or policy.start is not None
+    return sees or bool(flat_windows(policy, windows).warm.any())
+
+
+def drawn(
+    policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generator | None
+) -> Tensor:
+    """Where a policy's samplers start at windows ``[N]``, ``[N, P, d_a]``."""
+    inputs = rows.select(*policy.in_keys)
+    return policy.sampler(inputs, generator=generator)[policy.ode.in_keys[0]]
 
 
 def encoded_windows(
@@ -147,7 +168,7 @@ def encoded_windows(
         parts = [encoded(policy.network, part.to(device)) for part in observation.split(split)]
     features = torch.cat(parts)  # type: ignore[arg-type]
     result = windows.copy().to(device).set(key, features)
-    if policy.prior.conditions_network:  # the same without the mean, which stands behind the vector
+    if sees_history(policy):  # the same without the last actions, which stand behind the vector
         bare = windows[keys.OBSERVATION][keys.STATE].shape[-1]
         extended = observation[keys.STATE].shape[-1]
         without = torch.cat([features[..., :bare], features[..., extended:]], -1)
@@ -155,34 +176,33 @@ def encoded_windows(
     return result
 
 
-def told_mean(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
-    """Write what a network that sees the mean is told of it anew, after the mean has changed.
+def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
+    """Write what a network sees of the last actions anew, after the history has changed.
 
-    Observations with images have to be as they are, not encoded: the mean stands at their vector's end.
+    Observations with images have to be as they are, not encoded: the actions stand at their vector's end.
 
     Raises:
-        KeyError: if the windows lack what the network sees, or the mean.
+        KeyError: if the windows lack what the network sees, or the history.
     """
-    if not policy.prior.conditions_network:
+    if not sees_history(policy):
         return windows
-    told, loc_key, warm_key = policy.in_keys[:3]
-    make = MeanObservation(observation_key=told, loc_key=loc_key, warm_key=warm_key, out_key=told)
-    for key in (told, loc_key):
-        if windows.get(key, None) is None:
-            raise KeyError(f"the batch lacks {key!r}; windows of the policy's own prior hold it")
-    seen = windows.get(told)
-    width = MeanObservation.width(policy.prior, windows.get(loc_key).shape[-1])
+    key = policy.in_keys[0]
+    for needed in (key, keys.ACTIONS):
+        if windows.get(needed, None) is None:
+            raise KeyError(f"the batch lacks {needed!r}; sample windows with see_history=True")
+    seen, actions = windows.get(key), windows.get(keys.ACTIONS)
+    width = HistoryObservation.width(*actions.shape[-2:])
     if isinstance(seen, TensorDictBase):
         bare: Any = seen.copy().set(keys.STATE, seen.get(keys.STATE)[..., :-width])
     else:
         bare = seen[..., :-width]
-    return make(windows.set(told, bare))
+    return HistoryObservation(observation_key=key, out_key=key)(windows.set(key, bare))
 
 
 def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
-    """The observations of a batch without the mean that a conditioned network sees beside them."""
+    """The observations of a batch without the last actions that a network may see beside them."""
     key = policy.in_keys[0]
-    if policy.prior.conditions_network and isinstance(batch.get(keys.OBSERVATION), Tensor):
+    if sees_history(policy) and isinstance(batch.get(keys.OBSERVATION), Tensor):
         key = keys.OBSERVATION
     return batch.get(key)
 
@@ -191,13 +211,14 @@ def check_flow(policy: WarmPriorActor, steps: int) -> None:
     """Refuse policies whose field means nothing along a whole path.
 
     Raises:
-        ValueError: if the prior allows fewer than ``steps`` network evaluations, or ``steps < 1``.
+        ValueError: if the policy is trained for fewer than ``steps`` network evaluations, or ``steps < 1``.
     """
     if steps < 1:
         raise ValueError(f"a path needs at least 1 step, got {steps}")
-    if not policy.prior.is_flow and steps > 1:
+    most = policy.ode.max_nfe
+    if most is not None and steps > most:
         raise ValueError(
-            f"{policy.prior} trains its field for one network evaluation: it has no path of {steps} steps"
+            f"the policy is trained for at most {most} network evaluation(s): it has no path of {steps} steps"
         )
 
 
@@ -220,12 +241,18 @@ def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
 
 
 def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
-    """Those that the prior allows, ascending.
+    """Those that the policy is trained for, ascending.
 
     Raises:
-        ValueError: if it allows none, or the solver cannot spend one.
+        ValueError: if none is, or the solver cannot spend one.
     """
-    allowed = sorted(set(policy.prior.allowed_nfes(nfes)))
+    most = policy.ode.max_nfe
+    allowed = sorted({nfe for nfe in nfes if most is None or nfe <= most})
+    if not allowed:
+        raise ValueError(
+            f"the policy is trained for at most {most} network evaluation(s), and {list(nfes)} has none: "
+            f"add NFE {most}"
+        )
     for nfe in allowed:
         policy.ode.check_nfe(nfe)
     return allowed

@@ -6,17 +6,19 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from warmprior.diagnostics.flow import told_mean
+from warmprior import keys
+from warmprior.diagnostics.flow import seen_anew
+from warmprior.diagnostics.memory_gain import shifted
 from warmprior.modules.actor import WarmPriorActor
 
 __all__ = ["HistoryShift"]
 
 
 class HistoryShift(TensorDictModuleBase):
-    """A policy whose remembered mean is disturbed at every decision: inference-time history shift.
+    """A policy whose history is disturbed at every decision: inference-time history shift.
 
-    Adds normal noise to the warm positions of ``loc`` before the policy sees it. What the environment
-    remembers stays undisturbed.
+    Adds normal noise to the history's actions and forecast before the policy sees them. What the
+    environment remembers stays undisturbed.
 
     Args:
         policy: the policy.
@@ -51,10 +53,17 @@ class HistoryShift(TensorDictModuleBase):
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Disturb the mean and act."""
-        _, loc_key, warm_key = self.in_keys[:3]
-        loc, warm = tensordict.get(loc_key), tensordict.get(warm_key)
-        noise = torch.randn(loc.shape, generator=self.generator, dtype=loc.dtype, device=loc.device)
-        seen = tensordict.clone(recurse=False).set(loc_key, loc + self.std * noise * warm)
-        out = self.policy(told_mean(self.policy, seen))
+        """Disturb the history and act."""
+        history = tensordict[keys.HISTORY]
+        longest = max(history[name].shape[-2] for name in ("actions", "forecast"))
+        actions = history["actions"]
+        noise = torch.randn(
+            (*actions.shape[:-2], longest, actions.shape[-1]),
+            generator=self.generator,
+            dtype=actions.dtype,
+            device=actions.device,
+        )
+        seen = tensordict.clone(recurse=False)
+        seen.set(keys.HISTORY, shifted(history, self.std * noise))
+        out = self.policy(seen_anew(self.policy, seen))
         return tensordict.update(out.select(*self.out_keys))

@@ -10,10 +10,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.flow import evaluation_mode, flat_windows, predict
+from warmprior.diagnostics.flow import drawn, evaluation_mode, flat_windows, predict
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
-from warmprior.transforms.delay import executed_chunk
 
 __all__ = ["MeanError", "mean_error", "mean_revision"]
 
@@ -89,65 +87,45 @@ def mean_error(
         generator = torch.Generator(flat.loc.device).manual_seed(0)
     rows = windows.select(*policy.in_keys).reshape(len(flat)).to(flat.loc.device)
     with evaluation_mode(policy):
-        start = policy.prior.start(flat.loc, flat.warm, generator, flat.observation)
         nfe = policy.ode.nfe if nfe is None else nfe
-        chunk = predict(policy, rows, start, nfe=nfe, split=split)
-        mean, _ = policy.prior.distribution(flat.loc, flat.warm, flat.observation)
-    # STEP's source has no mean: its forecast enters the flow later.
-    has_mean = policy.prior.moves_source and policy.prior.start_time == 0.0
-    known = (flat.warm | policy.prior.always_warm) & flat.counted & has_mean
-    known = known.expand_as(mean)
+        chunk = predict(policy, rows, drawn(policy, rows, generator), nfe=nfe, split=split)
+    mean, known = flat.loc, (flat.warm & flat.counted).expand_as(flat.loc)
     return MeanError(_rms((mean - flat.target)[known]), _rms((mean - chunk)[known]))
 
 
-def mean_revision(rollout: TensorDictBase, prior: Prior) -> float:
-    """Distance of the carried mean from what is then predicted, along rollouts.
+def mean_revision(rollout: TensorDictBase) -> float:
+    """Distance of the mean from what is then predicted, along rollouts.
 
     Where it is larger than at demonstrated states (:attr:`MeanError.revision`), forecasts age worse where
     the policy brings itself than where the demonstrations are.
 
     Args:
-        rollout: ``[D]`` decisions, see :func:`~warmprior.diagnostics.executed_actions`.
-        prior: of the policy.
+        rollout: ``[D]`` decisions with what the policy wrote, see :class:`~warmprior.training.Episode`.
 
     Returns:
         Root mean square over warm positions and dimensions, in normalised action units; NaN if no
-        decision's mean is warm, or if the source is centred elsewhere (a learned one, for which rollouts
-        would have to keep the observations).
+        decision's mean is warm.
 
     Raises:
         KeyError: if a key is missing.
-        ValueError: if the rollout has other dimensions.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from warmprior import PreviewPrior
         >>> rollout = TensorDict({  # forecasts 2, 3, then predicts 2, 5
-        ...     "vla_action": {"chunk": torch.tensor([[0.0, 1, 2, 3], [2.0, 5, 0, 0]])[..., None]},
-        ...     "next": {"executed_steps": torch.tensor([[2], [2]])}}, [2])
-        >>> round(mean_revision(rollout, PreviewPrior(2)), 3)
+        ...     "vla_action": {"chunk": torch.tensor([[2.0, 5, 0, 0]])[..., None]},
+        ...     "prior": {"loc": torch.tensor([[2.0, 3, 0, 0]])[..., None],
+        ...               "warm": torch.tensor([[True, True, False, False]])[..., None]}}, [1])
+        >>> round(mean_revision(rollout), 3)
         1.414
     """
-    chunk, steps = rollout.get(keys.CHUNK, None), rollout.get(("next", keys.EXECUTED), None)
-    if chunk is None or steps is None:
-        raise KeyError(f"the rollout lacks {keys.CHUNK} or ('next', '{keys.EXECUTED}')")
-    if rollout.ndim != 1:
-        raise ValueError(f"need decisions [D] of one environment, got {tuple(rollout.shape)}")
-    if type(prior).distribution is not Prior.distribution or not prior.moves_source:
-        return math.nan
-    done = rollout.get(("next", "done"), torch.zeros_like(steps, dtype=torch.bool))
-    nothing = torch.zeros_like(chunk[0]), torch.zeros_like(chunk[0, :, :1], dtype=torch.bool)
-    (loc, warm), elapsed = nothing, torch.zeros_like(steps[0])
-    differences = []
-    taken = executed_chunk(rollout)
-    for predicted, played, executed, ended in zip(chunk, taken, steps, done, strict=True):
-        differences.append((predicted - loc)[warm.expand_as(loc)])
-        elapsed = elapsed + executed
-        loc, warm = prior.next_mean(loc, played, executed, elapsed)
-        if bool(ended):
-            (loc, warm), elapsed = nothing, torch.zeros_like(elapsed)
-    return _rms(torch.cat(differences))
+    found = [rollout.get(key, None) for key in (keys.CHUNK, keys.LOC, keys.WARM)]
+    if any(value is None for value in found):
+        raise KeyError(
+            f"the rollout lacks {keys.CHUNK}, {keys.LOC} or {keys.WARM}: let a policy write them"
+        )
+    chunk, loc, warm = found
+    return _rms((chunk - loc)[warm.expand_as(loc)])
 
 
 def _rms(values: Tensor) -> float:

@@ -12,11 +12,13 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.diagnostics.flow import (
     allowed_nfes,
+    drawn,
     encoded_windows,
     evaluation_mode,
     flat_windows,
     predict,
-    told_mean,
+    seen_anew,
+    sees_history,
 )
 from warmprior.modules.actor import WarmPriorActor
 
@@ -32,11 +34,11 @@ def memory_gain(
     split: int = 4096,
     generator: torch.Generator | None = None,
 ) -> dict[int, float]:
-    r"""How much of a shift of the remembered mean reappears in the executed actions.
+    r"""How much of a shift of the history reappears in the executed actions.
 
-    At the same observation and the same noise of the source, the mean is moved by
-    :math:`\pm\delta e`, alike at all warm positions, with a random direction :math:`e` of unit length per
-    window. The gain is
+    At the same observation and the same noise of the source, the history, all its actions and its forecast
+    alike, is moved by :math:`\pm\delta e`, with a random direction :math:`e` of unit length per window. The
+    gain is
 
     .. math::
         E\,\Big[e \cdot \frac{a_\tau(\mu + \delta e) - a_\tau(\mu - \delta e)}{2\delta}\Big]
@@ -53,7 +55,7 @@ def memory_gain(
     :math:`s^2 / (s^2 + V)` at one Euler step, a regression on the source, and :math:`s / \sqrt{s^2 + V}`,
     which is more, at infinitely many.
 
-    Windows whose mean is all cold, as at a reset, do not count. Actions that a policy clips do not move: what
+    Windows without a history, as at a reset, do not count. Actions that a policy clips do not move: what
     lies beyond its ``clip`` counts as 0. What is left of an old chunk for a policy's guidance stays as it is.
 
     Args:
@@ -69,7 +71,7 @@ def memory_gain(
             seed. One direction and sample of the source per window, the same for every NFE.
 
     Returns:
-        By NFE, ascending; 0 if nothing of the windows is warm, NaN if no position is inside an episode.
+        By NFE, ascending; 0 if no window has a history, NaN if no position is inside an episode.
 
     Raises:
         KeyError: if the windows lack a key.
@@ -102,31 +104,33 @@ def memory_gain(
     encoded = encoded_windows(policy, windows)
     flat = flat_windows(policy, encoded)
     device, n = flat.loc.device, len(flat)
-    # A network that sees the mean encodes it together with the images.
-    plain = (windows if prior.conditions_network else encoded).to(device)
-    _check_mean(policy, plain)
+    # A network that sees the last actions encodes them together with the images.
+    plain = (windows if sees_history(policy) else encoded).to(device)
+    _check_seen(policy, plain)
     if generator is None:
         generator = torch.Generator(device).manual_seed(0)
     normal = torch.randn(
         n, 1, flat.loc.shape[-1], generator=generator, dtype=flat.loc.dtype, device=device
     )
     direction = torch.nn.functional.normalize(normal, dim=-1)
-    drawn = generator.get_state()
-    observation_key, loc_key, _ = policy.in_keys[:3]
+    state = generator.get_state()
+    history = flat.history
 
     def predicted(shift: float) -> dict[int, Tensor]:
-        generator.set_state(drawn)  # the same noise on both sides
-        loc = flat.loc + shift * flat.warm * direction
-        rows = told_mean(policy, plain.clone(recurse=False).set(loc_key, loc))
+        generator.set_state(state)  # the same noise on both sides
+        rows = seen_anew(
+            policy,
+            plain.clone(recurse=False).set(keys.HISTORY, shifted(history, shift * direction)),
+        )
         rows = encoded_windows(policy, rows).select(*policy.in_keys)
-        a0 = prior.start(loc, flat.warm, generator, rows.get(observation_key))
+        a0 = drawn(policy, rows, generator)
         return {nfe: predict(policy, rows, a0, nfe=nfe, split=split) for nfe in allowed}
 
     with evaluation_mode(policy):
         up, down = predicted(shift), predicted(-shift)
     executed = slice(prior.chunk_length)
     counted = flat.counted[:, executed, 0]
-    followed = counted & flat.warm.any(1)
+    followed = counted & ((history["steps"] > 0) | (history["forecast_steps"] > 0))
     cold = 0.0 if counted.any() else math.nan
     gains = {}
     for nfe in allowed:
@@ -135,15 +139,31 @@ def memory_gain(
     return gains
 
 
-def _check_mean(policy: WarmPriorActor, windows: TensorDictBase) -> None:
-    key = policy.in_keys[0]
-    if not policy.prior.conditions_network:
+def shifted(history: TensorDictBase, by: Tensor) -> TensorDictBase:
+    """A history whose real actions and forecast are moved, ``[*B]``; empty entries stay zero.
+
+    Args:
+        history: ``[*B]``, see :mod:`warmprior.history`.
+        by: ``[*B, n, d_a]``, where ``n`` is 1 or at least the number of actions, whose first are taken.
+    """
+    moved = history.copy()
+    for name, from_end in (("actions", True), ("forecast", False)):
+        entry, steps = history[name], history["steps" if from_end else "forecast_steps"]
+        position = torch.arange(entry.shape[-2], device=entry.device)
+        real = position >= len(position) - steps if from_end else position < steps
+        moved[name] = entry + real.unsqueeze(-1) * by[..., : len(position), :]
+    return moved
+
+
+def _check_seen(policy: WarmPriorActor, windows: TensorDictBase) -> None:
+    if not sees_history(policy):
         return
-    given, made = windows.get(key), told_mean(policy, windows.copy()).get(key)
+    key = policy.in_keys[0]
+    given, made = windows.get(key), seen_anew(policy, windows.copy()).get(key)
     if isinstance(given, TensorDictBase):
         given, made = given.get(keys.STATE), made.get(keys.STATE)
     if given.shape != made.shape or not torch.allclose(given.to(made.dtype), made):
         raise ValueError(
-            f"{key!r} does not end in the windows' mean, as MeanObservation writes it: pass windows of the "
-            "policy's own prior, with images as they are, not encoded"
+            f"{key!r} does not end in the windows' last actions, as HistoryObservation writes them: pass "
+            "windows with images as they are, not encoded"
         )

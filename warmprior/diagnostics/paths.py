@@ -1,4 +1,4 @@
-"""Paths of a policy's flow, and the mean from which they start at deployment."""
+"""Paths of a policy's flow, and the history that they start from at deployment."""
 
 from __future__ import annotations
 
@@ -6,12 +6,20 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from warmprior import keys
 from warmprior.diagnostics.branching import executed_positions
-from warmprior.diagnostics.flow import check_flow, evaluation_mode, field_of, flat_windows
+from warmprior.diagnostics.flow import (
+    check_flow,
+    drawn,
+    evaluation_mode,
+    field_of,
+    flat_windows,
+)
+from warmprior.history import advance
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.ode import integrate
 
-__all__ = ["flow_paths", "forecast_mean"]
+__all__ = ["deployed_history", "flow_paths"]
 
 
 def flow_paths(
@@ -42,9 +50,10 @@ def flow_paths(
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.history import cold_history
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), GaussianPrior(8))
-        >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3), "prior": {
-        ...     "loc": torch.zeros(5, 8, 2), "warm": torch.zeros(5, 8, 1, dtype=torch.bool)}}, [5])
+        >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3),
+        ...                     "history": cold_history([5], 8, 8, action_dim=2)}, [5])
         >>> flow_paths(actor, batch, n_steps=20).shape
         torch.Size([5, 21, 8, 2])
     """
@@ -52,13 +61,13 @@ def flow_paths(
     windows = flat_windows(policy, batch)
     with evaluation_mode(policy):
         generator = policy.sampler.generator if generator is None else generator
-        a0 = policy.prior.sample(windows.loc, windows.warm, generator, windows.observation)
+        a0 = policy.prior.sample(windows.history, windows.observation, generator)
         field = field_of(policy, windows.observation)
         path = integrate(field, a0, nfe=n_steps, return_path=True)
     return path.view(*windows.shape, *path.shape[1:])
 
 
-def forecast_mean(
+def deployed_history(
     policy: WarmPriorActor,
     previous: TensorDictBase,
     *,
@@ -66,15 +75,15 @@ def forecast_mean(
     nfe: int | None = None,
     generator: torch.Generator | None = None,
 ) -> TensorDict:
-    """The mean that deployment meets: made from the policy's own prediction one decision earlier.
+    """The history that deployment meets: made from the policy's own prediction one decision earlier.
 
-    ``batch.update(forecast_mean(policy, previous))`` replaces the training mean of windows by it (and
-    :class:`~warmprior.MeanObservation` makes the observation of a conditioned network anew).
+    ``batch.update(deployed_history(policy, previous))`` replaces that of windows (and
+    :class:`~warmprior.HistoryObservation` makes the observation of a network that sees it anew).
 
     Args:
         policy: the policy.
         previous: windows ``[*B]`` of the decision before each window of interest, that is ``executed``
-            steps earlier in the same episode. Their own mean is the training one.
+            steps earlier in the same episode. Their own history is that of the training.
 
     Keyword Args:
         executed: actions executed between the two; ``H`` by default.
@@ -82,8 +91,7 @@ def forecast_mean(
         generator: source of randomness on the policy's device; the policy's own by default.
 
     Returns:
-        TensorDict ``[*B]`` with ``loc`` ``[*B, P, d_a]`` and ``warm`` ``[*B, P, 1]`` under the policy's
-        keys.
+        TensorDict ``[*B]`` with ``"history"``.
 
     Raises:
         KeyError: if the batch lacks a key.
@@ -93,31 +101,23 @@ def forecast_mean(
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.history import cold_history
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 16), PreviewPrior(8))
-        >>> previous = TensorDict({"observation": torch.zeros(5, 2, 3), "prior": {
-        ...     "loc": torch.zeros(5, 16, 2), "warm": torch.zeros(5, 16, 1, dtype=torch.bool)}}, [5])
-        >>> forecast_mean(actor, previous)["prior", "warm"][0].flatten().sum()
-        tensor(8)
+        >>> previous = TensorDict({"observation": torch.zeros(5, 2, 3),
+        ...                        "history": cold_history([5], 8, 16, action_dim=2)}, [5])
+        >>> deployed_history(actor, previous)["history", "forecast_steps"].flatten().tolist()
+        [8, 8, 8, 8, 8]
     """
     windows = flat_windows(policy, previous)
     prior = policy.prior
     k = executed_positions(prior, executed)
     if k > prior.chunk_length:
         raise ValueError(f"at most H = {prior.chunk_length} actions are executed, got {k}")
-    _, loc_key, warm_key = policy.in_keys[:3]
     data = previous.select(*policy.in_keys).to(windows.loc.device)
     with evaluation_mode(policy):
-        a0 = prior.start(
-            data.get(loc_key),
-            data.get(warm_key),
-            policy.sampler.generator if generator is None else generator,
-            data.get(policy.in_keys[0]),
-        )
-        data.set(policy.ode.in_keys[0], a0)
+        generator = policy.sampler.generator if generator is None else generator
+        data.set(policy.ode.in_keys[0], drawn(policy, data, generator))
         chunk = policy.integrate(data, nfe).get(policy.chunk_key)
         steps = torch.full((*data.batch_size, 1), k, device=chunk.device)
-        # A decision whose own mean is warm lies at least H actions after the reset.
-        elapsed = steps + prior.chunk_length * data.get(warm_key).any(-2)
-        loc, warm = prior.next_mean(data.get(loc_key), chunk, steps, elapsed)
-    result = TensorDict({}, batch_size=data.batch_size, device=chunk.device)
-    return result.set(loc_key, loc).set(warm_key, warm)
+        history = advance(data[keys.HISTORY], chunk, steps)
+    return TensorDict({keys.HISTORY: history}, batch_size=data.batch_size, device=chunk.device)

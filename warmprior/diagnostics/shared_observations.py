@@ -1,16 +1,19 @@
-"""The same observations for every policy, with each policy's own mean."""
+"""The same observations for every policy, with the history that each of them meets."""
 
 from __future__ import annotations
-
-import copy
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.flow import encoded_windows, told_mean
-from warmprior.diagnostics.paths import forecast_mean
+from warmprior.diagnostics.flow import (
+    depends_on_history,
+    encoded_windows,
+    seen_anew,
+    sees_history,
+)
+from warmprior.diagnostics.paths import deployed_history
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.transforms.window import window_transforms
@@ -21,8 +24,7 @@ __all__ = ["SharedObservations"]
 class SharedObservations:
     """Observations from which policies of any prior (of one chunk length) get their windows.
 
-    Only steps with ``H`` earlier ones in their episode are used, so that every history is complete,
-    and nothing is withheld, whatever the prior's ``cold_probability``.
+    Only steps with ``H`` earlier ones in their episode are used, so that every history is complete.
 
     Args:
         data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`. For a fair curvature,
@@ -42,7 +44,7 @@ class SharedObservations:
         >>> from warmprior import PastPrior
         >>> from warmprior.envs import navigation_demonstrations
         >>> shared = SharedObservations(navigation_demonstrations(), 4)  # 6 episodes of 64 steps
-        >>> len(shared), shared.windows(PastPrior(4))["prior", "loc"].shape
+        >>> len(shared), shared.windows(PastPrior(4))["history", "actions"].shape
         (360, torch.Size([360, 4, 1]))
     """
 
@@ -77,12 +79,17 @@ class SharedObservations:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def windows(self, prior: Prior, offset: int = 0) -> TensorDictBase:
-        """Windows with the mean of the training.
+    def windows(
+        self, prior: Prior, offset: int = 0, *, see_history: bool = False
+    ) -> TensorDictBase:
+        """Windows with the history of the training.
 
         Args:
-            prior: whose mean to make.
+            prior: for whose lengths.
             offset: how many steps earlier to cut them, at most ``H``.
+
+        Keyword Args:
+            see_history: whether a network sees the last actions.
 
         Returns:
             Windows ``[n]``, see :class:`~warmprior.ActionWindow`.
@@ -97,16 +104,16 @@ class SharedObservations:
                 f"policies compare at one chunk length only: these observations have H = "
                 f"{self.chunk_length}, {prior} has {prior.chunk_length}"
             )
-        whole = copy.copy(prior)
-        whole.cold_probability = 0.0
-        window = window_transforms(self.data, whole, observation_steps=self.observation_steps)
+        window = window_transforms(
+            self.data, prior, observation_steps=self.observation_steps, see_history=see_history
+        )
         frames = (self.frames - offset).to(self.data[keys.EPISODE].device)
         return window(TensorDict({keys.FRAME: frames}, [len(frames)]))
 
     def deployed(
         self, policy: WarmPriorActor, *, generator: torch.Generator | None = None
     ) -> TensorDictBase:
-        """Windows with the mean that deployment meets: from the policy's own earlier prediction.
+        """Windows with the history that deployment meets: from the policy's own earlier prediction.
 
         Observations with images are encoded, see :func:`encoded_windows`.
 
@@ -114,28 +121,30 @@ class SharedObservations:
             policy: the policy.
 
         Keyword Args:
-            generator: see :func:`forecast_mean`.
+            generator: see :func:`deployed_history`.
         """
-        earlier = encoded_windows(policy, self.windows(policy.prior, offset=self.chunk_length))
-        met = forecast_mean(policy, earlier, generator=generator)
-        windows = self.windows(policy.prior).to(met.device).update(met)
-        return encoded_windows(policy, told_mean(policy, windows))
+        see = sees_history(policy)
+        earlier = self.windows(policy.prior, offset=self.chunk_length, see_history=see)
+        met = deployed_history(policy, encoded_windows(policy, earlier), generator=generator)
+        windows = self.windows(policy.prior, see_history=see).to(met.device).update(met)
+        return encoded_windows(policy, seen_anew(policy, windows))
 
     def met(
         self, policy: WarmPriorActor, *, generator: torch.Generator | None = None
     ) -> TensorDictBase:
-        """Windows as decisions meet them: :meth:`deployed`, if anything of the source is ever warm.
+        """Windows as decisions meet them: :meth:`deployed`, if the policy depends on the history.
 
         Args:
             policy: the policy.
 
         Keyword Args:
-            generator: see :func:`forecast_mean`.
+            generator: see :func:`deployed_history`.
         """
-        windows = self.windows(policy.prior)
-        if windows[keys.WARM].any():
+        see = sees_history(policy)
+        windows = encoded_windows(policy, self.windows(policy.prior, see_history=see))
+        if depends_on_history(policy, windows):
             return self.deployed(policy, generator=generator)
-        return encoded_windows(policy, windows)
+        return windows
 
     def subset(self, index: Tensor) -> SharedObservations:
         """Some of the observations.

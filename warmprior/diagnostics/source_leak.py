@@ -14,6 +14,7 @@ from warmprior import keys
 from warmprior.diagnostics.flow import (
     RunningVariance,
     allowed_nfes,
+    drawn,
     evaluation_mode,
     flat_windows,
     observed,
@@ -196,7 +197,7 @@ def source_leak(
         observation = observed(policy, windows).reshape(n, -1).to(device)
         data_spread = _data_spread(observation, target, counted, episodes.to(device), neighbours)
         for _ in range(draws):
-            a0 = prior.start(flat.loc, flat.warm, generator, flat.observation)
+            a0 = drawn(policy, rows, generator)
             for nfe in allowed:
                 chunk = predict(policy, rows, a0, nfe=nfe, split=split)
                 chunk = moments[nfe].add(chunk[:, :chunk_length])

@@ -12,6 +12,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from warmprior.envs.env_args import delta_conventions
 from warmprior.envs.robosuite import RobosuiteEnv
+from warmprior.keys import CONDITIONED
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.camera_images import CameraImages
@@ -125,6 +126,7 @@ def environment_parts(
         normalizer=None if normalizer is None else normalizer.to("cpu"),
         **adapters,
         observation_steps=description["observation_steps"],
+        see_history=actor.in_keys[0] == CONDITIONED,
         # A guided policy reads what is left of its last chunk.
         delay=None if actor.ode.guidance is None else 0,
     )
@@ -142,7 +144,8 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         ValueError: if the policy keeps no description of one.
 
     Examples:
-        >>> actor = WarmPriorActor.from_pretrained("policy_010000")  # doctest: +SKIP
+        >>> from warmprior.training import load_policy
+        >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> environment_of(actor).rollout(10, actor)["next", "success"].any()  # doctest: +SKIP
         tensor(True)
         >>> from warmprior import PastPrior, VelocityMLP

@@ -14,6 +14,7 @@ from warmprior.experiments.figures import (
     plot_success_bars,
 )
 from warmprior.experiments.labels import prior_color, prior_label, source_labels
+from warmprior.experiments.methods import METHODS, Method
 from warmprior.experiments.navigation1d import (
     NAVIGATION_PRESETS,
     NavigationRecipe,
@@ -62,6 +63,7 @@ from warmprior.experiments.tables import (
 )
 
 __all__ = [
+    "METHODS",
     "NAVIGATION_PRESETS",
     "PRESETS",
     "Comparison",
@@ -72,6 +74,7 @@ __all__ = [
     "EvaluationOptions",
     "HeldOutOptions",
     "MeasuredRecipe",
+    "Method",
     "NavigationRecipe",
     "NetworkOptions",
     "PolicyOptions",

@@ -16,6 +16,7 @@ from warmprior.experiments.labels import prior_label
 from warmprior.experiments.results import Row, read_results
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.behaviour_cloning import policy_path
+from warmprior.training.saved import policy_config
 
 __all__ = ["PolicyResults", "model_card", "policy_results"]
 
@@ -78,7 +79,7 @@ def policy_results(run: str | Path, policy: str | Path) -> PolicyResults:
         >>> from warmprior.experiments import Results
         >>> from warmprior.experiments.results import played
         >>> facts = {"task": "lift", "data": "ph", "seed": 0, "iterations": 20}
-        >>> policy = facts | {"prior": {"name": "past"}, "folder": "lift-ph-past"}
+        >>> policy = facts | {"prior": "past", "folder": "lift-ph-past"}
         >>> meta = {"policies": [policy], "problems": [{"task": "lift", "style": "ph", "steps": 900}]}
         >>> with TemporaryDirectory() as folder:
         ...     run, policies = Path(folder) / "run", Path(folder) / "policies"
@@ -99,7 +100,7 @@ def policy_results(run: str | Path, policy: str | Path) -> PolicyResults:
             "the policy where that run keeps it"
         )
     entry = entries[0]
-    facts = {k: v for k, v in entry.items() if k not in ("prior", "folder")}
+    facts = {k: v for k, v in entry.items() if k not in ("method", "folder")}
     number = folder.name.rpartition("_")[2]
     checkpoint = int(number) if number.isdecimal() else 0
     if policy_path(folder.parent, checkpoint) != folder:
@@ -111,7 +112,7 @@ def policy_results(run: str | Path, policy: str | Path) -> PolicyResults:
     problem: Mapping[str, Any] = next(
         (p for p in meta["problems"] if (p["task"], p["style"]) == asked), {}
     )
-    recipe = facts | {"prior": entry["prior"]["name"], "checkpoint": checkpoint}
+    recipe = facts | {"checkpoint": checkpoint}
     seed = recipe.pop("seed")
     alike = [r for r in rows if recipe.items() <= r.facts.items() and "success_rate" in r.measures]
     return PolicyResults(
@@ -145,7 +146,7 @@ def model_card(
         licence: the hub's name of its licence, such as ``"mit"``.
 
     Raises:
-        TypeError: if the policy cannot be saved, see :meth:`WarmPriorActor.config`.
+        TypeError: if the policy cannot be saved, see :func:`~warmprior.training.check_saveable`.
         ImportError: if there are results, and scipy is not installed.
 
     Examples:
@@ -158,7 +159,11 @@ def model_card(
         license: "mit"
     """
     prior = actor.prior
-    label = prior_label(prior.name, prior.options)
+    label = prior_label(prior.name)
+    if results:
+        label = prior_label(
+            results.training.get("prior", prior.name), results.training.get("options", "")
+        )
     task = results.training["task"] if results else environment_name(actor)
     front = ["library_name: warmprior", "pipeline_tag: robotics"]
     front += [] if licence is None else [f"license: {json.dumps(licence)}"]
@@ -179,7 +184,7 @@ def model_card(
 
 
 def _source_told(actor: WarmPriorActor) -> str:
-    if not actor.prior.is_flow:
+    if actor.ode.max_nfe == 1:
         return "it predicts each chunk of actions in one step."
     return (
         "a flow carries a sample of the source named below to each chunk of actions, after "
@@ -200,7 +205,7 @@ def _code(value: Any) -> str:
 
 def _facts(actor: WarmPriorActor, results: PolicyResults | None) -> list[tuple[str, str]]:
     """What it is, in pairs."""
-    config, prior = actor.config(), actor.prior
+    config, prior = policy_config(actor), actor.prior
     network = dict(config["network"])
     count = sum(p.numel() for p in actor.network.parameters())
     sampler = {k: v for k, v in config["actor"].items() if not k.endswith("_key")}
@@ -273,8 +278,8 @@ def _use(actor: WarmPriorActor, repository: str) -> str:
         if not type(part).__module__.startswith("warmprior.")
     ]
     told = f"It needs classes of its author: import {' and '.join(own)} first.\n\n" if own else ""
-    lines = ["from warmprior import WarmPriorActor"]
-    play = f"actor = WarmPriorActor.from_pretrained({json.dumps(repository)})"
+    lines = ["from warmprior.training import load_policy"]
+    play = f"actor = load_policy({json.dumps(repository)})"
     if environment_name(actor) is None:
         lines += ["", play]
         command = f"python -m warmprior info {repository}"

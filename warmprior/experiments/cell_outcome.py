@@ -10,7 +10,6 @@ import torch
 
 from warmprior.diagnostics.mean_error import mean_revision
 from warmprior.diagnostics.smoothness import smoothness
-from warmprior.modules.prior import Prior
 from warmprior.training.evaluation import Episode
 
 __all__ = ["CellOutcome"]
@@ -29,12 +28,11 @@ class CellOutcome:
     motion: dict[str, float | None]
 
     @classmethod
-    def of(cls, episodes: Sequence[Episode], prior: Prior) -> Self:
+    def of(cls, episodes: Sequence[Episode]) -> Self:
         """Summarise episodes.
 
         Args:
             episodes: in any order.
-            prior: of the policy that played them.
         """
         # Sums depend on the order: that of the seeds, not that in which the episodes ended.
         episodes = sorted(episodes, key=lambda episode: episode.seed)
@@ -47,6 +45,6 @@ class CellOutcome:
             "mean_steps": sum(episode.steps for episode in episodes) / len(episodes),
             "boundary_jump": None if smooth is None else smooth.boundary_jump,
             "inner_jump": None if smooth is None else smooth.inner_jump,
-            "mean_revision": mean_revision(rollout, prior),
+            "mean_revision": mean_revision(rollout),
         }
         return cls([episode.success for episode in episodes], motion)

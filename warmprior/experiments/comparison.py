@@ -13,6 +13,7 @@ import torch
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.experiments.contestant import Contestant
 from warmprior.experiments.labels import source_labels
+from warmprior.experiments.methods import Method
 from warmprior.experiments.outcomes import Outcomes
 from warmprior.experiments.problem import find_problems, observe
 from warmprior.experiments.progress import ComparisonProgress
@@ -38,7 +39,6 @@ from warmprior.io.ray_pool import RayPool
 from warmprior.io.script import PartialFailure
 from warmprior.io.workers import Failure, Pool, WorkerPool, available_cores
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
 
 __all__ = ["Comparison"]
 
@@ -51,7 +51,7 @@ class Comparison:
         study: its name; a folder holds one.
         stores: the problems; those of the recipe by default.
         directory: where the results go; the run's output folder by default.
-        priors: the sources, the baseline first; those of the recipe by default.
+        methods: what is compared, the baseline first; those of the recipe by default.
 
     Attributes:
         contestants: the policies, in order; after a run without those that failed.
@@ -59,7 +59,7 @@ class Comparison:
         failures: what failed in the last run, and why.
 
     Raises:
-        ValueError: if a prior allows none of the NFEs, is longer than every demonstration, rows could not
+        ValueError: if a method allows none of the NFEs, is longer than every demonstration, rows could not
             tell two policies apart, or the folder's results belong to other options.
         OSError: if the folder cannot be written to.
 
@@ -78,7 +78,7 @@ class Comparison:
         ...     recipe = replace(recipe, run=RunOptions(out=Path(folder) / "run", logger="none"))
         ...     stores = [Store.of(recipe, navigation_problem())]
         ...     compared = Comparison(recipe, "navigation", stores=stores)
-        >>> [contestant.prior.name for contestant in compared.contestants]
+        >>> [contestant.method.name for contestant in compared.contestants]
         ['gaussian', 'regression', 'history', 'past', 'past', 'preview', 'preview']
         >>> compared.train()  # in worker processes, one per core  # doctest: +SKIP
     """
@@ -90,13 +90,13 @@ class Comparison:
         *,
         stores: Sequence[Store] | None = None,
         directory: Path | None = None,
-        priors: Sequence[Prior] | None = None,
+        methods: Sequence[Method] | None = None,
     ) -> None:
         self.recipe, self.directory = recipe, directory or recipe.run.directory
-        self.priors = recipe.sources.priors() if priors is None else list(priors)
+        self.methods = recipe.sources.methods() if methods is None else list(methods)
         self.nfes = recipe.evaluation.nfes
-        for prior in self.priors:
-            prior.allowed_nfes(self.nfes)
+        for method in self.methods:
+            method.allowed_nfes(self.nfes)
         check_writable(self.directory)
         if stores is None:
             with leader_first():  # the others find what it has generated, rendered or downloaded
@@ -109,14 +109,14 @@ class Comparison:
         identity = {
             "study": study,
             "recipe": record(recipe),
-            "priors": [prior.config() for prior in self.priors],
+            "methods": [method.config() for method in self.methods],
             "data": [problem.identity for problem in problems],
         }
         meta = {
             **facts_of_machine(**self._hardware, device=recipe.run.device, torch_threads=1),
             "problems": [{"task": p.task, "style": p.style, **p.facts} for p in problems],
             "policies": [
-                c.facts() | {"prior": c.prior.config(), "folder": c.folder.name}
+                c.facts() | {"method": c.method.config(), "folder": c.folder.name}
                 for c in self.contestants
             ],
         }
@@ -131,21 +131,21 @@ class Comparison:
         for store in self.stores:
             longest = int(store.problem.data["episode"].flatten().bincount().max())
             for training in self.recipe.trainings():
-                for prior in self.priors:
-                    if prior.chunk_length > longest:
+                for method in self.methods:
+                    if method.chunk_length > longest:
                         raise ValueError(
-                            f"{prior} predicts more steps than the longest demonstration of "
+                            f"{method} predicts more steps than the longest demonstration of "
                             f"{store.problem.name} has, {longest}: choose a shorter chunk"
                         )
                     for seed in self.recipe.seeds:
                         chosen = replace(training, seed=seed)
-                        contestant = Contestant(store, store.sized(prior), chosen)
+                        contestant = Contestant(store, method, chosen)
                         key = tuple(contestant.facts().values())
                         if told.setdefault(key, contestant.folder) != contestant.folder:
                             raise ValueError(
                                 "rows tell policies apart by their task, prior, options, sigma, chunk "
-                                f"length, iterations and seed: they would not tell {prior} from another "
-                                f"{prior.name}. Compare these in runs of their own"
+                                f"length, iterations and seed: they would not tell {method} from another "
+                                f"{method.name}. Compare these in runs of their own"
                             )
                         found.setdefault(contestant.folder, contestant)
         return list(found.values())
@@ -184,14 +184,14 @@ class Comparison:
         """
         return contestant.policy().replace(grid=self.recipe.evaluation.grid)
 
-    def policies(self) -> dict[str, dict[int, WarmPriorActor]]:
-        """The last policies, by the description of their prior and their training seed.
+    def policies(self) -> dict[Method, dict[int, WarmPriorActor]]:
+        """The last policies, by their method and training seed.
 
-        A prior of which a seed failed is left out: it would not compare with the others.
+        A method of which a seed failed is left out: it would not compare with the others.
         """
-        found: dict[str, dict[int, WarmPriorActor]] = {}
+        found: dict[Method, dict[int, WarmPriorActor]] = {}
         for c in self.contestants:
-            found.setdefault(c.prior.describe(), {})[c.training.seed] = c.policy()
+            found.setdefault(c.method, {})[c.training.seed] = c.policy()
         return {
             name: seeds for name, seeds in found.items() if len(seeds) == len(self.recipe.seeds)
         }
@@ -211,7 +211,7 @@ class Comparison:
             options,
             self.results.meta["problems"][0],
             problem.normalizer,
-            chunk_length=self.priors[0].chunk_length,
+            chunk_length=self.methods[0].chunk_length,
             observation_steps=self.recipe.network.observation_steps,
             device=self.recipe.run.device,
         )
@@ -226,7 +226,7 @@ class Comparison:
         rows = [Row(c.facts(), {}) for c in mine]
         label, curves = source_labels(rows), dict[str, list[Losses]]()
         for c, row in zip(mine, rows, strict=True):
-            curves.setdefault(label(row), []).append(store.train(c.prior, c.training))
+            curves.setdefault(label(row), []).append(store.train(c.method, c.training))
         return curves
 
     @property
@@ -241,7 +241,7 @@ class Comparison:
         It is no part of the results, which are the same on every machine.
         """
         seconds = {
-            tuple(c.facts().values()): c.store.training_seconds(c.prior, c.training)
+            tuple(c.facts().values()): c.store.training_seconds(c.method, c.training)
             for c in self.contestants
         }
         return [
@@ -286,9 +286,9 @@ class Comparison:
             raise PartialFailure("; ".join(self.failures))
 
     def _missing_teachers(self) -> list[Contestant]:
-        """Policies that others learn from (:attr:`Prior.teacher`), where they are not compared themselves."""
+        """Policies that others learn from (:attr:`Method.teacher`), where they are not compared."""
         known = {c.folder for c in self.contestants}
-        taught = (c for c in self.contestants if c.prior.teacher is not None)
+        taught = (c for c in self.contestants if c.method.teacher is not None)
         found = {t.folder: t for t in map(Contestant.teacher, taught) if t.folder not in known}
         return list(found.values())
 
@@ -332,7 +332,7 @@ class Comparison:
                             progress.say(f"FAILED {failed[n]}")
                     elif isinstance(job, Train):
                         schedule.trained(job.number)
-                        chosen.store.note_trained(chosen.prior, chosen.training, result)
+                        chosen.store.note_trained(chosen.method, chosen.training, result)
                         self.results.save()
                         done = "found" if job.number in found else "trained"
                         progress.say(f"{done} {chosen}, {chosen.training.iterations} iterations")
@@ -359,14 +359,14 @@ class Comparison:
         lost = set[Path]()
 
         def place(entry: tuple[int, Contestant]) -> tuple[int, bool]:
-            return entry[1].training.seed, entry[1].prior.teacher is not None
+            return entry[1].training.seed, entry[1].method.teacher is not None
 
         for number, chosen in sorted(enumerate(everyone), key=place):
-            if chosen.prior.teacher is not None and chosen.teacher().folder in lost:
+            if chosen.method.teacher is not None and chosen.teacher().folder in lost:
                 continue  # told with its teacher
             quiet = (lambda iteration: None) if rank() else None
             try:
-                chosen.store.train(chosen.prior, chosen.training, quiet)
+                chosen.store.train(chosen.method, chosen.training, quiet)
             except (FloatingPointError, ValueError) as error:
                 failed[number] = str(error)
                 lost.add(chosen.folder)
@@ -416,7 +416,7 @@ class Comparison:
             teachers={
                 n: numbers[c.teacher().folder]
                 for n, c in enumerate(everyone)
-                if c.prior.teacher is not None
+                if c.method.teacher is not None
             },
             workers=pool.num_workers,
             trainings_at_once=at_once,

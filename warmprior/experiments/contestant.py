@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from warmprior.experiments.condition import Condition
+from warmprior.experiments.methods import Method
 from warmprior.experiments.store import Store
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
 from warmprior.training.behaviour_cloning import policy_path
 from warmprior.training.training_config import TrainingConfig
 
@@ -45,7 +45,7 @@ class Contestant:
 
     Attributes:
         store: where it lies, with its problem.
-        prior: its source distribution.
+        method: what makes it differ from others.
         training: its recipe, with its seed.
 
     See Also:
@@ -53,11 +53,11 @@ class Contestant:
 
     Examples:
         >>> from tempfile import TemporaryDirectory
-        >>> from warmprior import PastPrior
-        >>> from warmprior.experiments import NetworkOptions, navigation_problem
+        >>> from warmprior.experiments import Method, NetworkOptions, navigation_problem
         >>> with TemporaryDirectory() as folder:
         ...     store = Store(navigation_problem(), NetworkOptions(), Path(folder), Path(folder) / "logs")
-        ...     contestant = Contestant(store, PastPrior(4), TrainingConfig(iterations=20, checkpoints=1))
+        ...     training = TrainingConfig(iterations=20, checkpoints=1)
+        ...     contestant = Contestant(store, Method("past", 4), training)
         ...     str(contestant), contestant.path.is_dir()
         ('navigation toy, past, sigma 0.5, H 4, seed 0', False)
         >>> [str(cell) for cell in contestant.cells(nfes=[9, 1], conditions=[Condition()])]
@@ -65,13 +65,13 @@ class Contestant:
     """
 
     store: Store
-    prior: Prior
+    method: Method
     training: TrainingConfig
 
     @property
     def folder(self) -> Path:
         """Where it lies, or will lie."""
-        return self.store.folder(self.prior, self.training)
+        return self.store.folder(self.method, self.training)
 
     @property
     def path(self) -> Path:
@@ -80,15 +80,18 @@ class Contestant:
 
     def policy(self) -> WarmPriorActor:
         """The last policy of averaged weights, trained if it is not yet."""
-        return self.store.policy(self.prior, self.training)
+        return self.store.policy(self.method, self.training)
 
     def __str__(self) -> str:
         problem = self.store.problem
-        return f"{problem.task} {problem.style}, {self.prior.describe()}, seed {self.training.seed}"
+        return (
+            f"{problem.task} {problem.style}, {self.method.describe()}, seed {self.training.seed}"
+        )
 
     def teacher(self) -> Contestant:
-        """The policy that it learns from, see :attr:`Prior.teacher`."""
-        return replace(self, prior=self.store.teacher(self.prior))
+        """The policy that it learns from, see :attr:`Method.teacher`."""
+        assert self.method.teacher is not None
+        return replace(self, method=self.method.teacher)
 
     def facts(self) -> dict[str, Any]:
         """What rows tell of it."""
@@ -96,10 +99,10 @@ class Contestant:
             "task": self.store.problem.task,
             "data": self.store.problem.style,
             **self.store.problem.space,
-            "prior": self.prior.name,
-            "options": self.prior.options,
-            "sigma": float(self.prior.sigma),
-            "chunk": self.prior.chunk_length,
+            "prior": self.method.name,
+            "options": self.method.options,
+            "sigma": self.method.sigma,
+            "chunk": self.method.chunk_length,
             "seed": self.training.seed,
             "iterations": self.training.iterations,
         }
@@ -114,6 +117,6 @@ class Contestant:
         return [
             Cell(checkpoint, nfe, condition)
             for checkpoint in self.training.checkpoint_iterations
-            for nfe in self.prior.allowed_nfes(nfes)
+            for nfe in self.method.allowed_nfes(nfes)
             for condition in conditions
         ]

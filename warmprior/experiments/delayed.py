@@ -8,10 +8,10 @@ from typing import Literal
 
 from warmprior.experiments.condition import Condition
 from warmprior.experiments.labels import source_labels
+from warmprior.experiments.methods import Method
 from warmprior.experiments.problem import Problem, find_problems, navigation_problem
 from warmprior.experiments.recipe import Recipe, check_counts
 from warmprior.experiments.results import Row
-from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.transforms.delay import check_delay
 
@@ -40,8 +40,8 @@ class DelayedRecipe(Recipe):
     Examples:
         >>> from warmprior.experiments import SourceOptions
         >>> recipe = DelayedRecipe(delay=(0, 4), toy="alone", sources=SourceOptions(("past",)))
-        >>> (prior,) = recipe.sources.priors()
-        >>> [(c.delay, c.execute, c.guidance is not None) for c in recipe.conditions(prior)]
+        >>> (method,) = recipe.sources.methods()
+        >>> [(c.delay, c.execute, c.guidance is not None) for c in recipe.conditions(method)]
         [(0, 4, False), (0, 4, True), (4, 4, False), (4, 4, True)]
         >>> DelayedRecipe(delay=(), toy="alone").check()
         Traceback (most recent call last):
@@ -74,33 +74,33 @@ class DelayedRecipe(Recipe):
             raise ValueError("the toy has an end of its own: leave out --play-on, or add --toy no")
         (chunk,) = self.sources.chunk
         check_counts(self, "execute", most=chunk)
-        for prior in self.sources.priors():
-            if not self.conditions(prior):
+        for method in self.sources.methods():
+            if not self.conditions(method):
                 raise ValueError(
-                    f"{prior.name} is no flow to guide: add --guidance none, or leave it out"
+                    f"{method.name} is no flow to guide: add --guidance none, or leave it out"
                 )
-            for condition in self.conditions(prior):
+            for condition in self.conditions(method):
                 delay, execute = condition.delay or 0, condition.execute or 0
                 try:
-                    check_delay(delay, execute, prior.prediction_length)
+                    check_delay(delay, execute, method.prediction_length)
                     if condition.guidance is not None:
-                        condition.guidance.check_delay(delay, prior.prediction_length - execute)
+                        condition.guidance.check_delay(delay, method.prediction_length - execute)
                 except ValueError as error:
                     raise ValueError(
-                        f"--delay {delay} with --execute {execute} and {prior.name}, which predicts "
-                        f"{prior.prediction_length}: {error}"
+                        f"--delay {delay} with --execute {execute} and {method.name}, which predicts "
+                        f"{method.prediction_length}: {error}"
                     ) from error
 
-    def conditions(self, prior: Prior) -> list[Condition]:
+    def conditions(self, method: Method) -> list[Condition]:
         """Every delay, without and with guidance, where there is a flow to guide.
 
         Args:
-            prior: of the policy.
+            method: of the policy.
 
         Examples:
-            >>> from warmprior import GaussianPrior
+            >>> from warmprior.experiments import Method
             >>> recipe = DelayedRecipe(delay=(0, 2), guidance=("none",))
-            >>> [(c.delay, c.execute) for c in recipe.conditions(GaussianPrior(8))]
+            >>> [(c.delay, c.execute) for c in recipe.conditions(Method("gaussian", 8))]
             [(0, 6), (2, 6)]
         """
         execute = self.execute
@@ -111,7 +111,7 @@ class DelayedRecipe(Recipe):
             Condition(delay, execute, guidances[name])
             for delay in sorted(set(self.delay))
             for name in dict.fromkeys(self.guidance)
-            if name == "none" or prior.is_flow
+            if name == "none" or method.is_flow
         ]
 
     def problems(self) -> list[Problem]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from typing import Any
 
+from warmprior.experiments.methods import METHODS, PALETTE
 from warmprior.experiments.results import Row
-from warmprior.modules.prior import Prior
 
 __all__ = [
     "prior_color",
@@ -58,7 +59,7 @@ def with_space(told: str, facts: Row | Mapping[str, Any]) -> str:
 
 
 def source_of(row: Row) -> tuple[str, str]:
-    """Name and options of the prior of a row; earlier versions wrote rows without options.
+    """Name and options of the method of a row.
 
     Examples:
         >>> [source_of(Row({"prior": "past", **told}, {})) for told in ({"options": "leap=2"}, {})]
@@ -68,36 +69,36 @@ def source_of(row: Row) -> tuple[str, str]:
 
 
 def prior_label(name: str, options: str = "") -> str:
-    """What tables and figures call a prior: its own label, or the name where it is not imported.
+    """What tables and figures call a method: its label, or its name where it is a user's own.
 
     Args:
         name: of the prior.
-        options: that are not at their defaults, as :attr:`Prior.options` tells them.
+        options: that are not at their defaults, as :attr:`Method.options` tells them.
 
     See Also:
         - :func:`~warmprior.experiments.prior_color`: its colour.
         - :func:`~warmprior.experiments.source_labels`: tells the rows of a figure apart.
 
     Examples:
-        >>> prior_label("past"), prior_label("past", "correlation=0.5"), prior_label("not imported")
-        ('WP-Past', 'WP-Past, correlation=0.5', 'not imported')
+        >>> prior_label("past"), prior_label("past", "correlation=0.5"), prior_label("Momentum")
+        ('WP-Past', 'WP-Past, correlation=0.5', 'Momentum')
     """
-    prior = Prior.registered().get(name)
-    return ", ".join(filter(None, (name if prior is None else prior.label, options)))
+    return ", ".join(filter(None, (METHODS[name].label if name in METHODS else name, options)))
 
 
-def prior_color(name: str) -> str | None:
-    """The colour of a prior in figures; ``None`` (matplotlib's next) where it is not imported.
+def prior_color(name: str) -> str:
+    """The colour of a method in figures.
 
     See Also:
         :func:`~warmprior.experiments.prior_label`: its name.
 
     Examples:
-        >>> prior_color("past"), prior_color("not imported")
-        ('#1f77b4', None)
+        >>> prior_color("past")
+        '#1f77b4'
     """
-    prior = Prior.registered().get(name)
-    return None if prior is None else prior.color
+    if name in METHODS:
+        return METHODS[name].color
+    return PALETTE[zlib.crc32(name.encode()) % len(PALETTE)]
 
 
 def source_colors(
@@ -124,7 +125,7 @@ def source_colors(
     def color(row: Row) -> Any:
         own, of_prior = prior_color(row["prior"]), variants[row["prior"]]
         place = of_prior.index(source(row))
-        if own is None or place == 0:
+        if place == 0:
             return own
         from matplotlib.colors import to_rgb
 

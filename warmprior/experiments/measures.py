@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 
-from warmprior.diagnostics.flow import encoded_windows
+from warmprior.diagnostics.flow import allowed_nfes, encoded_windows, sees_history
 from warmprior.diagnostics.mean_error import mean_error
 from warmprior.diagnostics.memory_gain import memory_gain
 from warmprior.diagnostics.shared_observations import SharedObservations
@@ -32,6 +32,7 @@ def measure(
     *,
     chunk_length: int,
     observation_steps: int,
+    coupled: bool = False,
 ) -> Measures:
     """Measure a policy on the same observations, and by the same draws, as all others.
 
@@ -43,6 +44,7 @@ def measure(
     Keyword Args:
         chunk_length: ``H``.
         observation_steps: ``To``.
+        coupled: whether the training pairs sources and targets, see :func:`flow_measures`.
 
     Returns:
         By NFE: the error of the policy's mean, its memory gain, its source leak (``None`` where no two
@@ -51,17 +53,18 @@ def measure(
     shared = SharedObservations(data.to("cpu"), chunk_length, observation_steps=observation_steps)
     drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
     shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
-    leaks, windows = {}, shared.windows(policy.prior)
+    leaks = {}
+    windows = shared.windows(policy.prior, see_history=sees_history(policy))
     seen = encoded_windows(policy, windows)
     if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
         leaks = source_leak(policy, seen, nfes=nfes, episodes=shared.episodes)
     generator = torch.Generator().manual_seed(0)
     met = shared.met(policy, generator=generator)
-    allowed = policy.prior.allowed_nfes(nfes)
+    allowed = allowed_nfes(policy, nfes)
     means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
-    shifted = windows if policy.prior.conditions_network else seen
+    shifted = windows if sees_history(policy) else seen
     gains = memory_gain(policy, shifted, nfes=nfes)
-    flow = flow_measures(policy, met, generator=generator)
+    flow = flow_measures(policy, met, coupled=coupled, generator=generator)
 
     def told(nfe: int) -> dict[str, float | None]:
         leak, mean = leaks.get(nfe), means[nfe]

@@ -11,6 +11,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
 from warmprior import keys
+from warmprior.diagnostics.flow import sees_history
 from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.smoothness import executed_actions, smoothness
 from warmprior.envs.navigation1d import NavigationEnv, navigation_metrics, navigation_positions
@@ -37,7 +38,7 @@ class NavigationRecipe(Recipe):
     Examples:
         >>> from dataclasses import replace
         >>> recipe = NAVIGATION_PRESETS["quick"]
-        >>> recipe.name, len(recipe.sources.priors())
+        >>> recipe.name, len(recipe.sources.methods())
         ('h4', 7)
         >>> replace(recipe, sources=SourceOptions(chunk=(40,))).check()
         Traceback (most recent call last):
@@ -63,12 +64,13 @@ class NavigationRecipe(Recipe):
             raise ValueError(f"--chunk must be between 1 and {steps}, got {self.sources.chunk[0]}")
 
 
+WITHHELD = 0.1
+"""The paper's Algorithm 1 withholds no history; see PreviewPrior for why small sigma needs it."""
+
 _SOURCES = SourceOptions(
     prior=("gaussian", "regression", "history", "past", "preview"),
     chunk=(4,),
     sigma=(0.1, 0.5),
-    # The paper's Algorithm 1 withholds no mean; see PreviewPrior for why small sigma needs it.
-    cold_probability=0.1,
 )
 _EVALUATION = EvaluationOptions(episodes=256, nfe=(9, 1))
 
@@ -83,6 +85,7 @@ NAVIGATION_PRESETS: dict[str, NavigationRecipe] = {
             warmup_ratio=0.0,
             checkpoints=1,
             save_every=3_000,
+            cold_probability=WITHHELD,
         ),
         sources=_SOURCES,
         evaluation=_EVALUATION,
@@ -90,7 +93,9 @@ NAVIGATION_PRESETS: dict[str, NavigationRecipe] = {
     # The paper's network and iterations: hours on a CPU.
     "wide": NavigationRecipe(
         network=NetworkOptions(hidden_dim=1024, observation_steps=1),
-        training=TrainingConfig(iterations=50_000, batch_size=256, checkpoints=1),
+        training=TrainingConfig(
+            iterations=50_000, batch_size=256, checkpoints=1, cold_probability=WITHHELD
+        ),
         sources=_SOURCES,
         evaluation=_EVALUATION,
     ),
@@ -127,7 +132,9 @@ def play_navigation(
         torch.Size([2, 16])
     """
     generator = torch.Generator().manual_seed(seed)
-    transforms = policy_transforms(actor.prior, observation_steps=1)
+    transforms = policy_transforms(
+        actor.prior, observation_steps=1, see_history=sees_history(actor)
+    )
     env = TransformedEnv(NavigationEnv(batch_size=[rollouts]), transforms)
     player = actor.replace(nfe=nfe, generator=generator)
     policy = HistoryShift(player, shift, generator=generator) if shift else player

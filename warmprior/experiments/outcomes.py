@@ -36,7 +36,7 @@ class Outcomes:
         self._whole_cells = whole_cells
         self._contestants, self._options = contestants, recipe.evaluation
         nfes = self._options.nfes
-        self._cells = [c.cells(nfes, recipe.conditions(c.prior)) for c in contestants]
+        self._cells = [c.cells(nfes, recipe.conditions(c.method)) for c in contestants]
         self._episodes: dict[tuple[int, Cell], list[Episode]] = {}
         self._played: dict[tuple[int, Cell], CellOutcome] = {}
         self._measures: dict[int, Measures] = {}
@@ -80,8 +80,7 @@ class Outcomes:
             episodes = self._episodes.setdefault((number, job.cell), [])
             episodes.append(outcome)
             if len(episodes) == self._options.episodes:
-                prior = self._contestants[number].prior
-                self._played[number, job.cell] = CellOutcome.of(episodes, prior)
+                self._played[number, job.cell] = CellOutcome.of(episodes)
                 del self._episodes[number, job.cell]
         return self._complete(number)
 

@@ -25,9 +25,7 @@ from warmprior.experiments.recipe import (
 )
 from warmprior.experiments.record import refuse_ignored
 from warmprior.experiments.store import finished_problem
-from warmprior.io.options import LATER
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
 from warmprior.rl import PriorAnchor, PriorSpaceConfig
 from warmprior.training.evaluation import parallel_env
 from warmprior.transforms import EncodeObservation, policy_transforms
@@ -78,7 +76,7 @@ class GroupOptions:
     base_delta: float | None = None
     num_envs: int = 4
     threads: int | None = None
-    collectors: int | None = field(default=None, metadata=LATER)
+    collectors: int | None = None
 
     def __post_init__(self) -> None:
         check_counts(self, "horizon", "num_envs", "threads")
@@ -137,26 +135,25 @@ class PriorSpaceRecipe(Recipe):
             self.data.check()
             self.check_observations()
         configs: dict[tuple[str, str], dict[str, Any]] = {}
-        for prior in self.sources.priors():
-            same = configs.setdefault((prior.name, prior.options), prior.config())
-            if same != prior.config():
+        for method in self.sources.methods():
+            same = configs.setdefault((method.name, method.options), method.config())
+            if same != method.config():
                 raise ValueError(
-                    "agents are told apart by the name and options of their prior, but for sigma and "
-                    f"cold_probability: they would not tell {prior} from another {prior.name}. Compare "
-                    "these in runs of their own"
+                    "agents are told apart by the name and options of their method, but for sigma: they "
+                    f"would not tell {method} from another {method.name}. Compare these in runs of their own"
                 )
-            if not prior.is_flow:
+            if not method.is_flow:
                 raise ValueError(
-                    f"--prior {prior.name} is no flow: there is no source space to act in"
+                    f"--prior {method.name} is no flow: there is no source space to act in"
                 )
             for algorithm in self.agents.algorithm:
-                self.agent(prior, algorithm, 0)
+                self.agent(method.has_anchor, algorithm, 0)
 
-    def agent(self, prior: Prior, algorithm: str, seed: int) -> PriorSpaceConfig:
+    def agent(self, anchored: bool, algorithm: str, seed: int) -> PriorSpaceConfig:
         """The recipe of one agent.
 
         Args:
-            prior: of its frozen policy.
+            anchored: whether its frozen policy has an anchor, see :func:`~warmprior.rl.has_anchor`.
             algorithm: of its learning.
             seed: its seed.
 
@@ -171,7 +168,7 @@ class PriorSpaceRecipe(Recipe):
             "evaluation_episodes": self.evaluation.episodes,
             "backup_entropy": shared["backup_entropy"] or algorithm == "dsrl-sac",
         }
-        if shared["delta"] is None and not prior.moves_source:
+        if shared["delta"] is None and not anchored:
             own["delta"] = self.agents.base_delta
         return PriorSpaceConfig(**{**shared, **own})
 
@@ -206,7 +203,7 @@ def _encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
 
 def _toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
     transforms = policy_transforms(actor.prior, observation_steps=1)
-    transforms.append(PriorAnchor(actor.prior, seed=seed))
+    transforms.append(PriorAnchor(actor, seed=seed))
     return TransformedEnv(GoalNavigationEnv(batch_size=[num_envs]), transforms)
 
 
@@ -215,7 +212,7 @@ def _simulators(
 ) -> EnvBase:
     # Outside of the workers: one anchor draws for all of them, and one encoder serves them.
     workers = parallel_env(make_env, make_transforms, num_envs)
-    env = TransformedEnv(workers, Compose(*_encoding(actor), PriorAnchor(actor.prior, seed=seed)))
+    env = TransformedEnv(workers, Compose(*_encoding(actor), PriorAnchor(actor, seed=seed)))
     env.set_seed(seed, static_seed=True)
     return env
 

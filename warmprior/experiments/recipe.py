@@ -15,9 +15,9 @@ from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
 from warmprior.experiments.condition import AT_ONCE, Condition
+from warmprior.experiments.methods import Method
 from warmprior.io.distributed import check_batch, check_device, launched
 from warmprior.io.extras import require
-from warmprior.io.options import LATER
 from warmprior.modules import (
     ChiTransformer,
     ImageEncoder,
@@ -28,7 +28,6 @@ from warmprior.modules import (
     load_imagenet,
 )
 from warmprior.modules.grid import check_grid
-from warmprior.modules.prior import Prior
 from warmprior.training.training_config import TrainingConfig
 
 __all__ = [
@@ -72,15 +71,15 @@ GENERATED = 150
 """Scripted demonstrations, where no other number is asked for."""
 
 
-def check_images(prior: Prior) -> None:
-    """Refuse a prior that cannot go with observations that have images.
+def check_images(method: Method) -> None:
+    """Refuse a method that cannot go with observations that have images.
 
     Raises:
         ValueError: naming it.
     """
-    if prior.needs_vector:
+    if method.needs_vector:
         raise ValueError(
-            f"{prior.name} reads observations that are one vector: leave it out with --obs image"
+            f"{method.name} reads observations that are one vector: leave it out with --obs image"
         )
 
 
@@ -123,11 +122,11 @@ class DataOptions:
     download: bool = False
     force_download: bool = False
     demonstrations: tuple[int, ...] = ()
-    actions: Literal["delta", "absolute"] = field(default="delta", metadata=LATER)
-    obs: Literal["state", "image"] = field(default="state", metadata=LATER)
-    cameras: tuple[str, ...] = field(default=(), metadata=LATER)
-    image_size: int = field(default=84, metadata=LATER)
-    fast_rendering: bool = field(default=False, metadata=LATER)
+    actions: Literal["delta", "absolute"] = "delta"
+    obs: Literal["state", "image"] = "state"
+    cameras: tuple[str, ...] = ()
+    image_size: int = 84
+    fast_rendering: bool = False
 
     def __post_init__(self) -> None:
         check_counts(self, "demonstrations", "image_size")
@@ -234,11 +233,9 @@ class NetworkOptions:
     hidden_dim: int | None = None
     precondition: bool = True
     observation_steps: int = 2
-    encoder: Literal["resnet18-imagenet", "resnet18", "small"] = field(
-        default="resnet18-imagenet", metadata=LATER
-    )
-    crop_size: int = field(default=76, metadata=LATER)
-    share_encoder: bool = field(default=False, metadata=LATER)
+    encoder: Literal["resnet18-imagenet", "resnet18", "small"] = "resnet18-imagenet"
+    crop_size: int = 76
+    share_encoder: bool = False
 
     def __post_init__(self) -> None:
         check_counts(self, "hidden_dim", "observation_steps", "crop_size")
@@ -287,7 +284,7 @@ class NetworkOptions:
 
 @dataclass(frozen=True)
 class SourceOptions:
-    """The source distributions to compare.
+    """The methods to compare.
 
     Attributes:
         prior: by name (gaussian, past, preview, forecast, history, regression, ot, reflow, step, cvae, a2a,
@@ -295,7 +292,6 @@ class SourceOptions:
             follow as in preview,correlation=0.5. Gains are over the first.
         chunk: chunk lengths H.
         sigma: residual noise of the warm priors, one policy each (default: past 0.5, preview 1.0).
-        cold_probability: share of training samples without a mean; the paper's Algorithm 1 has none.
 
     See Also:
         - :class:`~warmprior.Prior`: the class of one of your own.
@@ -303,7 +299,7 @@ class SourceOptions:
 
     Examples:
         >>> options = SourceOptions(("gaussian", "preview,correlation=0.5"), chunk=(8, 4))
-        >>> [(prior.label, prior.options, prior.chunk_length) for prior in options.priors()]
+        >>> [(method.label, method.options, method.chunk_length) for method in options.methods()]
         [('Base', '', 4), ('WP-Preview', 'correlation=0.5', 4),
          ('Base', '', 8), ('WP-Preview', 'correlation=0.5', 8)]
         >>> SourceOptions(("gaussian",), sigma=(0.5,)).check_sigma()
@@ -315,7 +311,6 @@ class SourceOptions:
     prior: tuple[str, ...] = ("gaussian", "past", "preview")
     chunk: tuple[int, ...] = (8,)
     sigma: tuple[float, ...] = ()
-    cold_probability: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("prior", "chunk"):
@@ -328,24 +323,24 @@ class SourceOptions:
         Raises:
             ValueError: naming them.
         """
-        if self.sigma and not any(Prior.find(name).takes("sigma") for name in self.prior):
+        if self.sigma and not any(Method.takes(name, "sigma") for name in self.prior):
             raise ValueError(f"--sigma belongs to warm priors; {', '.join(self.prior)} take none")
 
-    def priors(self) -> list[Prior]:
+    def methods(self) -> list[Method]:
         """All of them, chunk length by chunk length.
 
         Raises:
-            ValueError: if there is no such prior, or an argument is out of range.
+            ValueError: if there is no such method, or an argument is out of range.
 
         Examples:
-            >>> [p.describe() for p in SourceOptions(("gaussian", "past"), sigma=(1.0, 0.5)).priors()]
+            >>> [m.describe() for m in SourceOptions(("gaussian", "past"), sigma=(1.0, 0.5)).methods()]
             ['gaussian, sigma 1, H 8', 'past, sigma 1, H 8', 'past, sigma 0.5, H 8']
         """
         check_counts(self, "chunk")
         names = dict.fromkeys(self.prior)
-        noisy = {name: Prior.find(name).takes("sigma") for name in names}
+        noisy = {name: Method.takes(name, "sigma") for name in names}
         return [
-            Prior.make(name, chunk, sigma=sigma, cold_probability=self.cold_probability)
+            Method.parse(name, chunk, sigma=sigma)
             for chunk in sorted(set(self.chunk))
             for name in names
             for sigma in (dict.fromkeys(self.sigma) if noisy[name] and self.sigma else (None,))
@@ -383,7 +378,7 @@ class EvaluationOptions:
     nfe: tuple[int, ...] = (9, 3, 1)
     top_k: int = 1
     play_on: bool = False
-    grid: str = field(default="uniform", metadata=LATER)
+    grid: str = "uniform"
 
     def __post_init__(self) -> None:
         check_counts(self, "seeds", most=1_000)
@@ -580,23 +575,21 @@ class Recipe:
             )
         check_batch(self.training.batch_size)
         self.check_observations()
-        priors, played = self.sources.priors(), set[int]()
-        for prior in priors:
-            played.update(prior.allowed_nfes(self.evaluation.nfes))
-            self.training.check_prior(prior)
-            if self.training.batch_size < prior.least_batch:
-                raise ValueError(
-                    f"{prior.name} pairs within a batch: --batch-size must be at least {prior.least_batch}"
-                )
-        # Those of teachers count: a policy that is no flow may learn from one that is.
-        if self.training.times != "uniform" and not any(p.is_flow or p.teacher for p in priors):
+        methods, played = self.sources.methods(), set[int]()
+        for method in methods:
+            played.update(method.allowed_nfes(self.evaluation.nfes))
+            if not method.is_flow:
+                replace(self.training, times="start")  # refuses what needs a flow
+            if method.name == "ot" and self.training.batch_size < 2:
+                raise ValueError("ot pairs within a batch: --batch-size must be at least 2")
+        if self.training.times != "uniform" and not any(m.is_flow for m in methods):
             raise ValueError(
-                f"--times has no effect on {', '.join(dict.fromkeys(p.name for p in priors))}, trained at "
-                "t = 0 alone: leave it out, or add a prior that is a flow"
+                f"--times has no effect on {', '.join(dict.fromkeys(m.name for m in methods))}, trained at "
+                "t = 0 alone: leave it out, or add a method that is a flow"
             )
         if self.evaluation.grid != "uniform" and played == {1}:
             raise ValueError(
-                "--grid has no effect at NFE 1, which is one step on every grid, and these priors are "
+                "--grid has no effect at NFE 1, which is one step on every grid, and these methods are "
                 "evaluated at no other: leave it out"
             )
 
@@ -623,8 +616,8 @@ class Recipe:
             raise ValueError(
                 f"--crop-size {network.crop_size} does not fit into --image-size {size}, or is below 8"
             )
-        for prior in self.sources.priors():
-            check_images(prior)
+        for method in self.sources.methods():
+            check_images(method)
         if network.encoder == PRETRAINED:
             imagenet_weights()
         elif network.encoder != "small":
@@ -660,11 +653,11 @@ class Recipe:
             if len(values) > 1:
                 raise ValueError(f"this study has one --{name}, got {' '.join(map(str, values))}")
 
-    def conditions(self, prior: Prior) -> list[Condition]:
+    def conditions(self, method: Method) -> list[Condition]:
         """How policies are played, each a cell of its own.
 
         Args:
-            prior: of the policy.
+            method: of the policy.
         """
         return [AT_ONCE]
 

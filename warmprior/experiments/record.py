@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from warmprior.data.opening import resolved_place
 from warmprior.experiments.recipe import Flat, Recipe
-from warmprior.io.options import identity_of, variations
 
 __all__ = ["differences", "record", "refuse_ignored", "restore", "variation_notes"]
 
@@ -21,7 +20,7 @@ CHANGEABLE = {"run": ("envs", "logger")}
 
 
 def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
-    """A recipe as JSON holds it: what it is identified by, see :func:`~warmprior.io.options.identity_of`.
+    """A recipe as JSON holds it: what it is identified by.
 
     Args:
         recipe: a :class:`Recipe`, or a part of one.
@@ -43,7 +42,7 @@ def record(recipe: Any, *, changeable: bool = False) -> dict[str, Any]:
         # The same file from another working directory.
         return resolved_place(value) if isinstance(value, Path) else value
 
-    tree = plain(identity_of(recipe))
+    tree = plain(asdict(recipe))
     if not isinstance(recipe, Recipe):
         return tree
     for left_out in (OF_A_START,) if changeable else (OF_A_START, CHANGEABLE):
@@ -152,22 +151,52 @@ def refuse_ignored(
         raise ValueError(f"{told}: leave out {options}")
 
 
+BESIDE_THE_PAPER = (
+    "actions",
+    "obs",
+    "cameras",
+    "image_size",
+    "fast_rendering",
+    "encoder",
+    "crop_size",
+    "share_encoder",
+    "times",
+    "objective",
+    "weighting",
+    "self_distillation",
+    "precision",
+    "grid",
+)
+"""Options that tables name where they are not at their defaults."""
+
+
+def _variations(recipe: Any) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for f in fields(recipe):
+        value = getattr(recipe, f.name)
+        if is_dataclass(value):
+            found |= _variations(value)
+        elif f.name in BESIDE_THE_PAPER and value != f.default:
+            found[f.name] = value
+    return found
+
+
 def variation_notes(recipe: Any, paper: Any = None) -> list[str]:
     """What tables say of options beside the paper's recipe, if there are any.
 
     Args:
         recipe: of all rows of the table.
-        paper: the paper's, if it has later options itself.
+        paper: the paper's, if it has such options itself.
 
     Examples:
         >>> from warmprior.experiments import EvaluationOptions, Recipe
         >>> variation_notes(Recipe(evaluation=EvaluationOptions(grid="dense-jump")))
         ['- Beside the paper, for all sources: --grid dense-jump.']
     """
-    theirs = {} if paper is None else variations(paper)
+    theirs = {} if paper is None else _variations(paper)
     given = [
         f"--{name.replace('_', '-')} {value}"
-        for name, value in variations(recipe).items()
+        for name, value in _variations(recipe).items()
         if theirs.get(name) != value
     ]
     return [f"- Beside the paper, for all sources: {', '.join(given)}."] if given else []

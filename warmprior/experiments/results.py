@@ -8,7 +8,7 @@ import os
 import platform
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -333,8 +333,6 @@ def _read_rows(records: Sequence[Any]) -> list[Row]:
             if set(stored) | {"outcomes"} != {"facts", "measures", "outcomes"}:
                 raise ValueError(f"it has {sorted(stored)} instead of facts and measures")
             row = Row(**stored)
-            if "prior" in row.facts:  # rows from before there were options have none
-                row = replace(row, facts={**row.facts, "options": row.facts.get("options", "")})
             _check(row)
         except (AttributeError, TypeError, ValueError) as error:
             raise ValueError(f"row {i}: {error}") from error

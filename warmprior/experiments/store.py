@@ -7,24 +7,23 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
 from torchrl.record.loggers import get_logger
 
+from warmprior.experiments.learned_sources import Learner, learn
+from warmprior.experiments.methods import Method
 from warmprior.experiments.problem import Problem
 from warmprior.experiments.recipe import NetworkOptions, Recipe, RunOptions, check_images
 from warmprior.io.distributed import leader_first, mean_over_processes, rank, world_size
 from warmprior.io.files import check_writable, digest_of, read_json, write_atomic
-from warmprior.io.options import identity_of
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.learned import LearnedPrior
-from warmprior.modules.prior import Prior
+from warmprior.objectives.couplings import Coupling
 from warmprior.training.behaviour_cloning import (
     STATE_FORMAT,
     BehaviourCloning,
@@ -40,10 +39,10 @@ from warmprior.training.checkpoint import (
     save_state,
 )
 from warmprior.training.placement import placed
-from warmprior.training.prior_learning import learn_prior
+from warmprior.training.saved import load_policy
 from warmprior.training.threads import torch_threads
 from warmprior.training.training_config import TrainingConfig
-from warmprior.transforms import MeanObservation, policy_transforms
+from warmprior.transforms import policy_transforms
 
 __all__ = ["Store", "finished_policies", "finished_problem"]
 
@@ -80,14 +79,13 @@ class Store:
 
     Examples:
         >>> from tempfile import TemporaryDirectory
-        >>> from warmprior import PastPrior
-        >>> from warmprior.experiments import navigation_problem
+        >>> from warmprior.experiments import Method, navigation_problem
         >>> options, run = NetworkOptions(hidden_dim=8, observation_steps=1), RunOptions(logger="none")
-        >>> prior, training = PastPrior(4), TrainingConfig(iterations=4, batch_size=8, log_every=2)
+        >>> method, training = Method("past", 4), TrainingConfig(iterations=4, batch_size=8, log_every=2)
         >>> with TemporaryDirectory() as folder:
         ...     store = Store(navigation_problem(), options, Path(folder), Path(folder) / "logs", run)
-        ...     losses = store.train(prior, training, progress=lambda iterations: None)
-        ...     store.folder(prior, training).name, store.load(prior, training).prior.name
+        ...     losses = store.train(method, training, progress=lambda iterations: None)
+        ...     store.folder(method, training).name, store.load(method, training).prior.name
         ('navigation-toy-past-seed0-...', 'past')
         >>> [iteration for iteration, loss in losses]
         [2, 4]
@@ -119,46 +117,46 @@ class Store:
         out = recipe.run.directory
         return cls(problem, recipe.network, out.parent / "policies", out / "logs", recipe.run)
 
-    def sized(self, prior: Prior) -> Prior:
-        """A prior for the widths of this problem, see :meth:`Prior.sized`.
-
-        Raises:
-            ValueError: if it reads observation vectors, and the problem's have images.
-        """
+    def _widths(self, method: Method) -> tuple[int, int, int]:
+        """``d_a``, ``d_o`` of what the network sees, without the images, and ``To``."""
         if self.problem.images:
-            check_images(prior)
-        return prior.sized(*self._widths(prior), self.network.observation_steps)
-
-    def _widths(self, prior: Prior) -> tuple[int, int]:
-        """``d_a``, and ``d_o`` of what the network sees; without the images."""
+            check_images(method)
         action_dim = self.problem.data["action"].shape[-1]
-        width = self.problem.vector.shape[-1]
-        return action_dim, width + MeanObservation.width(prior, action_dim)
+        seen = self.problem.vector.shape[-1] + method.extra_width(action_dim)
+        return action_dim, seen, self.network.observation_steps
 
-    def new_actor(self, prior: Prior, training: TrainingConfig) -> WarmPriorActor:
+    def new_actor(self, method: Method, training: TrainingConfig) -> WarmPriorActor:
         """A policy whose flow is untrained; its initial weights depend on the seed alone.
 
-        What the prior needs before is done: it learns, or its teacher is trained.
+        What the method needs before is done: a part learns, or its teacher is trained.
 
         Args:
-            prior: its source distribution.
+            method: what makes it differ from others.
             training: its recipe, with its seed.
         """
-        prior, problem = self._prepared(self.sized(prior), training), self.problem
+        problem, steps = self.problem, self.network.observation_steps
+        widths = self._widths(method)
+        prior, start = method.prior(widths), method.start(widths)
+        for part in (prior, start):
+            if isinstance(part, Learner):
+                with leader_first():
+                    self._learn(part, method, training)
         torch.manual_seed(training.seed)
-        network = self.network.make(*self._widths(prior), prior.prediction_length, problem.images)
+        network = self.network.make(*widths[:2], prior.prediction_length, problem.images)
         if self.network.precondition:
-            steps = self.network.observation_steps
             network = precondition(
                 network,
                 problem.data,
                 prior,
                 observation_steps=steps,
+                coupling=self.coupling(method, training),
+                withhold=training.cold_probability,
                 rest=copy.deepcopy(problem.rest),
             )
-        actor = WarmPriorActor(
+        actor = method.actor(
             network,
             prior,
+            start,
             # A copy: the policy moves to the device, the environments' normaliser stays on the CPU.
             normalizer=copy.deepcopy(problem.normalizer),
             clip=problem.clip,
@@ -166,52 +164,47 @@ class Store:
         )
         return actor.to(self.run.device)
 
-    def _prepared(self, prior: Prior, training: TrainingConfig) -> Prior:
-        if isinstance(prior, nn.Module):  # it learns: every policy has its own
-            prior = Prior.from_config(prior.config())
-        if isinstance(prior, LearnedPrior):
-            with leader_first():
-                self._learn(prior, training)
-        if prior.teacher is not None:
-            prior = prior if isinstance(prior, nn.Module) else copy.copy(prior)
-            prior.learn_from(self.policy(self.teacher(prior), training))
-        return prior
+    def coupling(self, method: Method, training: TrainingConfig) -> Coupling | None:
+        """How a method pairs sources and targets, its teacher trained if it is not yet.
 
-    def teacher(self, prior: Prior) -> Prior:
-        """The prior whose policy teaches another one, see :attr:`Prior.teacher`."""
-        assert prior.teacher is not None
-        return Prior.make(prior.teacher, prior.chunk_length)
+        Args:
+            method: what makes it differ from others.
+            training: its recipe, with its seed.
+        """
+        teacher = None if method.teacher is None else self.policy(method.teacher, training)
+        return method.coupling(teacher)
 
-    def _learn(self, prior: LearnedPrior, training: TrainingConfig) -> None:
-        """Let a prior learn, or take what it learnt when the training was begun."""
-        path = self.folder(prior, training) / "prior.safetensors"
+    def _learn(self, learner: Learner, method: Method, training: TrainingConfig) -> None:
+        """Let a part learn, or take what it learnt when the training was begun."""
+        path = self.folder(method, training) / "learner.safetensors"
         if path.exists():
             tensors, facts = load_state(path)
-            check_identity(path, facts, prior.config())
+            check_identity(path, facts, method.config())
             with restoring(path):
-                restore_module(prior, tensors)
+                restore_module(learner, tensors)
             return
-        learn_prior(
-            prior,
+        learn(
+            learner,
             self.problem.data,
             iterations=max(1, round(LEARNING_SHARE * training.iterations)),
             observation_steps=self.network.observation_steps,
+            withhold=training.cold_probability,
             seed=training.seed,
         )
-        save_state(path, module_tensors(prior), prior.config())
+        save_state(path, module_tensors(learner), method.config())
 
-    def folder(self, prior: Prior, training: TrainingConfig) -> Path:
+    def folder(self, method: Method, training: TrainingConfig) -> Path:
         """Where a policy lies, or will lie.
 
         Args:
-            prior: its source distribution.
+            method: what makes it differ from others.
             training: its recipe, with its seed.
         """
         digest = digest_of(
             self.problem.identity,
-            identity_of(training),
-            self.sized(prior).config(),
-            identity_of(self.network if self.problem.images else self.network.without_images()),
+            asdict(training),
+            method.config(),
+            asdict(self.network if self.problem.images else self.network.without_images()),
             self.run.device,
             self.run.compile,
             version("torch"),
@@ -219,11 +212,11 @@ class Store:
             STATE_FORMAT,
         )
         task, style = self.problem.task, self.problem.style
-        return self.directory / f"{task}-{style}-{prior.name}-seed{training.seed}-{digest[:10]}"
+        return self.directory / f"{task}-{style}-{method.name}-seed{training.seed}-{digest[:10]}"
 
     def train(
         self,
-        prior: Prior,
+        method: Method,
         training: TrainingConfig,
         progress: Callable[[int], object] | None = None,
     ) -> Losses:
@@ -234,7 +227,7 @@ class Store:
         a GPU of its own.
 
         Args:
-            prior: its source distribution.
+            method: what makes it differ from others.
             training: its recipe, with its seed.
             progress: called with the number of iterations after each; a bar if ``None``.
 
@@ -244,10 +237,10 @@ class Store:
         Raises:
             FloatingPointError: if the loss becomes NaN or infinite.
         """
-        folder = self.folder(prior, training)
+        folder = self.folder(method, training)
         if folder not in self._losses:
-            if prior.teacher is not None:
-                self.train(self.teacher(prior), training, progress)
+            if method.teacher is not None:
+                self.train(method.teacher, training, progress)
             logger = None if rank() else self._logger(folder.name)
             started, known = time.process_time(), policy_path(folder, training.iterations).is_dir()
             on_cpu = torch.device(self.run.device).type == "cpu"
@@ -256,16 +249,18 @@ class Store:
                 # A worker process ends without the exit handlers that some loggers write in.
                 nullcontext() if logger is None else closing(logger),
             ):
+                own = training if method.is_flow else replace(training, times="start")
                 cloning = BehaviourCloning(
-                    self.new_actor(prior, training),
+                    self.new_actor(method, training),
                     placed(self.problem.data, self.run.device),
-                    training,
+                    own,
                     folder,
                     observation_steps=self.network.observation_steps,
+                    coupling=self.coupling(method, training),
                     logger=logger,
                     compile=self.run.compile,
                 )
-                told = f"train {prior.describe()}, seed {training.seed}"
+                told = f"train {method.describe()}, seed {training.seed}"
                 whole = cloning.iteration == 0
                 cloning.run(told if progress is None else None, progress)
             used = torch.tensor(time.process_time() - started, dtype=torch.float64)
@@ -273,67 +268,68 @@ class Store:
             if whole and not known and not rank():
                 text = json.dumps({"seconds": seconds}) + "\n"
                 write_atomic(folder / TIME, lambda path: path.write_text(text))
-            self.note_trained(prior, training, cloning.losses)
+            self.note_trained(method, training, cloning.losses)
         return self._losses[folder]
 
-    def training_seconds(self, prior: Prior, training: TrainingConfig) -> float | None:
-        """Processor time of a policy's training, with what its prior learnt and its teacher's training.
+    def training_seconds(self, method: Method, training: TrainingConfig) -> float | None:
+        """Processor time of a policy's training, with what learnt before it and its teacher's training.
 
         Args:
-            prior: its source distribution.
+            method: what makes it differ from others.
             training: its recipe.
 
         Returns:
             ``None`` if it is not trained, or was not in one go.
         """
-        path = self.folder(prior, training) / TIME
+        path = self.folder(method, training) / TIME
         mine = read_json(path)["seconds"] if path.is_file() else None
-        if mine is None or prior.teacher is None:
+        if mine is None or method.teacher is None:
             return mine
-        teachers = self.training_seconds(self.teacher(prior), training)
+        teachers = self.training_seconds(method.teacher, training)
         return None if teachers is None else mine + teachers
 
-    def note_trained(self, prior: Prior, training: TrainingConfig, losses: Losses) -> None:
+    def note_trained(self, method: Method, training: TrainingConfig, losses: Losses) -> None:
         """Take note of a policy that another process trained.
 
         Args:
-            prior: its source distribution.
+            method: what makes it differ from others.
             training: its recipe.
             losses: what :meth:`train` returned there.
         """
-        self._losses[self.folder(prior, training)] = losses
+        self._losses[self.folder(method, training)] = losses
 
-    def policy(self, prior: Prior, training: TrainingConfig) -> WarmPriorActor:
+    def policy(self, method: Method, training: TrainingConfig) -> WarmPriorActor:
         """The last policy of averaged weights, trained if it is not yet, on the run's device.
 
         Args:
-            prior: its source distribution.
+            method: what makes it differ from others.
             training: its recipe.
         """
-        self.train(prior, training)
-        return self.load(prior, training).to(self.run.device)
+        self.train(method, training)
+        return self.load(method, training).to(self.run.device)
 
     def load(
-        self, prior: Prior, training: TrainingConfig, checkpoint: int | None = None
+        self, method: Method, training: TrainingConfig, checkpoint: int | None = None
     ) -> WarmPriorActor:
         """A trained policy of averaged weights, from disk, on the CPU.
 
         Args:
-            prior: its source distribution.
+            method: what makes it differ from others.
             training: its recipe.
             checkpoint: iteration; the last by default.
 
         Raises:
             FileNotFoundError: if it is not trained that far.
         """
-        path = policy_path(self.folder(prior, training), checkpoint or training.iterations)
-        return WarmPriorActor.from_pretrained(path, prior=self.sized(prior))
+        path = policy_path(self.folder(method, training), checkpoint or training.iterations)
+        return load_policy(path)
 
-    def transforms(self, prior: Prior) -> partial[Any]:
+    def transforms(self, method: Method) -> partial[Any]:
         """Builder of the environment transforms that these policies need."""
         return partial(
             policy_transforms,
-            prior,
+            method.prior(),
+            see_history=method.sees_history,
             normalizer=self.problem.normalizer,
             **self.problem.adapters,
             observation_steps=self.network.observation_steps,
@@ -372,7 +368,7 @@ def finished_problem(run: Path) -> dict[str, Any]:
 
 def finished_policies(
     run: Path, device: str = "cpu"
-) -> tuple[dict[str, Any], dict[tuple[str, str], dict[int, WarmPriorActor]]]:
+) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
     """The last policies of a finished comparison of sources.
 
     Args:
@@ -380,8 +376,8 @@ def finished_policies(
         device: where to put them.
 
     Returns:
-        Facts of the problem (``task``, ``style`` and those of the data), and the policies by name and
-        :attr:`~warmprior.Prior.options` of their prior and training seed.
+        Facts of the problem (``task``, ``style`` and those of the data), and the policies by
+        their method and training seed.
 
     Raises:
         FileNotFoundError: if there are no results, or a policy is missing.
@@ -393,35 +389,31 @@ def finished_policies(
 
     Examples:
         >>> from tempfile import TemporaryDirectory
-        >>> from warmprior import PastPrior
-        >>> from warmprior.experiments import Results, navigation_problem
+        >>> from warmprior.experiments import Method, Results, navigation_problem
         >>> options, run = NetworkOptions(hidden_dim=8), RunOptions(logger="none")
-        >>> prior, training = PastPrior(4), TrainingConfig(iterations=1, batch_size=8)
+        >>> method, training = Method("past", 4), TrainingConfig(iterations=1, batch_size=8)
         >>> with TemporaryDirectory() as folder:  # what a Comparison does
         ...     out, policies = Path(folder) / "run", Path(folder) / "policies"
         ...     store = Store(navigation_problem(), options, policies, out / "logs", run)
-        ...     _ = store.train(prior, training, progress=lambda iterations: None)
-        ...     kept = {"folder": store.folder(prior, training).name, "iterations": 1, "seed": 0}
-        ...     kept["prior"] = prior.config()
+        ...     _ = store.train(method, training, progress=lambda iterations: None)
+        ...     kept = {"folder": store.folder(method, training).name, "iterations": 1, "seed": 0}
+        ...     kept["method"] = method.config()
         ...     meta = {"policies": [kept], "problems": [{"task": "navigation", "style": "toy"}]}
         ...     Results(out / "results.json", meta, {}).save()
         ...     problem, actors = finished_policies(out)
-        >>> problem["task"], actors["past", ""][0].prior.chunk_length
+        >>> problem["task"], next(iter(actors.values()))[0].prior.chunk_length
         ('navigation', 4)
     """
     meta = _facts_of(run)
-    entries = [(Prior.from_config(entry["prior"]), entry) for entry in meta["policies"]]
-    told = {
-        (prior.describe(), entry["iterations"]): (prior.name, prior.options)
-        for prior, entry in entries
-    }
+    entries = [(Method(**entry["method"]), entry) for entry in meta["policies"]]
+    told = {(m.describe(), entry["iterations"]): (m.name, m.options) for m, entry in entries}
     if len(set(told.values())) < len(told) or len(meta["problems"]) > 1:
         raise ValueError(
             f"--run {run} compares {'; '.join(name for name, _ in told)} on {len(meta['problems'])} "
             "problem(s): name a run of one task and style, with one sigma and one chunk length"
         )
-    actors: dict[tuple[str, str], dict[int, WarmPriorActor]] = {}
-    for prior, entry in entries:
+    actors: dict[Method, dict[int, WarmPriorActor]] = {}
+    for method, entry in entries:
         folder = policy_path(
             run.resolve().parent / "policies" / entry["folder"], entry["iterations"]
         )
@@ -429,6 +421,5 @@ def finished_policies(
             raise FileNotFoundError(
                 f"{folder} is missing: finish the run with --resume --out {run}"
             )
-        actor = WarmPriorActor.from_pretrained(folder, prior=prior, device=device)
-        actors.setdefault((prior.name, prior.options), {})[entry["seed"]] = actor
+        actors.setdefault(method, {})[entry["seed"]] = load_policy(folder, device=device)
     return meta["problems"][0], actors

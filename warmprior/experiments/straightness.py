@@ -15,9 +15,10 @@ from tqdm import tqdm
 from warmprior.diagnostics.branching import branching_bound
 from warmprior.diagnostics.coverage import source_coverage
 from warmprior.diagnostics.curvature import curvature
-from warmprior.diagnostics.flow import encoded_windows
+from warmprior.diagnostics.flow import depends_on_history, encoded_windows, sees_history
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.statistics import bootstrap_ratio
+from warmprior.experiments.methods import Method
 from warmprior.experiments.results import Row
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
@@ -38,6 +39,7 @@ def flow_measures(
     batch: TensorDictBase,
     *,
     n_steps: int = 100,
+    coupled: bool = False,
     generator: torch.Generator | None = None,
 ) -> dict[str, float]:
     """How far a policy's source is from its targets and how straight the flow between them.
@@ -50,6 +52,7 @@ def flow_measures(
 
     Keyword Args:
         n_steps: Euler steps.
+        coupled: whether the training pairs sources and targets: the bound does not apply then.
         generator: source of randomness on the policy's device; the policy's own by default.
 
     Returns:
@@ -59,18 +62,18 @@ def flow_measures(
         :func:`~warmprior.diagnostics.source_coverage`; NaN where they do not apply.
     """
     measured = dict.fromkeys(("kappa", "relative_curvature"), math.nan)
-    if policy.prior.is_flow:
+    if policy.ode.max_nfe is None:
         with warnings.catch_warnings():  # that something does not move is told by its NaN
             warnings.simplefilter("ignore")
             found = curvature(policy, batch, n_steps, generator=generator)
         for name, key in (("kappa", "kappa_executed"), ("relative_curvature", "relative_executed")):
             measured[name] = float(found[key].nanmean())
-    bound, coverage = _bounds(policy.prior, batch)[1], source_coverage(policy, batch)
+    bound, coverage = _bounds(policy.prior, batch, coupled)[1], source_coverage(policy, batch)
     return measured | {"bound": float(bound), "coverage": coverage}
 
 
 def straightness(
-    policies: Mapping[str, Mapping[int, WarmPriorActor]],
+    policies: Mapping[Method, Mapping[int, WarmPriorActor]],
     observations: SharedObservations,
     *,
     n_steps: int = 100,
@@ -80,12 +83,11 @@ def straightness(
 ) -> list[Row]:
     """Curvatures relative to the first policy's, with bootstrap intervals over episodes.
 
-    Every policy is measured at the mean of its training and, if anything of its source is warm, at the
-    mean that deployment meets, made from its own prediction one decision earlier.
+    Every policy is measured at the history of its training and, if it depends on that, at the one
+    that deployment meets, made from its own prediction one decision earlier.
 
     Args:
-        policies: by name the policies of one prior, by training seed; the baseline first. Those without a
-            flow are left out.
+        policies: by method and training seed; the baseline first. Those without a flow are left out.
         observations: the observations of all of them.
 
     Keyword Args:
@@ -108,35 +110,38 @@ def straightness(
         FloatingPointError: if a path becomes NaN or infinite.
 
     Examples:
-        >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP
+        >>> from warmprior import VelocityMLP
+        >>> from warmprior.experiments import Method
         >>> from warmprior.envs import navigation_demonstrations
         >>> def untrained(prior):
         ...     network = VelocityMLP(1, 9, prior.prediction_length, observation_steps=1, hidden_dim=8)
         ...     return {0: WarmPriorActor(network, prior)}
-        >>> policies = {"base": untrained(GaussianPrior(4)), "past": untrained(PastPrior(4))}
+        >>> methods = [Method("gaussian", 4), Method("past", 4)]
+        >>> policies = {method: untrained(method.prior()) for method in methods}
         >>> shared = SharedObservations(navigation_demonstrations(), 4, observation_steps=1, count=20)
         >>> with warnings.catch_warnings(action="ignore"):  # that an untrained field does not move
         ...     rows = straightness(policies, shared, n_steps=4)
         >>> [(row["policy"], row["mean"], row["ratio"]) for row in rows]
-        [('base', 'training', None), ('past', 'training', None), ('past', 'deployed', None)]
+        [('gaussian, sigma 1, H 4', 'training', None), ('past, sigma 0.5, H 4', 'training', None),
+         ('past, sigma 0.5, H 4', 'deployed', None)]
     """
-    priors = {name: next(iter(actors.values())).prior for name, actors in policies.items()}
-    policies = {name: actors for name, actors in policies.items() if priors[name].is_flow}
-    counts = {name: sorted(actors) for name, actors in policies.items()}
+    policies = {method: actors for method, actors in policies.items() if method.is_flow}
+    counts = {method: sorted(actors) for method, actors in policies.items()}
     if not counts:
         raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
     seeds = next(iter(counts.values()))
     if any(other != seeds for other in counts.values()):
-        raise ValueError(f"every policy needs the same training seeds, got {counts}")
-    measured: dict[tuple[str, str], list[TensorDict]] = {}
-    bounds: dict[tuple[str, str], list[Tensor]] = {}
-    jobs = [(name, actors[s]) for name, actors in policies.items() for s in seeds]
-    for name, actor in tqdm(jobs, desc=description, disable=description is None):
+        raise ValueError(f"every policy needs the same training seeds, got {list(counts.values())}")
+    measured: dict[tuple[Method, str], list[TensorDict]] = {}
+    bounds: dict[tuple[Method, str], list[Tensor]] = {}
+    jobs = [(method, actors[s]) for method, actors in policies.items() for s in seeds]
+    for method, actor in tqdm(jobs, desc=description, disable=description is None):
         device = next(actor.parameters()).device
         # Of the earlier prediction: at deployment its noise and that of the next are independent.
         earlier = torch.Generator(device).manual_seed(seed + 1)
-        batches = {"training": encoded_windows(actor, observations.windows(actor.prior))}
-        if batches["training"]["prior", "warm"].any():
+        windows = observations.windows(actor.prior, see_history=sees_history(actor))
+        batches = {"training": encoded_windows(actor, windows)}
+        if depends_on_history(actor, batches["training"]):
             batches["deployed"] = observations.deployed(actor, generator=earlier)
         for mean, batch in batches.items():
             # The same source noise for every policy and mean.
@@ -144,24 +149,28 @@ def straightness(
             try:
                 values = curvature(actor, batch, n_steps, draws=draws, generator=generator).cpu()
             except FloatingPointError as error:
-                raise FloatingPointError(f"{name}, {mean} mean: {error}") from error
-            measured.setdefault((name, mean), []).append(values)
-            bounds.setdefault((name, mean), []).append(_bounds(actor.prior, batch))
+                raise FloatingPointError(f"{method}, {mean} mean: {error}") from error
+            measured.setdefault((method, mean), []).append(values)
+            coupled = method.composition.coupling is not None
+            bounds.setdefault((method, mean), []).append(_bounds(actor.prior, batch, coupled))
     base = next(iter(policies))
     rows = []
-    for (name, mean), per_seed in measured.items():
-        prior = priors[name]
-        facts: dict[str, Any] = {"policy": name, "prior": prior.name, "options": prior.options}
-        facts |= {"sigma": float(prior.sigma), "chunk": prior.chunk_length, "mean": mean}
+    for (method, mean), per_seed in measured.items():
+        facts: dict[str, Any] = {
+            "policy": str(method),
+            "prior": method.name,
+            "options": method.options,
+        }
+        facts |= {"sigma": method.sigma, "chunk": method.chunk_length, "mean": mean}
         parts: list[tuple[int | None, TensorDict, TensorDict, Tensor]] = [
             (s, *part)
             for s, *part in zip(
-                seeds, per_seed, measured[base, "training"], bounds[name, mean], strict=True
+                seeds, per_seed, measured[base, "training"], bounds[method, mean], strict=True
             )
         ]
         if len(per_seed) > 1:
             average, bases = _average(per_seed), _average(measured[base, "training"])
-            parts.append((None, average, bases, torch.stack(bounds[name, mean]).mean(0)))
+            parts.append((None, average, bases, torch.stack(bounds[method, mean]).mean(0)))
         for s, values, baseline, bound in parts:
             measures = {
                 "observations": len(observations),
@@ -189,10 +198,13 @@ def _average(per_seed: Sequence[TensorDict]) -> TensorDict:
     return TensorDict(mean, batch_size=per_seed[0].shape)
 
 
-def _bounds(prior: Prior, batch: TensorDictBase) -> Tensor:
-    if not prior.is_gaussian:
+def _bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
+    try:
+        bound = branching_bound(batch, prior)
+    except ValueError:  # a source that is not Gaussian
+        coupled = True
+    if coupled:
         return torch.full((2,), math.nan)
-    bound = branching_bound(batch, prior)
     return torch.stack([bound[name].nanmean().cpu() for name in ("total", "total_executed")])
 
 

@@ -14,10 +14,10 @@ from warmprior.experiments.labels import (
     source_labels,
     source_of,
 )
+from warmprior.experiments.methods import Method
 from warmprior.experiments.paper import PAPER_SIGMA
 from warmprior.experiments.results import Row, grouped, mean_known, select, success_summary
 from warmprior.experiments.straightness import pooled
-from warmprior.modules.prior import Prior
 
 __all__ = ["plot_budget", "plot_chunk_lengths", "plot_delays", "plot_sigma"]
 
@@ -55,7 +55,7 @@ def plot_sigma(
     played = select(rows, "success_rate")
     measured = pooled(select(rows, "ratio_executed", mean="training"))
     by_source, curved = grouped(played, source_of), grouped(measured, source_of)
-    warm = [source for source in by_source if Prior.find(source[0]).takes("sigma")]
+    warm = [source for source in by_source if Method.takes(source[0], "sigma")]
     base = next((source for source in by_source if source not in warm), None)
     # Curvatures are told relative to the first policy, whether or not it is a baseline; so is the bound.
     policies = grouped(measured, lambda row: (source_of(row), row["sigma"]))

@@ -123,8 +123,8 @@ def _film(comparison: Comparison, store: Store, end: str) -> None:
     label = source_labels([Row(c.facts(), {}) for c in mine])
     first = {label(Row(c.facts(), {})): c for c in reversed(mine)}
     for name, contestant in reversed(first.items()):
-        nfe = min(contestant.prior.allowed_nfes(comparison.nfes))
-        slug = re.sub(r"[^\w.]+", "-", name if "," in name else contestant.prior.name)
+        nfe = min(contestant.method.allowed_nfes(comparison.nfes))
+        slug = re.sub(r"[^\w.]+", "-", name if "," in name else contestant.method.name)
         video = comparison.directory / f"film_{slug}{end.removesuffix('.png')}.mp4"
         strip = record_filmstrip(
             comparison.player(contestant),

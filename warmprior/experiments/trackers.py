@@ -16,7 +16,6 @@ from warmprior.experiments.contestant import Contestant
 from warmprior.experiments.recipe import EvaluationOptions
 from warmprior.experiments.worker import Job, PlayCell, Train
 from warmprior.io.files import digest_of, read_json, write_atomic
-from warmprior.io.options import identity_of
 
 __all__ = ["FileTracker", "MemoryTracker"]
 
@@ -67,7 +66,7 @@ class FileTracker:
     def __init__(
         self, folder: Path, contestants: Sequence[Contestant], options: EvaluationOptions
     ) -> None:
-        self._folder, self._options = folder.absolute(), identity_of(options)
+        self._folder, self._options = folder.absolute(), asdict(options)
         self._policies = [chosen.folder.name for chosen in contestants]
         self._reported = 0.0
 
@@ -109,7 +108,7 @@ class FileTracker:
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _path(self, job: Job, kind: str) -> Path:
-        cell = identity_of(job.cell) if isinstance(job, PlayCell) else type(job).__name__
+        cell = asdict(job.cell) if isinstance(job, PlayCell) else type(job).__name__
         digest = digest_of(self._policies[job.number], self._options, cell)
         return self._folder / f"{digest}.{kind}"
 

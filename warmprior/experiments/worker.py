@@ -94,7 +94,7 @@ class PlayCell:
         for seed in self.episode_seeds:
             episodes.append(worker.play(Play(self.number, self.cell, seed)))
             worker.tracker.report(self, len(episodes))
-        return CellOutcome.of(episodes, worker.contestants[self.number].prior)
+        return CellOutcome.of(episodes)
 
 
 Job = Train | Measure | Play | PlayCell
@@ -152,7 +152,7 @@ class Worker:
     def train(self, number: int) -> Losses:
         """Train a policy, see :meth:`Store.train`."""
         chosen, report = self.contestants[number], partial(self.tracker.report, Train(number))
-        losses = chosen.store.train(chosen.prior, chosen.training, report)
+        losses = chosen.store.train(chosen.method, chosen.training, report)
         if torch.cuda.is_initialized():
             torch.cuda.empty_cache()  # for the next training, which may be another worker's
         return losses
@@ -164,7 +164,8 @@ class Worker:
             self._load(chosen),
             chosen.store.problem.data,
             self.options.nfes,
-            chunk_length=chosen.prior.chunk_length,
+            chunk_length=chosen.method.chunk_length,
+            coupled=chosen.method.composition.coupling is not None,
             observation_steps=chosen.store.network.observation_steps,
         )
 
@@ -182,7 +183,7 @@ class Worker:
         )
 
     def _load(self, chosen: Contestant, checkpoint: int | None = None) -> WarmPriorActor:
-        policy = chosen.store.load(chosen.prior, chosen.training, checkpoint)
+        policy = chosen.store.load(chosen.method, chosen.training, checkpoint)
         return policy.replace(grid=self.options.grid)
 
     def _prepare(self, chosen: Contestant, cell: Cell) -> tuple[WarmPriorActor, EnvBase]:
@@ -194,7 +195,6 @@ class Worker:
             self._store = chosen.store
         condition = cell.condition
         policy = self._load(chosen, cell.checkpoint).replace(guidance=condition.guidance)
-        # The policy's own prior, which may have learnt.
-        make_transforms = chosen.store.transforms(policy.prior)
+        make_transforms = chosen.store.transforms(chosen.method)
         transforms = make_transforms(execute=condition.execute, delay=condition.delay)
         return policy, TransformedEnv(self._simulator, transforms)

@@ -293,13 +293,13 @@ def mean_over_processes(value: Tensor) -> Tensor:
 
 
 def check_batch(size: int) -> None:
-    """Whether every process gets a window.
+    """Whether a batch can be divided among the processes.
 
     Args:
         size: windows per step, of all processes.
 
     Raises:
-        ValueError: if there are more processes.
+        ValueError: if it cannot.
 
     See Also:
         :class:`~warmprior.training.BehaviourCloning`: shares its batches out.
@@ -309,12 +309,12 @@ def check_batch(size: int) -> None:
         >>> check_batch(0)
         Traceback (most recent call last):
             ...
-        ValueError: --batch-size 0 has fewer windows than there are processes, 1: start fewer, or choose ...
+        ValueError: --batch-size 0 cannot be divided among 1 process(es): choose a multiple of 1
     """
-    if size < world_size():
+    count = world_size()
+    if size < count or size % count:
         raise ValueError(
-            f"--batch-size {size} has fewer windows than there are processes, {world_size()}: start fewer, "
-            "or choose a larger batch"
+            f"--batch-size {size} cannot be divided among {count} process(es): choose a multiple of {count}"
         )
 
 

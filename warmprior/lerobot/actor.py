@@ -13,6 +13,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior import keys
+from warmprior.history import ENTRIES
 from warmprior.lerobot.ports import check_steps, port_for
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.network import network_observation
@@ -62,6 +63,7 @@ class LeRobotFlow(TensorDictModuleBase):
     """
 
     guidance = None
+    max_nfe = None
 
     def __init__(
         self,
@@ -96,7 +98,7 @@ class LeRobotFlow(TensorDictModuleBase):
         return self._policy[0]
 
     @property
-    def network(self) -> Any:
+    def network(self) -> ChunkSource:
         """What tells the width of actions."""
         return self.source
 
@@ -182,7 +184,7 @@ class LeRobotFlow(TensorDictModuleBase):
 class LeRobotActor(TensorDictModuleBase):
     """A LeRobot policy with the keys of :class:`~warmprior.WarmPriorActor`.
 
-    ``(observation, loc, warm) -> (noise, chunk)``: it acts in ``env.rollout`` and collectors with
+    ``(observation, history) -> (loc, warm, noise, chunk)``: it acts in ``env.rollout`` and collectors with
     :class:`~warmprior.ActionHistory` and
     :class:`~warmprior.ChunkStep`, resets included, and :class:`~warmprior.PriorDecoder` takes it as a frozen
     policy. What the model's source has beside the prior's part (padded dimensions, positions before the
@@ -199,22 +201,22 @@ class LeRobotActor(TensorDictModuleBase):
         std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it.
         nfe: integration steps per chunk; the policy's own by default. Per call: ``actor(data, nfe=1)``.
         generator: source of randomness; per call: ``actor(data, generator=...)``.
-        loc_key: the mean, ``[*B, P, d_a]``.
-        warm_key: bool ``[*B, P, 1]``.
         kwargs: further arguments of :class:`LeRobotFlow`.
 
     Raises:
         ValueError: see :class:`WarmPriorAdapter`.
+        KeyError: (when called) if an entry of the history is missing.
 
     Examples:
         >>> actor = LeRobotActor(policy, PastPrior(16), nfe=1)  # doctest: +SKIP
-        >>> env = TransformedEnv(base, Compose(ChunkStep(16), ActionHistory(actor.prior)))  # doctest: +SKIP
+        >>> env = TransformedEnv(base, Compose(ChunkStep(16), ActionHistory(16)))  # doctest: +SKIP
         >>> env.rollout(10, actor)["vla_action", "chunk"].shape  # doctest: +SKIP
         torch.Size([10, 16, 7])
     """
 
     normalizer = None
     environment = None
+    start = None
 
     def __init__(
         self,
@@ -223,8 +225,6 @@ class LeRobotActor(TensorDictModuleBase):
         *,
         std: Tensor | None = None,
         generator: torch.Generator | None = None,
-        loc_key: NestedKey = keys.LOC,
-        warm_key: NestedKey = keys.WARM,
         **kwargs: Any,
     ) -> None:
         super().__init__()
@@ -243,15 +243,19 @@ class LeRobotActor(TensorDictModuleBase):
         )
         self.ode = LeRobotFlow(policy, source, **kwargs)
         self.generator = generator
-        self._mean_keys = [loc_key, warm_key]
         noise_key, observation_key = self.ode.in_keys
-        self.in_keys = [observation_key, *self._mean_keys]
-        self.out_keys = [noise_key, *self.ode.out_keys]
+        self.in_keys = [observation_key, *((keys.HISTORY, name) for name in ENTRIES)]
+        self.out_keys = [keys.LOC, keys.WARM, noise_key, *self.ode.out_keys]
 
     @property
     def prior(self) -> Prior:
         """The source distribution."""
         return self.ode.source.prior
+
+    @property
+    def network(self) -> ChunkSource:
+        """What tells the width of actions."""
+        return self.ode.source
 
     @property
     def chunk_key(self) -> NestedKey:
@@ -265,16 +269,10 @@ class LeRobotActor(TensorDictModuleBase):
         generator: torch.Generator | None = None,
     ) -> TensorDictBase:
         """Sample the source and the chunk."""
-        loc, warm = (tensordict.get(key, None) for key in self._mean_keys)
-        if loc is None or warm is None:
-            raise KeyError(
-                f"LeRobotActor needs the keys {self._mean_keys}: ActionHistory writes them in an "
-                "environment"
-            )
-        batch = loc.shape[:-2]
-        generator = self.generator if generator is None else generator
-        a0 = self.ode.source.draw(
-            loc.reshape(-1, *loc.shape[-2:]), warm.reshape(-1, *warm.shape[-2:]), generator
-        )
-        tensordict.set(self.ode.in_keys[0], a0.reshape(*batch, *a0.shape[-2:]))
-        return self.ode(tensordict, nfe=nfe, padding=self.ode.source.place(a0, generator))
+        chunks, generator = self.ode.source, self.generator if generator is None else generator
+        source = chunks.distribution(tensordict.get(keys.HISTORY, None))
+        loc, a0 = (chunks.scaled(v, source.warm) for v in (source.loc, source.sample(generator)))
+        for key, value in zip(self.out_keys, (loc, source.warm, a0), strict=False):
+            tensordict.set(key, value)
+        padding = chunks.place(a0.reshape(-1, *a0.shape[-2:]), generator)
+        return self.ode(tensordict, nfe=nfe, padding=padding)

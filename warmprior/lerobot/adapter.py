@@ -18,16 +18,16 @@ from warmprior.modules.prior import Prior
 __all__ = ["HISTORY", "HISTORY_IS_PAD", "WarmPriorAdapter", "history_indices"]
 
 HISTORY = "action_history"
-"""The ``H`` actions before the current step, where they do not ride in front of ``"action"``."""
+"""The actions before the current step, where they do not ride in front of ``"action"``."""
 
 HISTORY_IS_PAD = f"{HISTORY}_is_pad"
 
 
-def history_indices(chunk_length: int, length: int, lead: int = 0) -> list[int]:
+def history_indices(history_length: int, length: int, lead: int = 0) -> list[int]:
     """Steps of the dataset that a training window takes, for ``action_delta_indices``.
 
     Args:
-        chunk_length: ``H`` of the prior.
+        history_length: of the prior, usually ``H``.
         length: ``T``, the length of the policy's chunk.
         lead: positions of the chunk before the current step.
 
@@ -38,7 +38,7 @@ def history_indices(chunk_length: int, length: int, lead: int = 0) -> list[int]:
         >>> history_indices(2, 3)
         [-2, -1, 0, 1, 2]
     """
-    return list(range(-max(chunk_length, lead), length - lead))
+    return list(range(-max(history_length, lead), length - lead))
 
 
 class WarmPriorAdapter:
@@ -67,6 +67,9 @@ class WarmPriorAdapter:
         stats: of the dataset (``dataset.meta.stats``), for ``sigma_unit="std"``.
         action_std: the standard deviation itself, ``[d_a]`` in the model's units, instead of ``stats``.
         relative: for policies with relative actions, how remembered ones are expressed at the next state.
+        coupling: pairs the sources and targets of a batch (:data:`~warmprior.objectives.Coupling`), without
+            observations; as they come by default.
+        cold_probability: share of the training windows whose history is withheld.
         nfe: integration steps per chunk; the policy's own by default.
         generator: source of randomness on the policy's device; PyTorch's global one by default.
 
@@ -90,6 +93,8 @@ class WarmPriorAdapter:
         stats: Mapping[str, Mapping[str, Any]] | None = None,
         action_std: Tensor | None = None,
         relative: RelativeActions | None = None,
+        coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
+        cold_probability: float = 0.0,
         nfe: int | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
@@ -119,7 +124,9 @@ class WarmPriorAdapter:
                 "the policy has relative actions, so that remembered ones must be expressed at the next "
                 "state: give relative=RelativeActions(preprocessor, postprocessor)"
             )
-        self.nfe = nfe
+        if not 0.0 <= cold_probability <= 1.0:
+            raise ValueError(f"cold_probability must be in [0, 1], got {cold_probability}")
+        self.coupling, self.cold_probability, self.nfe = coupling, cold_probability, nfe
         check_steps(nfe)
         self._relative = relative
         self._memory = ActionMemory(prior, self.source.action_dim)
@@ -150,8 +157,10 @@ class WarmPriorAdapter:
         """
         if kwargs.get("noise") is not None:
             raise ValueError("noise= is what the prior gives: leave it out")
-        history, valid, target, is_pad = self._window(batch)
-        a0, target = self.source.learn(history, valid, target, self.generator)
+        before, valid, target, is_pad = self._window(batch)
+        a0, target = self.source.learn(
+            before, valid, target, self.generator, self.coupling, self.cold_probability
+        )
         inputs = dict(batch)
         for name in (HISTORY, HISTORY_IS_PAD):
             inputs.pop(name, None)
@@ -199,8 +208,9 @@ class WarmPriorAdapter:
 
         Args:
             batch: a preprocessed observation.
-            executed_steps: actions executed of the last chunk, a number or ``[B]``; by default the policy's
-                ``n_action_steps``, or those that :meth:`select_action` gave out.
+            executed_steps: actions executed of the last chunk: a number, which leaves out the environments
+                that were reset since, or ``[B]``; by default the policy's ``n_action_steps``, or those that
+                :meth:`select_action` gave out.
             predict: the policy's ``predict_action_chunk`` by default.
             kwargs: handed to it.
 
@@ -270,7 +280,7 @@ class WarmPriorAdapter:
                 "mask that LeRobotDataset gives with delta_timestamps"
             )
         actions, is_pad = batch["action"], batch["action_is_pad"].bool()
-        length, history = self.source.length, self.prior.chunk_length
+        length, history = self.source.length, self.prior.history_length
         if HISTORY in batch:
             if HISTORY_IS_PAD not in batch:
                 raise KeyError(f"the batch has {HISTORY}, but not {HISTORY_IS_PAD}")
@@ -285,7 +295,7 @@ class WarmPriorAdapter:
         given = [actions.shape[1], *([past.shape[1]] if HISTORY in batch else [])]
         if given != expected:
             raise ValueError(
-                f"the batch has windows of {given} actions, expected {expected}: H={history} before the "
+                f"the batch has windows of {given} actions, expected {expected}: {history} before the "
                 f"current step and T={length} of the chunk. Take the steps of history_indices({history}, "
                 f"{length}, {self.source.lead}) from the dataset"
             )
@@ -301,18 +311,18 @@ class WarmPriorAdapter:
         return past, ~past_is_pad, actions[:, -length:], is_pad[:, -length:]
 
     def _source(self, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
-        """A draw around the mean of every environment."""
+        """A draw of the source of every environment."""
         move = None
         if self._relative is not None:
             relative, before, now = self._relative, self._state, self._relative.state()
             self._now = now
 
-            def move(loc: Tensor) -> Tensor:
+            def move(actions: Tensor) -> Tensor:
                 assert before is not None, "there was a decision, and it had a state"
-                return relative.reanchor(loc, before, now)
+                return relative.reanchor(actions, before, now)
 
-        loc, warm = self._memory.decide(shape[0], device, move)
-        a0 = self.source.draw(loc, warm, self.generator)
+        history = self._memory.decide(shape[0], device, move)
+        a0 = self.source.draw(history, self.generator)
         return self.source.place(a0, self.generator).to(dtype)
 
     def _record(self, actions: Tensor) -> None:

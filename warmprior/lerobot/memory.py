@@ -5,35 +5,38 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
+from warmprior.history import advance, cold_history, without
 from warmprior.modules.prior import Prior
 
 __all__ = ["ActionMemory"]
 
 
 class ActionMemory:
-    """The mean of a prior from decision to decision, one row per environment.
+    """The history (:mod:`warmprior.history`) from decision to decision, one row per environment.
 
     What :class:`~warmprior.ActionHistory` is in an environment of TorchRL: LeRobot's environments keep
     nothing, and its policies have a queue of actions that is common to all rows.
 
     Args:
-        prior: the source distribution.
+        prior: of the policy, whose lengths alone are used.
         action_dim: ``d_a``.
 
     Examples:
         >>> import torch
         >>> from warmprior import PastPrior
         >>> memory = ActionMemory(PastPrior(2), action_dim=1)
-        >>> loc, warm = memory.decide(3)
+        >>> memory.decide(3)["steps"].flatten().tolist()
+        [0, 0, 0]
         >>> memory.record(torch.tensor([[[1.0], [2.0]]]).expand(3, 2, 1))
         >>> memory.step(), memory.step()
         (None, None)
         >>> memory.forget(torch.tensor([False, True, False]))  # a new episode in the second environment
-        >>> loc, warm = memory.decide(3)
-        >>> loc[0].flatten().tolist(), warm[:, 0, 0].tolist()
-        ([1.0, 2.0], [True, False, True])
+        >>> history = memory.decide(3)
+        >>> history["actions"][0].flatten().tolist(), history["steps"].flatten().tolist()
+        ([1.0, 2.0], [2, 0, 2])
     """
 
     def __init__(self, prior: Prior, action_dim: int) -> None:
@@ -41,45 +44,45 @@ class ActionMemory:
         self.action_dim = action_dim
         # None between episodes; the others are of the same decision.
         self._chunk: Tensor | None = None
-        # Of the decision under way, which counts only once it has a chunk: a sampler may fail.
-        self._decision = torch.empty(0), torch.empty(0)
-        self._loc = self._elapsed = self._executed = self._new = torch.empty(0)
+        # That of the decision under way counts only once it has a chunk: a sampler may fail.
+        self._history = self._decision = TensorDict()
+        self._executed = self._new = torch.empty(0)
 
     def decide(
         self,
         batch_size: int,
         device: torch.device | str = "cpu",
         move: Callable[[Tensor], Tensor] | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Mean of the source for the decision that comes now.
+    ) -> TensorDict:
+        """The history at the decision that comes now.
 
         Args:
             batch_size: ``B``.
-            device: where the first mean of an episode is made.
-            move: expresses actions of the last decision at this one, ``[B, P, d_a]`` to the same.
+            device: where the first history of an episode is made.
+            move: expresses actions of the last decision at this one, ``[B, *, d_a]`` to the same.
 
         Returns:
-            ``loc`` ``[B, P, d_a]`` and ``warm``, bool ``[B, P, 1]``.
+            The history, ``[B]``.
 
         Raises:
             ValueError: if there are other environments than before.
         """
         if self._chunk is None:
-            size = (batch_size, self.prior.prediction_length, self.action_dim)
-            loc = torch.zeros(size, device=device)
-            warm = torch.zeros_like(loc[..., :1], dtype=torch.bool)
-            elapsed = torch.zeros(batch_size, 1, dtype=torch.int64, device=device)
+            lengths = self.prior.history_length, self.prior.prediction_length
+            history = cold_history([batch_size], *lengths, self.action_dim, device=device)
         elif len(self._chunk) != batch_size:
             raise ValueError(
                 f"{batch_size} environments follow {len(self._chunk)}: call reset() in between"
             )
         else:
-            elapsed = self._elapsed + self._executed
-            loc, warm = self.prior.next_mean(self._loc, self._chunk, self._executed, elapsed)
-            warm = warm & ~self._new[:, None, None]
-            loc = loc if move is None else move(loc)
-        self._decision = loc, elapsed
-        return loc, warm
+            history = advance(self._history, self._chunk, self._executed)
+            # What is left of the chunk is the plan of an episode that is over.
+            cold = without(history, self._new)
+            history.update(cold.select("forecast", "forecast_steps"))
+            if move is not None:
+                _move(history, move)
+        self._decision = history
+        return history
 
     def record(self, chunk: Tensor) -> None:
         """Remember what was predicted at this decision.
@@ -87,10 +90,10 @@ class ActionMemory:
         Args:
             chunk: ``[B, P, d_a]``.
         """
-        self._loc, self._elapsed = self._decision
-        self._chunk = chunk.detach().to(self._loc, copy=True)
-        self._executed = torch.zeros_like(self._elapsed)
-        self._new = torch.zeros_like(self._elapsed[:, 0], dtype=torch.bool)
+        self._history = self._decision
+        self._chunk = chunk.detach().to(self._history["forecast"], copy=True)
+        self._executed = torch.zeros_like(self._history["steps"])
+        self._new = torch.zeros_like(self._executed[:, 0], dtype=torch.bool)
 
     def step(self) -> None:
         """One more action of the chunk is executed."""
@@ -105,20 +108,22 @@ class ActionMemory:
         """Tell how many actions of the chunk were executed, whatever was counted.
 
         Args:
-            steps: a number, or ``[B]``.
+            steps: a number, which leaves out the environments whose episode began since; or ``[B]``, of
+                such environments those of the new episode.
 
         Raises:
-            ValueError: if more were executed than the prior remembers, or fewer than none.
+            ValueError: if more were executed than a decision may execute, or fewer than none.
         """
         if self._chunk is None:
             return
-        count = torch.as_tensor(steps, device=self._executed.device).reshape(-1, 1)
+        count = torch.as_tensor(steps, device=self._executed.device)
         if count.min() < 0 or count.max() > self.prior.chunk_length:
             raise ValueError(
                 f"executed_steps must be from 0 to chunk_length={self.prior.chunk_length} of "
                 f"{self.prior}, got {count.flatten().tolist()}"
             )
-        self._executed = count.expand_as(self._executed).clone()
+        counted = self._new[:, None] & (count.ndim == 0)
+        self._executed = torch.where(counted, self._executed, count.reshape(-1, 1))
 
     def correct(self, action: Tensor) -> None:
         """Replace the action executed last.
@@ -153,11 +158,18 @@ class ActionMemory:
                     f"{tuple(self._new.shape)}: one bool per environment"
                 )
             # The rest of the chunk goes on being executed, now as the first actions of an episode.
-            last = self._chunk.shape[1] - 1
-            steps = torch.arange(last + 1, device=rows.device) + self._executed
-            rest = self._chunk.gather(1, steps.clamp(max=last)[..., None].expand_as(self._chunk))
+            rest = advance(self._history, self._chunk, self._executed)["forecast"]
             self._chunk = torch.where(rows[:, None, None], rest, self._chunk)
-            self._loc = torch.where(rows[:, None, None], 0.0, self._loc)
-            self._elapsed = torch.where(rows[:, None], 0, self._elapsed)
-            self._executed = torch.where(rows[:, None], 0, self._executed)
+            self._history = without(self._history, rows)
+            self._executed = self._executed.masked_fill(rows[:, None], 0)
             self._new = self._new | rows
+
+
+def _move(history: TensorDict, move: Callable[[Tensor], Tensor]) -> None:
+    """Express the actions of a history anew; where it has none, it stays empty."""
+    actions, forecast = history["actions"], history["forecast"]
+    line = torch.cat([actions, forecast], 1)
+    step = torch.arange(-actions.shape[1], forecast.shape[1], device=line.device)
+    known = (step >= -history["steps"]) & (step < history["forecast_steps"])
+    line = torch.where(known[..., None], move(line).to(line), 0.0)
+    history.update({"actions": line[:, step < 0], "forecast": line[:, step >= 0]})

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
+from tensordict import TensorDictBase
+from torch import Tensor, nn
 
+from warmprior.history import check_history, cold_history, window_history, without
 from warmprior.lerobot.ports import port_for
-from warmprior.modules.prior import Prior
+from warmprior.modules.prior import Prior, Source
 
 __all__ = ["ChunkSource", "SigmaUnit", "action_std"]
 
@@ -25,8 +27,7 @@ class ChunkSource:
     checkpoints saw them.
 
     Args:
-        prior: the source distribution; any that needs neither observations as a vector nor a network that
-            sees the mean.
+        prior: the source distribution; any that needs no observation.
         length: ``T``.
         width: ``D``.
         action_dim: ``d_a``.
@@ -44,10 +45,11 @@ class ChunkSource:
     Examples:
         >>> import torch
         >>> from warmprior import PastPrior
+        >>> from warmprior.history import window_history
         >>> source = ChunkSource(PastPrior(4, sigma=0.0), length=6, width=3, action_dim=2, lead=1)
-        >>> warm = torch.ones(1, 4, 1, dtype=torch.bool)
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> a0 = source.place(source.draw(torch.full((1, 4, 2), 7.0), warm, generator), generator)
+        >>> executed, target = torch.full((1, 4, 2), 7.0), torch.zeros(1, 4, 2)
+        >>> history = window_history(executed, torch.tensor([[4]]), target, chunk_length=4)
+        >>> a0 = source.place(source.draw(history))
         >>> a0.shape, (a0 == 7).sum(1).tolist()
         (torch.Size([1, 6, 3]), [[4, 4, 0]])
     """
@@ -69,19 +71,16 @@ class ChunkSource:
                 f"from the current step on: use chunk_length <= "
                 f"{room // prior.prediction_chunks}, or a policy with longer chunks"
             )
-        told = f"{prior} cannot be the source of a policy of LeRobot: "
-        if prior.needs_vector:
-            raise ValueError(told + "it needs the observation as one vector")
-        if prior.teacher is not None:
-            raise ValueError(told + f"it needs a trained policy of {prior.teacher}")
-        if prior.conditions_network:
-            raise ValueError(told + "the network would have to see its mean")
-        if prior.start_time > 0:
+        weights = prior.parameters() if isinstance(prior, nn.Module) else ()
+        device = next((weight.device for weight in weights), None)
+        self._lengths = prior.history_length, prior.prediction_length
+        try:
+            prior.distribution(cold_history([1], *self._lengths, action_dim, device=device))
+        except Exception as error:
             raise ValueError(
-                told + f"it starts at time {prior.start_time}, and LeRobot integrates from 0"
-            )
-        if not prior.is_flow:
-            raise ValueError(told + "it is trained at t = 0 alone, and LeRobot trains at all times")
+                f"{prior} cannot be the source of a policy of LeRobot, where it is given the history and no "
+                f"observation: {error}"
+            ) from error
         if std is not None and not (
             tuple(std.shape) == (action_dim,) and (std > 0).all() and std.isfinite().all()
         ):
@@ -98,57 +97,83 @@ class ChunkSource:
         """Where the prior's ``P`` positions are in the chunk."""
         return slice(self.lead, self.lead + self.prior.prediction_length)
 
+    def distribution(self, history: TensorDictBase) -> Source:
+        """The prior's source, in units of its ``sigma``.
+
+        Args:
+            history: ``[*B]``, the model's units; see :mod:`warmprior.history`.
+
+        Raises:
+            KeyError: if an entry of it is missing.
+        """
+        check_history(history, *self._lengths, self.prior)
+        unit = self._unit(history["actions"])
+        own = {name: history[name] / unit for name in ("actions", "forecast")}
+        return self.prior.distribution(history.copy().update(own))
+
+    def scaled(self, values: Tensor, warm: Tensor) -> Tensor:
+        """Values of the source, such as draws, in the model's units.
+
+        Args:
+            values: ``[*B, P, d_a]``, in units of ``sigma`` where they are warm, and in the model's elsewhere:
+                what is cold is N(0, 1) there.
+            warm: bool ``[*B, P, 1]``.
+        """
+        return torch.where(warm, values * self._unit(values), values)
+
+    def draw(self, history: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
+        """The prior's part of a source, ``[*B, P, d_a]``, the model's units.
+
+        Args:
+            history: see :meth:`distribution`.
+            generator: source of randomness on its device; PyTorch's global one by default.
+        """
+        source = self.distribution(history)
+        return self.scaled(source.sample(generator), source.warm)
+
     def learn(
         self,
-        history: Tensor,
-        history_valid: Tensor,
+        before: Tensor,
+        valid: Tensor,
         target: Tensor,
         generator: torch.Generator | None = None,
+        coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
+        cold_probability: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
         """Source and target of training windows.
 
         Args:
-            history: the ``H`` actions before the current step, ``[B, H, >= d_a]``, the model's units.
-            history_valid: which of them lie inside of the episode, bool ``[B, H]``.
+            before: the prior's ``history_length`` actions before the current step, ``[B, *, >= d_a]``, the
+                model's units.
+            valid: which of them lie inside of the episode, bool ``[B, *]``.
             target: the chunk, ``[B, T, >= d_a]``, the model's units.
-            generator: source of randomness on their device; PyTorch's global one by default.
+            generator: see :meth:`draw`.
+            coupling: pairs sources and targets ``[B, P, d_a]`` of the model, ``(a0, a1, None) -> (a0, a1)``.
+            cold_probability: share of the windows whose history is withheld.
 
         Returns:
-            ``a_0`` ``[B, T, D]`` and the target, which is another only where the prior couples it.
+            ``a_0`` ``[B, T, D]`` and the target, which is another only where it is coupled.
         """
-        unit = self._unit(target)
-        wanted = target[:, self.positions, : self.action_dim] / unit
-        loc, warm = self.prior.training_mean(
-            history[..., : self.action_dim] / unit, history_valid, wanted
-        )
-        warm = self.prior.withhold(warm, generator)
-        a0 = self.prior.sample(loc, warm, generator)
-        a0, a1 = self.prior.couple(a0, wanted, generator)
-        if a1 is not wanted:
+        wanted = target[:, self.positions, : self.action_dim]
+        executed = torch.where(valid.unsqueeze(-1), before[..., : self.action_dim], 0.0)
+        steps = valid.sum(1, keepdim=True)
+        history = window_history(executed, steps, wanted, self.prior.chunk_length)
+        if cold_probability > 0:
+            draw = torch.rand(len(target), generator=generator, device=target.device)
+            history = without(history, draw < cold_probability)
+        a0 = self.draw(history, generator)
+        if coupling is not None:
+            a0, a1 = coupling(a0, wanted, None)
             target = target.clone()
-            target[:, self.positions, : self.action_dim] = a1 * unit
-        return self.place(self._scaled(a0, warm, unit), generator), target
-
-    def draw(self, loc: Tensor, warm: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The prior's part of the source of a decision.
-
-        Args:
-            loc: mean, ``[B, P, d_a]``, the model's units.
-            warm: bool ``[B, P, 1]``.
-            generator: see :meth:`learn`.
-
-        Returns:
-            ``[B, P, d_a]``, the model's units.
-        """
-        unit = self._unit(loc)
-        return self._scaled(self.prior.start(loc / unit, warm, generator), warm, unit)
+            target[:, self.positions, : self.action_dim] = a1
+        return self.place(a0, generator), target
 
     def place(self, a0: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The whole source around the prior's part of it: ``N(0, 1)`` everywhere else.
 
         Args:
             a0: ``[B, P, d_a]``.
-            generator: see :meth:`learn`.
+            generator: see :meth:`draw`.
 
         Returns:
             ``[B, T, D]``.
@@ -165,10 +190,6 @@ class ChunkSource:
     def _unit(self, like: Tensor) -> Tensor:
         one = torch.ones(self.action_dim, dtype=like.dtype, device=like.device)
         return one if self._std is None else self._std.to(one)
-
-    def _scaled(self, a0: Tensor, warm: Tensor, unit: Tensor) -> Tensor:
-        # What is cold is N(0, 1) in the model's units, whatever those of sigma.
-        return torch.where(warm | self.prior.always_warm, a0 * unit, a0)
 
 
 def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Tensor:

@@ -21,7 +21,7 @@ class Normalizer(nn.Module):
 
     Dimensions that vary by no more than the float noise of a resting body (half a range of 1e-5, relative
     above 1) count as constant and are only shifted: blown up to [-1, 1], the noise would drown the
-    rest. The statistics are buffers: they travel with :meth:`WarmPriorActor.save_pretrained` and to
+    rest. The statistics are buffers: they travel with :func:`~warmprior.training.save_policy` and to
     devices.
 
     Args:

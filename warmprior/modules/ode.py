@@ -26,6 +26,9 @@ DEFAULT_NFE = 9
 MAX_NFE = 10_000
 """No chunk is worth more: it would take minutes, and more look like a process that hangs."""
 
+GUIDED_BY = (keys.FORECAST, keys.FORECAST_STEPS, keys.DELAY)
+"""What guidance reads beside the inputs of every policy."""
+
 Velocity = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -146,9 +149,9 @@ class ODEActor(TensorDictModuleBase):
         clip: the chunk is clamped to ``[-clip, clip]``, one bound for all action dimensions or ``d_a`` of
             them; ``None`` (default) leaves it as integrated. Set it to what the normalised data span, such as
             1, so that what the environment executes is what the prior remembers.
-        guidance: leads to chunks that continue the one being executed; none by default. It reads its
-            leftover ``[*B, P, d_a]``, where that counts, bool ``[*B, P, 1]``, and the delay, int64
-            ``[*B, 1]``, under the keys of :mod:`warmprior.keys`.
+        guidance: leads to chunks that continue the one being executed; none by default. It reads what is
+            left of that, ``("history", "forecast")`` and ``("history", "forecast_steps")``, and the delay,
+            int64 ``[*B, 1]``.
         noise_key: key of the source, ``[*B, P, d_a]``.
         observation_key: key of the observation, ``[*B, To, d_o]``.
         chunk_key: key written, ``[*B, P, d_a]``.
@@ -228,17 +231,17 @@ class ODEActor(TensorDictModuleBase):
         self.path_key = path_key
         self.in_keys = [noise_key, observation_key]
         if guidance is not None:
-            self.in_keys += [keys.LEFTOVER, keys.VALID, keys.DELAY]
+            self.in_keys += GUIDED_BY
         self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
 
     @staticmethod
     def _told(missing: Sequence[NestedKey]) -> str:
         """Who writes what guidance reads, if that is what is missing."""
-        if not {keys.LEFTOVER, keys.VALID, keys.DELAY} & set(missing):
+        if not set(GUIDED_BY) & set(missing):
             return ""
         return (
-            ". What is left of the last chunk is written by InferenceDelay in an environment, as by "
-            "policy_transforms(prior, delay=0), and by AsyncExecutor on a robot"
+            ". The delay is written by InferenceDelay in an environment, as by policy_transforms(prior, "
+            "delay=0), and by AsyncExecutor on a robot"
         )
 
     def check_nfe(self, nfe: int) -> None:
@@ -280,12 +283,12 @@ class ODEActor(TensorDictModuleBase):
         observation = network_observation(observation, batch)
         velocity = velocity_field(self.network, observation)
         if self.guidance is not None:
-            leftover, valid, delay = rest
+            leftover, left, delay = rest
             scale = torch.ones_like(a0) if sigma is None else sigma.expand_as(a0)
             velocity = self.guidance.guided(
                 velocity,
                 leftover.reshape(-1, *a0.shape[-2:]).to(a0.dtype),
-                valid.reshape(-1, a0.shape[-2], 1),
+                left.reshape(-1, 1),
                 delay.reshape(-1, 1),
                 scale.reshape(-1, *a0.shape[-2:]),
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -110,6 +111,7 @@ class SourceMoments(nn.Module):
         windows: ReplayBuffer | TensorDictBase,
         prior: Prior,
         *,
+        coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         samples: int = 16_384,
         trend: PoseTrend | None = None,
         generator: torch.Generator | None = None,
@@ -118,9 +120,11 @@ class SourceMoments(nn.Module):
 
         Args:
             windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[*B]``.
-            prior: the source distribution that these windows were made for.
+            prior: the source distribution.
 
         Keyword Args:
+            coupling: how the training pairs sources and targets, see :data:`~warmprior.objectives.Coupling`;
+                as they come by default.
             samples: windows to draw from a buffer, in its batches; windows given as a tensordict are
                 used once each.
             trend: of the pose; the moments are those of what it leaves.
@@ -132,7 +136,7 @@ class SourceMoments(nn.Module):
             all windows gets the moments of independent standard normal ends: no loss ever reads it.
 
         Raises:
-            ValueError: if ``samples < 2``, there are fewer than two windows, or they are not of this prior.
+            ValueError: if ``samples < 2``, there are fewer than two windows, or they are of other lengths.
         """
         if isinstance(windows, TensorDictBase):
             batches = [windows]
@@ -148,19 +152,20 @@ class SourceMoments(nn.Module):
         if batch[keys.CHUNK].shape[-2] != prior.prediction_length:
             raise ValueError(
                 f"the windows have {batch[keys.CHUNK].shape[-2]} positions, but {prior} predicts "
-                f"{prior.prediction_length}: sample them with this very prior"
+                f"{prior.prediction_length}: make them for its lengths"
             )
         observation = batch.get(keys.OBSERVATION, None)
-        a0 = prior.sample(batch[keys.LOC], batch[keys.WARM], generator, observation)
-        sizes = [part.numel() for part in batches]  # couplings pair within a batch
-        parts = zip(
-            a0.split(sizes),
-            batch[keys.CHUNK].split(sizes),
-            [None] * len(sizes) if observation is None else observation.split(sizes),
-            strict=True,
-        )
-        pairs = [prior.couple(source, target, generator, seen) for source, target, seen in parts]
-        a0, a1 = (torch.cat(part).double() for part in zip(*pairs, strict=True))
+        a0, a1 = prior.sample(batch[keys.HISTORY], observation, generator), batch[keys.CHUNK]
+        if coupling is not None:
+            sizes = [part.numel() for part in batches]  # it pairs within a batch
+            parts = zip(
+                a0.split(sizes),
+                a1.split(sizes),
+                [None] * len(sizes) if observation is None else observation.split(sizes),
+                strict=True,
+            )
+            a0, a1 = map(torch.cat, zip(*(coupling(*part) for part in parts), strict=True))
+        a0, a1 = a0.double(), a1.double()
         if trend is not None:
             source, target = trend(batch[keys.OBSERVATION].float())
             a0, a1 = a0 - source, a1 - target

@@ -36,8 +36,8 @@ def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
         delay: control steps until ``chunk`` takes effect, int64 ``[*B, 1]``.
 
     See Also:
-        - :func:`~warmprior.transforms.shift_chunk`: takes the rest of the chunk before to the positions of
-          the next one.
+        - :func:`~warmprior.history.advance`: takes the rest of the chunk before to the positions of the
+          next one.
         - :class:`~warmprior.RealTimeChunking`: makes the prediction continue that rest.
 
     Examples:
@@ -188,7 +188,7 @@ class RealTimeChunking:
         self,
         velocity: Velocity,
         leftover: Tensor,
-        valid: Tensor,
+        left: Tensor,
         delay: Tensor,
         sigma: Tensor | float = 1.0,
     ) -> Velocity:
@@ -199,7 +199,7 @@ class RealTimeChunking:
         Args:
             velocity: ``(t [B], a_t [B, P, d_a]) -> [B, P, d_a]``.
             leftover: ``Y``, ``[B, P, d_a]``, at the positions of the new chunk.
-            valid: which positions it has, bool ``[B, P, 1]``: the first ones. Rows without any are not
+            left: how many positions it has, the first ones, int64 ``[B, 1]``. Rows without any are not
                 guided.
             delay: ``d``, int64 ``[B, 1]``.
             sigma: standard deviation of the source, broadcastable to ``[B, P, d_a]``.
@@ -212,12 +212,12 @@ class RealTimeChunking:
             RuntimeError: (when called) with the Jacobian, under ``torch.inference_mode()``.
         """
         rows, length = leftover.shape[:2]
-        if valid.shape != (rows, length, 1) or delay.shape != (rows, 1):
+        if not left.shape == delay.shape == (rows, 1):
             raise ValueError(
-                f"the leftover [B, P, d_a] has shape {tuple(leftover.shape)}: valid has to be [B, P, 1] and "
-                f"the delay [B, 1], got {tuple(valid.shape)} and {tuple(delay.shape)}"
+                f"the leftover [B, P, d_a] has shape {tuple(leftover.shape)}: left and delay have to be "
+                f"[B, 1], got {tuple(left.shape)} and {tuple(delay.shape)}"
             )
-        left, delay = valid.sum((1, 2)), delay.squeeze(1)
+        left, delay = left.squeeze(1), delay.squeeze(1)
         if not left.any():
             return velocity
         for late, count in torch.stack([delay, left], 1)[left > 0].unique(dim=0).tolist():

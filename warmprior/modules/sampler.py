@@ -1,6 +1,8 @@
-"""From a prior's mean to a source sample."""
+"""From the history to a source sample."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -8,37 +10,40 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
 from warmprior import keys
-from warmprior.modules.prior import Prior
+from warmprior.history import ENTRIES
+from warmprior.modules.prior import Prior, Source
+from warmprior.modules.start import StartPoint
 
 __all__ = ["PriorSampler"]
 
 
 class PriorSampler(TensorDictModuleBase):
-    """Draws where the flow starts: ``(observation, loc, warm) -> noise``, see :meth:`Prior.start`.
+    """Draws where the flow starts: ``(observation, history) -> (loc, warm, noise)``.
 
     Args:
         prior: the source distribution.
 
     Keyword Args:
+        start: the point from which samplers start, if that is not the source itself.
         observation_key: key of the observation, ``[*B, To, d_o]``; without one the prior is given none,
             as the paper's sources need none.
-        loc_key: key of the mean, ``[*B, P, d_a]``.
-        warm_key: key of the warm mask, bool ``[*B, P, 1]``.
         noise_key: key written, ``[*B, P, d_a]``.
         generator: source of randomness; PyTorch's global generator by default. Per call:
             ``sampler(data, generator=...)``.
 
     Raises:
-        KeyError: if an input key is missing.
+        KeyError: if an entry of the history is missing.
+        ValueError: if the history has other lengths than the prior.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PastPrior, PriorSampler
+        >>> from warmprior.history import window_history
         >>> sampler = PriorSampler(PastPrior(2, sigma=0.0))
-        >>> data = TensorDict({"prior": {"loc": torch.ones(3, 2, 1),
-        ...                              "warm": torch.ones(3, 2, 1, dtype=torch.bool)}}, [3])
-        >>> sampler(data)["prior", "noise"].unique()
+        >>> executed, steps = torch.ones(3, 2, 1), torch.full((3, 1), 2)
+        >>> history = window_history(executed, steps, torch.zeros(3, 2, 1), chunk_length=2)
+        >>> sampler(TensorDict({"history": history}, [3]))["prior", "noise"].unique()
         tensor([1.])
     """
 
@@ -46,32 +51,40 @@ class PriorSampler(TensorDictModuleBase):
         self,
         prior: Prior,
         *,
+        start: StartPoint | None = None,
         observation_key: NestedKey | None = None,
-        loc_key: NestedKey = keys.LOC,
-        warm_key: NestedKey = keys.WARM,
         noise_key: NestedKey = keys.NOISE,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
         self.prior = prior
+        self.start = start
         self.generator = generator
         self.observation_key = observation_key
-        self.in_keys = [loc_key, warm_key]
-        self.out_keys = [noise_key]
+        self.in_keys = [(keys.HISTORY, name) for name in ENTRIES]
+        self.out_keys = [keys.LOC, keys.WARM, noise_key]
+
+    def source(self, tensordict: TensorDictBase) -> Source:
+        """The source of decisions or windows.
+
+        Args:
+            tensordict: ``[*B]``, with the history and what the prior sees beside it.
+        """
+        history = tensordict.get(keys.HISTORY, None)
+        return self.prior.distribution(history, self._observation(tensordict))
 
     def forward(
         self, tensordict: TensorDictBase, generator: torch.Generator | None = None
     ) -> TensorDictBase:
-        """Write the source sample."""
-        loc, warm = (tensordict.get(key, None) for key in self.in_keys)
-        if loc is None or warm is None:
-            missing = [key for key, v in zip(self.in_keys, (loc, warm), strict=True) if v is None]
-            raise KeyError(
-                f"PriorSampler needs the keys {self.in_keys}; missing: {missing}. ActionHistory "
-                "writes them in an environment, ActionWindow in a replay buffer"
-            )
-        generator = self.generator if generator is None else generator
-        observation = None
-        if self.observation_key is not None:
-            observation = tensordict.get(self.observation_key, None)
-        return tensordict.set(self.out_keys[0], self.prior.start(loc, warm, generator, observation))
+        """Write the mean, where it is warm, and the point from which samplers start."""
+        source = self.source(tensordict)
+        point = source.sample(self.generator if generator is None else generator)
+        if self.start is not None:
+            point = self.start(point, tensordict[keys.HISTORY], self._observation(tensordict))
+        for key, value in zip(self.out_keys, (source.loc, source.warm, point), strict=True):
+            tensordict.set(key, value)
+        return tensordict
+
+    def _observation(self, tensordict: TensorDictBase) -> Any:
+        key = self.observation_key
+        return None if key is None else tensordict.get(key, None)

@@ -153,7 +153,7 @@ class PoseTrend(nn.Module):
 
         Args:
             windows: ``[N]``, see :class:`~warmprior.ActionWindow`, with observations ``[N, To, d_o]``.
-            prior: the source distribution that these windows were made for.
+            prior: the source distribution.
             rest: the resting action of an observation.
 
         Keyword Args:
@@ -164,9 +164,8 @@ class PoseTrend(nn.Module):
         """
         resting = rest(windows[keys.OBSERVATION][:, -1].float()).double()
         centre = resting.mean(0)
-        mean = windows[keys.LOC], windows[keys.WARM]
-        seen = windows[keys.OBSERVATION]
-        draws = [prior.sample(*mean, generator, seen).double() for _ in range(DRAWS)]
+        source = prior.distribution(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        draws = [source.sample(generator).double() for _ in range(DRAWS)]
         ends = torch.stack((torch.stack(draws).mean(0), windows[keys.CHUNK].double()))
         # Padded positions do not count: they would pull the trend to the episode's last action.
         weight = (~windows[keys.IS_PAD]).double().unsqueeze(-1)

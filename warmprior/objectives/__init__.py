@@ -1,5 +1,6 @@
-"""Losses."""
+"""Losses, and how they pair sources with targets."""
 
+from warmprior.objectives.couplings import Coupling, OTCoupling, ReflowCoupling
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 
-__all__ = ["FlowMatchingLoss"]
+__all__ = ["Coupling", "FlowMatchingLoss", "OTCoupling", "ReflowCoupling"]

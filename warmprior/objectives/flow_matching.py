@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal, cast, get_args
 
 import torch
@@ -19,7 +17,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.ode import integrate
-from warmprior.modules.prior import Prior
+from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.times import TIMES, Times
 
 __all__ = ["FlowMatchingLoss", "Objective", "Weighting", "check_objective"]
@@ -41,16 +39,14 @@ def check_objective(
     objective: str,
     weighting: str,
     self_distillation: float,
-    prior: Prior | None = None,
 ) -> None:
-    """Whether there is a loss of these options, and whether a prior's field can be trained by it.
+    """Whether there is a loss of these options.
 
     Keyword Args:
         times: name of the distribution of the times.
         objective: see :class:`FlowMatchingLoss`.
         weighting: see :class:`FlowMatchingLoss`.
         self_distillation: see :class:`FlowMatchingLoss`.
-        prior: the source distribution.
 
     Raises:
         ValueError: naming the option.
@@ -65,26 +61,22 @@ def check_objective(
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
     if not (self_distillation >= 0 and math.isfinite(self_distillation)):
         raise ValueError(f"self_distillation must be a finite weight >= 0, got {self_distillation}")
-    if prior is None or prior.is_flow:
-        return
     needs = {
         "objective": objective != "velocity" and objective,
         "self_distillation": self_distillation,
     }
     for name, asked in needs.items():
-        if asked:
+        if asked and times == "start":
             raise ValueError(
-                f"{prior.name} is trained at t = 0 alone and has no flow, which {name} = {asked} is for: "
-                f"leave out {prior.name}, or the option"
+                f"{name} = {asked} needs a flow, and times = 'start' trains none: leave one of them out"
             )
 
 
 class FlowMatchingLoss(LossModule):
     r"""Conditional flow matching with the actor's own source (Algorithm 1, training).
 
-    For each window: draw :math:`a_0` from the prior, pair it with :math:`a_1` (:meth:`Prior.couple`), draw
-    :math:`t \sim U(0, 1)` (:math:`t = 0` where the prior is no flow), set
-    :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regress
+    For each window: draw :math:`a_0` from the prior, pair it with :math:`a_1`, draw
+    :math:`t \sim U(0, 1)`, set :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regress
     :math:`v_\theta(t, a_t, o)` on :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's
     end do not count.
 
@@ -101,7 +93,7 @@ class FlowMatchingLoss(LossModule):
     with NFE 2. Their network gives :math:`\hat a_1`, ours the velocity of the same sample.
 
     **Self-distillation** trains the sampler of one step, :math:`v_\theta(s, a_s, o)` at the time :math:`s`
-    at which the prior's samplers start (:attr:`Prior.start_time`), on where the flow of averaged weights
+    at which the policy's samplers start, on where the flow of averaged weights
     :math:`\bar\theta` ends,
 
     .. math::
@@ -122,8 +114,11 @@ class FlowMatchingLoss(LossModule):
         actor_network: the policy whose velocity network is trained; its prior gives the source.
 
     Keyword Args:
+        coupling: pairs the sources and targets of a batch, see :data:`~warmprior.objectives.Coupling`; as
+            they come by default (Algorithm 1).
         times: how training times are distributed: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
-            ``"logit-normal"`` (:mod:`warmprior.objectives.times`), or a function of their signature.
+            ``"logit-normal"``, ``"start"`` (regression) (:mod:`warmprior.objectives.times`), or a function
+            of their signature.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) takes errors as they are. ``"standardised"`` divides them by
             what the best linear prediction leaves (:meth:`PreconditionedNetwork.remainder`): every time,
@@ -140,25 +135,19 @@ class FlowMatchingLoss(LossModule):
             ``"sum"`` (Algorithm 1's squared norm, summed over the batch) or ``"none"``
             (``[*B, P, d_a]``, zero where padded).
         generator: source of randomness of ``t`` and :math:`a_0`; the actor sampler's by default.
-        share: ``(rank, number)`` of processes that train together: this one evaluates the network at every
-            ``number``-th window from ``rank`` on. All of them have to be given the same batch and equal
-            generators: sources, couplings and times are those of the whole batch everywhere. The mean of
-            their losses, and of their gradients, is that of one process; unreduced errors are of the share.
-        autocast: type that the network's matrix products compute in (:class:`torch.autocast`), such as
-            ``torch.bfloat16``; that of its weights by default. The path and the errors keep the actions'.
 
     .. note::
         Keys read (all renameable by :meth:`set_keys`): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool
-        ``[*B, P]`` (True = padded; optional), ``loc`` ``[*B, P, d_a]``, ``warm`` bool ``[*B, P, 1]``
-        and ``observation`` ``[*B, To, d_o]``; by default those of the actor. Batches of any device are
+        ``[*B, P]`` (True = padded; optional), the history (:mod:`warmprior.history`) and
+        ``observation`` ``[*B, To, d_o]``; by default those of the actor. Batches of any device are
         moved to the network's, where the generator has to be.
 
     Raises:
-        ValueError: for an unknown ``reduction``, ``times``, ``objective`` or ``weighting``, a negative
-            weight, or a ``share`` that is none; for standardised errors of a network that is not
-            preconditioned; for a curved path with an option or a prior that needs the straight one; for an
-            option that needs a flow with a prior whose field is none; or for another path than the network is
-            preconditioned for.
+        ValueError: for an unknown ``reduction``, ``times``, ``objective`` or ``weighting``, or a negative
+            weight; for standardised errors of a network that is not preconditioned; for a curved path with an
+            option that needs the straight one; for an option that needs a flow with ``times="start"``, or
+            those times with a policy of more than one network evaluation; or for another path than the
+            network is preconditioned for.
 
     See Also:
         - :class:`~warmprior.training.BehaviourCloning`: the training loop around it.
@@ -187,8 +176,7 @@ class FlowMatchingLoss(LossModule):
 
         chunk: NestedKey = keys.CHUNK
         pad_mask: NestedKey = keys.IS_PAD
-        loc: NestedKey = keys.LOC
-        warm: NestedKey = keys.WARM
+        history: NestedKey = keys.HISTORY
         observation: NestedKey = keys.OBSERVATION
 
     default_keys = _AcceptedKeys
@@ -201,6 +189,7 @@ class FlowMatchingLoss(LossModule):
         self,
         actor_network: WarmPriorActor,
         *,
+        coupling: Coupling | None = None,
         times: str | Times = "uniform",
         objective: Objective = "velocity",
         weighting: Weighting = "velocity",
@@ -209,25 +198,25 @@ class FlowMatchingLoss(LossModule):
         interpolant: Interpolant | None = None,
         reduction: str = "mean",
         generator: torch.Generator | None = None,
-        share: tuple[int, int] = (0, 1),
-        autocast: torch.dtype | None = None,
     ) -> None:
         self._in_keys: list[NestedKey] | None = None
         self._out_keys: list[NestedKey] | None = None
         super().__init__()
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
-        if not 0 <= share[0] < share[1]:
-            raise ValueError(f"share must be (rank, number) with 0 <= rank < number, got {share}")
         self.convert_to_functional(actor_network.network, "velocity_network")
-        self.prior = actor_network.prior
+        self.prior, self.coupling = actor_network.prior, coupling
+        self.start_time = actor_network.ode.start_time
         check_objective(
             times="uniform" if callable(times) else times,
             objective=objective,
             weighting=weighting,
             self_distillation=self_distillation,
-            prior=self.prior,
         )
+        if times == "start" and actor_network.ode.max_nfe != 1:
+            raise ValueError(
+                "times = 'start' trains the field at t = 0 alone: build the policy with max_nfe=1"
+            )
         if weighting == "standardised" and not hasattr(actor_network.network, "remainder"):
             raise ValueError(
                 "standardised errors are in the units of a PreconditionedNetwork: wrap the network in one, "
@@ -250,16 +239,13 @@ class FlowMatchingLoss(LossModule):
             told = (
                 f"only on a straight path: use LinearInterpolant, not {type(interpolant).__name__}"
             )
-            if not self.prior.is_flow:
-                raise ValueError(
-                    f"{self.prior} is evaluated with one step, which ends at the data {told}"
-                )
+            if times == "start":
+                raise ValueError(f"one step from t = 0 ends at the data {told}")
             if objective != "velocity" or self_distillation:
                 raise ValueError(f"a velocity predicts the sample {told}")
-        self.reduction, self.share, self.autocast = reduction, share, autocast
+        self.reduction = reduction
         self.generator = actor_network.sampler.generator if generator is None else generator
-        observation, loc, warm = actor_network.in_keys[:3]
-        self.set_keys(observation=observation, loc=loc, warm=warm, chunk=actor_network.chunk_key)
+        self.set_keys(observation=actor_network.in_keys[0], chunk=actor_network.chunk_key)
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         self._in_keys = None
@@ -269,7 +255,7 @@ class FlowMatchingLoss(LossModule):
         """Keys that :meth:`forward` reads."""
         if self._in_keys is None:
             k = self.tensor_keys
-            self._in_keys = [k.observation, k.chunk, k.pad_mask, k.loc, k.warm]
+            self._in_keys = [k.observation, k.chunk, k.pad_mask, k.history]
         return self._in_keys
 
     @in_keys.setter
@@ -303,40 +289,31 @@ class FlowMatchingLoss(LossModule):
             KeyError: if a needed key is missing.
         """
         k = self.tensor_keys
-        needed = (k.chunk, k.loc, k.warm, k.observation)
-        a1, loc, warm, observation = (tensordict.get(key, None) for key in needed)
-        missing = [
-            key
-            for key, value in zip(needed, (a1, loc, warm, observation), strict=True)
-            if value is None
-        ]
+        needed = (k.chunk, k.history, k.observation)
+        found = {key: tensordict.get(key, None) for key in needed}
+        missing = [key for key, value in found.items() if value is None]
         if missing:
-            raise KeyError(f"FlowMatchingLoss needs the keys {list(needed)}; missing: {missing}")
-        weight = next(iter(self.velocity_network_params.values(True, True)), a1)
-        device = weight.device
-        a1, loc, warm, observation = (v.to(device) for v in (a1, loc, warm, observation))
+            raise KeyError(
+                f"FlowMatchingLoss needs the keys {list(needed)}; missing: {missing}. Take batches of "
+                "window_replay_buffer"
+            )
+        device = next(iter(self.velocity_network_params.values(True, True)), found[k.chunk]).device
+        a1, history, observation = (value.to(device) for value in found.values())
+        if a1.shape[-2] != self.prior.prediction_length:
+            raise ValueError(
+                f"{k.chunk} has {a1.shape[-2]} positions, but {self.prior} predicts "
+                f"{self.prior.prediction_length}: make the windows for this length"
+            )
         batch = a1.shape[:-2]
-        a0 = self.prior.sample(loc, warm, self.generator, observation)
-        a0, a1 = self.prior.couple(a0, a1, self.generator, observation)
-        t = a1.new_zeros(batch)
-        if self.prior.is_flow:
-            t = self.times(batch, self.generator, a1.dtype, a1.device)
+        a0 = self.prior.sample(history, observation, self.generator)
+        if self.coupling is not None:
+            a0, a1 = self.coupling(a0, a1, observation)
+        t = self.times(batch, self.generator, a1.dtype, a1.device)
         observation = network_observation(observation, batch)
         pad = tensordict.get(k.pad_mask, None)
         if pad is not None:
             pad = pad.to(device)
-        number, mine = batch.numel(), slice(self.share[0], None, self.share[1])
-        distilled = max(1, round(DISTILLED_SHARE * number))
-        counts = [_counted(pad, number, a1)]
-        if self.self_distillation:
-            part = None if pad is None else pad.reshape(-1, pad.shape[-1])[:distilled]
-            counts.append(_counted(part, distilled, a1))
-        if self.share[1] > 1:
-            # Every so many-th and not a block: of the first windows, which are distilled, all get a part.
-            a0, a1 = (a.reshape(-1, *a.shape[-2:])[mine] for a in (a0, a1))
-            t, observation = t.reshape(-1)[mine], observation[mine]
-            pad = None if pad is None else pad.reshape(-1, pad.shape[-1])[mine]
-            distilled = len(range(distilled)[mine])
+        distilled = max(1, round(DISTILLED_SHARE * batch.numel()))
         errors: list[Tensor] = []
         interrupt: KeyboardInterrupt | None = None
         with self.velocity_network_params.to_module(
@@ -350,36 +327,18 @@ class FlowMatchingLoss(LossModule):
                 interrupt = key  # leaving the context with it would make a RuntimeError of it
         if interrupt is not None:
             raise interrupt
-        losses = [self._reduced(errors[0], pad, counts[0])]
-        for error, count in zip(errors[1:], counts[1:], strict=True):
-            part = None if pad is None else pad.reshape(-1, pad.shape[-1])[: len(error)]
-            losses.append(self.self_distillation * self._reduced(error, part, count))
+        losses = [self._reduced(errors[0], pad)]
+        for error in errors[1:]:
+            part = None if pad is None else pad.reshape(-1, pad.shape[-1])[:distilled]
+            losses.append(self.self_distillation * self._reduced(error, part))
         return TensorDict(dict(zip(self.out_keys, losses, strict=True)), batch_size=[])
-
-    def _field(
-        self, network: nn.Module, observation: Tensor | TensorDictBase, like: Tensor
-    ) -> Callable[[Tensor, Tensor], Tensor]:
-        """A network's velocity at observations, see :func:`velocity_field`, in the type to compute in."""
-        if self.autocast is None:
-            return velocity_field(network, observation)
-        # A context of its own each time: what the teacher casts without gradients must not be taken for the
-        # weights that are trained.
-        compute = partial(torch.autocast, like.device.type, self.autocast)
-        with compute():
-            field = velocity_field(network, observation)
-
-        def velocity(t: Tensor, a: Tensor) -> Tensor:
-            with compute():
-                return field(t, a)
-
-        return velocity
 
     def _velocity_error(
         self, a0: Tensor, a1: Tensor, t: Tensor, observation: Tensor | TensorDictBase
     ) -> Tensor:
         """Error at times ``t`` ``[*B]`` of the path, ``[*B, P, d_a]``."""
         a_t, velocity = self.interpolant(a0, a1, t)
-        field = self._field(self.velocity_network, observation, a_t)
+        field = velocity_field(self.velocity_network, observation)
         predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:]))
         return self._distance(predicted.reshape(a1.shape), velocity, t)
 
@@ -388,23 +347,21 @@ class FlowMatchingLoss(LossModule):
     ) -> Tensor:
         """Error of the single step from the start to the end, of the first windows, ``[n, P, d_a]``."""
         a0, a1 = (a.detach().reshape(-1, *a.shape[-2:])[:n] for a in (a0, a1))
-        if not n:  # more processes than distilled windows
-            return a0
         observation = observation[:n]
-        begin = self.prior.start_time
+        begin = self.start_time
         near = begin + (1.0 - begin) / TEACHER_STEPS
         start, _ = self.interpolant(a0, a1, a0.new_full((n,), begin))
         with torch.no_grad():
             point, _ = self.interpolant(a0, a1, a0.new_full((n,), near))
             teacher = self.velocity_network if self.teacher is None else self.teacher
             end = integrate(
-                self._field(teacher, observation, point),
+                velocity_field(teacher, observation),
                 point,
                 nfe=TEACHER_STEPS - 1,
                 start_time=near,
             )
         t = a0.new_full((n,), begin)
-        jump = self._field(self.velocity_network, observation, start)(t, start)
+        jump = velocity_field(self.velocity_network, observation)(t, start)
         return self._distance(jump, (end - start) / (1.0 - begin), t)
 
     def _distance(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
@@ -415,20 +372,13 @@ class FlowMatchingLoss(LossModule):
             error = error / unit.view_as(error)
         return (1 - t)[..., None, None] * error.abs() if self.objective == "l1" else error.square()
 
-    def _reduced(self, error: Tensor, pad: Tensor | None, count: Tensor | int) -> Tensor:
-        """Errors ``[*B, P, d_a]`` where they count, of ``count`` coordinates that all processes have."""
+    def _reduced(self, error: Tensor, pad: Tensor | None) -> Tensor:
+        """Errors ``[*B, P, d_a]`` where they count."""
+        count: Tensor | int = max(1, error.numel())
         if pad is not None:
             error = error.masked_fill(pad.unsqueeze(-1), 0.0)
+            # At least 1: padding alone has no error, and no NaN.
+            count = ((~pad).sum() * error.shape[-1]).clamp_min(1)
         if self.reduction == "none":
             return error
-        loss = error.sum()
-        if self.reduction == "mean":
-            loss = loss / count
-        return loss if self.share[1] == 1 else self.share[1] * loss
-
-
-def _counted(pad: Tensor | None, number: int, a1: Tensor) -> Tensor | int:
-    """Coordinates of the windows that count, at least 1: padding alone has no error, and no NaN."""
-    if pad is None:
-        return max(1, number * a1.shape[-2:].numel())
-    return ((~pad).sum() * a1.shape[-1]).clamp_min(1)
+        return error.sum() / count if self.reduction == "mean" else error.sum()

@@ -9,12 +9,20 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-__all__ = ["TIMES", "Times", "TimesName", "logit_normal_times", "u_shaped_times", "uniform_times"]
+__all__ = [
+    "TIMES",
+    "Times",
+    "TimesName",
+    "logit_normal_times",
+    "start_times",
+    "u_shaped_times",
+    "uniform_times",
+]
 
 Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
 """Draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
 
-TimesName = Literal["uniform", "u-shaped", "logit-normal"]
+TimesName = Literal["uniform", "u-shaped", "logit-normal", "start"]
 
 STEEPNESS = 4.0
 """``a`` of :func:`u_shaped_times`: the ends are 3.8 times as dense as the middle."""
@@ -102,9 +110,33 @@ def logit_normal_times(
     return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
 
 
+def start_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""``t = 0`` alone: the network regresses :math:`a_1 - a_0`, and one step of Euler's method returns it.
+
+    The field means nothing at any other time: build the policy with ``max_nfe=1``.
+
+    Args:
+        shape: of the result.
+        generator: not used.
+        dtype: of the result.
+        device: of the result.
+
+    See Also:
+        :class:`~warmprior.FlowMatchingLoss`: can be trained so.
+
+    Examples:
+        >>> start_times(torch.Size([2]), None, torch.float32, torch.device("cpu"))
+        tensor([0., 0.])
+    """
+    return torch.zeros(shape, dtype=dtype, device=device)
+
+
 TIMES: dict[str, Times] = {
     "uniform": uniform_times,
     "u-shaped": u_shaped_times,
     "logit-normal": logit_normal_times,
+    "start": start_times,
 }
 """Those that have a name."""

@@ -1,6 +1,6 @@
 """Reinforcement learning in the source space of a frozen policy."""
 
-from warmprior.rl.anchor import PriorAnchor
+from warmprior.rl.anchor import PriorAnchor, has_anchor, source_anchor
 from warmprior.rl.box_normal import BoxTanhNormal
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.decoder import PriorDecoder
@@ -21,6 +21,8 @@ __all__ = [
     "PriorSpaceTraining",
     "ReplaySegments",
     "ResidualSampler",
+    "has_anchor",
     "make_prior_space_actor",
     "make_prior_space_critic",
+    "source_anchor",
 ]

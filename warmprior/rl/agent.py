@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.rl.anchor import has_anchor
 from warmprior.rl.box_normal import BoxTanhNormal
 from warmprior.rl.checks import check_finite
 from warmprior.rl.config import PriorSpaceConfig
@@ -60,7 +61,7 @@ class PriorSpaceAgent:
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
         # By default what is drawn around a mean stays in the box, but not what is drawn around zero.
-        drawn: ResidualDistribution | None = None if actor.prior.moves_source else "clipped"
+        drawn: ResidualDistribution | None = None if has_anchor(actor) else "clipped"
         self.warmup = TensorDictSequential(
             ResidualSampler(self.decoder, distribution=drawn), self.decoder
         )

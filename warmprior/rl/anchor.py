@@ -10,15 +10,70 @@ from typing import Any, Literal, Self
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
-from torch import nn
+from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs.transforms import Transform
 
 from warmprior import keys
-from warmprior.modules.prior import Prior
-from warmprior.rl.decoder import visible_priors
+from warmprior.history import check_history, window_history
 
-__all__ = ["PriorAnchor"]
+__all__ = ["PriorAnchor", "has_anchor", "residual_sigma", "source_anchor"]
+
+
+def has_anchor(actor: Any) -> bool:
+    """Whether a policy's source has a centre that moves, around which an agent can search.
+
+    It has where the policy starts on the way, or where the mean of its prior is warm once the history is
+    full. Otherwise agents search around zero, as in DSRL.
+
+    Args:
+        actor: the policy.
+
+    Examples:
+        >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
+        >>> network, priors = VelocityMLP(2, 3, 4), (GaussianPrior(4), PastPrior(4))
+        >>> [has_anchor(WarmPriorActor(network, prior)) for prior in priors]
+        [False, True]
+    """
+    prior, width = actor.prior, getattr(actor.network, "action_dim", None) or 1
+    if actor.start is not None:
+        return True
+    chunk, target = (
+        torch.zeros(length, width) for length in (prior.history_length, prior.prediction_length)
+    )
+    steps = torch.tensor([prior.history_length])
+    return bool(prior.mean(window_history(chunk, steps, target, prior.chunk_length))[1].any())
+
+
+def source_anchor(
+    actor: Any, history: TensorDictBase, observation: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Where the source of decisions is centred: the mean where it is warm, or where the policy starts.
+
+    Args:
+        actor: the policy, or what has its ``prior`` and ``start``.
+        history: ``[*B]``, see :mod:`warmprior.history`.
+        observation: what the policy's network sees, ``[*B, To, d_o]``.
+
+    Returns:
+        The anchor, ``[*B, P, d_a]``, and where it is one, bool ``[*B, P, 1]``.
+    """
+    if actor.start is not None:
+        centre = actor.start.centre(history, observation)
+        return centre, torch.ones_like(centre[..., :1], dtype=torch.bool)
+    loc, _, warm = actor.prior.distribution(history, observation)
+    return loc, warm
+
+
+def residual_sigma(actor: Any) -> float:
+    """Typical deviation of a policy's source from where an agent searches: 1 around zero.
+
+    Args:
+        actor: the policy.
+    """
+    if not has_anchor(actor):
+        return 1.0
+    return actor.prior.sigma if actor.start is None else actor.start.noise_share
 
 
 class PriorAnchor(Transform):
@@ -33,9 +88,8 @@ class PriorAnchor(Transform):
     draw of that source it does not. The draw is made *here*, before the agent acts, and written next to
     the observation: the agent sees which noise will be used, the decision process stays Markov (for WP-Past
     if whole chunks are executed, see :func:`~warmprior.make_prior_space_actor`) and the decoder
-    deterministic. ``("prior", "loc")`` is left alone, :class:`ActionHistory` carries it on. The mean is that
-    of what the flow starts from at decisions, :meth:`Prior.anchor`: of :class:`~warmprior.StepPrior` a share
-    of its forecast.
+    deterministic. Where the policy starts on the way (:class:`~warmprior.StartPoint`), the mean is that of
+    the point where it starts.
 
     Append it after :class:`ActionHistory`, inside or outside of batched environments.
 
@@ -45,64 +99,61 @@ class PriorAnchor(Transform):
         transform draws for all of them.
 
     Args:
-        prior: the policy's source distribution. One that learns is copied, as it is now: the copy goes where
-            the environment goes, and the policy's own where the policy goes.
+        actor: the policy. What its prior has learnt is copied, as it is now: the copy goes where the
+            environment goes, and the policy's own where the policy goes.
 
     Keyword Args:
-        cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default
-            noise for priors with a mean and zero for the others (:class:`~warmprior.GaussianPrior`,
-            :class:`~warmprior.HistoryPrior`), which gives vanilla DSRL: :math:`a_0 = \Delta`.
+        cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise where there
+            is an anchor (:func:`~warmprior.rl.has_anchor`) and zero elsewhere, which gives vanilla DSRL:
+            :math:`a_0 = \Delta`.
         seed: of the noise until ``env.set_seed`` is called. By default it is drawn from PyTorch's global
             generator with the first noise, and differs between the workers of a batched environment,
             whose generators are alike.
         seed_offset: mixed with the seed.
-        observation_key: what the policy's network sees, ``[*B, To, d_o]``, for priors whose mean depends on
-            it.
-        loc_key: the mean, ``[*B, P, d_a]``.
-        warm_key: its mask, bool ``[*B, P, 1]``.
         anchor_key: where the anchor is written, ``[*B, P, d_a]``.
 
     Raises:
-        ValueError: for an unknown ``cold``, or if the environment's :class:`ActionHistory` carries another
-            prior (compared where it can be seen, outside of workers; the length everywhere).
+        ValueError: for an unknown ``cold``, or if the environment's history has other lengths than the
+            policy.
         KeyError: if :class:`ActionHistory` does not come before.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv, Compose
         >>> from warmprior import ActionHistory, ChunkStep, PastPrior, PriorAnchor
-        >>> prior = PastPrior(4)
+        >>> from warmprior import VelocityMLP, WarmPriorActor
+        >>> actor = WarmPriorActor(VelocityMLP(1, 3, 4), PastPrior(4))
         >>> env = TransformedEnv(
-        ...     GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(prior), PriorAnchor(prior)))
+        ...     GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(4), PriorAnchor(actor)))
         >>> rollout = env.rollout(2)
         >>> anchor = rollout["prior", "anchor"]
-        >>> bool(anchor[0].any()), bool((anchor[1] == rollout["prior", "loc"][1]).all())
+        >>> bool(anchor[0].any()), bool((anchor[1] == rollout["history", "actions"][1]).all())
         (True, True)
     """
 
+    prior: Any
+    start: Any
+
     def __init__(
         self,
-        prior: Prior,
+        actor: Any,
         *,
         cold: Literal["noise", "zero"] | None = None,
         seed: int | None = None,
         seed_offset: int = 0,
-        observation_key: NestedKey = keys.OBSERVATION,
-        loc_key: NestedKey = keys.LOC,
-        warm_key: NestedKey = keys.WARM,
         anchor_key: NestedKey = keys.ANCHOR,
     ) -> None:
-        super().__init__(in_keys=[loc_key, warm_key], out_keys=[anchor_key])
+        super().__init__(in_keys=list(actor.in_keys), out_keys=[anchor_key])
         if cold not in (None, "noise", "zero"):
             raise ValueError(f"cold must be 'noise' or 'zero', got {cold!r}")
-        if isinstance(prior, nn.Module):
-            # It becomes a part of this one: whatever moved the environment would move the policy's weights.
-            prior = copy.deepcopy(prior).cpu().requires_grad_(False)
-        self.prior = prior
-        self.follows_mean = prior.moves_source
-        self.cold = cold or ("noise" if self.follows_mean else "zero")
+        # Copies: they become parts of this one, and whatever moved the environment would move the policy's.
+        self.prior, self.start = (
+            copy.deepcopy(part).cpu().requires_grad_(False) if isinstance(part, nn.Module) else part
+            for part in (actor.prior, actor.start)
+        )
+        self.moves = has_anchor(actor)
+        self.cold = cold or ("noise" if self.moves else "zero")
+        self.observation_key = actor.in_keys[0]
         self.seed_offset = seed_offset
-        self.observation_key = unravel_key(observation_key)
-        self.loc_key, self.warm_key = unravel_key(loc_key), unravel_key(warm_key)
         self.anchor_key = unravel_key(anchor_key)
         self.generator: torch.Generator | None = None
         if seed is not None:
@@ -155,32 +206,25 @@ class PriorAnchor(Transform):
         return type(env).set_seed(env, seed, static_seed=static_seed)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        loc = next_tensordict.get(self.loc_key, None)
-        warm = next_tensordict.get(self.warm_key, None)
-        if loc is None or warm is None:
-            raise KeyError(
-                f"PriorAnchor found no {self.loc_key} and {self.warm_key}: append it after ActionHistory"
-            )
-        if loc.shape[-2] != self.prior.prediction_length:
-            raise ValueError(
-                f"{self.loc_key} has shape {tuple(loc.shape)}, but {self.prior} predicts "
-                f"{self.prior.prediction_length} actions: ActionHistory must carry the same prior"
-            )
+        history = next_tensordict.get(keys.HISTORY, None)
+        check_history(history, self.prior.history_length, self.prior.prediction_length, self.prior)
+        forecast = history["forecast"]
         if self.cold == "noise":
             if self.generator is None:
                 drawn = int(torch.randint(2**62, ()))
                 self.set_seed(f"{drawn}/{multiprocessing.current_process().name}")
             # Drawn on the CPU: one seed gives one noise on every device.
-            cold = torch.randn(loc.shape, generator=self.generator, dtype=loc.dtype)
-            cold = cold.to(loc.device)
+            cold = torch.randn(forecast.shape, generator=self.generator, dtype=forecast.dtype)
+            cold = cold.to(forecast.device)
         else:
-            cold = torch.zeros_like(loc)
+            cold = torch.zeros_like(forecast)
         anchor = cold
-        if self.follows_mean:
-            observation = next_tensordict.get(self.observation_key, None)
+        if self.moves:
             with torch.no_grad():
-                mean = self.prior.anchor(loc, warm, observation)
-            anchor = torch.where(warm | self.prior.always_warm, mean, cold)
+                mean, known = source_anchor(
+                    self, history, next_tensordict.get(self.observation_key, None)
+                )
+            anchor = torch.where(known, mean, cold)
         return next_tensordict.set(self.anchor_key, anchor)
 
     def _reset(
@@ -195,13 +239,7 @@ class PriorAnchor(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the anchor."""
-        if self.loc_key not in observation_spec.keys(True, True):
-            raise KeyError(f"PriorAnchor found no {self.loc_key}: append it after ActionHistory")
-        for transform, prior in visible_priors(self.parent):
-            if prior.config() != self.prior.config():
-                raise ValueError(
-                    f"PriorAnchor was built for {self.prior}, but {transform} carries {prior}: all parts "
-                    "of an environment need the policy's own prior"
-                )
-        observation_spec[self.anchor_key] = observation_spec[self.loc_key].clone()
+        if keys.FORECAST not in observation_spec.keys(True, True):
+            raise KeyError(f"PriorAnchor found no {keys.FORECAST}: append it after ActionHistory")
+        observation_spec[self.anchor_key] = observation_spec[keys.FORECAST].clone()
         return observation_spec

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.rl.anchor import has_anchor
 from warmprior.rl.checks import check_counts, check_positive
 
 __all__ = ["PriorSpaceConfig"]
@@ -113,4 +114,4 @@ class PriorSpaceConfig:
         """``delta``, or its default for a policy: the paper's 0.5 around a mean, 1.5 around zero."""
         if self.delta is not None:
             return self.delta
-        return 0.5 if actor.prior.moves_source else 1.5
+        return 0.5 if has_anchor(actor) else 1.5

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
-from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
 from warmprior.rl.checks import check_positive
 
-__all__ = ["PriorDecoder", "visible_priors"]
+__all__ = ["PriorDecoder"]
 
 
 class PriorDecoder(TensorDictModuleBase):
@@ -81,10 +79,10 @@ class PriorDecoder(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         check_positive(delta=delta)
-        if not actor.prior.is_flow:
+        if actor.ode.max_nfe == 1:
             raise ValueError(
-                f"{actor.prior} starts at a single point and its field means nothing elsewhere: there is "
-                "no source space to act in"
+                "the policy is trained at t = 0 alone, and its field means nothing elsewhere: there is no "
+                "source space to act in"
             )
         if actor.ode.guidance is not None:
             raise ValueError(
@@ -96,7 +94,7 @@ class PriorDecoder(TensorDictModuleBase):
         self.nfe = self.ode.nfe if nfe is None else nfe
         self.ode.check_nfe(self.nfe)
         self.normalizer = copy.deepcopy(actor.normalizer)
-        self.prior = copy.deepcopy(actor.prior)
+        self.prior, self.start = copy.deepcopy(actor.prior), copy.deepcopy(actor.start)
         _freeze(self)
         self.anchor_key = unravel_key(anchor_key)
         self.delta_key = unravel_key(delta_key)
@@ -105,6 +103,11 @@ class PriorDecoder(TensorDictModuleBase):
         self.chunk_key = unravel_key(self.ode.out_keys[0])
         self.in_keys = [self.observation_key, self.anchor_key, self.delta_key]
         self.out_keys = [self.noise_key, self.chunk_key]
+
+    @property
+    def network(self) -> nn.Module:
+        """The frozen network."""
+        return self.ode.network
 
     @property
     def prediction_length(self) -> int:
@@ -144,9 +147,7 @@ class PriorDecoder(TensorDictModuleBase):
         return tensordict.set(self.chunk_key, chunk)
 
     def check_env(self, env: EnvBase) -> None:
-        """Compare the policy with an environment: chunk length, action width and prior.
-
-        Priors are compared where the environment's transforms can be seen, outside of workers.
+        """Compare the policy with an environment: chunk length and action width.
 
         Args:
             env: an environment whose action is the chunk.
@@ -168,11 +169,6 @@ class PriorDecoder(TensorDictModuleBase):
                 f"the environment takes chunks of (P, d_a) = {tuple(shape[-2:])}, but the policy "
                 f"predicts {expected}"
             )
-        for transform, prior in visible_priors(env):
-            if prior.config() != self.prior.config():
-                raise ValueError(
-                    f"the policy was trained with {self.prior}, but {transform} carries {prior}"
-                )
 
     def train(self, mode: bool = True) -> PriorDecoder:
         """Stays in evaluation mode."""
@@ -195,12 +191,3 @@ def _freeze(module: nn.Module) -> None:
 
 def _keep_weights() -> None:
     """Stands for ``reset_parameters``."""
-
-
-def visible_priors(env: EnvBase) -> Iterator[tuple[str, Prior]]:
-    """The priors that the transforms around ``env`` carry, with the transforms' names."""
-    while isinstance(env, TransformedEnv):
-        for transform in env.transform.modules():
-            if isinstance(getattr(transform, "prior", None), Prior):
-                yield type(transform).__name__, transform.prior
-        env = env.base_env

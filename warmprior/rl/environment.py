@@ -45,7 +45,7 @@ class PriorSpace(Transform):
 
     Raises:
         KeyError: if :class:`~warmprior.ChunkStep` or :class:`~warmprior.PriorAnchor` does not come before.
-        ValueError: if the environment's chunks or prior are not the policy's, see
+        ValueError: if the environment's chunks are not the policy's, see
             :meth:`PriorDecoder.check_env`.
 
     Examples:
@@ -55,7 +55,7 @@ class PriorSpace(Transform):
         >>> from warmprior.envs import NavigationEnv
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4), nfe=1)
         >>> transforms = policy_transforms(actor.prior, observation_steps=1)
-        >>> transforms.append(PriorAnchor(actor.prior))
+        >>> transforms.append(PriorAnchor(actor))
         >>> transforms.append(PriorSpace(PriorDecoder(actor, delta=0.5)))
         >>> env = TransformedEnv(NavigationEnv(batch_size=[3]), transforms)
         >>> env.action_keys, env.full_action_spec["prior", "delta"].shape

@@ -111,8 +111,8 @@ def make_prior_space_actor(
         hidden_dim: width of the layers.
         num_layers: number of layers.
         in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``. Leave the anchor
-            out where it is always zero. Add ``keys.LOC`` where the anchor does not tell what the decoder
-            or the next mean depends on: for :class:`~warmprior.HistoryPrior`, and for WP-Past with
+            out where it is always zero. Add ``keys.ACTIONS`` where the anchor does not tell what the decoder
+            or the next mean depends on: for a network that sees the last actions, and for WP-Past with
             ``execute < H``.
         delta_key: where the residual is written; its log-probability is summed over the chunk.
         distribution_class: :class:`~warmprior.BoxTanhNormal` for entropies in units of the box in TorchRL's
@@ -173,7 +173,7 @@ def make_prior_space_critic(
     :class:`~warmprior.DSRLNALoss`. ``in_keys=(keys.OBSERVATION, keys.CHUNK)`` is the latter's action critic.
     It judges all ``P`` actions of a chunk, which determine the next mean for WP-Preview, and for WP-Past if
     whole chunks are executed. If not (``execute < H``), earlier actions are part of the next mean: give
-    actor and critics ``keys.LOC`` as well.
+    actor and critics ``keys.ACTIONS`` as well.
 
     Args:
         action_dim: ``d_a``.

@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
+from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.rl.decoder import PriorDecoder
 
 __all__ = ["ResidualSampler"]
@@ -19,9 +20,9 @@ ResidualDistribution = Literal["normal", "clipped", "uniform"]
 class ResidualSampler(TensorDictModuleBase):
     r"""Draws residuals without an agent: to fill the buffer at first, and to distil the noise critic.
 
-    With :math:`\sigma` the typical deviation of the source from where the agent searches
-    (:attr:`~warmprior.Prior.residual_sigma`: by default the prior's ``sigma`` around its mean, and 1 around
-    zero) and :math:`\delta` the decoder's:
+    With :math:`\sigma` the typical deviation of the source from where the agent searches (the prior's
+    ``sigma`` around its mean, the share of noise where the policy starts on the way, and 1 around zero) and
+    :math:`\delta` the decoder's:
 
     ===============  =============================================================================
     distribution     residual
@@ -40,7 +41,7 @@ class ResidualSampler(TensorDictModuleBase):
     Keyword Args:
         distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
             noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
-        sigma: the prior's own by default, as it is now.
+        sigma: that by default. A learned prior whose ``sigma`` is a factor needs its own here.
         generator: source of randomness on the data's device; PyTorch's global one by default.
 
     Raises:
@@ -71,8 +72,8 @@ class ResidualSampler(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if sigma is None:
-            sigma = decoder.prior.residual_sigma
-        if distribution is None and decoder.prior.moves_source:
+            sigma = residual_sigma(decoder)
+        if distribution is None and has_anchor(decoder):
             distribution = "clipped" if sigma > 0 else "uniform"
         elif distribution is None:
             distribution = "normal"

@@ -21,6 +21,7 @@ from tqdm import tqdm
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.agent import PriorSpaceAgent
+from warmprior.rl.anchor import has_anchor
 from warmprior.rl.checks import check_finite
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
@@ -73,18 +74,18 @@ class PriorSpaceTraining:
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, PriorAnchor, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import GoalNavigationEnv
-        >>> prior = PastPrior(8)
         >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
+        >>> actor = WarmPriorActor(network, PastPrior(8))
         >>> def make_env(seed):
-        ...     transforms = policy_transforms(prior, observation_steps=1)
-        ...     transforms.append(PriorAnchor(prior, seed=seed))
+        ...     transforms = policy_transforms(actor.prior, observation_steps=1)
+        ...     transforms.append(PriorAnchor(actor, seed=seed))
         ...     return TransformedEnv(GoalNavigationEnv((1, 1), batch_size=[2]), transforms)
         >>> config = PriorSpaceConfig(
         ...     environment_steps=40, warmup_steps=20, evaluate_every=40, evaluation_episodes=2,
         ...     batch_size=4, updates=1, noise_critic_steps=1, hidden_dim=8, num_layers=1)
         >>> with TemporaryDirectory() as folder:
         ...     training = PriorSpaceTraining(
-        ...         WarmPriorActor(network, prior), make_env, config, folder, evaluation_seed=100)
+        ...         actor, make_env, config, folder, evaluation_seed=100)
         ...     [row["evaluation"] for row in training.run()]
         ['base', 'greedy', 'stochastic']
     """
@@ -259,9 +260,10 @@ class PriorSpaceTraining:
 
     def _check_executed(self, after: TensorDictBase) -> None:
         """Partial execution would put actions into the next mean that the critics do not see."""
-        prior = self.decoder.prior
+        decoder, prior = self.decoder, self.decoder.prior
         short = (after[keys.EXECUTED] < prior.chunk_length) & ~after["done"]
-        if short.any() and prior.ever_warm:
+        remembers = decoder.observation_key == keys.CONDITIONED or has_anchor(decoder)
+        if short.any() and remembers:
             raise ValueError(
                 f"the environment executes {int(after[keys.EXECUTED][short].max())} of H = "
                 f"{prior.chunk_length} actions per decision, but the agent's critics judge whole chunks: "

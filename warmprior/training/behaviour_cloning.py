@@ -7,6 +7,8 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -26,7 +28,6 @@ from warmprior.io.distributed import (
     world_size,
 )
 from warmprior.io.files import exclusive
-from warmprior.io.options import identity_of
 from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled
@@ -35,6 +36,7 @@ from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.trend import PoseTrend, RestingAction
+from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
     check_identity,
@@ -52,6 +54,7 @@ from warmprior.training.checkpoint import (
 )
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.placement import Prefetch
+from warmprior.training.saved import check_saveable, load_policy, save_policy
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer, without_images
 
@@ -66,7 +69,7 @@ HASHED_AT_ONCE = 2**26
 WINDOWS_SEED = 1_000_003
 """Added to the seed of windows that have a generator of their own: other draws than those of the sources."""
 
-STATE_FORMAT = 4
+STATE_FORMAT = 5
 """Part of every state's identity; raised whenever the same options give other weights."""
 
 
@@ -76,6 +79,8 @@ def precondition(
     prior: Prior,
     *,
     observation_steps: int = 2,
+    coupling: Coupling | None = None,
+    withhold: float = 0.0,
     rest: RestingAction | None = None,
     interpolant: Interpolant | None = None,
 ) -> PreconditionedNetwork:
@@ -88,6 +93,8 @@ def precondition(
 
     Keyword Args:
         observation_steps: ``To``.
+        coupling: how the training pairs sources and targets; as they come by default.
+        withhold: share of the windows whose history is withheld.
         rest: for absolute actions, to take off what follows from where the grippers are.
         interpolant: the path, that of the loss; linear by default.
 
@@ -103,16 +110,21 @@ def precondition(
         'PreconditionedNetwork'
     """
     generator = torch.Generator(data.device or "cpu").manual_seed(0)
-    if prior.teacher is None:  # which sees them
+    if coupling is None:  # which may look at them
         data = without_images(data)
     windows = window_replay_buffer(
-        data, prior, batch_size=1024, observation_steps=observation_steps, generator=generator
+        data,
+        prior,
+        batch_size=1024,
+        observation_steps=observation_steps,
+        withhold=withhold,
+        generator=generator,
     )
     trend = None
     if rest is not None:
         batch = torch.cat([windows.sample() for _ in range(TREND_BATCHES)])
         trend = PoseTrend.fit(batch, prior, rest, generator=generator)
-    moments = SourceMoments.fit(windows, prior, trend=trend, generator=generator)
+    moments = SourceMoments.fit(windows, prior, coupling=coupling, trend=trend, generator=generator)
     return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=interpolant)
 
 
@@ -125,9 +137,7 @@ class BehaviourCloning:
     uninterrupted run with the same number of threads.
 
     Processes that have :func:`~warmprior.io.distributed.joined` train together: each constructs the same
-    training, runs it and computes its share of every batch, and PyTorch's DDP averages the gradients. The
-    weights are those of one process up to rounding, whatever the number of processes, which may change from
-    one start to the next; only what a network draws itself (dropout, crops of images) is drawn anew. The
+    training, runs it and draws its own part of every batch, and PyTorch's DDP averages the gradients. The
     first process alone writes.
 
     Args:
@@ -139,6 +149,7 @@ class BehaviourCloning:
 
     Keyword Args:
         observation_steps: ``To``.
+        coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`.
         logger: a TorchRL logger for the loss, the learning rate and the speed.
         resume: continue from the folder's state if there is one; otherwise start over.
         compile: compile the velocity network with :func:`torch.compile`; on a GPU, as CUDA graphs.
@@ -146,10 +157,9 @@ class BehaviourCloning:
             on the CPU train a network that is not.
 
     Raises:
-        ValueError: if a batch has fewer windows than there are processes, the folder's
+        ValueError: if a batch cannot be divided among the processes, the folder's
             state is damaged or belongs to another recipe, prior, network or dataset, the policy could not be
-            loaded again (:meth:`WarmPriorActor.check_saveable`), or its prior conditions the network and it
-            reads another key than :class:`~warmprior.MeanObservation` writes.
+            loaded again (:func:`~warmprior.training.check_saveable`).
         TypeError: if the policy cannot be saved.
 
     See Also:
@@ -180,18 +190,14 @@ class BehaviourCloning:
         directory: str | Path,
         *,
         observation_steps: int = 2,
+        coupling: Coupling | None = None,
         logger: Logger | None = None,
         resume: bool = True,
         compile: bool = False,
         prefetch: bool | None = None,
     ) -> None:
-        actor.check_saveable()  # before hours are spent on what would be lost
+        check_saveable(actor)  # before hours are spent on what would be lost
         check_batch(config.batch_size)
-        if config.batch_size < actor.prior.least_batch:
-            raise ValueError(
-                f"{actor.prior.name} needs batches of at least {actor.prior.least_batch}, got "
-                f"{config.batch_size}"
-            )
         self.actor = actor
         self.config = config
         self.directory = Path(directory)
@@ -206,43 +212,45 @@ class BehaviourCloning:
         windows = self.generator
         if apart:
             windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
-        observation_key, loc_key, warm_key = actor.in_keys[:3]
-        renamed = {"loc_key": loc_key, "warm_key": warm_key, "chunk_key": actor.chunk_key}
-        if actor.prior.conditions_network:  # what it reads is made of the data's observation
-            if observation_key != CONDITIONED:
-                raise ValueError(
-                    f"with {actor.prior} the network reads what MeanObservation writes, {CONDITIONED!r}, but "
-                    f"this policy reads {observation_key!r}: build it without an observation_key"
-                )
-            observation_key = OBSERVATION
-        renamed["observation_key"] = observation_key
+        see_history = actor.in_keys[0] == CONDITIONED  # made of the data's observation
+        observation_key = OBSERVATION if see_history else actor.in_keys[0]
         self.replay_buffer = window_replay_buffer(
             data,
             actor.prior,
-            batch_size=config.batch_size,
+            batch_size=config.batch_size // self.processes,
             observation_steps=observation_steps,
+            see_history=see_history,
+            withhold=config.cold_probability,
             generator=windows,
-            **renamed,
+            observation_key=observation_key,
+            chunk_key=actor.chunk_key,
         )
         self._windows = windows if apart else None
         self._prefetch = (
             Prefetch(self.replay_buffer.sample, windows, device=device) if prefetch else None
         )
-        #: The network, and the prior where it learns as well.
+        #: The network, and the prior where it has weights as well.
         self.trained = nn.ModuleDict({"network": actor.network})
         if isinstance(actor.prior, nn.Module):
             self.trained["prior"] = actor.prior
         self.ema = ema_of(self.trained, config.ema_rate)
         self.loss_module = FlowMatchingLoss(
             actor,
+            coupling=coupling,
             times=config.times,
             objective=config.objective,
             weighting=config.weighting,
             self_distillation=config.self_distillation,
             teacher=cast(Any, self.ema.module)["network"],
             generator=self.generator,
-            share=(self.rank, self.processes),
-            autocast=torch.bfloat16 if config.precision == "bf16" else None,
+        )
+        # Without the cache: what the teacher casts without gradients must not be taken for the weights.
+        self._precision = partial(
+            torch.autocast,
+            device.type,
+            torch.bfloat16,
+            enabled=config.precision == "bf16",
+            cache_enabled=False,
         )
         self.optimizer = make_optimizer(
             actor.network,
@@ -259,8 +267,10 @@ class BehaviourCloning:
         self.losses: list[tuple[int, float]] = []
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
-            "config": identity_of(config) | {"betas": list(config.betas)},
+            "config": asdict(config) | {"betas": list(config.betas)},
             "prior": actor.prior.config() | _fixed_identity(actor.prior),
+            "start": None if actor.start is None else actor.start.config(),
+            "coupling": _coupling_identity(coupling),
             "network": _network_identity(actor.network),
             "data": _data_digest(data.select(observation_key, ACTION, EPISODE)),
             "policy": {"observation_steps": observation_steps, "clip": actor.ode.clip},
@@ -306,7 +316,8 @@ class BehaviourCloning:
             torch.compiler.cudagraph_mark_step_begin()
         batch = self.replay_buffer.sample() if self._prefetch is None else self._prefetch()
         with process_group():
-            loss = self._loss(batch)
+            with self._precision():
+                loss = self._loss(batch)
             self.optimizer.zero_grad()
             loss.backward()
             whole = loss.detach()
@@ -404,13 +415,13 @@ class BehaviourCloning:
 
     def _keep(self) -> None:
         """Keep the policy of this iteration."""
-        self._averaged_actor().save_pretrained(self.policy_path(self.iteration))
+        save_policy(self._averaged_actor(), self.policy_path(self.iteration))
 
     def _is_kept(self) -> bool:
         """Whether the policy of this iteration is on disk and whole."""
         try:
             with torch.random.fork_rng([]):  # a loaded policy was built with random weights before
-                WarmPriorActor.from_pretrained(self.policy_path(self.iteration))
+                load_policy(self.policy_path(self.iteration))
         except (OSError, ValueError):
             return False
         return True
@@ -486,15 +497,20 @@ class BehaviourCloning:
             # They were drawn by the generator of the rest, for the data lay on the device.
             seed = WINDOWS_SEED + self.config.seed + self.iteration
             state = torch.Generator(self._windows.device).manual_seed(seed).get_state()
-        if self._prefetch is None:
-            self._windows.set_state(state)
-        else:
+        if self._prefetch is not None:
             self._prefetch.restore(state)
+        else:
+            self._windows.set_state(state)
 
     def _differ(self) -> None:
-        """Draw apart from the other processes what networks draw: dropout and crops, each of its windows."""
-        if self.rank:
-            torch.manual_seed(int(torch.randint(2**62, ())) + self.rank)
+        """Draw apart from the other processes: windows, sources, times, dropout and crops."""
+        if not self.rank:
+            return
+        torch.manual_seed(int(torch.randint(2**62, ())) + self.rank)
+        self.generator.manual_seed(int(torch.randint(2**62, ())))
+        if self._windows is not None:
+            apart = torch.Generator(self._windows.device).manual_seed(int(torch.randint(2**62, ())))
+            self._restore_windows(apart.get_state())
 
     def _restore(self) -> None:
         """Continue from the folder's state, if there is one that is not continued already."""
@@ -521,8 +537,7 @@ class BehaviourCloning:
         if any(facts["schedule"][name] != value for name, value in schedule.items()):
             raise ValueError(f"its schedule is not that of iteration {iteration}")
         optimizer = select("optimizer", tensors)
-        # States written before the names were have none.
-        if not optimizer or sorted(optimizer) != facts.get("optimizer", sorted(optimizer)):
+        if not optimizer or sorted(optimizer) != facts["optimizer"]:
             raise ValueError("it lacks entries of the optimiser")
         losses = [(i, float(loss)) for i, loss in facts["losses"]]
         if not all(type(i) is int and 0 < i <= iteration for i, _ in losses):
@@ -539,7 +554,8 @@ class BehaviourCloning:
         self._running = list(tensors["running"].to(self.generator.device))
         self.iteration, self.losses = iteration, losses
         restore_rng(self.generator, select("rng", tensors))
-        self._restore_windows(tensors.get("rng/windows"))
+        if self._windows is not None:
+            self._restore_windows(tensors.get("rng/windows"))
         self._differ()
 
 
@@ -563,7 +579,7 @@ class _Loss(nn.Module):
 
 
 def _learning(prior: Prior) -> list[nn.Parameter]:
-    """Parameters of a prior that are trained with the flow; those of a LearnedPrior are fixed by then."""
+    """Parameters of a prior that are trained with the flow; one that learnt before is fixed by then."""
     if not isinstance(prior, nn.Module):
         return []
     return [parameter for parameter in prior.parameters() if parameter.requires_grad]
@@ -578,6 +594,13 @@ def _network_identity(network: nn.Module) -> Any:
     network = uncompiled(network)
     config: Any = network.config
     return {**config(), **_fixed_identity(network)}
+
+
+def _coupling_identity(coupling: Coupling | None) -> Any:
+    if coupling is None:
+        return None
+    config = getattr(coupling, "config", None)
+    return config() if config else getattr(coupling, "__qualname__", type(coupling).__qualname__)
 
 
 def _fixed_identity(part: object) -> dict[str, str]:

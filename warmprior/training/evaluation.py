@@ -40,8 +40,9 @@ class Episode:
         success: whether the task was solved at any step.
         steps: control steps executed.
         decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, whatever the policy's own
-            key for it, under ``"next"`` ``"executed_steps"`` and ``"done"``, and what
-            :class:`~warmprior.InferenceDelay` told, if chunks took effect late. Episodes concatenated along
+            key for it, the mean of its source and where that is warm, if it has one, under ``"next"``
+            ``"executed_steps"`` and ``"done"``, and the delay with what was left of the chunk before, if
+            chunks took effect late. Episodes concatenated along
             ``D`` are a rollout for :func:`~warmprior.diagnostics.smoothness`.
 
     Examples:
@@ -263,7 +264,7 @@ def play_episode(
     home = env.device or torch.device("cpu")
     chunk_key = _chunk_key(policy, env)
     decisions: list[TensorDictBase] = []
-    success = False
+    success, steps = False, 0
     with acting_in_episode(policy, seed, nfe=nfe, policy_seed=policy_seed) as act:
         env.set_seed(seed)
         data = env.reset()
@@ -271,8 +272,8 @@ def play_episode(
             data = env.step(act(data.to(device)).to(home))
             decisions.append(_decision(data, chunk_key))
             success |= bool(data["next", keys.SUCCESS])
+            steps += int(data["next", keys.EXECUTED])
             if data["next", "done"].all():
-                steps = int(data["next", keys.ELAPSED])
                 return Episode(seed, success, steps, _rollout(decisions))
             data = env.step_mdp(data)
 
@@ -376,7 +377,7 @@ def _play_batched(
     home = env.device or torch.device("cpu")
     chunk_key = _chunk_key(policy, env)
     played = [0] * num_envs
-    success = [False] * num_envs
+    success, steps = [False] * num_envs, [0] * num_envs
     decisions: list[list[TensorDictBase]] = [[] for _ in played]
     # The simulators need the cores; a policy's call is small, and its idle threads would spin.
     with torch_threads(1), watched(env), _acting(policy, policy_seed, nfe) as act:
@@ -391,17 +392,17 @@ def _play_batched(
             if not active.all():
                 data.set("_step", active.to(home))
             data = env.step(act(data.to(device)).to(home))
-            told = data["next"].select("done", keys.SUCCESS, keys.ELAPSED).cpu()
+            told = data["next"].select("done", keys.SUCCESS, keys.EXECUTED).cpu()
             done = told["done"].flatten() & active
             decided = _decision(data, chunk_key)
             for i in active.nonzero().flatten().tolist():
                 decisions[i].append(decided[i])
                 success[i] |= bool(told[keys.SUCCESS][i])
+                steps[i] += int(told[keys.EXECUTED][i])
             for i in done.nonzero().flatten().tolist():
                 episode = i + num_envs * played[i]
-                steps = int(told[keys.ELAPSED][i])
-                report(Episode(seeds[episode], success[i], steps, _rollout(decisions[i])))
-                decisions[i], success[i] = [], False
+                report(Episode(seeds[episode], success[i], steps[i], _rollout(decisions[i])))
+                decisions[i], success[i], steps[i] = [], False, 0
                 played[i] += 1
                 if episode + num_envs < len(seeds):
                     seed_row(i, seeds[episode + num_envs])
@@ -446,9 +447,9 @@ def _check_keys(env: EnvBase) -> None:
     known = env.observation_spec.keys(True, True)
     if keys.SUCCESS not in known:
         raise KeyError(f"the environment does not tell {keys.SUCCESS!r}, bool [*B, 1]")
-    if keys.EXECUTED not in known or keys.ELAPSED not in known:
+    if keys.EXECUTED not in known or keys.ACTIONS not in known:
         raise KeyError(
-            f"the environment lacks {keys.EXECUTED!r} or {keys.ELAPSED!r}: give it the policy's transforms, "
+            f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: give it the policy's transforms, "
             "see warmprior.policy_transforms"
         )
 
@@ -466,7 +467,8 @@ def _device(policy: TensorDictModuleBase) -> torch.device:
 
 def _decision(data: TensorDictBase, chunk_key: NestedKey) -> TensorDictBase:
     """What :attr:`Episode.decisions` keeps of a step, on the CPU."""
-    kept = data.select(keys.LEFTOVER, keys.DELAY, ("next", keys.EXECUTED), strict=False).cpu()
+    late = [keys.DELAY, keys.FORECAST] if data.get(keys.DELAY, None) is not None else []
+    kept = data.select(keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED), strict=False).cpu()
     return kept.set(keys.CHUNK, data[chunk_key].cpu())
 
 

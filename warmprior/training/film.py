@@ -147,7 +147,7 @@ def record_filmstrip(
         ValueError: if the policy keeps no description of its environment, or the size of a video is odd.
 
     Examples:
-        >>> actor = WarmPriorActor.from_pretrained("policy_010000")  # doctest: +SKIP
+        >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> record_filmstrip(actor, seed=10_000_000, nfe=1, frames=5).steps  # doctest: +SKIP
         [0, 24, 48, 71, 95]
         >>> record_filmstrip(actor=None, seed=0, size=161, video=Path("film.mp4"))
@@ -212,7 +212,7 @@ def record_video(
         ValueError: if the policy keeps no description of its environment, or the size is odd.
 
     Examples:
-        >>> actor = WarmPriorActor.from_pretrained("policy_010000")  # doctest: +SKIP
+        >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> record_video(actor, Path("film.mp4"), seed=10_000_000, nfe=1)  # doctest: +SKIP
         True
         >>> record_video(None, Path("film.mp4"), seed=0, size=255)

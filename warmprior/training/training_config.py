@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, get_args
 
-from warmprior.io.options import LATER
-from warmprior.modules.prior import Prior
 from warmprior.objectives.flow_matching import Objective, Weighting, check_objective
 from warmprior.objectives.times import TimesName
 
@@ -39,6 +37,7 @@ class TrainingConfig:
             time counts alike.
         self_distillation: weight of learning in one step where the flow of averaged weights ends.
         precision: of the network's matrix products in training; weights, averages and optimiser are float32.
+        cold_probability: share of the windows whose history is withheld; the paper's Algorithm 1 has none.
 
     Raises:
         ValueError: for a number out of its range, naming it.
@@ -65,11 +64,12 @@ class TrainingConfig:
     save_every: int | None = None
     log_every: int = 100
     seed: int = 0
-    times: TimesName = field(default="uniform", metadata=LATER)
-    objective: Objective = field(default="velocity", metadata=LATER)
-    weighting: Weighting = field(default="velocity", metadata=LATER)
-    self_distillation: float = field(default=0.0, metadata=LATER)
-    precision: Precision = field(default="float32", metadata=LATER)
+    times: TimesName = "uniform"
+    objective: Objective = "velocity"
+    weighting: Weighting = "velocity"
+    self_distillation: float = 0.0
+    precision: Precision = "float32"
+    cold_probability: float = 0.0
 
     def __post_init__(self) -> None:
         counts = ("iterations", "batch_size", "checkpoints", "log_every", "save_every")
@@ -84,30 +84,17 @@ class TrainingConfig:
         if self.precision not in get_args(Precision):
             known = ", ".join(get_args(Precision))
             raise ValueError(f"precision must be one of {known}, got {self.precision!r}")
+        if not 0.0 <= self.cold_probability <= 1.0:
+            raise ValueError(f"cold_probability must lie in [0, 1], got {self.cold_probability}")
         shares = {"betas": self.betas, "warmup_ratio": (self.warmup_ratio,)}
         for name, values in (shares | {"ema_rate": (self.ema_rate,)}).items():
             if not all(0.0 <= value < 1.0 for value in values):
                 raise ValueError(f"{name} must lie in [0, 1), got {getattr(self, name)}")
-        self._check_objective()
-
-    def check_prior(self, prior: Prior) -> None:
-        """Refuse a prior that cannot be trained by this recipe.
-
-        Args:
-            prior: the source distribution.
-
-        Raises:
-            ValueError: naming the option.
-        """
-        self._check_objective(prior)
-
-    def _check_objective(self, prior: Prior | None = None) -> None:
         check_objective(
             times=self.times,
             objective=self.objective,
             weighting=self.weighting,
             self_distillation=self.self_distillation,
-            prior=prior,
         )
 
     @property

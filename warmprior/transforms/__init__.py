@@ -3,10 +3,10 @@
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.camera_images import CameraImages
 from warmprior.transforms.chunk import ChunkStep
-from warmprior.transforms.delay import InferenceDelay, executed_chunk, shift_chunk
+from warmprior.transforms.delay import InferenceDelay, executed_chunk
 from warmprior.transforms.encode import EncodeObservation
-from warmprior.transforms.history import ActionHistory
-from warmprior.transforms.mean_observation import MeanObservation
+from warmprior.transforms.history import ActionHistory, WithheldHistory
+from warmprior.transforms.history_observation import HistoryObservation
 from warmprior.transforms.policy import policy_transforms
 from warmprior.transforms.stack import ObservationStack
 from warmprior.transforms.window import ActionWindow, window_replay_buffer, window_transforms
@@ -18,12 +18,12 @@ __all__ = [
     "CameraImages",
     "ChunkStep",
     "EncodeObservation",
+    "HistoryObservation",
     "InferenceDelay",
-    "MeanObservation",
     "ObservationStack",
+    "WithheldHistory",
     "executed_chunk",
     "policy_transforms",
-    "shift_chunk",
     "window_replay_buffer",
     "window_transforms",
 ]

@@ -6,14 +6,15 @@ from numbers import Integral
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
+from torchrl.data import TensorSpec, Unbounded
+from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.modules.real_time_chunking import with_leftover
-from warmprior.transforms.memory import ChunkMemory
 
-__all__ = ["InferenceDelay", "check_delay", "executed_chunk", "shift_chunk"]
+__all__ = ["InferenceDelay", "check_delay", "executed_chunk"]
 
 
 def check_delay(delay: int, execute: int, length: int | None = None) -> None:
@@ -61,45 +62,18 @@ def executed_chunk(tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> chunk, leftover = torch.ones(1, 3, 1), torch.zeros(1, 3, 1)
-        >>> data = TensorDict({keys.CHUNK: chunk, keys.LEFTOVER: leftover}, [1])
+        >>> chunk, forecast = torch.ones(1, 3, 1), torch.zeros(1, 3, 1)
+        >>> data = TensorDict({keys.CHUNK: chunk, keys.FORECAST: forecast}, [1])
         >>> executed_chunk(data.set(keys.DELAY, torch.tensor([[1]]))).flatten().tolist()
         [0.0, 1.0, 1.0]
     """
     delay = tensordict.get(keys.DELAY, None)
     if delay is None:
         return tensordict.get(chunk_key)
-    return with_leftover(tensordict.get(chunk_key), tensordict.get(keys.LEFTOVER), delay)
+    return with_leftover(tensordict.get(chunk_key), tensordict.get(keys.FORECAST), delay)
 
 
-def shift_chunk(chunk: Tensor, steps: Tensor) -> tuple[Tensor, Tensor]:
-    """What is left of a chunk, at the positions of the next one.
-
-    Args:
-        chunk: ``[*B, P, d_a]``.
-        steps: control steps between the two, int64 ``[*B, 1]``.
-
-    Returns:
-        The chunk's ``[steps, P)`` followed by zeros, ``[*B, P, d_a]``, and where it holds, bool
-        ``[*B, P, 1]``.
-
-    See Also:
-        :func:`~warmprior.modules.with_leftover`: puts what is left before the next chunk.
-
-    Examples:
-        >>> import torch
-        >>> left, valid = shift_chunk(torch.tensor([[1.0], [2.0], [3.0]]), torch.tensor([2]))
-        >>> left.flatten().tolist(), valid.flatten().tolist()
-        ([3.0, 0.0, 0.0], [True, False, False])
-    """
-    length = chunk.shape[-2]
-    index = (steps + torch.arange(length, device=chunk.device)).unsqueeze(-1)
-    valid = index < length
-    index = index.clamp(max=length - 1).expand_as(chunk)
-    return torch.where(valid, chunk.gather(-2, index), 0.0), valid
-
-
-class InferenceDelay(ChunkMemory):
+class InferenceDelay(Transform):
     r"""Lets every chunk take effect ``delay`` control steps after the observation that it answers.
 
     Simulators wait for policies and robots do not. Here the robot goes on meanwhile: of the ``execute``
@@ -113,17 +87,9 @@ class InferenceDelay(ChunkMemory):
     every ``execute`` steps, so that predictions have to reach ``execute + delay`` steps: with ``H = P``
     (Gaussian source, WP-Past) fewer actions are executed per decision.
 
-    =======================  =======================  =================================================
-    key                      shape                    meaning
-    =======================  =======================  =================================================
-    ``("rtc", "leftover")``  ``[*B, P, d_a]`` float   what the chunk before holds for the next ``P``
-                                                      control steps, 0 behind its end
-    ``("rtc", "valid")``     ``[*B, P, 1]`` bool      where it holds any
-    ``("rtc", "delay")``     ``[*B, 1]`` int64        ``delay``; 0 at the first decision of an episode
-    =======================  =======================  =================================================
-
-    :class:`~warmprior.RealTimeChunking` reads them, and :func:`executed_chunk` tells of a rollout what was
-    executed.
+    It writes ``("rtc", "delay")``, int64 ``[*B, 1]``: ``delay``, and 0 at the first decision of an episode.
+    :class:`~warmprior.RealTimeChunking` reads it, and what is left of the chunk before from the history;
+    :func:`executed_chunk` tells of a rollout what was executed.
 
     Args:
         delay: ``d``, control steps until a chunk takes effect.
@@ -136,7 +102,7 @@ class InferenceDelay(ChunkMemory):
     Raises:
         ValueError: if not ``0 <= delay <= execute`` (the next decision would be due before the last one took
             effect), or (in an environment) ``execute + delay`` exceeds the length of predictions.
-        KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks what is left.
+        KeyError: if :class:`ActionHistory` does not come before, or a step's input lacks delay or history.
         RuntimeError: (on a step) if a decision executed more than ``execute`` actions.
 
     Examples:
@@ -161,30 +127,57 @@ class InferenceDelay(ChunkMemory):
         chunk_key: NestedKey = keys.CHUNK,
         executed_key: NestedKey = keys.EXECUTED,
     ) -> None:
-        super().__init__(
-            (keys.LEFTOVER, keys.VALID, keys.DELAY), chunk_key=chunk_key, executed_key=executed_key
-        )
+        super().__init__(in_keys=[keys.FORECAST], out_keys=[keys.DELAY])
         check_delay(delay, execute)
         self.delay = delay
         self.execute = execute
+        self.chunk_key = unravel_key(chunk_key)
+        self.executed_key = unravel_key(executed_key)
 
-    def _check_length(self, length: int) -> None:
-        check_delay(self.delay, self.execute, length)
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        missing = [k for k in (keys.FORECAST, keys.DELAY) if tensordict.get(k, None) is None]
+        if missing:
+            raise KeyError(
+                f"InferenceDelay found no {missing} in a step's input: hand over what the reset or the step "
+                "before gave, with the chunk"
+            )
+        if tensordict.get(self.chunk_key, None) is None:
+            return tensordict  # ChunkStep tells
+        return tensordict.set(self.chunk_key, executed_chunk(tensordict, self.chunk_key))
 
-    def _remember(
-        self, tensordict: TensorDictBase, executed: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        executed = next_tensordict.get(self.executed_key)
         if (executed > self.execute).any():
             raise RuntimeError(
                 f"a decision executed {int(executed.max())} actions, and InferenceDelay was told "
                 f"execute={self.execute}: give it the number that ChunkStep has"
             )
-        # The chunk here is the executed one: TorchRL hands over the input that the inverses gave.
-        leftover, valid = shift_chunk(tensordict.get(self.chunk_key), executed)
-        return leftover, valid, torch.full_like(executed, self.delay)
+        delay = torch.full_like(executed, self.delay)
+        rows = tensordict.get("_step", None)
+        if rows is not None:  # a partial step: the others were not asked
+            asked = rows.view(next_tensordict.batch_size).unsqueeze(-1)
+            delay = torch.where(asked, delay, tensordict.get(keys.DELAY))
+        return next_tensordict.set(keys.DELAY, delay)
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._check_input(tensordict)
-        if tensordict.get(self.chunk_key, None) is None:
-            return tensordict  # ChunkStep tells
-        return tensordict.set(self.chunk_key, executed_chunk(tensordict, self.chunk_key))
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        shape = (*tensordict_reset.batch_size, 1)
+        none = torch.zeros(shape, dtype=torch.int64, device=tensordict_reset.device)
+        return tensordict_reset.set(keys.DELAY, none)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Does nothing: in data no chunk is late."""
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the delay."""
+        if keys.FORECAST not in observation_spec.keys(True, True):
+            raise KeyError(
+                f"InferenceDelay found no {keys.FORECAST}: append it after ActionHistory"
+            )
+        check_delay(self.delay, self.execute, observation_spec[keys.FORECAST].shape[-2])
+        observation_spec[keys.DELAY] = Unbounded(
+            (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device
+        )
+        return observation_spec

@@ -1,96 +1,184 @@
-"""The environment's side of a prior: its mean for the next decision."""
+"""The environment's side of the history, and what is withheld of it in training."""
 
 from __future__ import annotations
 
-import copy
-
+import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from torchrl.data import TensorSpec, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Transform
 
 from warmprior import keys
-from warmprior.modules.prior import Prior
-from warmprior.transforms.memory import ChunkMemory
+from warmprior.history import ENTRIES, advance, cold_history, without
+from warmprior.modules.checks import check_finite_numbers
 
-__all__ = ["ActionHistory"]
+__all__ = ["ActionHistory", "WithheldHistory"]
+
+HISTORY_KEYS: list[NestedKey] = [(keys.HISTORY, name) for name in ENTRIES]
 
 
-class ActionHistory(ChunkMemory):
-    """Writes the prior's mean for the next decision after each step, and a cold one at resets.
+class ActionHistory(Transform):
+    """Writes the history for the next decision after each step, and a cold one at resets.
 
     A function of the step's own tensordict, without state: it gives the same in ``env.rollout``,
     collectors and batched environments, inside or outside of workers, with any policy (random ones
     included), and per sub-environment when some of them reset. Append it after :class:`ChunkStep`,
-    which tells how many actions were executed.
-
-    =========================  ===========================  ====================================
-    key                        shape                        meaning
-    =========================  ===========================  ====================================
-    ``("prior", "loc")``       ``[*B, P, d_a]`` float       the mean, normalised action space, of the
-                                                            action's dtype
-    ``("prior", "warm")``      ``[*B, P, 1]`` bool          where the mean counts
-    ``("prior", "elapsed")``   ``[*B, 1]`` int64            actions executed since the reset
-    =========================  ===========================  ====================================
+    which tells how many actions were executed. It knows no prior: :mod:`warmprior.history` has the layout.
 
     Args:
-        prior: the source distribution of the policy that will act. One that learns is copied, as it is now:
-            the copy goes where the environment goes, and the policy's own where the policy goes.
+        history_length: how many executed actions are remembered, usually ``H``.
 
     Keyword Args:
         chunk_key: the predicted chunk, ``[*B, P, d_a]``.
         executed_key: the number of executed actions, int64 ``[*B, 1]``.
-        loc_key: where the mean is written.
-        warm_key: where the mask is written.
-        elapsed_key: where the count of executed actions is written.
 
     Raises:
-        ValueError: if the environment's chunks have another length than the prior's predictions.
-        KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks the mean, the mask or
-            the count.
+        ValueError: if ``history_length < 1``.
+        KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks the history.
+
+    See Also:
+        - :class:`~warmprior.ActionWindow`: writes the same layout in training windows.
+        - :class:`~warmprior.Prior`: makes the mean of it.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv, Compose
-        >>> from warmprior import ActionHistory, ChunkStep, PastPrior
-        >>> env = TransformedEnv(
-        ...     GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(PastPrior(4))))
+        >>> from warmprior import ActionHistory, ChunkStep
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(4)))
         >>> rollout = env.rollout(3)
-        >>> rollout["prior", "warm"].all(1).flatten().tolist()
-        [False, True, True]
-        >>> bool((rollout["prior", "loc"][1:] == rollout["vla_action", "chunk"][:-1]).all())
+        >>> rollout["history", "steps"].flatten().tolist()
+        [0, 4, 4]
+        >>> bool((rollout["history", "actions"][1:] == rollout["vla_action", "chunk"][:-1]).all())
         True
     """
 
     def __init__(
         self,
-        prior: Prior,
+        history_length: int,
         *,
         chunk_key: NestedKey = keys.CHUNK,
         executed_key: NestedKey = keys.EXECUTED,
-        loc_key: NestedKey = keys.LOC,
-        warm_key: NestedKey = keys.WARM,
-        elapsed_key: NestedKey = keys.ELAPSED,
     ) -> None:
-        super().__init__(
-            (loc_key, warm_key, elapsed_key), chunk_key=chunk_key, executed_key=executed_key
+        super().__init__(in_keys=[chunk_key], out_keys=HISTORY_KEYS)
+        if history_length < 1:
+            raise ValueError(f"history_length must be at least 1, got {history_length}")
+        self.history_length = history_length
+        self.chunk_key = unravel_key(chunk_key)
+        self.executed_key = unravel_key(executed_key)
+        self._chunk: TensorSpec | None = None
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Forget the environment that this one, or what it was cloned from, was in."""
+        super().set_container(container)
+        self._chunk = None
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        history, executed = (
+            tensordict.get(keys.HISTORY, None),
+            next_tensordict.get(self.executed_key),
         )
-        if isinstance(prior, nn.Module):
-            # It becomes a part of this one: whoever moved or cast the policy would do so to the environment.
-            prior = copy.deepcopy(prior).cpu().requires_grad_(False)
-        self.prior = prior
-
-    def _check_length(self, length: int) -> None:
-        if length != self.prior.prediction_length:
-            raise ValueError(
-                f"the environment takes chunks of {length} actions, but {self.prior} predicts "
-                f"{self.prior.prediction_length}: use "
-                f"ChunkStep({self.prior.chunk_length}, "
-                f"prediction_length={self.prior.prediction_length})"
+        if history is None:
+            raise KeyError(
+                f"ActionHistory found no {keys.HISTORY!r} in a step's input: hand over what the reset or the "
+                "step before gave, with the chunk"
             )
+        if executed is None:
+            raise KeyError(
+                f"ActionHistory found no {self.executed_key!r} after the step: append it after ChunkStep"
+            )
+        moved = advance(history, tensordict.get(self.chunk_key), executed)
+        rows = tensordict.get("_step", None)
+        for name in ENTRIES:
+            value, before = moved[name], history[name]
+            if rows is not None:
+                # A partial step: the others were not asked, and what lies in their chunk was not executed.
+                asked = expand_as_right(rows.view(next_tensordict.batch_size), before)
+                value = torch.where(asked, value, before)
+            next_tensordict.set((keys.HISTORY, name), value)
+        return next_tensordict
 
-    def _remember(
-        self, tensordict: TensorDictBase, executed: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        loc_key, _, elapsed_key = self.memory_keys
-        elapsed = tensordict.get(elapsed_key) + executed
-        chunk = tensordict.get(self.chunk_key)
-        return *self.prior.next_mean(tensordict.get(loc_key), chunk, executed, elapsed), elapsed
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        # Everywhere: TorchRL merges these rows into the sub-environments that were reset only.
+        chunk = self._chunk or self._check_chunk()
+        cold = cold_history(
+            tensordict_reset.batch_size,
+            self.history_length,
+            *chunk.shape[-2:],
+            dtype=chunk.dtype,
+            device=tensordict_reset.device,
+        )
+        for name in ENTRIES:
+            tensordict_reset.set((keys.HISTORY, name), cold[name])
+        return tensordict_reset
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Does nothing: in data the history is already there."""
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the history."""
+        chunk, batch = self._check_chunk(), observation_spec.shape
+        cold = cold_history((), self.history_length, *chunk.shape[-2:], dtype=chunk.dtype)
+        for name, value in cold.items():
+            observation_spec[(keys.HISTORY, name)] = Unbounded(
+                (*batch, *value.shape), dtype=value.dtype, device=observation_spec.device
+            )
+        return observation_spec
+
+    def _check_chunk(self) -> TensorSpec:
+        actions = self.parent.full_action_spec
+        if self.chunk_key not in actions.keys(True, True):
+            raise KeyError(
+                f"ActionHistory found no {self.chunk_key} among the actions "
+                f"{list(actions.keys(True, True))}: append it after ChunkStep"
+            )
+        # Kept because resets are frequent and TorchRL rebuilds specs on every access.
+        self._chunk = actions[self.chunk_key]
+        return self._chunk
+
+
+class WithheldHistory(Transform):
+    """Makes the history of a share of training windows cold, so that the network also learns the cold start.
+
+    Append it to a replay buffer, like any other augmentation. The paper's Algorithm 1 withholds nothing.
+
+    Args:
+        probability: share of the windows, in [0, 1].
+
+    Keyword Args:
+        generator: source of randomness on the windows' device; PyTorch's global one by default.
+
+    Raises:
+        ValueError: if the probability is not in [0, 1].
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior.history import window_history
+        >>> steps = torch.full((1000, 1), 2)
+        >>> history = window_history(torch.ones(1000, 2, 1), steps, torch.ones(1000, 2, 1), chunk_length=2)
+        >>> withheld = WithheldHistory(0.25, generator=torch.Generator().manual_seed(0))
+        >>> batch = withheld(TensorDict({"history": history}, [1000]))
+        >>> 0.2 < float((batch["history", "steps"] == 0).float().mean()) < 0.3
+        True
+    """
+
+    def __init__(self, probability: float, *, generator: torch.Generator | None = None) -> None:
+        super().__init__(in_keys=[keys.HISTORY], out_keys=[keys.HISTORY])
+        check_finite_numbers(probability=probability)
+        if not 0.0 <= probability <= 1.0:
+            raise ValueError(f"probability must be in [0, 1], got {probability}")
+        self.probability = probability
+        self.generator = generator
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Make some rows cold."""
+        history = tensordict.get(keys.HISTORY, None)
+        if history is None:
+            raise KeyError("WithheldHistory found no history: append it after ActionWindow")
+        draw = torch.rand(
+            history.batch_size, generator=self.generator, device=history["actions"].device
+        )
+        return tensordict.set(keys.HISTORY, without(history, draw < self.probability))

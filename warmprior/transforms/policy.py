@@ -11,7 +11,7 @@ from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.delay import InferenceDelay, check_delay
 from warmprior.transforms.history import ActionHistory
-from warmprior.transforms.mean_observation import mean_observation
+from warmprior.transforms.history_observation import HistoryObservation
 from warmprior.transforms.stack import ObservationStack
 
 __all__ = ["policy_transforms"]
@@ -27,22 +27,22 @@ def policy_transforms(
     execute: int | None = None,
     delay: int | None = None,
     gamma: float = 1.0,
+    see_history: bool = False,
     observation_key: NestedKey = keys.OBSERVATION,
     action_key: NestedKey = keys.ACTION,
     chunk_key: NestedKey = keys.CHUNK,
-    loc_key: NestedKey = keys.LOC,
-    warm_key: NestedKey = keys.WARM,
 ) -> Compose:
     """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
 
     In this order: what makes actions the environment's own, images of its cameras, normalisation of
     observations and denormalisation of actions, a stack of the last ``To`` observations (the first one
-    repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`, :class:`MeanObservation` where the
-    prior conditions the network, and :class:`InferenceDelay` where asked for. It works around a single
+    repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`, and :class:`HistoryObservation` and
+    :class:`InferenceDelay` where asked for. It works around a single
     environment, and inside or outside of batched ones (with images, inside).
 
     Args:
-        prior: the policy's source distribution.
+        prior: the policy's source distribution, whose lengths alone are used: the environment serves every
+            prior of the same.
 
     Keyword Args:
         normalizer: the normaliser of the training data; none if the environment is normalised already.
@@ -52,14 +52,13 @@ def policy_transforms(
         observation_steps: ``To``.
         execute: actions executed per decision; all ``H`` by default, with a ``delay`` as many as predictions
             allow.
-        delay: control steps until a chunk takes effect, see :class:`InferenceDelay`; 0 only tells what is
-            left of the last chunk, for :class:`~warmprior.RealTimeChunking`. By default nothing is told.
+        delay: control steps until a chunk takes effect, see :class:`InferenceDelay`; 0 for
+            :class:`~warmprior.RealTimeChunking` without one. By default none is written.
         gamma: discount per control step inside a chunk.
+        see_history: whether the network sees the last actions.
         observation_key: as for :class:`~warmprior.WarmPriorActor`, also for the following.
         action_key: the single action that the environment takes.
         chunk_key: the chunk.
-        loc_key: the mean of the source.
-        warm_key: where it counts.
 
     Raises:
         ValueError: for numbers that do not go together, see :class:`ChunkStep` and :class:`InferenceDelay`.
@@ -76,6 +75,7 @@ def policy_transforms(
         torch.Size([2, 3])
     """
     late: list[Transform] = []
+    seen = [HistoryObservation(observation_key=observation_key)] if see_history else []
     if delay is not None:
         if execute is None:
             execute = min(prior.chunk_length, prior.prediction_length - delay)
@@ -94,9 +94,7 @@ def policy_transforms(
             action_key=action_key,
             chunk_key=chunk_key,
         ),
-        ActionHistory(prior, chunk_key=chunk_key, loc_key=loc_key, warm_key=warm_key),
-        *mean_observation(
-            prior, observation_key=observation_key, loc_key=loc_key, warm_key=warm_key
-        ),
+        ActionHistory(prior.history_length, chunk_key=chunk_key),
+        *seen,
         *late,
     )

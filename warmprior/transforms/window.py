@@ -12,29 +12,33 @@ from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
+from warmprior.history import window_history
 from warmprior.modules.prior import Prior
-from warmprior.transforms.mean_observation import mean_observation
+from warmprior.transforms.history import WithheldHistory
+from warmprior.transforms.history_observation import HistoryObservation
 
 __all__ = ["ActionWindow", "window_replay_buffer", "window_transforms", "without_images"]
 
 
 class ActionWindow(Transform):
-    """Replaces sampled steps by training windows with the mean of a prior.
+    """Replaces sampled steps by training windows with the history before them.
 
     For the step ``i`` it gathers the last ``To`` observations (the episode's first one repeated at the
     start), the target chunk ``[i, i+P)`` (the episode's last action repeated past its end, and marked
-    in ``"action_is_pad"``) and the ``H`` actions before, from which the prior makes its mean. Windows
-    never cross episode borders, and border windows are sampled like all others.
+    in ``"action_is_pad"``) and the history (:mod:`warmprior.history`): the actions before, and the target's
+    first ``P - H`` as a forecast. Windows never cross episode borders, and border windows are sampled like
+    all others. They know no prior: one buffer serves all priors of its lengths.
 
     Args:
         data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
             ``"action"`` ``[N, d_a]`` and ``"episode"`` ``[N]``; in memory, memory-mapped or on a GPU.
             An observation may be an image ``[N, C, H, W]``, or several entries nested under its key.
-        prior: the source distribution.
+        chunk_length: ``H``.
 
     Keyword Args:
+        prediction_length: ``P``; ``H`` by default.
+        history_length: how many executed actions are remembered; ``H`` by default, and at least.
         observation_steps: ``To``.
-        generator: source of randomness of :meth:`Prior.withhold`, on the data's device.
         frame_key: the sampled step's index into ``data``, int64 ``[B]``. (A replay buffer adds its
             own ``"index"`` only after its transforms ran.)
         observation_key: key of the observation, in ``data`` and in windows.
@@ -42,28 +46,25 @@ class ActionWindow(Transform):
         episode_key: key of the episode number in ``data``.
         chunk_key: where the target is written, ``[*B, P, d_a]``.
         pad_key: where the mask of padding is written, bool ``[*B, P]``.
-        loc_key: where the mean is written, ``[*B, P, d_a]``.
-        warm_key: where its mask is written, bool ``[*B, P, 1]``.
 
     Raises:
         KeyError: if ``data`` lacks a key.
-        ValueError: if ``data`` is empty or not flat, an action is not one vector, an entry holds NaN or Inf,
-            or an episode is not contiguous.
+        ValueError: if not ``1 <= chunk_length <= prediction_length, history_length``, ``data`` is empty or
+            not flat, an action is not one vector, an entry holds NaN or Inf, or an episode is not contiguous.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from warmprior import PastPrior
         >>> data = TensorDict({"observation": torch.zeros(5, 3),
         ...                    "action": torch.arange(5.0)[:, None],
         ...                    "episode": torch.zeros(5, dtype=torch.int64)}, [5])
-        >>> window = ActionWindow(data, PastPrior(2))
+        >>> window = ActionWindow(data, 2)
         >>> batch = window(TensorDict({"frame": torch.tensor([0, 2, 4])}, [3]))
         >>> batch["vla_action", "chunk"].squeeze(-1).tolist()
         [[0.0, 1.0], [2.0, 3.0], [4.0, 4.0]]
         >>> batch["action_is_pad"].tolist()
         [[False, False], [False, False], [False, True]]
-        >>> batch["prior", "loc"].squeeze(-1).tolist()
+        >>> batch["history", "actions"].squeeze(-1).tolist()
         [[0.0, 0.0], [0.0, 1.0], [2.0, 3.0]]
     """
 
@@ -75,38 +76,41 @@ class ActionWindow(Transform):
     def __init__(
         self,
         data: TensorDictBase,
-        prior: Prior,
+        chunk_length: int,
         *,
+        prediction_length: int | None = None,
+        history_length: int | None = None,
         observation_steps: int = 2,
-        generator: torch.Generator | None = None,
         frame_key: NestedKey = keys.FRAME,
         observation_key: NestedKey = keys.OBSERVATION,
         action_key: NestedKey = keys.ACTION,
         episode_key: NestedKey = keys.EPISODE,
         chunk_key: NestedKey = keys.CHUNK,
         pad_key: NestedKey = keys.IS_PAD,
-        loc_key: NestedKey = keys.LOC,
-        warm_key: NestedKey = keys.WARM,
     ) -> None:
-        out_keys = [observation_key, chunk_key, pad_key, loc_key, warm_key]
+        out_keys = [observation_key, chunk_key, pad_key, keys.HISTORY]
         super().__init__(in_keys=[frame_key], out_keys=out_keys)
         if observation_steps < 1:
             raise ValueError(f"observation_steps must be at least 1, got {observation_steps}")
-        self.prior = prior
-        self.generator = generator
+        prediction_length = chunk_length if prediction_length is None else prediction_length
+        history_length = chunk_length if history_length is None else history_length
+        if not 1 <= chunk_length <= min(prediction_length, history_length):
+            raise ValueError(
+                "need 1 <= chunk_length <= prediction_length and history_length, got "
+                f"chunk_length={chunk_length}, prediction_length={prediction_length}, "
+                f"history_length={history_length}"
+            )
+        self.chunk_length, self.history_length = chunk_length, history_length
         self.frame_key = frame_key
         observations, action, episode = _checked(data, observation_key, action_key, episode_key)
         self._observations = {f"observation_{i}": key for i, key in enumerate(observations)}
         start, end = _episode_borders(episode)
-        chunk_length = prior.chunk_length
         for name, value in {
             **dict(zip(self._observations, observations.values(), strict=True)),
             "action": action,
             "start": start,
             "end": end,
-            "action_offsets": torch.arange(
-                -chunk_length, prior.prediction_length, device=start.device
-            ),
+            "action_offsets": torch.arange(-history_length, prediction_length, device=start.device),
             "observation_offsets": torch.arange(1 - observation_steps, 1, device=start.device),
         }.items():
             self.register_buffer(name, value, persistent=False)
@@ -119,23 +123,21 @@ class ActionWindow(Transform):
                 f"ActionWindow needs the index of each sampled step under {self.frame_key!r}: store "
                 "torch.arange(N) there, or use window_replay_buffer"
             )
-        batch, chunk_length = tensordict.batch_size, self.prior.chunk_length
+        batch, before = tensordict.batch_size, self.history_length
         frame = frame.reshape(-1, 1)
         start, end = _rows(self.start, frame), _rows(self.end, frame)
         index = frame + self.action_offsets
-        history_valid = index[:, :chunk_length] >= start
-        is_pad = index[:, chunk_length:] > end
+        is_pad = index[:, before:] > end
         action = _rows(self.action, index.clamp(start, end))
-        target = action[:, chunk_length:]
+        target = action[:, before:]
         # Outside the episode the gather repeats its first action, which belongs to the target: zero it.
-        history = action[:, :chunk_length] * history_valid.unsqueeze(-1)
-        loc, warm = self.prior.training_mean(history, history_valid, target)
-        warm = self.prior.withhold(warm, self.generator)
+        executed = action[:, :before] * (index[:, :before] >= start).unsqueeze(-1)
+        history = window_history(executed, frame - start, target, self.chunk_length)
         recent = (frame + self.observation_offsets).clamp_min(start)
         written = (
             (key, _rows(self.get_buffer(name), recent)) for name, key in self._observations.items()
         )
-        values = (target, is_pad, loc, warm)
+        values = (target, is_pad, history)
         for key, value in (*written, *zip(self.out_keys[1:], values, strict=True)):
             tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
         return tensordict
@@ -212,21 +214,27 @@ def window_transforms(
     prior: Prior,
     *,
     observation_steps: int = 2,
+    see_history: bool = False,
+    withhold: float = 0.0,
     generator: torch.Generator | None = None,
     **renamed: NestedKey,
 ) -> Compose:
-    """What makes of step numbers the windows that a policy of the prior reads.
+    """What makes of step numbers the windows that a policy reads.
 
-    :class:`ActionWindow`, and :class:`~warmprior.MeanObservation` where the prior conditions the network: the
-    counterpart of :func:`~warmprior.policy_transforms` on the side of the data.
+    :class:`ActionWindow`, and where asked for :class:`~warmprior.WithheldHistory` and
+    :class:`~warmprior.HistoryObservation`: the counterpart of :func:`~warmprior.policy_transforms` on the
+    side of the data.
 
     Args:
         data: contiguous normalised steps, see :class:`ActionWindow`.
-        prior: the source distribution.
+        prior: the policy's source distribution, whose lengths alone are used: the windows serve every prior
+            of the same.
 
     Keyword Args:
         observation_steps: ``To``.
-        generator: see :class:`ActionWindow`.
+        see_history: whether the network sees the last actions.
+        withhold: share of the windows whose history is withheld.
+        generator: source of randomness of what is withheld, on the data's device.
         renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
 
     Examples:
@@ -235,16 +243,27 @@ def window_transforms(
         ...                    "episode": torch.arange(50) // 25}, [50])
         >>> windows = window_transforms(data, PastPrior(2), observation_steps=1)
         >>> batch = windows(TensorDict({"frame": torch.tensor([10, 25])}, [2]))
-        >>> batch["vla_action", "chunk"].squeeze(-1).tolist(), batch["prior", "loc"].squeeze(-1).tolist()
-        ([[10.0, 11.0], [25.0, 26.0]], [[8.0, 9.0], [0.0, 0.0]])
+        >>> batch["vla_action", "chunk"].squeeze(-1).tolist()
+        [[10.0, 11.0], [25.0, 26.0]]
+        >>> batch["history", "actions"].squeeze(-1).tolist()
+        [[8.0, 9.0], [0.0, 0.0]]
     """
-    window = ActionWindow(
-        data, prior, observation_steps=observation_steps, generator=generator, **renamed
-    )
-    read = ("observation_key", "loc_key", "warm_key")
-    return Compose(
-        window, *mean_observation(prior, **{k: renamed[k] for k in read if k in renamed})
-    )
+    transforms: list[Transform] = [
+        ActionWindow(
+            data,
+            prior.chunk_length,
+            prediction_length=prior.prediction_length,
+            history_length=prior.history_length,
+            observation_steps=observation_steps,
+            **renamed,
+        )
+    ]
+    if withhold:
+        transforms.append(WithheldHistory(withhold, generator=generator))
+    if see_history:
+        seen = {k: v for k, v in renamed.items() if k == "observation_key"}
+        transforms.append(HistoryObservation(**seen))
+    return Compose(*transforms)
 
 
 def window_replay_buffer(
@@ -253,6 +272,8 @@ def window_replay_buffer(
     *,
     batch_size: int,
     observation_steps: int = 2,
+    see_history: bool = False,
+    withhold: float = 0.0,
     sampler: Sampler | None = None,
     generator: torch.Generator | None = None,
     **renamed: NestedKey,
@@ -264,13 +285,16 @@ def window_replay_buffer(
 
     Args:
         data: contiguous normalised steps, see :class:`ActionWindow`.
-        prior: the source distribution.
+        prior: the policy's source distribution, whose lengths alone are used: the windows serve every prior
+            of the same.
 
     Keyword Args:
         batch_size: windows per sample.
         observation_steps: ``To``.
+        see_history: see :func:`window_transforms`.
+        withhold: see :func:`window_transforms`.
         sampler: ``RandomSampler()`` by default; ``SamplerWithoutReplacement()`` for epochs.
-        generator: source of randomness of sampler and prior; PyTorch's global one by default.
+        generator: source of randomness of sampler and what is withheld; PyTorch's global one by default.
         renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
 
     See Also:
@@ -288,7 +312,13 @@ def window_replay_buffer(
         (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
     """
     windows = window_transforms(
-        data, prior, observation_steps=observation_steps, generator=generator, **renamed
+        data,
+        prior,
+        observation_steps=observation_steps,
+        see_history=see_history,
+        withhold=withhold,
+        generator=generator,
+        **renamed,
     )
     window = windows[0]
     frames = torch.arange(len(data), device=window.start.device)

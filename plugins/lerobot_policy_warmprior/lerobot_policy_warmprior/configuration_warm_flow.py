@@ -11,6 +11,7 @@ from lerobot.optim.schedulers import DiffuserSchedulerConfig
 
 from warmprior import Prior
 from warmprior.lerobot import history_indices
+from warmprior.modules.registry import make
 
 __all__ = ["WarmFlowConfig"]
 
@@ -24,6 +25,7 @@ class WarmFlowConfig(PreTrainedConfig):
         n_obs_steps: ``To``, observations per decision.
         n_action_steps: ``H``, actions executed per decision, and remembered by the prior.
         prior: its name, with options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
+        cold_probability: share of the training windows whose history is withheld.
         nfe: network evaluations per chunk.
         network: configuration of another velocity network, as JSON (``VelocityNetwork.config()``).
         embedding_dim: width of the transformer.
@@ -35,6 +37,7 @@ class WarmFlowConfig(PreTrainedConfig):
     n_obs_steps: int = 2
     n_action_steps: int = 8
     prior: str = "past"
+    cold_probability: float = 0.0
     nfe: int = 9
     network: str = ""
     embedding_dim: int = 384
@@ -60,7 +63,7 @@ class WarmFlowConfig(PreTrainedConfig):
         Raises:
             ValueError: if there is none of that name and these options.
         """
-        return Prior.make(self.prior, self.n_action_steps)
+        return make(Prior, self.prior, self.n_action_steps)
 
     @property
     def observed(self) -> list[str]:
@@ -109,7 +112,7 @@ class WarmFlowConfig(PreTrainedConfig):
     def action_delta_indices(self) -> list[int]:
         """Steps that LeRobot loads of every action: the history, and the chunk."""
         prior = self.make_prior()
-        return history_indices(prior.chunk_length, prior.prediction_length)
+        return history_indices(prior.history_length, prior.prediction_length)
 
     @property
     def reward_delta_indices(self) -> None:

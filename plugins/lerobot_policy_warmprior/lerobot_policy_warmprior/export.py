@@ -18,10 +18,11 @@ from torch import Tensor
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from lerobot_policy_warmprior.modeling_warm_flow import WarmFlowPolicy
 from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post_processors
-from warmprior import WarmPriorActor, keys
+from warmprior import keys
 from warmprior.envs import TASKS
 from warmprior.envs.description import environment_name
 from warmprior.io.script import run_script
+from warmprior.training.saved import load_policy
 
 __all__ = ["export_policy"]
 
@@ -39,7 +40,7 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
     environment all of it is the latter.
 
     Args:
-        folder: of :meth:`WarmPriorActor.save_pretrained <warmprior.WarmPriorActor.save_pretrained>`.
+        folder: of :func:`~warmprior.training.save_policy`.
         out: to write; must not exist.
 
     Returns:
@@ -48,29 +49,31 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
     Raises:
         FileExistsError: if ``out`` exists.
         ValueError: if the policy has images, absolute actions, no normaliser, another sampler than
-            Euler's in uniform steps, or a prior that a policy of LeRobot cannot have.
+            Euler's in uniform steps from the source, a network that sees the last actions, or a prior with
+            networks of its own.
     """
     out = Path(out)
     if out.exists():
         raise FileExistsError(f"{out} exists: choose another folder")
-    actor = WarmPriorActor.from_pretrained(folder)
+    actor = load_policy(folder)
     described = actor.environment or {}
-    if "images" in described or "actions" in described:
+    sees_history = actor.in_keys[0] == keys.CONDITIONED
+    if sees_history or "images" in described or "actions" in described:
         raise ValueError(
-            f"{folder}: policies of images or absolute actions need what stands beside the environment here; "
-            "only policies of states and pose deltas can be exported"
+            f"{folder}: policies of images, absolute actions or observed last actions need what stands "
+            "beside the environment here; only policies of states and pose deltas can be exported"
         )
     if actor.normalizer is None or actor.ode.clip != 1.0:
         raise ValueError(
             f"{folder}: the policy needs a normaliser, and the bound clip=1.0 on its actions (it has "
             f"{actor.ode.clip}), which are those of LeRobot's policy"
         )
-    if actor.ode.solver != "euler" or actor.ode.grid != "uniform" or actor.ode.guidance is not None:
+    sampler = actor.ode.solver, actor.ode.grid, actor.ode.guidance, actor.start
+    if sampler != ("euler", "uniform", None, None):
         raise ValueError(
-            f"{folder}: warm_flow integrates by Euler's method in uniform steps, without guidance, and the "
-            f"policy has solver={actor.ode.solver!r}, grid={actor.ode.grid!r}, "
-            f"guidance={actor.ode.guidance}: change it first, as by actor.replace(solver='euler', "
-            "grid='uniform', guidance=None), and save it"
+            f"{folder}: warm_flow integrates by Euler's method in uniform steps, without guidance, from the "
+            f"source, and the policy has (solver, grid, guidance, start)={sampler}: change it first, as by "
+            "actor.replace(solver='euler', grid='uniform', guidance=None, start=None), and save it"
         )
     prior, network, normalizer = actor.prior, actor.network, actor.normalizer
     spec = next((t for t in TASKS.values() if t.env_name == environment_name(actor)), None)
@@ -87,7 +90,7 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
             inputs[name] = PolicyFeature(type=kind, shape=(width,))
             stats[name] = bounds(keys.OBSERVATION, slice(first, first + width))
         first += width
-    sigma = f"sigma={prior.sigma}" if prior.takes("sigma") else ""
+    told = {k: v for k, v in prior.config().items() if k not in ("name", "chunk_length")}
     config = WarmFlowConfig(
         input_features=inputs,
         output_features={
@@ -95,7 +98,7 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
         },
         n_obs_steps=network.observation_steps,
         n_action_steps=prior.chunk_length,
-        prior=",".join(filter(None, (prior.name, sigma, prior.options))),
+        prior=",".join([prior.name, *(f"{k}={json.dumps(v)}" for k, v in told.items())]),
         nfe=actor.ode.nfe,
         network=json.dumps(network.config()),
         device="cpu",

@@ -19,8 +19,10 @@ from warmprior import (
     FlowMatchingLoss,
     VelocityNetwork,
     WarmPriorActor,
+    WithheldHistory,
     keys,
 )
+from warmprior.history import window_history
 from warmprior.lerobot import ActionMemory
 
 __all__ = ["WarmFlowPolicy"]
@@ -34,8 +36,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
         kwargs: what LeRobot tells of the dataset; nothing of it is needed.
 
     Raises:
-        ValueError: if the network does not fit the dataset, or the prior has networks of its own, which
-            LeRobot would not train.
+        ValueError: if the network does not fit the dataset, the prior has networks of its own, which
+            LeRobot would not train, or ``cold_probability`` is not in [0, 1].
     """
 
     config_class = WarmFlowConfig
@@ -45,10 +47,10 @@ class WarmFlowPolicy(PreTrainedPolicy):
         super().__init__(config)
         config.validate_features()
         prior = config.make_prior()
-        if isinstance(prior, nn.Module) or prior.teacher or prior.conditions_network:
+        if isinstance(prior, nn.Module):
             raise ValueError(
-                f"prior={config.prior!r} is trained, or conditions the network, beside the flow: "
-                "lerobot-train does not; take past, preview or gaussian"
+                f"prior={config.prior!r} is trained beside the flow: lerobot-train does not; take past, "
+                "preview or gaussian"
             )
         width = sum(config.input_features[name].shape[0] for name in config.observed)
         sizes = (config.action_feature.shape[0], width, prior.prediction_length, config.n_obs_steps)
@@ -80,6 +82,7 @@ class WarmFlowPolicy(PreTrainedPolicy):
         # those of the extremes it is not known.
         spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX
         self.actor = WarmPriorActor(network, prior, nfe=config.nfe, clip=1.0 if spans else None)
+        self._withheld = WithheldHistory(config.cold_probability)
         # Of the same weights, so that it is no part of the module and is not saved again.
         self.__dict__["_made"] = None
         self.reset()
@@ -101,8 +104,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
         """Conditional flow matching (Algorithm 1).
 
         Args:
-            batch: ``"action"`` ``[B, H + P, d_a]`` and ``"action_is_pad"``, with the history in front, and
-                the observations ``[B, To, d]``.
+            batch: ``"action"`` ``[B, H + P, d_a]`` and ``"action_is_pad"``, with the actions before in front,
+                and the observations ``[B, To, d]``.
 
         Raises:
             KeyError: if the mask is missing, without which the history would leak the target.
@@ -113,23 +116,22 @@ class WarmFlowPolicy(PreTrainedPolicy):
                 "target, and must be masked"
             )
         prior = self.actor.prior
-        history, target = batch["action"].split(
-            [prior.chunk_length, prior.prediction_length], dim=1
-        )
-        valid, inside = (~batch["action_is_pad"].bool()).split(
-            [prior.chunk_length, prior.prediction_length], dim=1
-        )
-        loc, warm = prior.training_mean(history, valid, target)
+        lengths = [prior.history_length, prior.prediction_length]
+        before, target = batch["action"].split(lengths, dim=1)
+        valid, inside = (~batch["action_is_pad"].bool()).split(lengths, dim=1)
+        before = torch.where(valid.unsqueeze(-1), before, 0.0)
+        steps = valid.sum(1, keepdim=True)
         data = TensorDict(
             {
                 keys.OBSERVATION: self._observation(batch),
-                keys.LOC: loc,
-                keys.WARM: prior.withhold(warm),
+                keys.HISTORY: window_history(before, steps, target, prior.chunk_length),
                 keys.CHUNK: target,
                 keys.IS_PAD: ~inside,
             },
             [len(target)],
         )
+        if self.config.cold_probability > 0:
+            data = self._withheld(data)
         loss = self._loss()(data)["loss_flow_matching"]
         return loss, {"flow_matching": loss.item()}
 
@@ -174,10 +176,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
         self.eval()
         seen = {name: torch.stack(list(self._queues[name]), dim=1) for name in self.config.observed}
         observation = self._observation(seen)
-        loc, warm = self._memory.decide(len(observation), observation.device)
-        data = TensorDict(
-            {keys.OBSERVATION: observation, keys.LOC: loc, keys.WARM: warm}, [len(observation)]
-        )
+        history = self._memory.decide(len(observation), observation.device)
+        data = TensorDict({keys.OBSERVATION: observation, keys.HISTORY: history}, history.shape)
         chunk = self.actor(data)[keys.CHUNK]
         self._memory.record(chunk)
         return chunk

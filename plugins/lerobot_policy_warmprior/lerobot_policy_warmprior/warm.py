@@ -11,6 +11,7 @@ from torch import Tensor
 
 from warmprior import Prior
 from warmprior.lerobot import WarmPriorAdapter, action_std, history_indices
+from warmprior.modules.registry import find, make
 
 __all__ = ["WarmConfigMixin", "WarmPolicyMixin"]
 
@@ -25,12 +26,14 @@ class WarmConfigMixin:
         sigma_unit: what sigma is in units of: ``model`` or ``std``, see
             :class:`~warmprior.lerobot.WarmPriorAdapter`.
         action_std: taken from the dataset for ``std``, and kept with the policy.
+        cold_probability: share of the training windows whose history is withheld.
     """
 
     prior: str = "past"
     prior_chunk: int | None = None
     sigma_unit: str = "model"
     action_std: list[float] | None = None
+    cold_probability: float = 0.0
 
     def make_prior(self) -> Prior:
         """The source distribution.
@@ -38,14 +41,14 @@ class WarmConfigMixin:
         Raises:
             ValueError: if there is none of that name and these options.
         """
-        kind = Prior.find(self.prior)
+        kind = find(Prior, self.prior.partition(",")[0])
         room = self.chunk_size // kind.prediction_chunks
-        return Prior.make(self.prior, room if self.prior_chunk is None else self.prior_chunk)
+        return make(Prior, self.prior, room if self.prior_chunk is None else self.prior_chunk)
 
     @property
     def action_delta_indices(self) -> list[int]:
         """Steps that LeRobot loads of every action: the history, and the chunk."""
-        return history_indices(self.make_prior().chunk_length, self.chunk_size)
+        return history_indices(self.make_prior().history_length, self.chunk_size)
 
 
 class WarmPolicyMixin:
@@ -65,7 +68,11 @@ class WarmPolicyMixin:
         prior = config.make_prior()
         # Not a submodule: it refers back to the policy.
         self.__dict__["warm_adapter"] = WarmPriorAdapter(
-            self, prior, sigma_unit=config.sigma_unit, action_std=std
+            self,
+            prior,
+            sigma_unit=config.sigma_unit,
+            action_std=std,
+            cold_probability=config.cold_probability,
         )
 
     def forward(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> Any:

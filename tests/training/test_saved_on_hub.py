@@ -9,7 +9,9 @@ import torch
 from tensordict import TensorDict
 
 from tests.io.hub_server import TOKEN, Repository, model_hub
+from tests.toy_env import random_history
 from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor
+from warmprior.training.saved import load_policy, policy_config, push_policy, save_policy
 
 pytest.importorskip("huggingface_hub")
 
@@ -37,10 +39,7 @@ def chunk(actor):
     data = TensorDict(
         {
             "observation": torch.randn(4, 2, 5, generator=generator),
-            "prior": {
-                "loc": torch.randn(4, 3, 2, generator=generator),
-                "warm": torch.rand(4, 3, 1, generator=generator) < 0.5,
-            },
+            "history": random_history(actor.prior, 4),
         },
         [4],
     )
@@ -49,76 +48,76 @@ def chunk(actor):
 
 def put(hub, actor, folder, **change):
     """Lay the files of a policy into a repository, without an upload."""
-    actor.save_pretrained(folder)
+    save_policy(actor, folder)
     files = {name: (folder / name).read_bytes() for name in FILES} | change
     hub.repositories.setdefault(NAME, Repository(False)).commit("main", files)
 
 
 def test_a_policy_goes_to_the_hub_and_back(hub, actor):
-    commit = actor.push_to_hub(NAME, card="# Mine\n", token=TOKEN)
+    commit = push_policy(actor, NAME, card="# Mine\n", token=TOKEN)
     assert hub.files(NAME)["README.md"] == b"# Mine\n"
     assert set(hub.files(NAME)) == FILES | {"README.md"}
     assert commit == hub.repositories[NAME].branches["main"]
-    again = WarmPriorActor.from_pretrained(NAME)
+    again = load_policy(NAME)
     assert torch.equal(chunk(again), chunk(actor))
-    assert again.config() == actor.config() and not again.training
+    assert policy_config(again) == policy_config(actor) and not again.training
     # The card is not needed here; what is here is not fetched again, nor the hub needed.
     fetched = [r for r in hub.requests if r.startswith("GET") and "/resolve/" in r]
     assert {r.rsplit("/", 1)[-1] for r in fetched} == FILES and len(fetched) == 2
     before = len(hub.requests)
-    WarmPriorActor.from_pretrained(NAME)
+    load_policy(NAME)
     assert not [r for r in hub.requests[before:] if r.startswith("GET") and "/resolve/" in r]
     hub.close()
-    assert torch.equal(chunk(WarmPriorActor.from_pretrained(NAME)), chunk(actor))
+    assert torch.equal(chunk(load_policy(NAME)), chunk(actor))
 
 
 def test_the_endpoint_is_an_argument(hub, actor, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
-    actor.push_to_hub(NAME, token=TOKEN, endpoint=hub.address)
-    again = WarmPriorActor.from_pretrained(NAME, endpoint=hub.address)
+    push_policy(actor, NAME, token=TOKEN, endpoint=hub.address)
+    again = load_policy(NAME, endpoint=hub.address)
     assert torch.equal(chunk(again), chunk(actor))
 
 
 def test_revisions(hub, actor):
-    first = actor.push_to_hub(NAME, token=TOKEN, card="first")
+    first = push_policy(actor, NAME, token=TOKEN, card="first")
     other = WarmPriorActor(VelocityMLP(2, 5, 3, 2, hidden_dim=16), PastPrior(3), nfe=2).eval()
-    other.push_to_hub(NAME, token=TOKEN)
+    push_policy(other, NAME, token=TOKEN)
     assert hub.files(NAME)["README.md"] == b"first"  # without a card the old one stays
-    actor.push_to_hub(NAME, token=TOKEN, revision="steady", message="a branch")
+    push_policy(actor, NAME, token=TOKEN, revision="steady", message="a branch")
     for revision, mine in ((None, other), (first, actor), ("steady", actor)):
-        again = WarmPriorActor.from_pretrained(NAME, revision=revision)
+        again = load_policy(NAME, revision=revision)
         assert torch.equal(chunk(again), chunk(mine))
     with pytest.raises(FileNotFoundError, match=f"{NAME} at the hub has no branch, .* v9: look"):
-        WarmPriorActor.from_pretrained(NAME, revision="v9")
+        load_policy(NAME, revision="v9")
 
 
 def test_a_folder_is_a_folder(hub, actor, tmp_path):
     put(hub, actor, tmp_path / "kept")
     mine = WarmPriorActor(VelocityMLP(2, 5, 3, 2, hidden_dim=16), PastPrior(3), nfe=2).eval()
-    mine.save_pretrained(tmp_path / NAME)
-    assert torch.equal(chunk(WarmPriorActor.from_pretrained(NAME)), chunk(mine))
+    save_policy(mine, tmp_path / NAME)
+    assert torch.equal(chunk(load_policy(NAME)), chunk(mine))
     for name in ("missing", "a/b/c", "../someone", f"{tmp_path}/missing", tmp_path / "missing"):
         with pytest.raises(FileNotFoundError, match="no policy at"):
-            WarmPriorActor.from_pretrained(name)
+            load_policy(name)
     with pytest.raises(ValueError, match=r"is a folder on this machine.*leave out revision='main'"):
-        WarmPriorActor.from_pretrained(NAME, revision="main")
+        load_policy(NAME, revision="main")
     assert not hub.requests
 
 
 def test_a_private_repository_needs_a_token(hub, actor):
-    actor.push_to_hub(NAME, token=TOKEN, private=True)
+    push_policy(actor, NAME, token=TOKEN, private=True)
     assert hub.repositories[NAME].private
     for told in (None, "hf_wrong"):
         with pytest.raises(FileNotFoundError, match=r"or a private one: .* give a token") as caught:
-            WarmPriorActor.from_pretrained(NAME, token=told)
+            load_policy(NAME, token=told)
         assert "\n" not in str(caught.value) and "hf_wrong" not in str(caught.value)
-    assert torch.equal(chunk(WarmPriorActor.from_pretrained(NAME, token=TOKEN)), chunk(actor))
+    assert torch.equal(chunk(load_policy(NAME, token=TOKEN)), chunk(actor))
 
 
 def test_what_is_to_be_private_is_not_published(hub, actor):
     hub.repositories[NAME] = Repository(private=False)
     with pytest.raises(ValueError, match=f"{NAME} is there already, and public"):
-        actor.push_to_hub(NAME, token=TOKEN, private=True)
+        push_policy(actor, NAME, token=TOKEN, private=True)
     assert not hub.files(NAME) and not hub.objects
 
 
@@ -127,19 +126,19 @@ def test_writing_needs_a_token(hub, actor, known):
     if known:
         hub.repositories[NAME] = Repository(private=False)
     with pytest.raises(PermissionError, match=rf"not allow this with {NAME}: give a token") as told:
-        actor.push_to_hub(NAME)
+        push_policy(actor, NAME)
     assert "\n" not in str(told.value)
     assert known == (NAME in hub.repositories) and not hub.objects
 
 
 def test_a_missing_repository(hub):
     with pytest.raises(FileNotFoundError, match=f"no folder {NAME} here, .* no repository {NAME}"):
-        WarmPriorActor.from_pretrained(NAME)
+        load_policy(NAME)
 
 
 @pytest.mark.parametrize("file", sorted(FILES))
 def test_a_tampered_file_is_refused(hub, actor, tmp_path, file):
-    actor.save_pretrained(tmp_path / "kept")
+    save_policy(actor, tmp_path / "kept")
     content = bytearray((tmp_path / "kept" / file).read_bytes())
     if file == "config.json":
         content = content.replace(b'"nfe": 2', b'"nfe": 3')
@@ -147,34 +146,34 @@ def test_a_tampered_file_is_refused(hub, actor, tmp_path, file):
         content[-1] ^= 1
     put(hub, actor, tmp_path / "kept", **{file: bytes(content)})
     with pytest.raises(ValueError, match=rf"{NAME} at the hub: .*damaged or was changed") as caught:
-        WarmPriorActor.from_pretrained(NAME)
+        load_policy(NAME)
     assert "someone--square-past to fetch it again" in str(caught.value)
 
 
 def test_without_a_digest_it_is_refused(hub, actor, tmp_path):
-    actor.save_pretrained(tmp_path / "kept")
+    save_policy(actor, tmp_path / "kept")
     config = json.loads((tmp_path / "kept" / "config.json").read_text())
     del config["sha256"]
     put(hub, actor, tmp_path / "kept", **{"config.json": json.dumps(config).encode()})
     with pytest.raises(ValueError, match=f"{NAME} at the hub holds no policy.*lacks the digest"):
-        WarmPriorActor.from_pretrained(NAME)
+        load_policy(NAME)
 
 
 def test_something_else_is_refused_before_its_weights_are_fetched(hub, actor, tmp_path):
     put(hub, actor, tmp_path / "kept", **{"config.json": b'{"model_type": "bert"}'})
     with pytest.raises(ValueError, match=f"{NAME} at the hub holds no policy of warmprior: .*json"):
-        WarmPriorActor.from_pretrained(NAME)
+        load_policy(NAME)
     assert not [r for r in hub.requests if r.endswith("model.safetensors")]
     for name in sorted(FILES):
         put(hub, actor, tmp_path / "kept")
         hub.files(NAME).pop(name)
         with pytest.raises(FileNotFoundError, match=f"{NAME} at the hub holds no .*{name} is miss"):
-            WarmPriorActor.from_pretrained(NAME)
+            load_policy(NAME)
 
 
 def test_only_the_files_of_a_policy_are_fetched(hub, actor, tmp_path):
     put(hub, actor, tmp_path / "kept", **{"pickle.bin": b"x", "run.py": b"x"})
-    WarmPriorActor.from_pretrained(NAME)
+    load_policy(NAME)
     names = {path.name for path in (tmp_path / "cache").rglob("*") if path.is_symlink()}
     assert names == FILES
 
@@ -184,21 +183,21 @@ def test_offline(hub, actor, tmp_path, monkeypatch):
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     told = f"may not be asked for {NAME}, as HF_HUB_OFFLINE is set"
     with pytest.raises(ConnectionError, match=told):
-        WarmPriorActor.from_pretrained(NAME)
+        load_policy(NAME)
     with pytest.raises(ConnectionError, match=told):
-        actor.push_to_hub(NAME, token=TOKEN)
+        push_policy(actor, NAME, token=TOKEN)
     assert not hub.requests
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
-    WarmPriorActor.from_pretrained(NAME)
+    load_policy(NAME)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     asked = len(hub.requests)
-    assert torch.equal(chunk(WarmPriorActor.from_pretrained(NAME)), chunk(actor))
+    assert torch.equal(chunk(load_policy(NAME)), chunk(actor))
     assert len(hub.requests) == asked
 
 
 def test_a_hub_that_does_not_answer(hub, actor):
     hub.close()
-    for call in (WarmPriorActor.from_pretrained, lambda name: actor.push_to_hub(name, token=TOKEN)):
+    for call in (load_policy, lambda name: push_policy(actor, name, token=TOKEN)):
         with pytest.raises(ConnectionError, match=f"cannot be reached for {NAME}: check") as caught:
             call(NAME)
         assert "\n" not in str(caught.value)
@@ -207,7 +206,7 @@ def test_a_hub_that_does_not_answer(hub, actor):
 def test_names_that_are_none(actor):
     for name in ("policy", "a/b/c", "../x", "a/b--c", "/tmp/x", "a/b.git"):
         with pytest.raises(ValueError, match="use user/name"):
-            actor.push_to_hub(name)
+            push_policy(actor, name)
 
 
 def test_without_the_client(actor, monkeypatch, tmp_path):
@@ -215,6 +214,6 @@ def test_without_the_client(actor, monkeypatch, tmp_path):
     found = "warmprior.io.extras.importlib.util.find_spec"
     monkeypatch.setattr(found, lambda name: None)
     with pytest.raises(ImportError, match=r"no folder a/b here, .*pip install 'warmprior\[sim\]'"):
-        WarmPriorActor.from_pretrained("a/b")
+        load_policy("a/b")
     with pytest.raises(ImportError, match=r"huggingface_hub is not installed; run: pip install"):
-        actor.push_to_hub("a/b")
+        push_policy(actor, "a/b")

@@ -11,9 +11,16 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import nn
 
-from warmprior import GaussianPrior, OTPrior, PastPrior, ReflowPrior, VelocityMLP, WarmPriorActor
-from warmprior.modules import SourceMoments
-from warmprior.training import BehaviourCloning, TrainingConfig
+from tests.objectives.test_flow_matching import actor_for, sample
+from warmprior import (
+    FlowMatchingLoss,
+    GaussianPrior,
+    SourceMoments,
+    VelocityMLP,
+    WarmPriorActor,
+    window_replay_buffer,
+)
+from warmprior.objectives import OTCoupling, ReflowCoupling
 
 pytest.importorskip("scipy")
 
@@ -26,7 +33,7 @@ def test_the_plan_is_the_best_of_all_permutations(n, weight, seed):
     g = torch.Generator().manual_seed(seed)
     a0, a1 = (torch.randn(n, H, 3, generator=g) for _ in range(2))
     seen = torch.randn(n, 2, 4, generator=g)
-    paired, target = OTPrior(H, observation_weight=weight).couple(a0, a1, observation=seen)
+    paired, target = OTCoupling(weight)(a0, a1, seen)
     assert target is a1
 
     def cost(order):
@@ -41,9 +48,9 @@ def test_the_plan_is_the_best_of_all_permutations(n, weight, seed):
 def test_dear_observations_leave_everything_in_its_place():
     a0, a1 = torch.randn(300, H, 1), torch.randn(300, H, 1)
     seen = torch.arange(300.0).view(300, 1, 1)
-    same, _ = OTPrior(H, observation_weight=1e6).couple(a0, a1, observation=seen)
+    same, _ = OTCoupling(1e6)(a0, a1, seen)
     assert torch.equal(same, a0)
-    free, _ = OTPrior(H, observation_weight=0.0).couple(a0, a1, observation=seen)
+    free, _ = OTCoupling(0.0)(a0, a1, seen)
     assert torch.equal(free.flatten(1).sum(1).sort()[0], a0.flatten(1).sum(1).sort()[0])
     # Groups of at most 256, of nearly one size: each half is paired within itself.
     assert set(free[150:, 0, 0].tolist()) == set(a0[150:, 0, 0].tolist())
@@ -53,16 +60,14 @@ def test_dear_observations_leave_everything_in_its_place():
 def test_no_window_is_left_over():
     a0, a1 = torch.randn(257, 1, 1), torch.randn(257, 1, 1)
     a0[-1], a1[-1] = 100.0, -100.0
-    paired, _ = OTPrior(1, observation_weight=0.0).couple(a0, a1)
+    paired, _ = OTCoupling(0.0)(a0, a1)
     assert float(paired[-1]) < 100.0
 
 
 def test_batch_dimensions_stay():
     a0, a1, seen = torch.randn(2, 3, H, 1), torch.randn(2, 3, H, 1), torch.randn(2, 3, 1, 4)
-    paired, _ = OTPrior(H).couple(a0, a1, observation=seen)
-    flat, _ = OTPrior(H).couple(
-        *(x.flatten(0, 1) for x in (a0, a1)), observation=seen.flatten(0, 1)
-    )
+    paired, _ = OTCoupling()(a0, a1, seen)
+    flat, _ = OTCoupling()(*(x.flatten(0, 1) for x in (a0, a1, seen)))
     assert torch.equal(paired.flatten(0, 1), flat)
 
 
@@ -78,34 +83,27 @@ def demonstrations():
 
 def test_moments_are_those_of_the_pairs():
     """Paired without regard of the observation, sources come close to their targets."""
-    from warmprior import window_replay_buffer
-
-    correlations = []
-    for prior in (GaussianPrior(1), OTPrior(1, observation_weight=0.0)):
+    prior, correlations = GaussianPrior(1), []
+    for coupling in (None, OTCoupling(0.0)):
         g = torch.Generator().manual_seed(0)
         buffer = window_replay_buffer(demonstrations(), prior, batch_size=256, generator=g)
-        moments = SourceMoments.fit(buffer, prior, samples=2048, generator=g)
+        moments = SourceMoments.fit(buffer, prior, coupling=coupling, samples=2048, generator=g)
         deviation = (moments.source_variance * moments.target_variance).sqrt()
         correlations.append(float((moments.covariance / deviation).mean()))
     assert abs(correlations[0]) < 0.1 and correlations[1] > 0.95
 
 
-def test_batches_of_one_are_refused_before_training(tmp_path):
-    prior = OTPrior(H)
+def test_what_cannot_be_paired():
+    couple, chunk = OTCoupling(), torch.zeros(2, H, 1)
     with pytest.raises(ValueError, match="at least 2"):
-        prior.couple(torch.zeros(1, H, 1), torch.zeros(1, H, 1), observation=torch.zeros(1, 1, 3))
-    with pytest.raises(ValueError, match="observation_weight=0"):
-        prior.couple(torch.zeros(2, H, 1), torch.zeros(2, H, 1))
-    nested = TensorDict({"pose": torch.zeros(2, 1, 3)}, [2])
-    with pytest.raises(ValueError, match=r"ot compares.*nested.*observation_weight=0"):
-        prior.couple(torch.zeros(2, H, 1), torch.zeros(2, H, 1), observation=nested)
+        couple(chunk[:1], chunk[:1], torch.zeros(1, 1, 3))
+    for told, seen in (("none", None), ("nested", TensorDict({"pose": torch.zeros(2, 3)}, [2]))):
+        with pytest.raises(ValueError, match=f"compares .*{told}.*observation_weight=0"):
+            couple(chunk, chunk, seen)
+        OTCoupling(0.0)(chunk, chunk, seen)
     for weight in (-1.0, float("inf"), float("nan"), True, "abc"):
         with pytest.raises(ValueError, match="observation_weight"):
-            OTPrior(H, observation_weight=weight)
-    actor = WarmPriorActor(VelocityMLP(1, 3, H, 1, hidden_dim=8), prior)
-    config = TrainingConfig(iterations=1, batch_size=1)
-    with pytest.raises(ValueError, match="batches of at least 2, got 1"):
-        BehaviourCloning(actor, demonstrations(), config, tmp_path, observation_steps=1)
+            OTCoupling(weight)
 
 
 class Known(nn.Module):
@@ -116,32 +114,49 @@ class Known(nn.Module):
 
 
 def test_reflow_pairs_sources_with_the_ends_of_the_teachers_flow():
-    prior = ReflowPrior(H, teacher_nfe=4)
-    a0, a1 = torch.randn(5, H, 1), torch.zeros(5, H, 1)
-    seen = torch.randn(5, 1, 3)
-    with pytest.raises(ValueError, match="no teacher"):
-        prior.couple(a0, a1, observation=seen)
-    with pytest.raises(ValueError, match="learns from gaussian"):
-        prior.learn_from(WarmPriorActor(Known(), PastPrior(H)))
-    prior.learn_from(WarmPriorActor(Known(), GaussianPrior(H)))
-    same, target = prior.couple(a0, a1, observation=seen)
+    couple = ReflowCoupling(WarmPriorActor(Known(), GaussianPrior(H)), nfe=4)
+    a0, a1, seen = torch.randn(5, H, 1), torch.zeros(5, H, 1), torch.randn(5, 1, 3)
+    same, target = couple(a0, a1, seen)
     assert same is a0
     level = seen[:, :, :1]
     torch.testing.assert_close(target, level + 0.75**4 * (a0 - level))
-    assert prior.config() == {"name": "reflow", "chunk_length": H, "teacher_nfe": 4}
-    with pytest.raises(ValueError, match=f"chunks of {H} actions, but its teacher of {H + 1}"):
-        prior.learn_from(WarmPriorActor(Known(), GaussianPrior(H + 1)))
+    with pytest.raises(ValueError, match=f"chunks of {H + 1} actions, but the teacher's have {H}"):
+        couple(torch.zeros(5, H + 1, 1), a1, seen)
     for nfe in (0, 2.5, True):
-        with pytest.raises(ValueError, match="teacher_nfe"):
-            ReflowPrior(H, teacher_nfe=nfe)
-    with pytest.raises(ValueError, match="has no teacher"):
-        GaussianPrior(H).learn_from(None)
+        with pytest.raises(ValueError, match="nfe"):
+            ReflowCoupling(couple.teacher, nfe=nfe)
 
 
-def test_a_teacher_follows_the_data_to_their_device():
-    prior = ReflowPrior(H)
-    prior.learn_from(WarmPriorActor(VelocityMLP(1, 3, H, 1, hidden_dim=8), GaussianPrior(H)))
-    shapes = (5, H, 1), (5, H, 1), (5, 1, 3)
+def test_a_teacher_is_frozen_and_follows_the_data_to_their_device():
+    actor = WarmPriorActor(VelocityMLP(1, 3, H, 1, hidden_dim=8), GaussianPrior(H))
+    couple = ReflowCoupling(actor)
+    assert not actor.training and not any(p.requires_grad for p in actor.parameters())
     for device in ("cpu", "meta"):
-        a0, a1, seen = (torch.zeros(shape, device=device) for shape in shapes)
-        assert prior.couple(a0, a1, observation=seen)[1].device.type == device
+        a0, a1, seen = (torch.zeros(s, device=device) for s in ((5, H, 1), (5, H, 1), (5, 1, 3)))
+        assert couple(a0, a1, seen)[1].device.type == device
+
+
+def test_what_they_depend_on():
+    teacher = WarmPriorActor(Known(), GaussianPrior(H))
+    assert OTCoupling(2.0).config() == {"name": "ot", "observation_weight": 2.0}
+    assert ReflowCoupling(teacher, nfe=3).config() == {"name": "reflow", "nfe": 3}
+
+
+def test_the_coupling_reaches_the_loss():
+    """Sources drawn first, paired with targets in their order, times after them."""
+    prior = GaussianPrior(3)
+    actor, data = actor_for(prior), sample(prior, 16)
+
+    def reversed_(a0, a1, observation):
+        assert torch.equal(observation, data["observation"])
+        return a0.flip(0), a1
+
+    generator = torch.Generator().manual_seed(3)
+    loss = FlowMatchingLoss(actor, coupling=reversed_, generator=generator)
+    found = loss(data)["loss_flow_matching"]
+    generator, target = torch.Generator().manual_seed(3), data["vla_action", "chunk"]
+    a0 = torch.randn(target.shape, generator=generator).flip(0)
+    t = torch.rand(16, generator=generator)
+    a_t = a0 + t[:, None, None] * (target - a0)
+    error = actor.network(t, a_t, data["observation"]) - (target - a0)
+    torch.testing.assert_close(found, error.square()[~data["action_is_pad"]].mean())

@@ -1,0 +1,151 @@
+"""Histories of batches that no environment keeps, by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior.history import ENTRIES
+from warmprior.lerobot import ActionMemory
+
+
+def chunk(first, length, size=2):
+    """Actions that tell their step, from ``first`` on."""
+    steps = torch.arange(float(first), first + length)
+    return (steps + 100.0 * torch.arange(size)[:, None])[..., None]
+
+
+def row(history, i=0):
+    return {name: history[name][i].flatten().tolist() for name in ENTRIES}
+
+
+def executing(prior, count, first=1):
+    """A memory that executed ``count`` actions of its first chunk."""
+    memory = ActionMemory(prior, 1)
+    memory.decide(2)
+    memory.record(chunk(first, prior.prediction_length))
+    for _ in range(count):
+        memory.step()
+    return memory
+
+
+def test_a_history_moves_by_what_was_executed():
+    memory = executing(PreviewPrior(3), 2)
+    told = {
+        "actions": [0, 1, 2],
+        "steps": [2],
+        "forecast": [3, 4, 5, 6, 0, 0],
+        "forecast_steps": [4],
+    }
+    assert row(memory.decide(2)) == told
+    assert row(memory.decide(2)) == told  # a decision without a chunk does not count
+    memory.record(chunk(11, 6))
+    memory.executed(torch.tensor([3, 0]))
+    history = memory.decide(2)
+    assert row(history) == {
+        "actions": [11, 12, 13],
+        "steps": [3],
+        "forecast": [14, 15, 16, 0, 0, 0],
+        "forecast_steps": [3],
+    }
+    assert row(history, 1) == {
+        "actions": [0, 101, 102],
+        "steps": [2],
+        "forecast": [111, 112, 113, 114, 115, 116],
+        "forecast_steps": [6],
+    }
+
+
+def test_an_episode_that_begins_inside_a_chunk():
+    """It executes the rest of the chunk, and has no plan of the old episode."""
+    memory = executing(PreviewPrior(4), 1)
+    memory.forget(torch.tensor([True, False]))
+    assert row(memory._history) == {
+        "actions": [0] * 4,
+        "steps": [0],
+        "forecast": [0] * 8,
+        "forecast_steps": [0],
+    }
+    memory.step()
+    memory.correct(torch.tensor([[-5.0], [-6.0]]))  # of the rest
+    memory.step()
+    history = memory.decide(2)
+    assert row(history) == {
+        "actions": [0, 0, -5, 3],
+        "steps": [2],
+        "forecast": [0] * 8,
+        "forecast_steps": [0],
+    }
+    assert row(history, 1) == {
+        "actions": [0, 101, -6, 103],
+        "steps": [3],
+        "forecast": [104, 105, 106, 107, 108, 0, 0, 0],
+        "forecast_steps": [5],
+    }
+    _, _, warm = PreviewPrior(4).distribution(history)
+    assert warm[:, :4].all(1).flatten().tolist() == [False, True]
+    # From its own first chunk on it has a plan as others have.
+    memory.record(chunk(21, 8))
+    memory.step()
+    assert row(memory.decide(2)) == {
+        "actions": [0, -5, 3, 21],
+        "steps": [3],
+        "forecast": [22, 23, 24, 25, 26, 27, 28, 0],
+        "forecast_steps": [7],
+    }
+
+
+def test_two_episodes_that_begin_inside_one_chunk():
+    memory = executing(PastPrior(4), 1)
+    for rows in ([True, False], [True, True]):
+        memory.forget(torch.tensor(rows))
+        memory.step()
+    history = memory.decide(2)
+    assert [row(history, i)["actions"] for i in range(2)] == [[0, 0, 0, 3], [0, 0, 0, 103]]
+    assert history["steps"].flatten().tolist() == [1, 1]
+    assert not history["forecast"].any() and not history["forecast_steps"].any()
+
+
+def test_a_number_of_executed_actions_is_not_that_of_a_new_episode():
+    """It is counted from the chunk's beginning, where that of a new episode is not known."""
+    for told, steps in ((4, [0, 4]), (torch.tensor([2, 4]), [2, 4])):
+        memory = executing(PastPrior(4), 0)
+        memory.forget(torch.tensor([True, False]))
+        assert memory.waits
+        memory.executed(told)
+        assert memory.decide(2)["steps"].flatten().tolist() == steps
+    for wrong in (5, torch.tensor([-1, 0])):
+        with pytest.raises(ValueError, match="from 0 to chunk_length=4"):
+            memory.executed(wrong)
+
+
+def test_actions_are_expressed_at_the_present_state_and_nothing_becomes_one():
+    memory = executing(PreviewPrior(3), 2)
+    history = memory.decide(2, move=lambda actions: actions.double() - 0.5)
+    assert row(history) == {
+        "actions": [0, 0.5, 1.5],
+        "steps": [2],
+        "forecast": [2.5, 3.5, 4.5, 5.5, 0, 0],
+        "forecast_steps": [4],
+    }
+    assert history["actions"].dtype == history["forecast"].dtype == torch.float32
+    # What was moved once is moved on from there.
+    memory.record(chunk(11, 6))
+    memory.step()
+    assert row(memory.decide(2, move=lambda actions: actions - 1.0))["actions"] == [-0.5, 0.5, 10]
+    memory.forget(torch.tensor([True, True]))
+    history = memory.decide(2, move=lambda actions: actions - 1.0)
+    assert not any(history[name].any() for name in ENTRIES)
+
+
+def test_precisions_stay_those_of_the_history():
+    memory = ActionMemory(GaussianPrior(2), 1)
+    memory.decide(2)
+    given = chunk(1, 2).bfloat16()
+    memory.record(given)
+    given.zero_()  # it has a copy
+    memory.step()
+    history = memory.decide(2)
+    assert history["actions"].dtype == torch.float32 and history["steps"].dtype == torch.int64
+    assert row(history)["actions"] == [0, 1]

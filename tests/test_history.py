@@ -1,0 +1,283 @@
+"""Histories against lists of executed actions, and the paper's equations 2 to 4 of them."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from tensordict import TensorDict
+
+from tests.toy_env import random_history
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
+from warmprior.history import (
+    ENTRIES,
+    advance,
+    check_history,
+    cold_history,
+    window_history,
+    without,
+)
+
+PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
+
+
+class Robot:
+    """One row's executed actions and last chunk, as Python's own lists."""
+
+    def __init__(self):
+        self.executed, self.left, self.reach = [], [], 0
+
+    def decide(self, chunk, k):
+        self.executed += list(chunk[:k])
+        self.left = list(chunk[k:])
+
+    def history(self, remembered, length):
+        zero = torch.zeros(2)
+        real = self.executed[-remembered:]
+        forecast = self.left + [zero] * (length - len(self.left))
+        return {
+            "actions": torch.stack([zero] * (remembered - len(real)) + real),
+            "steps": torch.tensor([len(real)]),
+            "forecast": torch.stack(forecast),
+            "forecast_steps": torch.tensor([len(self.left)]),
+        }
+
+
+def assert_equal(history, expected):
+    assert set(history.keys()) == set(ENTRIES) == set(expected.keys())
+    for name, value in expected.items():
+        assert history[name].dtype == value.dtype, name
+        assert torch.equal(history[name], value), name
+
+
+@given(
+    remembered=st.integers(1, 6),
+    length=st.integers(1, 8),
+    executed=st.lists(st.lists(st.integers(0, 8), min_size=3, max_size=3), min_size=1, max_size=6),
+    resets=st.sets(st.tuples(st.integers(0, 5), st.integers(0, 2))),
+    seed=st.integers(0, 10**6),
+)
+def test_any_number_of_executed_actions_and_rows_that_begin_anew(
+    remembered, length, executed, resets, seed
+):
+    """History longer and shorter than predictions; each row executes its own number, none included."""
+    g = torch.Generator().manual_seed(seed)
+    history, robots = cold_history([3], remembered, length, 2), [Robot() for _ in range(3)]
+    for t, numbers in enumerate(executed):
+        again = torch.tensor([(t, row) in resets for row in range(3)])
+        history = without(history, again)
+        robots = [Robot() if new else robot for robot, new in zip(robots, again, strict=True)]
+        chunk = torch.randn(3, length, 2, generator=g)
+        k = [min(n, remembered, length) for n in numbers]
+        before = history.clone(), chunk.clone()
+        after = advance(history, chunk, torch.tensor(k)[:, None])
+        assert (history == before[0]).all() and torch.equal(chunk, before[1])  # not written into
+        history = after
+        for row, robot in enumerate(robots):
+            robot.decide(chunk[row], k[row])
+            assert_equal(history[row], robot.history(remembered, length))
+
+
+@pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
+def test_batch_shapes(shape):
+    history, chunk = cold_history(shape, 3, 5, 2), torch.randn(*shape, 5, 2)
+    executed = torch.randint(0, 4, (*shape, 1))
+    after = advance(history, chunk, executed)
+    assert history.batch_size == after.batch_size == shape
+    flat = advance(history.reshape(-1), chunk.reshape(-1, 5, 2), executed.reshape(-1, 1))
+    assert_equal(after.reshape(-1), dict(flat.items()))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32, torch.bfloat16])
+@pytest.mark.parametrize("given_dtype", [torch.float64, torch.float32])
+def test_precisions_stay_those_of_the_history(dtype, given_dtype):
+    history = cold_history([2], 2, 4, 1, dtype=dtype)
+    chunk = torch.rand(2, 4, 1, dtype=given_dtype)
+    after = advance(history, chunk, torch.tensor([[1], [2]]))
+    for found in (after, without(after, torch.tensor([True, False]))):
+        types = {name: value.dtype for name, value in found.items()}
+        assert types == {name: value.dtype for name, value in history.items()}
+    assert torch.equal(after["forecast"][0, :3], chunk[0, 1:].to(dtype))
+
+
+@given(
+    chunk_length=st.integers(1, 4),
+    further=st.integers(0, 5),
+    longer=st.integers(0, 3),
+    frame=st.integers(0, 9),
+    seed=st.integers(0, 10**6),
+)
+def test_a_window_is_a_perfect_forecast_of_which_a_chunk_was_executed(
+    chunk_length, further, longer, frame, seed
+):
+    """Eq. 3: as if the policy had said all along what is executed."""
+    length, remembered = chunk_length + further, chunk_length + longer
+    actions = torch.randn(40, 2, generator=torch.Generator().manual_seed(seed))
+    before = torch.cat([torch.zeros(remembered, 2), actions])[frame : frame + remembered]
+    target, steps = actions[frame : frame + length], torch.tensor([frame])
+    window = window_history(before, steps, target, chunk_length)
+    robot = Robot()
+    robot.decide(actions[:frame], frame)
+    expected = robot.history(remembered, length)
+    expected["forecast"] = torch.cat([target[:further], torch.zeros(chunk_length, 2)])
+    expected["forecast_steps"] = torch.tensor([further])
+    assert_equal(window, expected)
+    # Nothing of the rest of the target is in there.
+    other = torch.cat([target[:further], torch.randn(chunk_length, 2)])
+    assert_equal(window_history(before, steps, other, chunk_length), expected)
+    if frame >= chunk_length:
+        robot, start = Robot(), frame - chunk_length
+        robot.decide(actions[:start], start)
+        history = TensorDict(robot.history(remembered, length))
+        deployed = advance(history, actions[start:][:length], torch.tensor([chunk_length]))
+        assert_equal(deployed, expected)
+
+
+def test_withheld_rows_are_those_of_robots_that_did_nothing():
+    history = random_history(PreviewPrior(3), 2, 4, cold=0.0)
+    rows = torch.rand(2, 4) < 0.5
+    found, cold = without(history, rows), cold_history([2, 4], 3, 6, 2)
+    assert_equal(found[rows], dict(cold[rows].items()))
+    assert_equal(found[~rows], dict(history[~rows].items()))
+    history["actions"][0, 0] = float("nan")
+    assert not without(history, torch.ones(2, 4, dtype=torch.bool))["actions"].any()
+
+
+@pytest.mark.parametrize(
+    ("executed", "told"),
+    [
+        ([[1], [3]], r"executed 3 actions, but the history remembers 2 .* between 0 and 2"),
+        ([[-1], [0]], r"executed -1 actions.* between 0 and 2"),
+    ],
+)
+def test_more_executed_than_remembered_or_less_than_nothing(executed, told):
+    with pytest.raises(ValueError, match=told):
+        advance(cold_history([2], 2, 4, 1), torch.zeros(2, 4, 1), torch.tensor(executed))
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 1), (2, 5, 1), (2, 4, 2), (3, 4, 1)])
+def test_a_chunk_of_another_shape(shape):
+    with pytest.raises(ValueError, match=rf"chunk has shape \({shape[0]}, .*forecast \(2, 4, 1\)"):
+        advance(cold_history([2], 2, 4, 1), torch.zeros(shape), torch.tensor([[1]]))
+
+
+@pytest.mark.parametrize("missing", ENTRIES)
+def test_a_history_that_lacks_an_entry(missing):
+    with pytest.raises(KeyError) as caught:
+        GaussianPrior(2).distribution(cold_history([1], 2, 2, 1).exclude(missing))
+    told = rf'^GaussianPrior.* missing: \("history", "{missing}"\)\. ActionHistory .*ActionWindow'
+    assert re.search(told, caught.value.args[0])
+
+
+# ------------------------------------------------------------------------------------------ the priors
+
+
+def equation(prior, robot, decided):
+    """The mean per position, or None where it is cold."""
+    horizon, length = prior.chunk_length, prior.prediction_length
+    if isinstance(prior, PastPrior):  # Eq. 2
+        return robot.executed[-horizon:] if len(robot.executed) >= horizon else [None] * length
+    if isinstance(prior, PreviewPrior) and decided:  # Eq. 3 in windows, Eq. 4 at decisions
+        return robot.left[:horizon] + [None] * (length - horizon)
+    return [None] * length
+
+
+def assert_mean(source, prior, expected):
+    loc, scale, warm = source
+    assert warm.dtype == torch.bool and warm.shape == (prior.prediction_length, 1)
+    assert warm.flatten().tolist() == [mean is not None for mean in expected]
+    scale = scale.expand_as(loc)
+    for position, mean in enumerate(expected):
+        assert torch.equal(loc[position], torch.zeros(2) if mean is None else mean)
+        assert torch.equal(scale[position], torch.full((2,), 1.0 if mean is None else prior.sigma))
+
+
+@given(
+    horizon=st.integers(1, 5),
+    executed=st.lists(st.lists(st.integers(0, 5), min_size=3, max_size=3), min_size=1, max_size=8),
+    prior_class=st.sampled_from(PRIORS),
+    seed=st.integers(0, 10**6),
+)
+def test_means_at_decisions_are_equations_2_and_4(horizon, executed, prior_class, seed):
+    g, prior = torch.Generator().manual_seed(seed), prior_class(horizon)
+    length = prior.prediction_length
+    history, robots = cold_history([3], horizon, length, 2), [Robot() for _ in range(3)]
+    for decided, numbers in enumerate(executed):
+        for row, robot in enumerate(robots):
+            expected = equation(prior, robot, decided)
+            assert_mean(prior.distribution(history[row]), prior, expected)
+        chunk, k = torch.randn(3, length, 2, generator=g), [min(n, horizon) for n in numbers]
+        history = advance(history, chunk, torch.tensor(k)[:, None])
+        for row, robot in enumerate(robots):
+            robot.decide(chunk[row], k[row])
+
+
+@pytest.mark.parametrize("prior_class", PRIORS)
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_means_in_windows_are_equations_2_and_3(prior_class, horizon):
+    prior, actions = prior_class(horizon), torch.randn(20, 2)
+    padded = torch.cat([torch.zeros(horizon, 2), actions])
+    for frame in range(8):
+        target = actions[frame : frame + prior.prediction_length]
+        before, robot = padded[frame : frame + horizon], Robot()
+        robot.decide(actions, frame)
+        history = window_history(before, torch.tensor([frame]), target, horizon)
+        assert_mean(prior.distribution(history), prior, equation(prior, robot, True))
+
+
+@pytest.mark.parametrize("prior_class", PRIORS)
+def test_a_mean_does_not_write_into_the_history(prior_class):
+    prior = prior_class(3)
+    history = random_history(prior, 4)
+    before = history.clone()
+    prior.distribution(history).loc.add_(1.0)
+    prior.sample(history).add_(1.0)
+    assert (history == before).all()
+
+
+@pytest.mark.parametrize(
+    ("prior", "lengths", "told"),
+    [
+        (PastPrior(3), (4, 3), r"needs 3 remembered .* of 3, but .*\"actions\"\) has 4 .* has 3"),
+        (PastPrior(3), (3, 6), r"needs 3 .* forecasts of 3.*\"forecast\"\) has 6: make windows"),
+        (PreviewPrior(3), (3, 3), r"PreviewPrior.*needs 3 .* of 6.*\"forecast\"\) has 3"),
+    ],
+)
+def test_a_history_of_other_lengths(prior, lengths, told):
+    with pytest.raises(ValueError, match=told):
+        prior.distribution(cold_history([2], *lengths, 2))
+
+
+def test_no_history_at_all():
+    with pytest.raises(KeyError, match=r"a robot needs the history; missing: .*ActionWindow in"):
+        check_history(None, 2, 2, "a robot")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda loc, warm: (loc[..., :-1, :], warm),
+        lambda loc, warm: (loc[0], warm),
+        lambda loc, warm: (loc, warm[..., :1, :]),
+        lambda loc, warm: (loc, warm.expand_as(loc)),
+        lambda loc, warm: (loc, warm.float()),
+    ],
+)
+def test_a_mean_of_another_shape_or_type(wrong):
+    class Wrong(PastPrior):
+        name = "wrong-for-this-test"
+
+        def mean(self, history):
+            return wrong(*super().mean(history))
+
+    try:
+        with pytest.raises(
+            ValueError,
+            match=r"Wrong.mean must return loc \(4, 3, 2\) and warm \(4, 3, 1\) of .*bool",
+        ):
+            Wrong(3).distribution(random_history(PastPrior(3), 4))
+    finally:
+        del Prior._classes["wrong-for-this-test"]

@@ -1,0 +1,194 @@
+"""History: what the robot did and what it meant to do, as a value with one layout.
+
+Training windows, environments, the executor and LeRobot's adapter write the same layout under
+:data:`warmprior.keys.HISTORY`, and a prior reads it (:meth:`Prior.mean`). So a mean is the same function of
+the same values everywhere.
+
+=====================  =========================  =====================================================
+entry                  shape                      meaning, in the normalised action space
+=====================  =========================  =====================================================
+``"actions"``          ``[*B, H, d_a]`` float     the last ``H`` executed actions, the oldest first; 0
+                                                  where the episode has none
+``"steps"``            ``[*B, 1]`` int64          how many of them are real, counted from the newest
+``"forecast"``         ``[*B, P, d_a]`` float     what the last prediction says of the next ``P`` steps,
+                                                  0 behind its end
+``"forecast_steps"``   ``[*B, 1]`` int64          how many of them it reaches
+=====================  =========================  =====================================================
+
+A training window holds the target's first ``P - H`` actions as a perfect forecast (Eq. 3), and no more of
+the target. At decisions after ``k < H`` actions the forecast reaches ``P - k`` (Eq. 4): priors read its first
+``P - H``, Real-Time Chunking reads all of it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+__all__ = ["ENTRIES", "advance", "check_history", "cold_history", "window_history", "without"]
+
+ENTRIES = ("actions", "steps", "forecast", "forecast_steps")
+
+
+def cold_history(
+    batch_size: Any, history_length: int, prediction_length: int, action_dim: int, **like: Any
+) -> TensorDict:
+    """The history of robots that did nothing yet.
+
+    Args:
+        batch_size: ``B``.
+        history_length: how many actions are remembered, usually ``H``.
+        prediction_length: ``P``.
+        action_dim: ``d_a``.
+        like: ``dtype`` of the actions, and ``device``.
+
+    Examples:
+        >>> cold_history([5], 4, 8, 2)["forecast"].shape
+        torch.Size([5, 8, 2])
+    """
+    device = like.get("device")
+    actions, forecast = (
+        torch.zeros(*batch_size, length, action_dim, **like)
+        for length in (history_length, prediction_length)
+    )
+    none = torch.zeros(*batch_size, 1, dtype=torch.int64, device=device)
+    return TensorDict(
+        {"actions": actions, "steps": none, "forecast": forecast, "forecast_steps": none.clone()},
+        batch_size,
+    )
+
+
+def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorDict:
+    """The history after some actions of a chunk were executed. Histories move here and nowhere else.
+
+    Precisions stay those of the history. A row that executes nothing keeps its actions, and its forecast
+    becomes the chunk; whoever did not ask it (a partial step) puts its history back.
+
+    Args:
+        history: before the decision, ``[*B]``.
+        chunk: what is executed of the decision, ``[*B, P, d_a]``.
+        executed: how many actions of it were executed, at most as many as are remembered, int64 ``[*B, 1]``.
+
+    Raises:
+        ValueError: if the chunk has another length than the forecast, or ``executed`` is out of range.
+
+    Examples:
+        >>> history = cold_history([], 2, 4, 1)
+        >>> history = advance(history, torch.arange(1.0, 5.0)[:, None], torch.tensor([1]))
+        >>> {key: value.flatten().tolist() for key, value in sorted(history.items())}
+        {'actions': [0.0, 1.0], 'forecast': [2.0, 3.0, 4.0, 0.0], 'forecast_steps': [3], 'steps': [1]}
+    """
+    before, length = history["actions"], history["forecast"].shape[-2]
+    remembered = before.shape[-2]
+    if chunk.shape != history["forecast"].shape:
+        raise ValueError(
+            f"the chunk has shape {tuple(chunk.shape)}, but the history's forecast "
+            f"{tuple(history['forecast'].shape)}: both need one prediction length"
+        )
+    low, high = (int(value) for value in torch.aminmax(executed))
+    if not 0 <= low <= high <= min(remembered, length):
+        raise ValueError(
+            f"a decision executed {high if low >= 0 else low} actions, but the history remembers "
+            f"{remembered} and the chunk has {length}: execute between 0 and {min(remembered, length)}"
+        )
+    chunk = chunk.to(before.dtype)
+    # Of [actions, chunk, zeros] the last executed actions begin at k, what is left of the chunk behind them.
+    line = torch.cat([before, chunk, torch.zeros_like(chunk[..., :remembered, :])], -2)
+    index = (executed + torch.arange(remembered + length, device=executed.device)).unsqueeze(-1)
+    moved = line.gather(-2, index.expand(*index.shape[:-1], line.shape[-1]))
+    return TensorDict(
+        {
+            "actions": moved[..., :remembered, :],
+            "steps": (history["steps"] + executed).clamp(max=remembered),
+            "forecast": moved[..., remembered:, :],
+            "forecast_steps": length - executed,
+        },
+        history.batch_size,
+    )
+
+
+def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: int) -> TensorDict:
+    """The history of a training window (Eq. 3).
+
+    Args:
+        before: the actions before the window, ``[*B, H, d_a]``, 0 before the episode.
+        steps: steps since the episode began, int64 ``[*B, 1]``.
+        target: the chunk to predict, ``[*B, P, d_a]``.
+        chunk_length: ``H``.
+
+    Examples:
+        >>> target = torch.arange(1.0, 5.0)[:, None]
+        >>> history = window_history(torch.zeros(2, 1), torch.tensor([0]), target, chunk_length=2)
+        >>> history["forecast"].flatten().tolist(), history["forecast_steps"].tolist()
+        ([1.0, 2.0, 0.0, 0.0], [2])
+    """
+    known = target.shape[-2] - chunk_length
+    forecast = torch.cat([target[..., :known, :], torch.zeros_like(target[..., known:, :])], -2)
+    return TensorDict(
+        {
+            "actions": before,
+            "steps": steps.clamp(max=before.shape[-2]),
+            "forecast": forecast,
+            "forecast_steps": torch.full_like(steps, known),
+        },
+        target.shape[:-2],
+    )
+
+
+def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
+    """The history with some rows cold: of new episodes, or of windows whose history is withheld.
+
+    Args:
+        history: ``[*B]``.
+        rows: which, bool ``[*B]``.
+
+    Examples:
+        >>> history = window_history(
+        ...     torch.ones(2, 1, 1), torch.ones(2, 1, dtype=torch.int64), torch.ones(2, 2, 1), 1)
+        >>> without(history, torch.tensor([True, False]))["forecast_steps"].flatten().tolist()
+        [0, 1]
+    """
+    step = rows.unsqueeze(-1)
+    return TensorDict(
+        {
+            name: torch.where(
+                step if name.endswith("steps") else step.unsqueeze(-1),
+                torch.zeros((), dtype=history[name].dtype, device=history[name].device),
+                history[name],
+            )
+            for name in ENTRIES
+        },
+        history.batch_size,
+    )
+
+
+def check_history(history: Any, history_length: int, prediction_length: int, whose: Any) -> None:
+    """Refuse a history that is missing, incomplete or of other lengths.
+
+    Args:
+        history: what was found.
+        history_length: actions that have to be remembered.
+        prediction_length: ``P``.
+        whose: what reads it, for the message.
+
+    Raises:
+        KeyError: if there is none, or an entry is missing.
+        ValueError: naming the lengths.
+    """
+    found = None if history is None else set(history.keys())
+    if found is None or not found.issuperset(ENTRIES):
+        missing = [f'("history", "{name}")' for name in ENTRIES if name not in (found or ())]
+        raise KeyError(
+            f"{whose} needs the history; missing: {', '.join(missing)}. ActionHistory writes it in an "
+            "environment, ActionWindow in a replay buffer"
+        )
+    lengths = history["actions"].shape[-2], history["forecast"].shape[-2]
+    if lengths != (history_length, prediction_length):
+        raise ValueError(
+            f"{whose} needs {history_length} remembered actions and forecasts of {prediction_length}, but "
+            f'("history", "actions") has {lengths[0]} and ("history", "forecast") has {lengths[1]}: make '
+            "windows and environment for the same lengths"
+        )

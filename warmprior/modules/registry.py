@@ -1,0 +1,246 @@
+"""Classes that configurations name: what a file may build, and what it was built from."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, ClassVar, Self
+
+__all__ = ["Registered", "find", "from_config", "make", "options_of", "registered"]
+
+_NEXT_OPTION = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
+"""What separates options behind a name; other commas belong to a value."""
+
+
+class Registered:
+    """A class whose subclasses are known by name, and whose objects remember their constructor's arguments.
+
+    A class that derives from this one directly has a registry of its own.
+
+    Raises:
+        ValueError: when a subclass takes the name of another, or one that no file can have.
+        TypeError: when a constructor is given arguments behind ``*``, which have no names to save them by.
+
+    Examples:
+        >>> class Shape(Registered): ...
+        >>> class Circle(Shape):
+        ...     def __init__(self, radius=1.0): ...
+        >>> Circle(radius=2.0).config(), from_config(Shape, {"name": "Circle"})
+        ({'name': 'Circle', 'radius': 2.0}, Circle(radius=1.0))
+    """
+
+    name: ClassVar[str]
+    """In options and files; that of the class by default."""
+    _classes: ClassVar[dict[str, type[Any]]]
+    _arguments: dict[str, Any]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        if Registered in cls.__bases__:
+            cls._classes = {}
+            return
+        cls.name = cls.__dict__.get("name", cls.__name__)
+        if not re.fullmatch(r"[\w.+-]+", cls.name):
+            raise ValueError(
+                f"the name of {cls.__name__} becomes that of files: {cls.name!r} cannot"
+            )
+        taken = cls._classes.get(cls.name)
+        # The same class once more, as when a notebook's cell runs again, replaces itself.
+        if taken is not None and _place(taken) != _place(cls):
+            raise ValueError(
+                f"{cls.name!r} is the name of {_place(taken)}: choose another name for {_place(cls)}"
+            )
+        cls._classes[cls.name] = cls
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Remember the arguments, whatever the subclass does with them."""
+        self = super().__new__(cls)
+        self.__dict__["_arguments"] = _bound(cls, args, kwargs)
+        return self
+
+    def config(self) -> dict[str, Any]:
+        """Name and constructor arguments as JSON holds them; :func:`from_config` reverses it.
+
+        One that was left to the constructor, as by ``sigma=None``, is what the object keeps under its name,
+        if that is a number or text; all others are told as they were given.
+
+        Raises:
+            TypeError: if an argument is nothing that JSON can hold.
+        """
+        try:
+            return json.loads(json.dumps({"name": self.name, **self._resolved()}, allow_nan=False))
+        except (TypeError, ValueError) as error:
+            raise TypeError(
+                f"{type(self).__name__} has an argument that cannot be saved ({error}): take numbers, text, "
+                "lists or dictionaries, and build the rest of them"
+            ) from error
+
+    def _resolved(self) -> dict[str, Any]:
+        plain, resolved = (bool, int, float, str), dict(self._arguments)
+        for name, value in self._arguments.items():
+            kept = getattr(self, name, None)
+            # A number that was given is told as it was: what the constructor made of it, it would make again.
+            if isinstance(kept, plain) and (not isinstance(value, plain) or kept == value):
+                resolved[name] = kept
+        return resolved
+
+    def __repr__(self) -> str:
+        told = (f"{key}={value!r}" for key, value in self._resolved().items())
+        return f"{type(self).__name__}({', '.join(told)})"
+
+
+def registered[T: Registered](base: type[T]) -> Mapping[str, type[T]]:
+    """All imported subclasses by name."""
+    return MappingProxyType(base._classes)
+
+
+def find[T: Registered](base: type[T], name: str) -> type[T]:
+    """The subclass of a name, or at a place such as ``"mypackage.priors:Anchor"``, which is imported.
+
+    Importing runs code: this is for what a user typed, and never for what a file says.
+
+    Args:
+        base: of the registry.
+        name: of the subclass, or ``"module:Class"``.
+
+    Raises:
+        ValueError: if there is none.
+
+    Examples:
+        >>> from warmprior import Prior
+        >>> find(Prior, "past").__name__
+        'PastPrior'
+    """
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        if name in base._classes:
+            return base._classes[name]
+        known = ", ".join(sorted(base._classes))
+        raise ValueError(
+            f"unknown {base.__name__.lower()} {name!r}: it is none of {known}; name your own as "
+            "package.module:Class"
+        )
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
+        raise ValueError(f"there is no {base.__name__.lower()} at {name}: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise ValueError(f"{name} is no subclass of {base.__name__}")
+    return found
+
+
+def make[T: Registered](base: type[T], text: str, *args: Any, **kwargs: Any) -> T:
+    """Build what a user typed: a name, and perhaps options of the constructor behind it.
+
+    Args:
+        base: of the registry.
+        text: what :func:`find` takes, with options as in ``"preview,correlation=0.5"``
+            (:func:`options_of`).
+        args: further arguments of the constructor.
+        kwargs: likewise; those that are ``None`` are left out.
+
+    Raises:
+        ValueError: if there is no such name, or an argument is out of range, given twice or unknown, naming
+            it and what the constructor takes.
+
+    Examples:
+        >>> from warmprior import Prior
+        >>> make(Prior, "past,correlation=0.5", 8, sigma=None)
+        PastPrior(chunk_length=8, sigma=0.5, correlation=0.5)
+    """
+    found, typed = find(base, text.partition(",")[0]), options_of(text)
+    given = {name: value for name, value in kwargs.items() if value is not None}
+    try:
+        for name in typed.keys() & given.keys():
+            raise ValueError(f"{name} is given twice: also as {given[name]!r}")
+        return found(*args, **given, **typed)
+    except (TypeError, ValueError, ArithmeticError) as error:
+        told = [*map(repr, args), *(f"{k}={v!r}" for k, v in (given | typed).items())]
+        parameters = list(inspect.signature(found.__init__).parameters.values())[1:]  # without self
+        taken = [f"**{p.name}" if p.kind is p.VAR_KEYWORD else p.name for p in parameters]
+        raise ValueError(
+            f"{found.__name__} cannot be built from {', '.join(told) or 'nothing'} ({error}): it takes "
+            f"{', '.join(taken) or 'nothing'}"
+        ) from error
+
+
+def options_of(text: str) -> dict[str, Any]:
+    """The options behind a name, as JSON or plain text.
+
+    A comma separates them if ``option=`` follows, and belongs to the value otherwise.
+
+    Args:
+        text: ``name,option=value,...``.
+
+    Raises:
+        ValueError: if they are not written like this, or one is given twice.
+
+    Examples:
+        >>> options_of("preview,correlation=0.5,words=one, two")
+        {'correlation': 0.5, 'words': 'one, two'}
+    """
+    options: dict[str, Any] = {}
+    _, comma, rest = text.partition(",")
+    for part in _NEXT_OPTION.split(rest) if comma else ():
+        key, equals, value = part.partition("=")
+        key = key.strip()
+        if not equals or not key.isidentifier():
+            raise ValueError(f"options are written as name,option=value, got {part!r} in {text!r}")
+        if key in options:
+            raise ValueError(f"the option {key} is given twice in {text!r}")
+        try:
+            options[key] = json.loads(value)
+        except json.JSONDecodeError:
+            options[key] = value
+    return options
+
+
+def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
+    """Build what :meth:`Registered.config` describes; nothing is imported for it.
+
+    Raises:
+        ValueError: if no imported class has that name.
+
+    Examples:
+        >>> from warmprior import Prior
+        >>> from_config(Prior, {"name": "past", "chunk_length": 8})
+        PastPrior(chunk_length=8, sigma=0.5, correlation=0.0)
+    """
+    arguments = dict(config)
+    name = arguments.pop("name", None)
+    if name not in base._classes:
+        known = ", ".join(sorted(base._classes))
+        raise ValueError(
+            f"unknown {base.__name__.lower()} {name!r}; known: {known}. Import the module that defines it "
+            "before loading it"
+        )
+    return base._classes[name](**arguments)
+
+
+def _place(cls: type) -> str:
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _bound(cls: type, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
+    """Constructor arguments by name, defaults included."""
+    signature = inspect.signature(cls.__init__)  # type: ignore[misc]
+    try:
+        bound = signature.bind(None, *args, **kwargs)
+    except TypeError:
+        # A copy, which brings its arguments along; or a mistake that the call itself tells.
+        return {}
+    bound.apply_defaults()
+    arguments: dict[str, Any] = {}
+    for name, parameter in list(signature.parameters.items())[1:]:  # without self
+        value = bound.arguments[name]
+        if parameter.kind is parameter.VAR_KEYWORD:
+            arguments |= value
+        elif parameter.kind is not parameter.VAR_POSITIONAL:
+            arguments[name] = value
+        elif value:
+            raise TypeError(f"{cls.__name__} must name its arguments: *{name} could not be saved")
+    return arguments

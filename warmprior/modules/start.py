@@ -1,0 +1,58 @@
+"""Where samplers start, if not at the source: a point on the way, at a later time."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+
+from warmprior.modules.registry import Registered
+
+__all__ = ["StartPoint"]
+
+
+class StartPoint(Registered, nn.Module):
+    r"""Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
+
+    The flow is trained from the prior's source as ever; at decisions it is entered on the way.
+
+    Attributes:
+        time: ``s``.
+        noise_share: standard deviation of the point for source noise of 1.
+
+    See Also:
+        :class:`~warmprior.WarmPriorActor`: takes one as ``start``.
+
+    Examples:
+        >>> import torch
+        >>> class Halved(StartPoint):
+        ...     time = 0.5
+        ...     noise_share = 0.5
+        ...     def centre(self, history, observation):
+        ...         return torch.zeros_like(history["forecast"])
+        ...     def forward(self, noise, history, observation):
+        ...         return self.centre(history, observation) + self.noise_share * noise
+        >>> Halved().config()
+        {'name': 'Halved'}
+    """
+
+    time: float
+    noise_share: float
+
+    def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+        """Mean of the point, around which an agent searches, ``[*B, P, d_a]``.
+
+        Args:
+            history: ``[*B]``, see :mod:`warmprior.history`.
+            observation: what the network sees, ``[*B, To, d_o]``.
+        """
+        raise NotImplementedError
+
+    def forward(self, noise: Tensor, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+        """The point, ``[*B, P, d_a]``.
+
+        Args:
+            noise: a draw of the prior's source, ``[*B, P, d_a]``.
+            history: see :meth:`centre`.
+            observation: see :meth:`centre`.
+        """
+        raise NotImplementedError

@@ -1,0 +1,150 @@
+"""How the sources and targets of a batch are paired, other than as they come."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import chain
+from typing import Any, ClassVar
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from warmprior.io.extras import require
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
+
+__all__ = ["Coupling", "OTCoupling", "ReflowCoupling"]
+
+Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
+"""Pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, each chunk ``[*B, P, d_a]``.
+
+The observations ``[*B, To, d_o]`` belong to the targets: permute ``a0``, or replace ``a1``. What it depends
+on it tells by ``config()``, if it has that, so that a training knows whether it may be continued.
+"""
+
+
+class OTCoupling:
+    r"""OT-CFM: source and data of a batch are paired by optimal transport.
+
+    The permutation :math:`\pi` of the sources minimises
+
+    .. math::
+        \sum_j \|a_0^{\pi(j)} - a_1^j\|^2 + w \|o^{\pi(j)} - o^j\|^2
+
+    (Tong et al., 2024; Pooladian et al., 2023), exactly, in nearly equal groups of at most 256. At decisions
+    the source is drawn at any observation, so pairs across observations bias the policy; ``w`` makes them
+    dear. At ``w = 0`` the observation is ignored; at a large one everything stays where it is.
+
+    Args:
+        observation_weight: ``w``, for observations in the data's normalised units, each one tensor.
+
+    Raises:
+        ValueError: if the weight is negative or not finite, a batch has fewer than two windows, or its
+            observations are nested.
+        ImportError: if scipy is missing.
+
+    See Also:
+        :class:`~warmprior.objectives.ReflowCoupling`: pairs each source with what a trained flow makes of it.
+
+    Examples:
+        >>> import torch
+        >>> couple = OTCoupling(observation_weight=0.0)
+        >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
+        >>> [x.flatten().tolist() for x in couple(a0, a1)]
+        [[1.0, 0.0], [5.0, 4.0]]
+    """
+
+    GROUP: ClassVar[int] = 256
+
+    def __init__(self, observation_weight: float = 10.0) -> None:
+        check_finite_numbers(observation_weight=observation_weight)
+        if observation_weight < 0:
+            raise ValueError(f"observation_weight must be at least 0, got {observation_weight}")
+        require("scipy", "sim")
+        self.observation_weight = observation_weight
+
+    def config(self) -> dict[str, Any]:
+        """What it depends on."""
+        return {"name": "ot", "observation_weight": self.observation_weight}
+
+    def __call__(
+        self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Permute the sources within the batch."""
+        from scipy.optimize import linear_sum_assignment
+
+        source, target = a0.reshape(-1, *a0.shape[-2:]), a1.reshape(-1, *a1.shape[-2:])
+        if len(source) < 2:
+            raise ValueError("optimal transport pairs within a batch: it needs at least 2 windows")
+        if self.observation_weight and not isinstance(observation, Tensor):
+            found = "none" if observation is None else "nested ones"
+            raise ValueError(
+                f"optimal transport compares observations that are one tensor each, and got {found}: "
+                "concatenate their entries, or set observation_weight=0"
+            )
+        paired = []
+        # Groups of nearly one size: a window that is left over could only be paired with itself.
+        for group in torch.arange(len(source)).tensor_split(-(-len(source) // self.GROUP)):
+            cost = _squared_distances(target[group], source[group])
+            if isinstance(observation, Tensor) and self.observation_weight:
+                seen = observation.reshape(len(source), -1)[group]
+                cost = cost + self.observation_weight * _squared_distances(seen, seen)
+            order = torch.as_tensor(linear_sum_assignment(cost.double().cpu().numpy())[1])
+            paired.append(source[group][order.to(source.device)])
+        return torch.cat(paired).view_as(a0), a1
+
+
+def _squared_distances(x: Tensor, y: Tensor) -> Tensor:
+    return torch.cdist(x.flatten(1), y.flatten(1)).square()
+
+
+class ReflowCoupling:
+    r"""2-rectified flow: the target of every source is where a trained policy's flow leads it.
+
+    Pairs :math:`(a_0, \hat a_1)`, with :math:`\hat a_1` the end of the teacher's flow at the window's
+    observation, are drawn anew for every batch (Liu et al., 2023): a step costs ``nfe`` more forward passes.
+
+    Args:
+        teacher: a trained policy of the same source; it is frozen, and moved to the device of the data.
+        nfe: its Euler steps.
+
+    Raises:
+        ValueError: if ``nfe`` is no whole number of at least 1, or a batch has chunks of another shape than
+            the teacher's.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> couple = ReflowCoupling(WarmPriorActor(VelocityMLP(2, 3, 4), GaussianPrior(4)), nfe=2)
+        >>> a0, a1, seen = torch.randn(5, 4, 2), torch.zeros(5, 4, 2), torch.zeros(5, 2, 3)
+        >>> source, target = couple(a0, a1, seen)
+        >>> source is a0, target.shape
+        (True, torch.Size([5, 4, 2]))
+    """
+
+    def __init__(self, teacher: WarmPriorActor, nfe: int = 9) -> None:
+        check_whole_numbers(nfe=nfe)
+        self.teacher, self.nfe = teacher.eval().requires_grad_(False), nfe
+
+    def config(self) -> dict[str, Any]:
+        """What it depends on, beside the teacher's weights."""
+        return {"name": "reflow", "nfe": self.nfe}
+
+    @torch.no_grad()
+    def __call__(
+        self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Replace the targets by the ends of the teacher's flow."""
+        ode, length = self.teacher.ode, self.teacher.prior.prediction_length
+        if a0.shape[-2] != length:
+            raise ValueError(
+                f"the batch has chunks of {a0.shape[-2]} actions, but the teacher's have {length}"
+            )
+        for tensor in chain(self.teacher.parameters(), self.teacher.buffers()):
+            if tensor.device != a0.device:
+                self.teacher.to(a0.device)
+                break
+        noise_key, observation_key = ode.in_keys[:2]
+        data = TensorDict({noise_key: a0, observation_key: observation}, a0.shape[:-2])
+        return a0, ode(data, nfe=self.nfe)[ode.out_keys[0]]
