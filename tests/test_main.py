@@ -14,11 +14,13 @@ from tests.io.hub_server import TOKEN, model_hub
 from tests.processes import apart
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.__main__ import main
+from warmprior.training.saved import save_policy
 
 pytest.importorskip("robosuite")
 from warmprior.envs import RobosuiteEnv, rendering_backend
 from warmprior.envs.tasks import TaskSpec
 from warmprior.experiments import NetworkOptions, RunOptions, Store, robosuite_problem
+from warmprior.experiments.methods import Method
 from warmprior.training import TrainingConfig, play_episode
 from warmprior.training.behaviour_cloning import policy_path
 
@@ -40,13 +42,13 @@ def saved(tmp_path_factory):
     problem, network = robosuite_problem(path), NetworkOptions(hidden_dim=16)
     run = RunOptions(logger="none")
     store = Store(problem, network, folder / "policies", folder / "logs", run)
-    prior = PastPrior(8)
-    actor = store.policy(prior, training)
-    env = problem.make_env().append_transform(store.transforms(prior)())
+    method = Method.parse("past", 8)
+    actor = store.policy(method, training)
+    env = problem.make_env().append_transform(store.transforms(method)())
     episode = play_episode(actor, env, 10_000_000, nfe=1)
     env.close()
     kept = folder / "kept"
-    shutil.copytree(policy_path(store.folder(prior, training), 3), kept)
+    shutil.copytree(policy_path(store.folder(method, training), 3), kept)
     path.unlink()
     shutil.rmtree(store.directory)
     return kept, episode
@@ -146,13 +148,13 @@ def test_info_tells_who_wrote_it(saved, tmp_path, capsys):
     config["sha256"] = hashlib.sha256(text.encode()).hexdigest()
     (folder / "config.json").write_text(json.dumps(config))
     assert main(["info", str(folder)]) == 0
-    assert "written by   warmprior 0.1.0, format 3" in capsys.readouterr().out
+    assert "written by   warmprior 0.1.0, format 4" in capsys.readouterr().out
 
 
 def test_what_a_user_can_mend_is_told_in_one_line(saved, tmp_path, capsys):
     bare = tmp_path / "bare"
     network = VelocityMLP(7, 19, 8, hidden_dim=8)
-    WarmPriorActor(network, PastPrior(8)).save_pretrained(bare)
+    save_policy(WarmPriorActor(network, PastPrior(8)), bare)
     for argv, message in (
         (["evaluate", str(tmp_path / "missing")], "no policy at"),
         (["evaluate", str(bare)], "keeps no description of a robosuite environment"),

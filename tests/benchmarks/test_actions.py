@@ -7,8 +7,8 @@ import importlib
 import pytest
 
 from tests.benchmarks.script_parts import command_line, options, stored, written
-from warmprior import WarmPriorActor
 from warmprior.__main__ import main
+from warmprior.training.saved import load_policy
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
@@ -48,7 +48,7 @@ def test_policies_of_both_spaces_lie_side_by_side(finished, capsys):
     for run in ("absolute", "delta"):
         for entry in stored(finished / run)["meta"]["policies"]:
             folder = finished / "policies" / entry["folder"] / "policy_000030"
-            widths[folder] = WarmPriorActor.from_pretrained(folder).network.action_dim
+            widths[folder] = load_policy(folder).network.action_dim
     assert list(widths.values()) == [10, 10, 7, 7]
     assert main(["evaluate", str(next(iter(widths))), "--episodes", "1", "--nfe", "1"]) == 0
     assert "of 1 episodes solved" in capsys.readouterr().out

@@ -9,9 +9,11 @@ import pytest
 
 from tests.benchmarks.script_parts import is_png, options, refused, stored, written
 from tests.experiments.row_parts import row as evaluation
-from warmprior import PastPrior, WarmPriorActor
+from warmprior import PastPrior
 from warmprior.data import RobomimicExperienceReplay
 from warmprior.diagnostics import SharedObservations, action_error
+from warmprior.experiments.methods import Method
+from warmprior.training.saved import load_policy
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
@@ -55,7 +57,7 @@ def test_every_budget_is_a_training_of_its_own(budget, dataset, validation, tmp_
     assert names == ["policy_000002", "policy_000004"]
     for row in result["rows"]:
         n = row["iterations"]
-        actor = WarmPriorActor.from_pretrained(policies / folders[n] / f"policy_{n:06d}")
+        actor = load_policy(policies / folders[n] / f"policy_{n:06d}")
         error = action_error(actor, held_out_windows(actor, validation), nfes=(1,))[1]
         assert row["action_error"] == pytest.approx(error, rel=0.3)
         assert f"({row['action_error']:.4f})" in table
@@ -108,6 +110,7 @@ def test_options_of_a_prior_have_cells_of_their_own(budget, monkeypatch):
     contestants = [
         SimpleNamespace(
             prior=PastPrior(8, sigma=1.0, correlation=each),
+            method=Method("past", 8, {"sigma": 1.0, "correlation": each}),
             facts=lambda r=r: {n: r.facts[n] for n in names},
         )
         for r, each in ((first, 0.0), (second, 0.5))
@@ -122,7 +125,7 @@ def test_options_of_a_prior_have_cells_of_their_own(budget, monkeypatch):
         budget, "action_error", lambda actor, windows, nfes: {1: actor.prior.correlation}
     )
     monkeypatch.setattr(budget, "encoded_windows", lambda actor, windows: windows)
-    observations = SimpleNamespace(windows=lambda prior: None)
+    observations = SimpleNamespace(windows=lambda prior, see_history: None)
     rows = budget.with_errors(comparison, observations)
     assert [each["action_error"] for each in rows] == [0.0, 0.5]
     assert [each.outcomes for each in rows] == [first.outcomes, second.outcomes]

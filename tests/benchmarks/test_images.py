@@ -9,9 +9,10 @@ import torch
 
 from tests.benchmarks.script_parts import options, refused, stored
 from tests.processes import apart
-from warmprior import ImageEncoder, WarmPriorActor
+from warmprior import ImageEncoder
 from warmprior.data import RobomimicExperienceReplay, generate_demonstrations
 from warmprior.diagnostics import encoded_windows
+from warmprior.training.saved import load_policy
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
@@ -66,7 +67,7 @@ def test_a_loaded_policy_decides_as_before(finished):
 
     @apart
     def chunks(folder):
-        actor = WarmPriorActor.from_pretrained(folder)
+        actor = load_policy(folder)
         env = environment_of(actor, horizon=17)
         env.set_seed(3)
         torch.manual_seed(0)
@@ -80,7 +81,7 @@ def test_a_loaded_policy_decides_as_before(finished):
 def test_diagnostics_see_what_the_encoder_makes_of_images(finished):
     (path,) = finished.glob("cache/rendered/*.hdf5")
     (folder,) = finished.glob("policies/*gaussian*/policy_000004")
-    actor = WarmPriorActor.from_pretrained(folder).eval()
+    actor = load_policy(folder).eval()
     keys = ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]
     images = ["agentview_image", "robot0_eye_in_hand_image"]
     data = RobomimicExperienceReplay(path, observation_keys=keys, image_keys=images).data[:10]

@@ -19,7 +19,9 @@ import torch
 from torchrl.envs import UnaryTransform
 
 from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
-from warmprior import ForecastPrior, PastPrior, VelocityMLP, WarmPriorActor
+from warmprior import VelocityMLP, WarmPriorActor
+from warmprior.experiments.methods import Method
+from warmprior.training.saved import load_policy, save_policy
 
 pytest.importorskip("matplotlib")
 pytest.importorskip("tyro")
@@ -130,7 +132,7 @@ def test_options_of_a_prior_are_agents_of_their_own(benchmark, tmp_path, capsys)
     assert len({len(points) for points in found.values()}) == 1
     # Each acts in the source of its own policy; folders without options are called as ever.
     for name, correlation in (("past", 0.0), ("past-correlation=0.5", 0.5)):
-        kept = WarmPriorActor.from_pretrained(out / "policies" / f"{name}-seed0")
+        kept = load_policy(out / "policies" / f"{name}-seed0")
         assert kept.prior.correlation == correlation
         assert (out / f"dsrl-na-{name}-seed0").is_dir()
     table = (out / "table.md").read_text()
@@ -228,7 +230,7 @@ def test_resume_goes_on_where_it_stopped(benchmark, tmp_path, monkeypatch):
         ("--preset unit --prior regression", "--prior regression is no flow"),
         ("--preset unit --prior nobodys", "unknown prior 'nobodys'"),
         ("--preset unit --prior past past,sigma=0.3", "Compare these in runs of their own"),
-        ("--preset unit --prior past past,cold_probability=0.3", "would not tell PastPrior"),
+        ("--preset unit --prior past,cold_probability=0.3", "cold_probability is unknown to it"),
         ("--horizon 0", "--horizon must be between 1 and"),
         (
             "--preset unit --data mh",
@@ -280,15 +282,15 @@ def test_papers_recipes():
     }
     for task, values in known.items():
         recipe = read(f"--preset paper --task {task} --download")
-        priors = {prior.name: prior for prior in recipe.sources.priors()}
-        assert tuple(priors) == ("gaussian", "past", "preview")
-        chunk = priors["past"].chunk_length
-        made = {name: recipe.agent(prior, "dsrl-na", 0) for name, prior in priors.items()}
+        methods = {method.name: method for method in recipe.sources.methods()}
+        assert tuple(methods) == ("gaussian", "past", "preview")
+        chunk = methods["past"].chunk_length
+        made = {name: recipe.agent(method, "dsrl-na", 0) for name, method in methods.items()}
         base, config = made["gaussian"].delta or 1.5, made["past"]
         found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
         assert (*found, recipe.agents.horizon, chunk, base) == values
         assert made["past"].delta is None  # the paper's 0.5
-        other = recipe.agent(priors["past"], "dsrl-sac", 3)
+        other = recipe.agent(methods["past"], "dsrl-sac", 3)
         assert other.seed == 3 and other.algorithm == "dsrl-sac" and other.backup_entropy
         assert not config.backup_entropy
         assert (config.alpha_init, config.tau, config.batch_size) == (1.0, 0.005, 256)
@@ -296,8 +298,8 @@ def test_papers_recipes():
         expected = ("dsrl-na", "dsrl-sac") if task == "transport" else ("dsrl-na",)
         assert recipe.agents.algorithm == expected
     recipe = read("--preset paper --task transport --download --rl.delta 0.7 --episodes 3 --nfe 9")
-    for prior in recipe.sources.priors():
-        config = recipe.agent(prior, "dsrl-na", 0)
+    for method in recipe.sources.methods():
+        config = recipe.agent(method, "dsrl-na", 0)
         assert (config.delta, config.evaluation_episodes, config.nfe) == (0.7, 3, 9)
     # Options of the command line stand above those of the task.
     assert read("--preset paper --task square --rl.gamma 0.9").rl.gamma == 0.9
@@ -350,17 +352,18 @@ def finished(dataset, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def with_options(tmp_path_factory):
-    """What a finished run leaves of policies: three options of one prior, and a learned one."""
+    """What a finished run leaves of policies: three options of one method, and a learned one."""
     out = tmp_path_factory.mktemp("of-options") / "main"
-    priors = [
-        *(PastPrior(8, sigma=0.3, correlation=share) for share in (0.0, 0.5, 0.25)),
-        ForecastPrior(8).sized(2, 3, 1),
+    shares = (0.0, 0.5, 0.25)
+    methods = [
+        *(Method("past", 8, {"sigma": 0.3, "correlation": share}) for share in shares),
+        Method("forecast", 8),
     ]
     entries = []
-    for i, prior in enumerate(priors):
+    for i, method in enumerate(methods):
         folder = policy_path(out.parent / "policies" / str(i), 1)
-        WarmPriorActor(VelocityMLP(2, 3, 8, 1), prior).save_pretrained(folder)
-        entry = {"prior": prior.config(), "iterations": 1, "seed": 0, "folder": str(i)}
+        save_policy(WarmPriorActor(VelocityMLP(2, 3, 8, 1), method.prior((2, 3, 1))), folder)
+        entry = {"method": method.config(), "iterations": 1, "seed": 0, "folder": str(i)}
         entries.append(entry)
     out.mkdir()
     meta = {"policies": entries, "problems": [{"task": "lift", "style": "ph"}]}
@@ -447,9 +450,9 @@ def test_policies_of_a_finished_run(benchmark, finished, tmp_path, capsys):
 
     # An agent goes on with the very policy it began with, whatever has become of the run's.
     for folder in (finished.parent / "policies").glob("*/policy_*"):
-        actor = WarmPriorActor.from_pretrained(folder)
+        actor = load_policy(folder)
         torch.nn.init.normal_(next(actor.parameters()))
-        actor.save_pretrained(folder)
+        save_policy(actor, folder)
     assert benchmark.main(["--resume", "--out", str(out)]) == 0
     assert stored(out)["rows"] == result["rows"]
     # Started anew, the folder's agent is not passed off as one of the present policy.

@@ -92,7 +92,7 @@ def test_a_prior_of_ones_own_enters_by_its_place(benchmark, dataset, tmp_path, c
     out, place = tmp_path / "runs" / "own", "tests.benchmarks.user_priors:HeldAction"
     argv = options(dataset, out, prior=["gaussian", place], sigma=0.2, envs=2)
     assert benchmark.main(argv) == 0
-    assert "NFE 1: Base | NFE 1: Held action |" in capsys.readouterr().out
+    assert "NFE 1: Base | NFE 1: held |" in capsys.readouterr().out
     assert [(row["prior"], row["sigma"]) for row in stored(out)["rows"]] == [
         ("gaussian", 1.0),
         ("held", 0.2),

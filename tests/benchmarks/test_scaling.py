@@ -19,6 +19,7 @@ from warmprior.envs.simulator import task_env_args
 from warmprior.experiments.condition import AT_ONCE
 from warmprior.experiments.contestant import Cell
 from warmprior.experiments.worker import Play
+from warmprior.training.saved import save_policy
 
 
 def episode(*steps, decision=1.0):
@@ -77,7 +78,7 @@ def test_the_script(tmp_path, capsys):
     prior = PastPrior(8)
     environment = environment_description(task_env_args("lift"), "ph", 2)
     network = VelocityMLP(7, 19, 8, 2, hidden_dim=16)
-    WarmPriorActor(network, prior, environment=environment).save_pretrained(tmp_path / "policy")
+    save_policy(WarmPriorActor(network, prior, environment=environment), tmp_path / "policy")
     out = tmp_path / "out"
     argv = [str(tmp_path / "policy"), "--episodes", "2", "--repeats", "1", "--out", str(out)]
     assert scaling.main([*argv, "--processes", "2", "--cores", "1", "16"]) == 0

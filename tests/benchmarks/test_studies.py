@@ -18,12 +18,12 @@ from tests.benchmarks.script_parts import (
 )
 from tests.data.synthetic import write_robomimic_file
 from tests.experiments.row_parts import row as evaluation
-from warmprior import PastPrior
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
 
 from warmprior.experiments import PRESETS, Row, parse, started, success_study
+from warmprior.experiments.methods import Method
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
 
@@ -132,11 +132,11 @@ def test_studies_cover_the_papers_grid_by_default(scripts, monkeypatch):
     for name in ("sigma", "chunking"):
         monkeypatch.setattr(scripts[name], "started", keep)
         assert scripts[name].main([]) == 2
-    grid = {(prior.name, prior.sigma) for prior in made["sigma"].sources.priors()}
+    grid = {(method.name, method.sigma) for method in made["sigma"].sources.methods()}
     sigmas = {1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0}
     assert grid == {("gaussian", 1.0)} | {(n, s) for n in ("past", "preview") for s in sigmas}
     assert made["sigma"].evaluation.nfes == [1]
-    lengths = {(prior.name, prior.chunk_length) for prior in made["chunking"].sources.priors()}
+    lengths = {(m.name, m.chunk_length) for m in made["chunking"].sources.methods()}
     names = ("gaussian", "past", "preview")
     assert lengths == {(n, h) for n in names for h in (1, 2, 4, 8, 16)}
     assert made["chunking"].evaluation.nfes == [9, 3, 1]
@@ -292,7 +292,8 @@ def test_a_run_of_several_policies_of_a_prior_is_not_taken_for_seeds(
     for change in ({}, changes):
         values = {"chunk_length": 8, "sigma": 0.5, "iterations": 1} | change
         iterations = values.pop("iterations")
-        entry = {"prior": PastPrior(**values).config(), "iterations": iterations, "seed": 0}
+        method = Method("past", values["chunk_length"], {"sigma": values["sigma"]})
+        entry = {"method": method.config(), "iterations": iterations, "seed": 0}
         policies.append(entry | {"folder": "past"})
     meta = {"policies": policies, "problems": [{"task": "lift"}]}
     (run / "results.json").write_text(json.dumps({"meta": meta, "rows": []}))
@@ -304,7 +305,7 @@ def test_a_run_of_several_policies_of_a_prior_is_not_taken_for_seeds(
 def test_a_missing_policy_of_a_run_is_named(scripts, tmp_path, capsys):
     run = tmp_path / "main"
     run.mkdir()
-    entry = {"prior": PastPrior(8).config(), "iterations": 1, "seed": 0, "folder": "past"}
+    entry = {"method": Method("past", 8).config(), "iterations": 1, "seed": 0, "folder": "past"}
     meta = {"policies": [entry], "problems": [{"task": "lift"}]}
     (run / "results.json").write_text(json.dumps({"meta": meta, "rows": []}))
     argv = command_line(run=run, out=tmp_path / "out")

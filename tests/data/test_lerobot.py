@@ -59,7 +59,7 @@ def test_windows_are_those_of_delta_timestamps(written):
     theirs = LeRobotDataset("local/test", root=root, delta_timestamps=deltas)
     data = LeRobotExperienceReplay(root, observation_keys=["observation.state"]).data
     windows = window_replay_buffer(data, PastPrior(H), batch_size=8, observation_steps=TO)
-    transform = windows.transform
+    transform, prior = windows.transform, PastPrior(H)
     assert len(data) == len(theirs) == 16
     for i in range(len(theirs)):
         item = theirs[i]
@@ -69,9 +69,10 @@ def test_windows_are_those_of_delta_timestamps(written):
         assert torch.equal(row["action_is_pad"], pad[H:])
         assert torch.equal(row["observation"], item["observation.state"])
         # The mean of the past is what LeRobot's history is where that is no padding, and cold elsewhere.
-        assert row["prior", "warm"].all() == (not pad[:H].any())
+        source = prior.distribution(row["history"])
+        assert source.warm.all() == (not pad[:H].any())
         if not pad[:H].any():
-            assert torch.equal(row["prior", "loc"], action[:H])
+            assert torch.equal(source.loc, action[:H])
         assert item["episode_index"] == data["episode"][i]
 
 

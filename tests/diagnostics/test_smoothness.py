@@ -16,13 +16,15 @@ from torchrl.envs.transforms import Compose
 
 from warmprior import (
     ChunkStep,
-    HistoryPrior,
-    MeanObservation,
+    GaussianPrior,
+    HistoryObservation,
     PastPrior,
     VelocityMLP,
     WarmPriorActor,
+    keys,
 )
 from warmprior.diagnostics import HistoryShift, compare_smoothness, executed_actions, smoothness
+from warmprior.history import cold_history
 
 
 def rollout_of(chunks, steps, done=None):
@@ -122,29 +124,30 @@ def test_what_is_not_executed_may_be_anything():
     assert smoothness(rollout_of(chunks, [1, 1])).boundary_jump == 1.0
 
 
-@pytest.mark.parametrize("prior_class", [PastPrior, HistoryPrior])
-def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(prior_class):
-    prior = prior_class(2)
-    network = VelocityMLP(1, 3 + MeanObservation.width(prior, 1), 2, 1, hidden_dim=8)
-    actor = WarmPriorActor(network, prior, generator=torch.Generator().manual_seed(0))
-    data = TensorDict(
-        {
-            "observation": torch.zeros(4, 1, 3),
-            "prior": {
-                "loc": torch.ones(4, 2, 1),
-                "warm": torch.tensor([1, 1, 0, 0]).bool()[:, None, None].expand(4, 2, 1),
-            },
-        },
-        [4],
+@pytest.mark.parametrize("see_history", [False, True])
+def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(see_history):
+    prior = GaussianPrior(2) if see_history else PastPrior(2)
+    width = HistoryObservation.width(2, 1) if see_history else 0
+    key = keys.CONDITIONED if see_history else keys.OBSERVATION
+    network = VelocityMLP(1, 3 + width, 2, 1, hidden_dim=8)
+    for parameter in network.parameters():
+        parameter.data.normal_()  # the last layer begins at zero
+    actor = WarmPriorActor(
+        network, prior, observation_key=key, generator=torch.Generator().manual_seed(0)
     )
+    data = TensorDict(
+        {"observation": torch.zeros(4, 1, 3), "history": cold_history([4], 2, 2, 1)}, [4]
+    )
+    data["history", "actions"][:2] = 1.0
+    data["history", "steps"][:2] = 2
     expected = data.clone()
     noise = torch.randn(4, 2, 1, generator=torch.Generator().manual_seed(5))
-    expected["prior", "loc"][:2] += 0.3 * noise[:2]
-    chunk = actor(MeanObservation()(expected))["vla_action", "chunk"]
+    expected["history", "actions"][:2] += 0.3 * noise[:2]
+    chunk = actor(HistoryObservation()(expected))["vla_action", "chunk"]
     actor.sampler.generator.manual_seed(0)
-    shifted = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(5))
-    out = shifted(MeanObservation()(data) if actor.prior.conditions_network else data)
+    disturbed = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(5))
+    out = disturbed(HistoryObservation()(data))
     torch.testing.assert_close(out["vla_action", "chunk"], chunk)
-    assert (out["prior", "loc"] == 1).all()
+    assert (out["history", "actions"][:2] == 1).all()
     with pytest.raises(ValueError, match="std"):
         HistoryShift(actor, -1.0)

@@ -13,10 +13,10 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.experiments import (
     Comparison,
     EvaluationOptions,
+    Method,
     NetworkOptions,
     Problem,
     Recipe,
@@ -28,7 +28,7 @@ from warmprior.modules import Normalizer
 from warmprior.training import TrainingConfig
 
 H = 4
-PRIORS = (GaussianPrior(H), PastPrior(H), PreviewPrior(H))
+METHODS = tuple(Method(name, H) for name in ("gaussian", "past", "preview"))
 OBSERVATION_DIM, ACTION_DIM = 19, 7
 TRAINING = TrainingConfig(
     iterations=20, batch_size=16, learning_rate=1e-2, checkpoints=2, log_every=5
@@ -113,7 +113,7 @@ def comparison(
     folder,
     envs,
     *,
-    priors=PRIORS,
+    methods=METHODS,
     kind=Store,
     training=TRAINING,
     resume=False,
@@ -149,7 +149,7 @@ def comparison(
         folder / "out" / "logs",
         recipe.run,
     )
-    return Comparison(recipe, stores=[store], priors=priors)
+    return Comparison(recipe, stores=[store], methods=methods)
 
 
 def stored(folder):

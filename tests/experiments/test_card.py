@@ -14,13 +14,13 @@ from tests.experiments.comparison_parts import comparison, stored
 from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.diagnostics import success_posterior
 from warmprior.envs.description import environment_description
-from warmprior.experiments import model_card, policy_results
+from warmprior.experiments import Method, model_card, policy_results
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
-    played = comparison(folder, 1, priors=(PastPrior(4),))
+    played = comparison(folder, 1, methods=(Method("past", 4),))
     played.run()
     return folder, played.contestants
 
@@ -82,7 +82,7 @@ def test_what_is_missing_is_said():
     missing = card.partition("## What is not told here")[2]
     for told in ("environment:", "iterations, seed", "Any success rate.", "A licence"):
         assert told in missing
-    assert "Not measured" in card and 'from_pretrained("me/it")' in card
+    assert "Not measured" in card and 'load_policy("me/it")' in card
     assert "environment_of" not in card and warmprior.__version__ in card
 
 

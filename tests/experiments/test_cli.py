@@ -79,7 +79,7 @@ def test_every_leaf_is_an_option_under_its_own_name(tmp_path):
     assert recipe.data.task == ("can", "stack") and recipe.data.count("mh") == 9
     assert (recipe.network.hidden_dim, recipe.network.precondition) == (32, False)
     assert (recipe.training.iterations, recipe.training.learning_rate) == (11, 0.5)
-    sources = [(p.name, p.chunk_length, p.sigma) for p in recipe.sources.priors()]
+    sources = [(p.name, p.chunk_length, p.sigma) for p in recipe.sources.methods()]
     assert sources == [("past", h, s) for h in (2, 4) for s in (0.1, 0.2)]
     assert list(recipe.seeds) == [3, 4, 5, 6] and recipe.evaluation.nfes == [5, 1]
     assert recipe.run.envs == 2
@@ -89,7 +89,7 @@ def test_every_leaf_is_an_option_under_its_own_name(tmp_path):
     ("argv", "message"),
     [
         ("--no-precondition", "--weighting standardised needs --precondition"),
-        ("--prior past,age=3", "PastPrior cannot be built"),
+        ("--prior past,age=3", "past cannot be built from"),
         ("--preset nobodys", "--preset must be one of quick, cpu, paper"),
         ("--seeds 1000000000", "--seeds must be between 1 and 1,000"),
         ("--episodes 0", "--episodes must be between 1"),

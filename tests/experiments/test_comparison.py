@@ -8,21 +8,19 @@ from dataclasses import replace
 import pytest
 import torch
 
-from warmprior import ForecastPrior, PastPrior, StepPrior
+from warmprior import PastPrior
 from warmprior.io.script import PartialFailure
 
 pytest.importorskip("tyro")
 
 from tests.experiments.comparison_parts import (
-    ACTION_DIM,
-    OBSERVATION_DIM,
-    PRIORS,
+    METHODS,
     H,
     comparison,
     rows_of,
     stored,
 )
-from warmprior.experiments import Store, store, write_report
+from warmprior.experiments import Method, Store, store, write_report
 
 
 def test_losses_are_those_of_the_workers_and_nothing_is_trained_again(
@@ -33,7 +31,7 @@ def test_losses_are_those_of_the_workers_and_nothing_is_trained_again(
     iterations = [5, 10, 15, 20]
     monkeypatch.setattr(Store, "new_actor", lambda *args: pytest.fail("something was trained"))
     losses = finished.losses(finished.stores[0])
-    assert {name: len(curves) for name, curves in losses.items()} == {p.label: 2 for p in PRIORS}
+    assert {name: len(curves) for name, curves in losses.items()} == {p.label: 2 for p in METHODS}
     assert all([i for i, _ in curve] == iterations for c in losses.values() for curve in c)
     monkeypatch.undo()
     again = comparison(undisturbed, 1, resume=True)
@@ -77,12 +75,12 @@ def test_another_number_of_workers_continues(undisturbed, tmp_path):
 
 
 def test_rows_of_a_policy_that_failed_on_the_way_are_kept_but_not_shown(tmp_path):
-    compared = comparison(tmp_path, 1, priors=PRIORS[:2], seeds=2)
+    compared = comparison(tmp_path, 1, methods=METHODS[:2], seeds=2)
     compared.run()
     everything = compared.results.rows
     failed = compared.contestants.pop()
     assert [row for row in everything if row["prior"] == "past" and row["seed"] == 1]
-    assert len(compared.rows) == len(everything) - 4 and failed.prior.name == "past"
+    assert len(compared.rows) == len(everything) - 4 and failed.method.name == "past"
     assert {(row["prior"], row["seed"]) for row in compared.timed()} == {
         ("gaussian", 0),
         ("gaussian", 1),
@@ -95,25 +93,15 @@ def test_rows_of_a_policy_that_failed_on_the_way_are_kept_but_not_shown(tmp_path
 
 
 def test_the_same_policy_is_trained_once(tmp_path, capsys):
-    twice = [PastPrior(H), PastPrior(H)]
-    compared = comparison(tmp_path, 2, priors=twice, seeds=1)
+    twice = [Method("past", H), Method("past", H, {"sigma": 0.5})]
+    compared = comparison(tmp_path, 2, methods=twice, seeds=1)
     assert len(compared.run().rows) == 4  # two checkpoints, two NFEs
     assert capsys.readouterr().out.count("trained ") == 1
     (tmp_path / "out" / "results.json").unlink()
-    comparison(tmp_path, 2, priors=[PastPrior(H)], seeds=2).run()
+    comparison(tmp_path, 2, methods=[Method("past", H)], seeds=2).run()
     told = capsys.readouterr().out
     assert told.count("found drift own, past") == 1 and told.count("trained drift own, past") == 1
     assert "found" in told.partition("seed 0, 20 iterations")[0]
-
-
-class Unhashable(PastPrior):
-    """As a dataclass is that compares its fields."""
-
-    name = "unhashable"
-    __hash__ = None
-
-    def __eq__(self, other):
-        return self is other
 
 
 class Widening(PastPrior, torch.nn.Module):
@@ -121,44 +109,40 @@ class Widening(PastPrior, torch.nn.Module):
 
     name = "widening"
 
-    def __init__(self, chunk_length, *, sigma=0.5, cold_probability=0.0):
+    def __init__(self, chunk_length, *, sigma=0.5):
         torch.nn.Module.__init__(self)
-        super().__init__(chunk_length, sigma=sigma, cold_probability=cold_probability)
+        super().__init__(chunk_length, sigma=sigma)
         self.scale = torch.nn.Parameter(torch.ones(()))
 
-    def sample(self, loc, warm, generator=None, observation=None):
-        return loc + self.scale * (super().sample(loc, warm, generator) - loc)
+    def distribution(self, history, observation=None):
+        source = super().distribution(history, observation)
+        return replace(source, scale=self.scale * source.scale)
 
 
-def test_priors_that_learn_or_cannot_be_hashed(tmp_path):
-    compared = comparison(tmp_path, 2, priors=[Unhashable(H), Widening(H)], seeds=1)
-    rows = compared.run().rows
-    assert [row["prior"] for row in rows] == ["unhashable"] * 4 + ["widening"] * 4
-    assert float(compared.contestants[1].policy().prior.scale) != 1.0
+def test_a_prior_of_ones_own_that_learns_with_the_flow(tmp_path):
+    method = Method.parse(f"{__name__}:Widening", H)
+    compared = comparison(tmp_path, 2, methods=[method], seeds=1)
+    assert [row["prior"] for row in compared.run().rows] == ["widening"] * 4
+    assert float(compared.contestants[0].policy().prior.scale) != 1.0
 
 
-def test_priors_that_learn_before_the_flow_learn_once(tmp_path, monkeypatch):
-    priors = [ForecastPrior(H), StepPrior(H)]
-    compared = comparison(tmp_path, 2, priors=priors, seeds=1)
+def test_parts_that_learn_before_the_flow_learn_once(tmp_path, monkeypatch):
+    methods = [Method("forecast", H), Method("step", H)]
+    compared = comparison(tmp_path, 2, methods=methods, seeds=1)
     compared.run()
-    forecast = compared.contestants[0]
-    assert forecast.prior.is_sized and (forecast.folder / "prior.safetensors").exists()
-    learnt = forecast.policy().prior
-    loaded = forecast.store.load(priors[0], forecast.training).prior
-    assert all(
-        torch.equal(a, b) for a, b in zip(*(p.buffers() for p in (learnt, loaded)), strict=True)
-    )
-    fresh = ForecastPrior(H).sized(ACTION_DIM, OBSERVATION_DIM, 2).state_dict()
-    assert any(not torch.equal(learnt.state_dict()[name], fresh[name]) for name in fresh)
+    assert all((c.folder / "learner.safetensors").exists() for c in compared.contestants)
     rows = rows_of(tmp_path)
-    monkeypatch.setattr(store, "learn_prior", lambda *args, **kwargs: pytest.fail("learnt again"))
-    again = comparison(tmp_path, 1, priors=priors, seeds=1, resume=True)
-    again.run()
+    monkeypatch.setattr(store, "learn", lambda *args, **kwargs: pytest.fail("learnt again"))
+    comparison(tmp_path, 1, methods=methods, seeds=1, resume=True).run()
     assert rows_of(tmp_path) == rows
+    forecast = compared.contestants[0]
+    again = forecast.store.new_actor(forecast.method, forecast.training).prior.state_dict()
+    learnt = forecast.policy().prior.state_dict()
+    assert learnt and all(torch.equal(learnt[name], again[name]) for name in learnt)
 
 
 def test_times_of_trainings_are_told_beside_the_rows(tmp_path):
-    compared = comparison(tmp_path, 2, priors=PRIORS[:2], seeds=1)
+    compared = comparison(tmp_path, 2, methods=METHODS[:2], seeds=1)
     assert compared.timed() == []
     compared.run()
     first = compared.timed()
@@ -167,7 +151,7 @@ def test_times_of_trainings_are_told_beside_the_rows(tmp_path):
     ]
     assert all(row["training_seconds"] > 0 for row in first)
     assert len({row["training_seconds"] for row in first}) == 2
-    again = comparison(tmp_path, 1, priors=PRIORS[:2], seeds=1, resume=True)
+    again = comparison(tmp_path, 1, methods=METHODS[:2], seeds=1, resume=True)
     again.run()
     assert again.timed() == first  # nothing was trained
     (compared.contestants[0].folder / "training_time.json").unlink()
@@ -176,7 +160,7 @@ def test_times_of_trainings_are_told_beside_the_rows(tmp_path):
 
 def test_a_chunk_longer_than_every_demonstration_is_refused(tmp_path):
     with pytest.raises(ValueError, match="longest demonstration of drift own has, 40"):
-        comparison(tmp_path, 1, priors=[PastPrior(41)])
+        comparison(tmp_path, 1, methods=[Method("past", 41)])
 
 
 def test_results_of_another_recipe_are_not_continued(undisturbed):
@@ -185,6 +169,6 @@ def test_results_of_another_recipe_are_not_continued(undisturbed):
 
 
 def test_what_rows_could_not_tell_is_refused(tmp_path):
-    twins = [PastPrior(3), PastPrior(3, cold_probability=0.5)]
+    twins = [Method("past", 3), Method("past", 3, {"correlation": 0.0})]
     with pytest.raises(ValueError, match="rows tell policies apart by their task"):
-        comparison(tmp_path, 1, priors=twins)
+        comparison(tmp_path, 1, methods=twins)

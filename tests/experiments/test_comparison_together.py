@@ -11,27 +11,26 @@ import torch
 
 from tests.experiments.comparison_parts import comparison, rows_of, weights
 from tests.together import together
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
-from warmprior.experiments import Store
+from warmprior.experiments import Method, Store
 from warmprior.io.distributed import rank, world_size
 
-PRIORS = (GaussianPrior(4), PastPrior(4), PreviewPrior(4))
+METHODS = tuple(Method(name, 4) for name in ("gaussian", "past", "preview"))
 
 
 class FailingStore(Store):
     """The policies of one source diverge, and it is told who trained."""
 
-    def train(self, prior, training, progress=None):
+    def train(self, method, training, progress=None):
         with (self.directory / f"trained by {world_size()}").open("a") as file:
-            file.write(f"{prior.name} {rank()}\n")
-        if prior.name == "preview":
+            file.write(f"{method.name} {rank()}\n")
+        if method.name == "preview":
             raise FloatingPointError("the loss became nan")
-        return super().train(prior, training, progress)
+        return super().train(method, training, progress)
 
 
 def run(folder):
     (folder / "policies").mkdir(exist_ok=True)
-    made = comparison(folder, 1, priors=PRIORS, kind=FailingStore, seeds=1, episodes=2)
+    made = comparison(folder, 1, methods=METHODS, kind=FailingStore, seeds=1, episodes=2)
     with redirect_stdout(io.StringIO()) as told:
         made.run()
     assert rank() == 0 and world_size() == 1  # the others have ended
@@ -47,26 +46,17 @@ def folders(tmp_path_factory):
     return one, two
 
 
-def test_policies_are_those_of_one_process(folders):
-    one, two = (weights(folder) for folder in folders)
-    assert one.keys() == two.keys() and one
-    for name, value in one.items():
-        torch.testing.assert_close(two[name], value, rtol=0, atol=1e-5, msg=name)
-
-
 def test_all_trained_and_one_played(folders):
-    """The rows have the same facts, episodes and order; what is measured may differ by rounding."""
+    """The rows have the same facts and order; processes draw other batches than one does."""
     one, two = (rows_of(folder) for folder in folders)
     assert [row["prior"] for row in two] == [row["prior"] for row in one]
     assert {row["prior"] for row in two} == {"gaussian", "past"}
     for mine, theirs in zip(one, two, strict=True):
         assert mine.keys() == theirs.keys() and len(mine["outcomes"]) == 2
-        for key, value in mine.items():
-            assert theirs[key] == (
-                pytest.approx(value, rel=1e-3) if isinstance(value, float) else value
-            ), key
+        facts = ("task", "prior", "sigma", "seed", "checkpoint", "nfe", "episodes")
+        assert [mine[key] for key in facts] == [theirs[key] for key in facts]
     trained = sorted((folders[1] / "policies" / "trained by 2").read_text().splitlines())
-    assert trained == sorted(f"{prior.name} {r}" for prior in PRIORS for r in range(2))
+    assert trained == sorted(f"{method.name} {r}" for method in METHODS for r in range(2))
 
 
 def test_what_all_trained_is_not_said_to_be_found(folders):
@@ -84,11 +74,11 @@ def test_a_training_that_fails_in_all_does_not_stop_the_others(folders):
 
 def test_it_can_be_resumed_without_torchrun(folders):
     made = comparison(
-        folders[1], 1, priors=PRIORS[:2], kind=FailingStore, seeds=1, episodes=2, resume=False
+        folders[1], 1, methods=METHODS[:2], kind=FailingStore, seeds=1, episodes=2, resume=False
     )
     before = weights(folders[1])
     for contestant in made.contestants:
         assert contestant.path.is_dir()
-        contestant.store.train(contestant.prior, contestant.training, lambda iteration: None)
+        contestant.store.train(contestant.method, contestant.training, lambda iteration: None)
     after = weights(folders[1])
     assert all(torch.equal(after[name], value) for name, value in before.items())

@@ -9,10 +9,10 @@ pytest.importorskip("tyro")
 from torchrl.envs import TransformedEnv
 
 from tests.experiments.comparison_parts import DriftEnv, H, comparison, rows_of
-from warmprior import PastPrior, RealTimeChunking
+from warmprior import RealTimeChunking
 from warmprior.diagnostics import smoothness
 from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.experiments import Comparison, Condition, DelayedRecipe
+from warmprior.experiments import Comparison, Condition, DelayedRecipe, Method
 from warmprior.training import play_episode
 
 RTC = RealTimeChunking(schedule="linear")
@@ -20,10 +20,10 @@ RTC = RealTimeChunking(schedule="linear")
 
 def delayed(folder):
     """The comparison of :func:`comparison`, of WP-Past alone, under conditions."""
-    usual = comparison(folder, 1, priors=[PastPrior(H)], seeds=1)
+    usual = comparison(folder, 1, methods=[Method("past", H)], seeds=1)
     parts = {n: getattr(usual.recipe, n) for n in ("network", "training", "evaluation", "run")}
     recipe = DelayedRecipe(delay=(1, 0), execute=3, rtc=RTC, **parts)
-    return Comparison(recipe, stores=usual.stores, priors=[PastPrior(H)])
+    return Comparison(recipe, stores=usual.stores, methods=[Method("past", H)])
 
 
 def test_rows_tell_what_was_played_under_their_condition(tmp_path):
@@ -42,7 +42,7 @@ def test_rows_tell_what_was_played_under_their_condition(tmp_path):
     (contestant,) = compared.contestants
     (store,) = compared.stores
     for guidance, name in ((None, "none"), (RTC, "rtc")):
-        transforms = store.transforms(contestant.prior)(execute=3, delay=1)
+        transforms = store.transforms(contestant.method)(execute=3, delay=1)
         env = TransformedEnv(DriftEnv(), transforms)
         policy = contestant.policy().replace(guidance=guidance)
         seeds = range(EVALUATION_SEED, EVALUATION_SEED + 5)

@@ -10,23 +10,22 @@ pytest.importorskip("tyro")
 
 from tests.diagnostics.fields import Field, seeing_network
 from tests.experiments.comparison_parts import ACTION_DIM, OBSERVATION_DIM, H, drift_problem
-from warmprior import HistoryPrior, WarmPriorActor
+from warmprior import GaussianPrior, HistoryObservation, WarmPriorActor, keys
 from warmprior.diagnostics import SharedObservations, memory_gain
 from warmprior.experiments.measures import measure
-from warmprior.transforms import MeanObservation
 
 
-def test_the_memory_gain_of_a_network_that_sees_the_mean_is_that_of_what_it_is_told():
+def test_the_memory_gain_of_a_network_that_sees_the_history_is_that_of_what_it_is_told():
     told = slice(OBSERVATION_DIM, OBSERVATION_DIM + H * ACTION_DIM)
     follows = Field(lambda t, a, o: 0.4 * o[:, -1, told].unflatten(-1, (H, ACTION_DIM)) - a)
-    policy = WarmPriorActor(follows, HistoryPrior(H))
+    policy = WarmPriorActor(follows, GaussianPrior(H), observation_key=keys.CONDITIONED)
     found = measure(policy, drift_problem().data, (1,), chunk_length=H, observation_steps=2)
     assert found[1]["memory_gain"] == pytest.approx(0.4, rel=1e-4)
 
 
-def test_images_that_stand_beside_the_mean_are_encoded_with_it():
-    prior, n = HistoryPrior(H), 20
-    width = OBSERVATION_DIM + MeanObservation.width(prior, ACTION_DIM)
+def test_images_that_stand_beside_the_history_are_encoded_with_it():
+    prior, n = GaussianPrior(H), 20
+    width = OBSERVATION_DIM + HistoryObservation.width(H, ACTION_DIM)
     network = seeing_network(ACTION_DIM, width, H)
     data = TensorDict(
         {
@@ -39,7 +38,8 @@ def test_images_that_stand_beside_the_mean_are_encoded_with_it():
         },
         [n],
     )
-    policy = WarmPriorActor(network, prior)
+    policy = WarmPriorActor(network, prior, observation_key=keys.CONDITIONED)
     found = measure(policy, data, (1,), chunk_length=H, observation_steps=2)[1]["memory_gain"]
     shared = SharedObservations(data, H, observation_steps=2)
-    assert found == pytest.approx(memory_gain(policy, shared.windows(prior))[1]) and found != 0
+    gain = memory_gain(policy, shared.windows(prior, see_history=True))[1]
+    assert found == pytest.approx(gain) and found != 0

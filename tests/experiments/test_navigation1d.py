@@ -16,6 +16,7 @@ pytest.importorskip("tyro")
 
 from warmprior.experiments import (
     NAVIGATION_PRESETS,
+    Method,
     Store,
     judge_navigation,
     navigation_problem,
@@ -23,7 +24,7 @@ from warmprior.experiments import (
     straightness,
 )
 
-PRIORS = NAVIGATION_PRESETS["quick"].sources.priors()
+METHODS = NAVIGATION_PRESETS["quick"].sources.methods()
 
 
 def store_in(directory):
@@ -33,10 +34,10 @@ def store_in(directory):
 
 
 def train(store, name, sigma=None, *, iterations, seed=0):
-    (prior,) = (p for p in PRIORS if p.name == name and sigma in (None, p.sigma))
+    (method,) = (p for p in METHODS if p.name == name and sigma in (None, p.sigma))
     training = NAVIGATION_PRESETS["quick"].training
     recipe = replace(training, iterations=iterations, save_every=iterations, seed=seed)
-    return store.policy(prior, recipe)
+    return store.policy(method, recipe)
 
 
 @pytest.fixture(scope="module")
@@ -46,8 +47,8 @@ def tiny(tmp_path_factory):
     return lambda name, sigma=None: train(store, name, sigma, iterations=5, seed=1)
 
 
-def test_priors_differ_in_the_source_alone():
-    told = [(p.name, p.sigma if p.takes("sigma") else None) for p in PRIORS]
+def test_methods_differ_in_the_source_alone():
+    told = [(p.name, p.sigma if Method.takes(p.name, "sigma") else None) for p in METHODS]
     assert told == [
         ("gaussian", None),
         ("regression", None),
@@ -57,17 +58,17 @@ def test_priors_differ_in_the_source_alone():
         ("preview", 0.1),
         ("preview", 0.5),
     ]
-    assert {p.chunk_length for p in PRIORS} == {4}
-    assert [p.cold_probability for p in PRIORS] == [0, 0] + [0.1] * 5
+    assert {p.chunk_length for p in METHODS} == {4}
+    assert all(p.training.cold_probability == 0.1 for p in NAVIGATION_PRESETS.values())
 
 
 def test_windows_are_the_demonstrated_steps_with_a_full_history():
     data = navigation_problem().data
     observations = SharedObservations(data, 4)
-    for prior in PRIORS:
+    for prior in (method.prior() for method in METHODS):
         now, before = observations.windows(prior), observations.windows(prior, offset=4)
         assert len(now) == 6 * 60
-        assert now["prior", "warm"].any(1).all() == (prior.name not in ("gaussian", "regression"))
+        assert (now["history", "steps"] >= 4).all()
         chunk, earlier = now["vla_action", "chunk"], before["vla_action", "chunk"]
         assert torch.equal(chunk[0, 0], earlier[4, 0])
         assert torch.equal(earlier[:, :4].flatten(0, 1)[:4], data["action"][:4])
@@ -136,10 +137,14 @@ def test_warm_sources_stop_mode_switching(tmp_path):
     assert of_base["switch_rate"] > 0.4 and of_base["collision_rate"] > 0.8
     assert of_past["switch_rate"] < 0.05 and of_past["collision_rate"] < 0.3
     observations = SharedObservations(store.problem.data, 4)
-    rows = straightness({"base": {0: base}, "past": {0: past}}, observations, draws=4)
-    assert next(row for row in rows if row["policy"] == "past")["ratio"] < 0.3
-    bounds = {row["policy"]: row["bound"] for row in rows}
-    assert bounds["past"] < bounds["base"]
+    rows = straightness(
+        {Method("gaussian", 4): {0: base}, Method("past", 4, {"sigma": 0.1}): {0: past}},
+        observations,
+        draws=4,
+    )
+    assert next(row for row in rows if row["prior"] == "past")["ratio"] < 0.3
+    bounds = {row["prior"]: row["bound"] for row in rows}
+    assert bounds["past"] < bounds["gaussian"]
 
 
 @pytest.mark.slow
@@ -170,13 +175,15 @@ def test_the_figure_at_the_benchmarks_budget(tmp_path, seed):
     assert history["switch_rate"] < 0.03
     assert history["shifted_distance"] > 2 * sharp["shifted_distance"]
     observations = SharedObservations(store.problem.data, 4)
-    policies = {f"{name} {sigma}": {seed: actor} for (name, sigma), actor in chosen.items()}
+    policies = {
+        Method.parse(name, 4, sigma=sigma): {seed: actor} for (name, sigma), actor in chosen.items()
+    }
     ratios = {
-        row["policy"]: row["ratio"]
+        (row["prior"], row["sigma"]): row["ratio"]
         for row in straightness(policies, observations, draws=4, seed=seed)
         if row["mean"] == "training"
     }
-    assert ratios["past 0.1"] < ratios["past 0.5"] < 0.3
+    assert ratios["past", 0.1] < ratios["past", 0.5] < 0.3
     played = play_navigation(chosen["gaussian", None], seed, nfe=9)
     # Each decision of the base alone is right: it stays near the data, on either side.
     assert navigation_metrics(executed_actions(played)[0].squeeze(-1), 4).distance < 0.1

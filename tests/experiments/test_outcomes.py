@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 import warnings
@@ -25,24 +24,22 @@ from warmprior.training import play_episode
 pytest.importorskip("tyro")
 
 from tests.experiments.comparison_parts import (
-    PRIORS,
+    METHODS,
     TRAINING,
     DriftEnv,
     comparison,
     rows_of,
-    stored,
 )
 from warmprior.experiments import Store
-from warmprior.experiments.outcomes import Outcomes
 
 
 class LastIsFirst(Store):
     """The trainings end in the opposite order, each some time after the one behind it."""
 
-    def train(self, prior, training, progress=None):
-        losses = super().train(prior, training, progress)
-        place = 2 * [p.name for p in PRIORS].index(prior.name) + training.seed
-        ended = [self.folder(prior, training).parent / f"ended-{i}" for i in range(6)]
+    def train(self, method, training, progress=None):
+        losses = super().train(method, training, progress)
+        place = 2 * [p.name for p in METHODS].index(method.name) + training.seed
+        ended = [self.folder(method, training).parent / f"ended-{i}" for i in range(6)]
         patience = time.monotonic() + 120
         while place < 5 and not ended[place + 1].exists():
             assert time.monotonic() < patience
@@ -71,20 +68,21 @@ def test_rows_tell_what_was_measured_of_their_policy(undisturbed):
         if row["checkpoint"] != TRAINING.iterations:
             assert row.get("source_leak") is None and row.get("kappa") is None
             continue
-        prior = next(prior for prior in PRIORS if prior.name == row["prior"])
+        method = next(method for method in METHODS if method.name == row["prior"])
+        prior = method.prior()
         shared = SharedObservations(store.problem.data, prior.chunk_length, observation_steps=2)
         order = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
         shared = shared.subset(order.sort()[0])
         windows = shared.windows(prior)
-        policy = store.load(prior, replace(TRAINING, seed=row["seed"]), row["checkpoint"])
+        policy = store.load(method, replace(TRAINING, seed=row["seed"]), row["checkpoint"])
         leak = source_leak(policy, windows, nfes=(1, 3), episodes=shared.episodes)[row["nfe"]]
         assert row["source_leak"] == pytest.approx(leak.leak)
         assert row["inner_step_ratio"] == pytest.approx(leak.inner_step_ratio)
         gain = memory_gain(policy, windows, nfes=(1, 3))[row["nfe"]]
         assert row["memory_gain"] == pytest.approx(gain)
-        assert (gain != 0) == prior.ever_warm
+        assert (gain != 0) == (method.name != "gaussian")
         generator = torch.Generator().manual_seed(0)
-        if prior.ever_warm:
+        if method.name != "gaussian":
             windows = shared.deployed(policy, generator=generator)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -100,21 +98,10 @@ def test_rows_tell_what_was_measured_of_their_policy(undisturbed):
 def test_rows_tell_every_episode_in_the_order_of_the_seeds(undisturbed):
     (store,) = comparison(undisturbed, 1, resume=True).stores
     row = rows_of(undisturbed)[-1]
-    policy = store.load(PRIORS[2], replace(TRAINING, seed=row["seed"]), row["checkpoint"])
-    env = TransformedEnv(DriftEnv(), store.transforms(PRIORS[2])())
+    policy = store.load(METHODS[2], replace(TRAINING, seed=row["seed"]), row["checkpoint"])
+    env = TransformedEnv(DriftEnv(), store.transforms(METHODS[2])())
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + row["episodes"])
     options = {"nfe": row["nfe"], "policy_seed": row["seed"]}
     solved = [play_episode(policy, env, seed, **options).success for seed in seeds]
     assert row["outcomes"] == "".join(str(int(s)) for s in solved)
     assert 0 < sum(solved) < len(solved)
-
-
-def test_rows_from_before_priors_had_options_are_continued(undisturbed, tmp_path):
-    (tmp_path / "out").mkdir()
-    results = stored(undisturbed)
-    for row in results["rows"]:
-        assert row["facts"].pop("options") == ""
-    (tmp_path / "out" / "results.json").write_text(json.dumps(results))
-    again = comparison(tmp_path, 1, resume=True)
-    outcomes = Outcomes(again.contestants, again.recipe)
-    assert not any(outcomes.missing(n, again.results) for n in range(len(again.contestants)))

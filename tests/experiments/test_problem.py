@@ -9,11 +9,18 @@ from tensordict import TensorDict
 pytest.importorskip("robosuite")
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
-from warmprior import GaussianPrior, ODEActor, PoseTrend
+from warmprior import ODEActor, PoseTrend
 from warmprior.data import DatasetError, generate_demonstrations
 from warmprior.data.hdf5 import read_index
 from warmprior.envs import rendering_backend
-from warmprior.experiments import NetworkOptions, Recipe, RunOptions, Store, robosuite_problem
+from warmprior.experiments import (
+    Method,
+    NetworkOptions,
+    Recipe,
+    RunOptions,
+    Store,
+    robosuite_problem,
+)
 from warmprior.experiments.recipe import DataOptions, HeldOutOptions
 from warmprior.experiments.record import record, restore
 from warmprior.io.files import file_digest
@@ -34,12 +41,11 @@ def store(problem, folder):
     return Store(problem, network, folder / "policies", folder / "logs", RunOptions(logger="none"))
 
 
-def test_recorded_actions_are_identified_as_ever(path):
-    """By their file alone: policies from before there was a choice have no other identity."""
+def test_recorded_actions_are_identified_by_their_file(path):
+    """By their file alone."""
     problem = robosuite_problem(path)
     assert problem.identity == file_digest(path)
     assert "actions" not in problem.facts and problem.name == "lift ph (file data)"
-    assert "actions" not in record(Recipe())["data"]
     absolute = record(Recipe(data=DataOptions(actions="absolute")))
     assert absolute["data"]["actions"] == "absolute"
     assert restore(Recipe, absolute).data.actions == "absolute"
@@ -59,9 +65,9 @@ def test_absolute_actions(path, tmp_path):
     units = [0.05] * 3 + [0.5] * 6
     assert absolute.normalizer.scale("action")[:9].tolist() == pytest.approx(units)
     assert absolute.data["action"][:, 9].abs().max() <= 1
-    prior = GaussianPrior(8)
+    method = Method("gaussian", 8)
     stores = (store(p, tmp_path) for p in (delta, absolute))
-    networks = [s.new_actor(prior, TrainingConfig()).network for s in stores]
+    networks = [s.new_actor(method, TrainingConfig()).network for s in stores]
     assert networks[0].trend is None and isinstance(networks[1].trend, PoseTrend)
 
 
@@ -72,7 +78,7 @@ def test_what_leaves_the_span_of_the_demonstrations_is_remembered_at_its_bound(p
     )
     span = problem.data["action"].abs().amax(0)
     assert delta.clip == 1.0 and span[9] < span.max() / 2
-    actor = store(problem, tmp_path).new_actor(GaussianPrior(8), TrainingConfig())
+    actor = store(problem, tmp_path).new_actor(Method("gaussian", 8), TrainingConfig())
     demonstrated, beyond = problem.data["action"][:8], 1e3 * problem.data["action"][8:16].sign()
     for wanted, expected in ((demonstrated, demonstrated), (beyond, beyond.clamp(-span, span))):
         mean = {("prior", "noise"): torch.zeros(1, 8, 10), "observation": torch.zeros(1, 2, 19)}

@@ -15,7 +15,7 @@ pytest.importorskip("tyro")
 pytest.importorskip("ray")
 
 from tests.experiments.comparison_parts import (
-    PRIORS,
+    METHODS,
     DriftEnv,
     comparison,
     drift_problem,
@@ -57,13 +57,13 @@ def test_rows_are_those_of_the_local_engine_though_a_process_dies_and_a_cell_fai
 ):
     (tmp_path / "log").mkdir()
     monkeypatch.chdir(tmp_path)  # that of the cluster is another
-    options = {"engine": "ray", "ray_address": ray_address, "priors": PRIORS[1:2], "seeds": 1}
+    options = {"engine": "ray", "ray_address": ray_address, "methods": METHODS[1:2], "seeds": 1}
     sound = drift_problem(MortalOnce(tmp_path / "log"))
     compared = comparison(Path(), None, problem=sound, **options)
     (store,) = compared.stores
     broken = replace(drift_problem(Failing()), task="broken")
     stores = [store, Store(broken, store.network, store.directory, store.logs, store.run)]
-    both = Comparison(compared.recipe, stores=stores, priors=PRIORS[1:2])
+    both = Comparison(compared.recipe, stores=stores, methods=METHODS[1:2])
     both.run()
     expected = [r for r in rows_of(undisturbed) if (r["prior"], r["seed"]) == ("past", 0)]
     assert told_of(both.rows) == rows_of(tmp_path) == expected and len(expected) == 4
@@ -85,7 +85,7 @@ def driver(folder, address, resume=False):
         folder,
         None,
         problem=drift_problem(env),
-        priors=PRIORS[:2],
+        methods=METHODS[:2],
         seeds=1,
         resume=resume,
         engine="ray",

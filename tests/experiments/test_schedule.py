@@ -10,21 +10,20 @@ from itertools import pairwise
 import pytest
 import torch
 
-from warmprior import GaussianPrior, PastPrior, ReflowPrior
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.script import PartialFailure
 
 pytest.importorskip("tyro")
 
 from tests.experiments.comparison_parts import (
-    PRIORS,
+    METHODS,
     DriftEnv,
     H,
     comparison,
     drift_problem,
     rows_of,
 )
-from warmprior.experiments import Comparison, Condition, Store
+from warmprior.experiments import Comparison, Condition, Method, Store
 from warmprior.experiments.contestant import Cell
 from warmprior.experiments.schedule import Schedule
 from warmprior.experiments.worker import Measure, Play, Train
@@ -63,12 +62,12 @@ def test_what_a_failure_ends_is_told_once_and_never_starts():
 class WaitsForAnEpisode(Store):
     """The last training does not end before an episode was played."""
 
-    def train(self, prior, training, progress=None):
+    def train(self, method, training, progress=None):
         deadline = time.monotonic() + 30
-        while prior.name == "preview" and not any(self.problem.make_env().log.iterdir()):
+        while method.name == "preview" and not any(self.problem.make_env().log.iterdir()):
             assert time.monotonic() < deadline, "nothing was played while this training ran"
             time.sleep(0.05)
-        return super().train(prior, training, progress)
+        return super().train(method, training, progress)
 
 
 def test_a_policy_is_played_before_the_last_training_ended(tmp_path):
@@ -82,12 +81,12 @@ def test_a_policy_is_played_before_the_last_training_ended(tmp_path):
 class Timed(Store):
     """Notes when its trainings ran."""
 
-    def train(self, prior, training, progress=None):
+    def train(self, method, training, progress=None):
         started = time.monotonic()
-        losses = super().train(prior, training, progress)
+        losses = super().train(method, training, progress)
         time.sleep(0.2)
         note = {"from": started, "to": time.monotonic()}
-        (self.directory / f"{prior.name}-{training.seed}.json").write_text(json.dumps(note))
+        (self.directory / f"{method.name}-{training.seed}.json").write_text(json.dumps(note))
         return losses
 
 
@@ -104,12 +103,12 @@ def test_trainings_share_a_device_only_where_they_may(tmp_path, monkeypatch, at_
 
 def test_a_student_waits_for_its_teacher(tmp_path, capsys):
     """Whatever the order; and without the teacher in the comparison, it is trained on the way."""
-    priors = [ReflowPrior(H, teacher_nfe=2), GaussianPrior(H)]
-    compared = comparison(tmp_path / "both", 3, priors=priors, seeds=1)
+    methods = [Method("reflow", H, {"teacher_nfe": 2}), Method("gaussian", H)]
+    compared = comparison(tmp_path / "both", 3, methods=methods, seeds=1)
     compared.run()
     told = capsys.readouterr().out
     assert told.index("trained drift own, gaussian") < told.index("trained drift own, reflow")
-    comparison(tmp_path / "one", 2, priors=priors[:1], seeds=1).run()
+    comparison(tmp_path / "one", 2, methods=methods[:1], seeds=1).run()
     both, one = rows_of(tmp_path / "both"), rows_of(tmp_path / "one")
     assert [row["prior"] for row in both] == ["reflow"] * 4 + ["gaussian"] * 4 and both[:4] == one
     reflow, gaussian = (c.policy().network.state_dict() for c in compared.contestants)
@@ -118,43 +117,43 @@ def test_a_student_waits_for_its_teacher(tmp_path, capsys):
 
 def test_students_of_one_teacher_share_it(tmp_path, capsys):
     """It is trained once, by one worker, though it is not compared itself."""
-    priors = [ReflowPrior(H, teacher_nfe=n) for n in (2, 3)]
+    methods = [Method("reflow", H, {"teacher_nfe": n}) for n in (2, 3)]
     for envs in (1, 3):
-        compared = comparison(tmp_path / str(envs), envs, priors=priors, seeds=1)
+        compared = comparison(tmp_path / str(envs), envs, methods=methods, seeds=1)
         compared.run()
         told = capsys.readouterr().out
         assert not compared.failures and told.count("trained drift own, gaussian") == 1
         teacher = compared.contestants[0].teacher()
-        whole = teacher.store.training_seconds(teacher.prior, teacher.training)
+        whole = teacher.store.training_seconds(teacher.method, teacher.training)
         assert all(row["training_seconds"] > whole for row in compared.timed())
     assert rows_of(tmp_path / "1") == rows_of(tmp_path / "3")
 
 
 class Unteachable(Store):
-    def train(self, prior, training, progress=None):
-        if prior.name == "gaussian":
+    def train(self, method, training, progress=None):
+        if method.name == "gaussian":
             raise FloatingPointError("the teacher diverged")
-        return super().train(prior, training, progress)
+        return super().train(method, training, progress)
 
 
 def test_without_its_teacher_a_student_fails_at_once(tmp_path):
-    priors = [ReflowPrior(H), PastPrior(H)]
-    compared = comparison(tmp_path, 2, kind=Unteachable, priors=priors, seeds=1)
+    methods = [Method("reflow", H), Method("past", H)]
+    compared = comparison(tmp_path, 2, kind=Unteachable, methods=methods, seeds=1)
     compared.run()
-    assert [c.prior.name for c in compared.contestants] == ["past"]
+    assert [c.method.name for c in compared.contestants] == ["past"]
     assert len(compared.failures) == 2
     assert all("the teacher diverged" in failure for failure in compared.failures)
 
 
 class Diverging(Store):
-    def train(self, prior, training, progress=None):
-        if prior.name != "past":
-            return super().train(prior, training, progress)
+    def train(self, method, training, progress=None):
+        if method.name != "past":
+            return super().train(method, training, progress)
         data = self.problem.data.clone()
         data["action"].fill_(1e30)
         problem = replace(self.problem, data=data)
         broken = Store(problem, self.network, self.directory, self.logs, self.run)
-        return broken.train(prior, training, progress)
+        return broken.train(method, training, progress)
 
 
 def test_a_policy_that_fails_is_named_and_does_not_stop_the_others(undisturbed, tmp_path, capsys):
@@ -163,11 +162,11 @@ def test_a_policy_that_fails_is_named_and_does_not_stop_the_others(undisturbed, 
     file = str(compared.contestants[1].folder / "state.safetensors")
     rows = compared.run().rows
     assert [row["prior"] for row in rows] == ["gaussian"] * 4 + ["preview"] * 4
-    assert [c.prior.name for c in compared.contestants] == ["gaussian", "preview"]
+    assert [c.method.name for c in compared.contestants] == ["gaussian", "preview"]
     (failure,) = compared.failures
     assert failure.startswith("drift") and "past" in failure and file in failure
     assert f"FAILED {failure}" in capsys.readouterr().out
-    assert set(compared.policies()) == {prior.describe() for prior in (PRIORS[0], PRIORS[2])}
+    assert set(compared.policies()) == {METHODS[0], METHODS[2]}
     # A second attempt, in which nothing fails, adds what is missing.
     again = comparison(tmp_path, 2, seeds=1, precondition=False, resume=True)
     assert [row["prior"] for row in again.run().rows][4:8] == ["past"] * 4

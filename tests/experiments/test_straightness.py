@@ -10,18 +10,19 @@ import torch
 
 from tests.diagnostics.fields import policy
 from tests.diagnostics.test_shared_observations import H, steps
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, RegressionPrior
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations
 
 pytest.importorskip("tyro")
 
-from warmprior.experiments import Row, curvature_table
+from warmprior.experiments import Method, Row, curvature_table
 from warmprior.experiments import straightness as by_seed
 
 
 def straightness(policies, *args, **options):
-    """Of the policies of seeds 0, 1, ..."""
-    return by_seed({n: dict(enumerate(group)) for n, group in policies.items()}, *args, **options)
+    """Of the policies of seeds 0, 1, ..., by the name of their method."""
+    given = {Method(n, H): dict(enumerate(group)) for n, group in policies.items()}
+    return by_seed(given, *args, **options)
 
 
 def turning(speed):
@@ -57,7 +58,7 @@ def test_ratios_follow_from_the_fields(monkeypatch):
         "past": [policy(turning(1.0), PastPrior(H)), policy(turning(2.0), PastPrior(H))],
         "preview": [policy(turning(1.0), PreviewPrior(H))] * 2,
     }
-    rows = {(r["policy"], r["seed"], r["mean"]): r for r in straightness(policies, shared())}
+    rows = {(r["prior"], r["seed"], r["mean"]): r for r in straightness(policies, shared())}
     assert {mean for name, _, mean in rows if name == "gaussian"} == {"training"}
     assert rows["past", 0, "training"]["ratio"] == pytest.approx(1 / 4, rel=1e-4)
     assert rows["past", 1, "deployed"]["ratio"] == pytest.approx(1.0, rel=1e-4)
@@ -97,7 +98,7 @@ def test_ratios_follow_from_the_fields(monkeypatch):
 
 def test_rows_tell_the_training_seeds(monkeypatch):
     small_loss(monkeypatch)
-    policies = {"gaussian": {4: policy(turning(2.0)), 3: policy(turning(1.0))}}
+    policies = {Method("gaussian", H): {4: policy(turning(2.0)), 3: policy(turning(1.0))}}
     rows = {row["seed"]: row["kappa"] for row in by_seed(policies, shared(), n_steps=10)}
     assert set(rows) == {3, 4, None}
     assert rows[4] == pytest.approx(4 * rows[3], rel=1e-4)  # each that of its own policy
@@ -110,7 +111,7 @@ def test_an_average_over_seeds_leaves_none_out(monkeypatch):
         "past": [policy(turning(0.0), PastPrior(H)), policy(turning(1.0), PastPrior(H))],
     }
     with pytest.warns(UserWarning, match="do not move"):
-        rows = {(r["policy"], r["seed"], r["mean"]): r for r in straightness(policies, shared())}
+        rows = {(r["prior"], r["seed"], r["mean"]): r for r in straightness(policies, shared())}
     assert rows["past", 1, "training"]["ratio_executed"] == pytest.approx(1 / 4, rel=1e-4)
     for seed in (0, None):
         row = rows["past", seed, "training"]
@@ -118,7 +119,7 @@ def test_an_average_over_seeds_leaves_none_out(monkeypatch):
         assert row.measures["ratio_executed"] is None and row.measures["ratio_one_step"] is None
     with pytest.warns(UserWarning, match="do not move"):  # the baseline, now
         rows = straightness(dict(reversed(policies.items())), shared())
-    base = [row for row in rows if (row["policy"], row["seed"]) == ("gaussian", 0)]
+    base = [row for row in rows if (row["prior"], row["seed"]) == ("gaussian", 0)]
     assert len(base) == 1 and base[0].measures["ratio_one_step"] is None
 
 
@@ -133,7 +134,7 @@ def test_the_noise_of_the_earlier_prediction_is_not_that_of_the_path(monkeypatch
         return torch.ones_like(a)
 
     observations = shared(count=None)
-    demonstrated = observations.windows(PastPrior(H))["prior", "loc"]
+    demonstrated = PastPrior(H).distribution(observations.windows(PastPrior(H))["history"]).loc
     straightness({"past": [policy(field, PastPrior(H, sigma=1.0))]}, observations, n_steps=2)
     # At time 0: the earlier prediction, then path and one step at either mean.
     earlier, at_training, at_deployed = starts[0], starts[1], starts[3]
@@ -141,7 +142,8 @@ def test_the_noise_of_the_earlier_prediction_is_not_that_of_the_path(monkeypatch
     assert torch.equal(starts[1], starts[2]) and torch.equal(starts[3], starts[4])
     mean = earlier + 1.0  # what the field makes of it
     torch.testing.assert_close(at_deployed - mean, noise, atol=1e-5, rtol=0)
-    previous = earlier - observations.windows(PastPrior(H), offset=H)["prior", "loc"]
+    before = observations.windows(PastPrior(H), offset=H)["history"]
+    previous = earlier - PastPrior(H).distribution(before).loc
     both = torch.stack([noise.flatten(), previous.flatten()])
     assert abs(float(torch.corrcoef(both)[0, 1])) < 0.25
 
@@ -155,7 +157,9 @@ def test_the_bound_is_that_of_the_mean_it_stands_beside(monkeypatch):
 
 def test_a_path_that_diverges_names_its_policy():
     policies = {"past": [policy(lambda t, a, o: a * math.inf, PastPrior(H))]}
-    with pytest.raises(FloatingPointError, match="past, training mean: 20 of 20 paths"):
+    with pytest.raises(
+        FloatingPointError, match=r"past, sigma 0\.5, H 3, training mean: 20 of 20"
+    ):
         straightness(policies, shared(), n_steps=4)
 
 
@@ -170,23 +174,23 @@ def test_one_seed_one_result(monkeypatch):
 def test_bad_input_is_named():
     base = policy(turning(1.0))
     with pytest.raises(ValueError, match="same training seeds"):
-        straightness({"a": [base], "b": [base, base]}, shared())
+        straightness({"gaussian": [base], "past": [base, base]}, shared())
     with pytest.raises(ValueError, match="one chunk length only"):
-        straightness({"a": [policy(turning(1.0), PastPrior(H + 1))]}, shared())
+        straightness({"past": [policy(turning(1.0), PastPrior(H + 1))]}, shared())
     with pytest.raises(ValueError, match="none of these policies has a flow"):
-        straightness({"a": [policy(turning(1.0), RegressionPrior(H))]}, shared())
+        straightness({"regression": [policy(turning(1.0))]}, shared())
 
 
 def test_policies_without_a_flow_are_left_out(monkeypatch):
     small_loss(monkeypatch)
     policies = {
-        "regression": [policy(turning(5.0), RegressionPrior(H))],
+        "regression": [policy(turning(5.0))],
         "gaussian": [policy(turning(2.0))],
         "past": [policy(turning(1.0), PastPrior(H))],
     }
     rows = straightness(policies, shared())
     # The baseline is the first of those with a flow.
-    found = {(row["policy"], row["mean"]): row["ratio"] for row in rows}
+    found = {(row["prior"], row["mean"]): row["ratio"] for row in rows}
     assert found["gaussian", "training"] == 1.0
     assert found["past", "training"] == pytest.approx(1 / 4, rel=1e-4)
     assert {name for name, _ in found} == {"gaussian", "past"}
@@ -195,9 +199,9 @@ def test_policies_without_a_flow_are_left_out(monkeypatch):
 def test_the_ratio_of_linear_fields_has_the_closed_form(monkeypatch):
     """v = -rate * a: v_k = -rate * (1 - rate/N)^k a0 at step k, from the same sources a0."""
     small_loss(monkeypatch)
-    fields = {"a": [policy(lambda t, a, o: -a)], "b": [policy(lambda t, a, o: -2 * a)]}
-    rows = {row["policy"]: row for row in straightness(fields, shared(), draws=2)}
+    fields = {"gaussian": [policy(lambda t, a, o: -a)], "history": [policy(lambda t, a, o: -2 * a)]}
+    rows = {row["prior"]: row for row in straightness(fields, shared(), draws=2)}
     steps = torch.arange(100, dtype=torch.float64)
     kappas = [(rate * (1 - rate / 100) ** steps).var(correction=0) for rate in (1.0, 2.0)]
-    assert rows["a"]["ratio"] == 1.0
-    assert rows["b"]["ratio"] == pytest.approx(float(kappas[1] / kappas[0]), rel=1e-3)
+    assert rows["gaussian"]["ratio"] == 1.0
+    assert rows["history"]["ratio"] == pytest.approx(float(kappas[1] / kappas[0]), rel=1e-3)

@@ -1,93 +1,28 @@
-"""Options that came after policies had been trained and runs begun: those are found, and continued."""
+"""Options beside the paper's recipe: what is refused, continued, played and told of them."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from importlib.metadata import version
 
 import pytest
 import torch
 
 pytest.importorskip("tyro")
 
-from tests.experiments.comparison_parts import PRIORS, TRAINING, comparison, drift_problem, rows_of
-from warmprior import PastPrior, RegressionPrior
+from tests.experiments.comparison_parts import METHODS, TRAINING, comparison, rows_of
 from warmprior.experiments import (
-    NAVIGATION_PRESETS,
     PRESETS,
     EvaluationOptions,
-    NetworkOptions,
-    Store,
     parse,
-    record,
-    restore,
     started,
 )
 from warmprior.experiments.success_study import success_notes
-from warmprior.io.files import digest_of
-from warmprior.training.behaviour_cloning import STATE_FORMAT
 
-LATER = ["--times", "u-shaped", "--objective", "l1", "--self-distillation", "0.5"]
+VARIED = ["--times", "u-shaped", "--objective", "l1", "--self-distillation", "0.5"]
 
 
 def read(*argv, presets=PRESETS, **options):
     return parse(presets, [*map(str, argv)], study="a-study", **options)
-
-
-def test_policies_of_before_are_found_again(tmp_path):
-    """The name of their folder, of what determined it when there were no other options."""
-    problem = drift_problem()
-    store = Store(problem, NetworkOptions(hidden_dim=16), tmp_path, tmp_path / "logs")
-    training = {
-        "iterations": 20,
-        "batch_size": 16,
-        "learning_rate": 1e-2,
-        "weight_decay": 1e-5,
-        "betas": (0.9, 0.999),
-        "eps": 1e-8,
-        "warmup_ratio": 0.2,
-        "ema_rate": 0.995,
-        "checkpoints": 2,
-        "save_every": None,
-        "log_every": 5,
-        "seed": 3,
-    }
-    network = {"network": "mlp", "hidden_dim": 16, "precondition": True, "observation_steps": 2}
-    prior = PastPrior(4)
-    digest = digest_of(
-        problem.identity,
-        training,
-        prior.config(),
-        network,
-        "cpu",
-        False,
-        version("torch"),
-        version("warmprior"),
-        STATE_FORMAT,
-    )
-    config = replace(TRAINING, seed=3)
-    assert store.folder(prior, config).name == f"drift-own-past-seed3-{digest[:10]}"
-    others = [{"times": "u-shaped"}, {"objective": "l1"}, {"self_distillation": 0.5}]
-    names = {store.folder(prior, replace(config, **other)).name for other in [{}, *others]}
-    assert len(names) == 4
-
-
-def test_the_record_of_a_recipe_is_that_of_before_until_an_option_is_used():
-    for presets in (PRESETS, NAVIGATION_PRESETS):
-        for preset in presets.values():
-            tree = record(preset)
-            assert not {"times", "objective", "self_distillation"} & tree["training"].keys()
-            assert "grid" not in tree["evaluation"]
-            used = replace(
-                preset,
-                training=replace(preset.training, times="logit-normal", self_distillation=1.0),
-                evaluation=replace(preset.evaluation, grid="dense-jump:0.7"),
-            )
-            tree = json.loads(json.dumps(record(used)))
-            assert tree["training"]["times"] == "logit-normal"
-            assert tree["evaluation"]["grid"] == "dense-jump:0.7"
-            assert restore(type(preset), tree) == used
 
 
 def test_a_continued_run_has_its_options(tmp_path):
@@ -97,12 +32,12 @@ def test_a_continued_run_has_its_options(tmp_path):
 
     plain, later = ["--out", tmp_path / "plain"], ["--out", tmp_path / "later"]
     begin(read(*plain))
-    begin(read(*LATER, "--grid", "dense-jump", *later))
+    begin(read(*VARIED, "--grid", "dense-jump", *later))
     assert read("--resume", *plain).training.times == "uniform"
     again = read("--resume", *later)
     assert again.training.self_distillation == 0.5 and again.evaluation.grid == "dense-jump"
-    assert read("--resume", *LATER, *later) == again
-    with pytest.raises(ValueError, match=r"was started with no --times: leave"):
+    assert read("--resume", *VARIED, *later) == again
+    with pytest.raises(ValueError, match=r"was started with --times uniform: leave"):
         read("--resume", "--times", "u-shaped", *plain)
     with pytest.raises(ValueError, match=r"was started with --grid dense-jump: leave"):
         read("--resume", "--grid", "uniform", *later)
@@ -154,23 +89,11 @@ def test_one_flow_makes_use_of_them(tmp_path):
     assert (recipe.training.times, recipe.evaluation.grid) == ("u-shaped", "dense-jump")
 
 
-class Copying(RegressionPrior):
-    """No flow itself, but it learns from one, which the times are of."""
-
-    name = "copying"
-    teacher = "gaussian"
-
-
-def test_times_are_those_of_teachers_as_well(tmp_path):
-    given = ["--prior", "copying", "--times", "u-shaped", "--out", tmp_path / "out"]
-    assert read(*given).training.times == "u-shaped"
-
-
 def test_policies_are_played_and_measured_on_the_grid(tmp_path):
     """One step is the same on each; more are not, on the same policies."""
     rows = {}
     for i, grid in enumerate(("uniform", "dense-jump:0.9")):
-        compared = comparison(tmp_path / str(i), 1, priors=PRIORS[1:2], seeds=1, grid=grid)
+        compared = comparison(tmp_path / str(i), 1, methods=METHODS[1:2], seeds=1, grid=grid)
         compared.run()
         player = compared.player(compared.contestants[0])
         assert player.ode.grid == grid
@@ -181,13 +104,13 @@ def test_policies_are_played_and_measured_on_the_grid(tmp_path):
     for measure in ("boundary_jump", "source_leak"):
         assert uniform[3][measure] != jump[3][measure]
     with pytest.raises(ValueError, match="belongs to another recipe"):
-        comparison(tmp_path / "1", 1, priors=PRIORS[1:2], seeds=1, resume=True)
+        comparison(tmp_path / "1", 1, methods=METHODS[1:2], seeds=1, resume=True)
 
 
 def test_tables_name_them(tmp_path):
     plain, varied = (
         success_notes(read(*argv, "--out", tmp_path / "out"), PRESETS["paper"])
-        for argv in (("--preset", "paper"), (*LATER, "--grid", "dense-jump"))
+        for argv in (("--preset", "paper"), (*VARIED, "--grid", "dense-jump"))
     )
     assert not [line for line in plain if "Beside the paper" in line]
     told = (
@@ -202,6 +125,6 @@ def test_every_source_learns_with_all_of_them(tmp_path):
     compared = comparison(tmp_path, 1, training=training, seeds=1, episodes=1, grid="dense-jump")
     compared.run()
     assert not compared.failures
-    assert {row["prior"] for row in rows_of(tmp_path)} == {prior.name for prior in PRIORS}
+    assert {row["prior"] for row in rows_of(tmp_path)} == {method.name for method in METHODS}
     for c in compared.contestants:
         assert all(bool(torch.isfinite(p).all()) for p in c.policy().parameters())

@@ -18,7 +18,7 @@ from warmprior.training import WorkerError
 pytest.importorskip("tyro")
 
 from tests.experiments.comparison_parts import (
-    PRIORS,
+    METHODS,
     TRAINING,
     DriftEnv,
     comparison,
@@ -56,7 +56,7 @@ def test_rows_and_weights_do_not_depend_on_the_number_of_workers(undisturbed, tm
 def test_spawned_workers_give_the_same_rows(undisturbed, tmp_path, monkeypatch):
     """As beside CUDA: everything that a worker needs is handed over instead of inherited."""
     monkeypatch.setattr(workers, "start_method", lambda: "spawn")
-    comparison(tmp_path, 2, priors=PRIORS[1:2], seeds=1).run()
+    comparison(tmp_path, 2, methods=METHODS[1:2], seeds=1).run()
     expected = [r for r in rows_of(undisturbed) if (r["prior"], r["seed"]) == ("past", 0)]
     assert rows_of(tmp_path) == expected
 
@@ -65,7 +65,7 @@ def test_every_worker_plays_each_seed_once_per_cell(tmp_path):
     log = tmp_path / "log"
     log.mkdir()
     env = DriftEnv(log, sleep=0.01)
-    comparison(tmp_path, 2, problem=drift_problem(env), priors=PRIORS[:2]).run()
+    comparison(tmp_path, 2, problem=drift_problem(env), methods=METHODS[:2]).run()
     names = [path.name.split("-") for path in log.iterdir()]
     seeds = [int(seed) for seed, _, _ in names]
     cells = 2 * 2 * 2 * 2
@@ -106,7 +106,7 @@ def unbuildable(**options):
 def test_a_problem_that_cannot_be_built_leaves_the_others_alone(tmp_path):
     """In one worker, which plays the sound problem before and after."""
     sound, broken = drift_problem(), replace(drift_problem(), task="broken", make_env=unbuildable)
-    options = {"priors": PRIORS[:2], "seeds": 1}
+    options = {"methods": METHODS[:2], "seeds": 1}
     alone = comparison(tmp_path / "alone", 1, **options)
     alone.run()
     both = comparison(tmp_path / "both", 1, **options)
@@ -115,7 +115,7 @@ def test_a_problem_that_cannot_be_built_leaves_the_others_alone(tmp_path):
     stores = [
         Store(p, store.network, store.directory, store.logs, store.run) for p in (sound, broken)
     ]
-    both = Comparison(recipe, "two", stores=stores, directory=tmp_path / "two", priors=PRIORS[:2])
+    both = Comparison(recipe, "two", stores=stores, directory=tmp_path / "two", methods=METHODS[:2])
     both.run()
     assert len(both.failures) == 2 and all("cannot be built" in f for f in both.failures)
     assert both.rows == alone.rows
@@ -157,7 +157,7 @@ def test_several_problems_in_one_run_are_what_each_is_alone(tmp_path):
             Store(p, recipe.network, tmp_path / folder / "policies", tmp_path / "logs", options)
             for p in problems
         ]
-        compared = Comparison(replace(recipe, run=options), stores=stores, priors=PRIORS[:2])
+        compared = Comparison(replace(recipe, run=options), stores=stores, methods=METHODS[:2])
         return compared.run().rows
 
     rows = run(drift_problem(), other, folder="both")
@@ -176,7 +176,7 @@ def test_play_on_goes_to_the_end_and_remembers_success(tmp_path):
         folder = tmp_path / str(play_on)
         problem = replace(drift_problem(), make_env=SolvedEarly)
         compared = comparison(
-            folder, 1, priors=PRIORS[:1], seeds=1, problem=problem, play_on=play_on
+            folder, 1, methods=METHODS[:1], seeds=1, problem=problem, play_on=play_on
         )
         (found[play_on], *_) = compared.run().rows
     assert [row["success_rate"] for row in found.values()] == [1.0, 1.0]

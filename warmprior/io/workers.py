@@ -13,6 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import cache
 from types import TracebackType
 from typing import Any, Protocol, Self
 
@@ -31,10 +32,6 @@ __all__ = [
 ]
 
 _forks = True
-
-# Autograd counts devices when it first computes a gradient, and refuses to work in forks from then on if
-# there is one. Compiling anything, or fake tensors, let it see a GPU that is not there: it counts before.
-torch.ones((), requires_grad=True).backward()
 
 
 class WorkerError(RuntimeError):
@@ -67,7 +64,20 @@ def start_method() -> str:
     But autograd refuses to work in the child of a process that used it where a GPU is in sight, even if
     that GPU is never used. See also :func:`stop_forking`.
     """
-    return "fork" if _forks and not torch.cuda.is_available() else "spawn"
+    if not _forks or torch.cuda.is_available():
+        return "spawn"
+    count_devices()
+    return "fork"
+
+
+@cache
+def count_devices() -> None:
+    """Let autograd count devices now, where there is none.
+
+    It does so when it first computes a gradient, and refuses to work in forks from then on if there is one.
+    Compiling anything, or fake tensors, let it see a GPU that is not there: it has to count before.
+    """
+    torch.ones((), requires_grad=True).backward()
 
 
 def stop_forking() -> None:

@@ -89,6 +89,11 @@ class Prior(Registered):
         ValueError: if ``chunk_length < 1``, ``sigma`` is not a finite number >= 0, or ``correlation`` is not
             in [0, 1].
 
+    See Also:
+        - :class:`~warmprior.PastPrior`: the paper's first one.
+        - :class:`~warmprior.PriorSampler`: draws from it.
+        - :class:`~warmprior.ActionHistory`: writes what it reads.
+
     Examples:
         >>> import torch
         >>> from warmprior.history import advance, cold_history

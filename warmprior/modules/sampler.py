@@ -35,6 +35,10 @@ class PriorSampler(TensorDictModuleBase):
         KeyError: if an entry of the history is missing.
         ValueError: if the history has other lengths than the prior.
 
+    See Also:
+        - :class:`~warmprior.ODEActor`: integrates what it draws.
+        - :class:`~warmprior.WarmPriorActor`: both in one.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

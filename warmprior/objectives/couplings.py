@@ -113,6 +113,9 @@ class ReflowCoupling:
         ValueError: if ``nfe`` is no whole number of at least 1, or a batch has chunks of another shape than
             the teacher's.
 
+    See Also:
+        :class:`~warmprior.objectives.OTCoupling`: permutes the sources instead.
+
     Examples:
         >>> import torch
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor

@@ -29,6 +29,9 @@ def has_anchor(actor: Any) -> bool:
     Args:
         actor: the policy.
 
+    See Also:
+        :func:`~warmprior.rl.source_anchor`: where that centre is.
+
     Examples:
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
         >>> network, priors = VelocityMLP(2, 3, 4), (GaussianPrior(4), PastPrior(4))
@@ -57,6 +60,18 @@ def source_anchor(
 
     Returns:
         The anchor, ``[*B, P, d_a]``, and where it is one, bool ``[*B, P, 1]``.
+
+    See Also:
+        :class:`~warmprior.PriorAnchor`: writes it in an environment, with noise elsewhere.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> target, steps = torch.zeros(4, 2), torch.tensor([4])
+        >>> history = window_history(torch.ones(4, 2), steps, target, chunk_length=4)
+        >>> anchor, known = source_anchor(
+        ...     WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), history, None)
+        >>> anchor.unique().tolist(), bool(known.all())
+        ([1.0], True)
     """
     if actor.start is not None:
         centre = actor.start.centre(history, observation)

@@ -28,6 +28,7 @@ from warmprior.io.distributed import (
     world_size,
 )
 from warmprior.io.files import exclusive
+from warmprior.io.workers import count_devices
 from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled
@@ -283,6 +284,7 @@ class BehaviourCloning:
         self._restore()
         self._graphs = compile and device.type == "cuda"
         if compile:
+            count_devices()
             mode = "reduce-overhead" if self._graphs else None
             self.loss_module.velocity_network.compile(mode=mode)
         self._loss: nn.Module = _Loss(self.loss_module, self.trained)

@@ -232,6 +232,10 @@ def check_saveable(actor: WarmPriorActor) -> None:
     Raises:
         TypeError: if there is no :func:`policy_config`.
         ValueError: if a policy built from it has other tensors than this one.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> check_saveable(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)))
     """
     _saveable(actor)
 
@@ -272,6 +276,18 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
         OSError: if the folder cannot be written to.
         TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed).
         ValueError: if the policy could not be loaded again, see :func:`check_saveable`.
+
+    See Also:
+        :func:`~warmprior.training.load_policy`: reads it.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
+        >>> with TemporaryDirectory() as folder:
+        ...     save_policy(actor, folder)
+        ...     load_policy(folder).prior
+        PastPrior(chunk_length=4, sigma=0.5, correlation=0.0)
     """
     config, tensors = _saveable(actor)
     directory = Path(directory)
@@ -382,6 +398,12 @@ def load_policy(
         ImportError: if the hub has to be asked, and huggingface_hub is not installed.
 
     Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> with TemporaryDirectory() as folder:
+        ...     save_policy(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), folder)
+        ...     load_policy(folder).prior.chunk_length
+        4
         >>> load_policy("user/square-past")  # doctest: +SKIP
         WarmPriorActor(...)
     """

@@ -153,6 +153,9 @@ class WithheldHistory(Transform):
     Raises:
         ValueError: if the probability is not in [0, 1].
 
+    See Also:
+        :func:`~warmprior.window_replay_buffer`: appends it, with ``withhold``.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict

@@ -52,6 +52,10 @@ class ActionWindow(Transform):
         ValueError: if not ``1 <= chunk_length <= prediction_length, history_length``, ``data`` is empty or
             not flat, an action is not one vector, an entry holds NaN or Inf, or an episode is not contiguous.
 
+    See Also:
+        - :class:`~warmprior.ActionHistory`: writes the same history in an environment.
+        - :func:`~warmprior.window_replay_buffer`: a buffer of such windows.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
