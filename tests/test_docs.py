@@ -18,6 +18,7 @@ from warmprior.io.workers import WorkerError, worker_died
 DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
 SHOWN_ALONE = {
+    "warmprior.training.push_policy": "needs the hub",
     "warmprior.data.download_lerobot": "fetches from the hub",
     "warmprior.modules.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",

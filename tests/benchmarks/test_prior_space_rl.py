@@ -285,12 +285,14 @@ def test_papers_recipes():
         methods = {method.name: method for method in recipe.sources.methods()}
         assert tuple(methods) == ("gaussian", "past", "preview")
         chunk = methods["past"].chunk_length
-        made = {name: recipe.agent(method, "dsrl-na", 0) for name, method in methods.items()}
+        made = {
+            name: recipe.agent(method.has_anchor, "dsrl-na", 0) for name, method in methods.items()
+        }
         base, config = made["gaussian"].delta or 1.5, made["past"]
         found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
         assert (*found, recipe.agents.horizon, chunk, base) == values
         assert made["past"].delta is None  # the paper's 0.5
-        other = recipe.agent(methods["past"], "dsrl-sac", 3)
+        other = recipe.agent(True, "dsrl-sac", 3)
         assert other.seed == 3 and other.algorithm == "dsrl-sac" and other.backup_entropy
         assert not config.backup_entropy
         assert (config.alpha_init, config.tau, config.batch_size) == (1.0, 0.005, 256)
@@ -299,7 +301,7 @@ def test_papers_recipes():
         assert recipe.agents.algorithm == expected
     recipe = read("--preset paper --task transport --download --rl.delta 0.7 --episodes 3 --nfe 9")
     for method in recipe.sources.methods():
-        config = recipe.agent(method, "dsrl-na", 0)
+        config = recipe.agent(method.has_anchor, "dsrl-na", 0)
         assert (config.delta, config.evaluation_episodes, config.nfe) == (0.7, 3, 9)
     # Options of the command line stand above those of the task.
     assert read("--preset paper --task square --rl.gamma 0.9").rl.gamma == 0.9

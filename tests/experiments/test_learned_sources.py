@@ -249,7 +249,7 @@ class TestStep:
 def test_configurations_build_the_same_learner(kind, data, batch):
     base = StartPoint if kind is ForecastStart else Prior
     made = make(base, kind.name, H)
-    assert made.config()["action_dim"] is None and made.config()["hidden_dim"] == 256
+    assert made.config()["widths"] is None and made.config()["hidden_dim"] == 256
     assert make(base, f"{kind.name},hidden_dim=256", H).config() == made.config()
     learner = learned(kind, data, iterations=2)
     again = from_config(base, learner.config())
@@ -291,11 +291,10 @@ def test_a_sampler_hands_on_the_observation(batch):
 
 
 def test_bad_input_is_named(data):
-    widths = {"action_dim": 1, "observation_dim": 1, "observation_steps": 1}
     for options, told in (
-        ({"action_dim": 1}, r"needs all of \['action_dim', .* or none"),
-        (widths | {"action_dim": 0}, "at least 1"),
-        (widths | {"observation_steps": 1.5}, "observation_steps"),
+        ({"widths": [1, 1]}, "zip"),
+        ({"widths": [0, 1, 1]}, "at least 1"),
+        ({"widths": [1, 1, 1.5]}, "observation_steps"),
         *(({"hidden_dim": wrong}, "hidden_dim") for wrong in (0, 1.5, True)),
     ):
         with pytest.raises(ValueError, match=told):

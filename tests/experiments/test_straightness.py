@@ -157,9 +157,7 @@ def test_the_bound_is_that_of_the_mean_it_stands_beside(monkeypatch):
 
 def test_a_path_that_diverges_names_its_policy():
     policies = {"past": [policy(lambda t, a, o: a * math.inf, PastPrior(H))]}
-    with pytest.raises(
-        FloatingPointError, match=r"past, sigma 0\.5, H 3, training mean: 20 of 20"
-    ):
+    with pytest.raises(FloatingPointError, match=r"past, sigma 0\.5, H 3, training mean: 20 of 20"):
         straightness(policies, shared(), n_steps=4)
 
 

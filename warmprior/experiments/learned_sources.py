@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
@@ -56,48 +57,24 @@ class Learner(nn.Module):
     hidden_dim: int
     network: nn.Module
 
-    def _set_widths(
-        self,
-        action_dim: int | None,
-        observation_dim: int | None,
-        observation_steps: int | None,
-        hidden_dim: int,
-    ) -> None:
+    def _set_widths(self, widths: Sequence[int] | None, hidden_dim: int) -> None:
         """Make the networks, if the widths of the data are known; :meth:`sized` tells them."""
         check_whole_numbers(hidden_dim=hidden_dim)
         self.hidden_dim = hidden_dim
-        widths = {
-            "action_dim": action_dim,
-            "observation_dim": observation_dim,
-            "observation_steps": observation_steps,
-        }
-        given = {name: width for name, width in widths.items() if width is not None}
-        if given and len(given) < len(widths):
-            raise ValueError(
-                f"{type(self).__name__} needs all of {list(widths)} or none, got {widths}"
-            )
-        if given:
+        if widths is not None:
+            names = ("action_dim", "observation_dim", "observation_steps")
+            given = dict(zip(names, widths, strict=True))
             check_whole_numbers(**given)
             self.__dict__.update(given)
             self.build()
             self.requires_grad_(False)
 
     def sized(self, action_dim: int, observation_dim: int, observation_steps: int) -> Self:
-        """The same with fresh networks for data of these widths.
-
-        Args:
-            action_dim: ``d_a``.
-            observation_dim: ``d_o``.
-            observation_steps: ``To``.
-        """
+        """The same with fresh networks for data of these widths, ``d_a``, ``d_o`` and ``To``."""
         assert isinstance(self, Registered)
-        widths = {
-            "action_dim": action_dim,
-            "observation_dim": observation_dim,
-            "observation_steps": observation_steps,
-        }
         kind: Any = type(self)
-        return kind(**(self._resolved() | widths))
+        widths = [action_dim, observation_dim, observation_steps]
+        return kind(**(self._resolved() | {"widths": widths}))
 
     def build(self) -> None:
         """Make the networks, once the widths are known."""
@@ -189,9 +166,7 @@ class LearnedPrior(PastPrior, Learner):
         chunk_length: ``H``.
 
     Keyword Args:
-        action_dim: ``d_a``; like the other widths it is filled in by :meth:`sized`.
-        observation_dim: ``d_o``.
-        observation_steps: ``To``.
+        widths: ``d_a``, ``d_o`` and ``To``, which :meth:`sized` fills in.
         hidden_dim: width of the network's two hidden layers.
         sigma: see the subclass.
     """
@@ -200,15 +175,13 @@ class LearnedPrior(PastPrior, Learner):
         self,
         chunk_length: int,
         *,
-        action_dim: int | None = None,
-        observation_dim: int | None = None,
-        observation_steps: int | None = None,
+        widths: Sequence[int] | None = None,
         hidden_dim: int = 256,
         sigma: float | None = None,
     ) -> None:
         nn.Module.__init__(self)
         PastPrior.__init__(self, chunk_length, sigma=sigma)
-        self._set_widths(action_dim, observation_dim, observation_steps, hidden_dim)
+        self._set_widths(widths, hidden_dim)
 
     def _everywhere(self, loc: Tensor, scale: Tensor) -> Source:
         return Source(loc, scale, torch.ones_like(loc[..., :1], dtype=torch.bool))
@@ -365,9 +338,7 @@ class CVAEPrior(LearnedPrior):
         *,
         latent_dim: int = 8,
         beta: float = 0.01,
-        action_dim: int | None = None,
-        observation_dim: int | None = None,
-        observation_steps: int | None = None,
+        widths: Sequence[int] | None = None,
         hidden_dim: int = 256,
         sigma: float | None = None,
     ) -> None:
@@ -376,14 +347,7 @@ class CVAEPrior(LearnedPrior):
         if beta <= 0:
             raise ValueError(f"beta must be a finite number > 0, got {beta}")
         self.__dict__.update(latent_dim=latent_dim, beta=beta)
-        super().__init__(
-            chunk_length,
-            action_dim=action_dim,
-            observation_dim=observation_dim,
-            observation_steps=observation_steps,
-            hidden_dim=hidden_dim,
-            sigma=sigma,
-        )
+        super().__init__(chunk_length, widths=widths, hidden_dim=hidden_dim, sigma=sigma)
 
     def build(self) -> None:
         """Encoder and decoder."""
@@ -438,9 +402,7 @@ class ForecastStart(StartPoint, Learner):
         start_time: :math:`t_s`.
         stall: see above, in normalised action units.
         stall_noise: see above.
-        action_dim: see :class:`LearnedPrior`.
-        observation_dim: see :class:`LearnedPrior`.
-        observation_steps: see :class:`LearnedPrior`.
+        widths: see :class:`LearnedPrior`.
         hidden_dim: see :class:`LearnedPrior`.
 
     Raises:
@@ -466,9 +428,7 @@ class ForecastStart(StartPoint, Learner):
         start_time: float = 0.5,
         stall: float = 0.02,
         stall_noise: float = 0.1,
-        action_dim: int | None = None,
-        observation_dim: int | None = None,
-        observation_steps: int | None = None,
+        widths: Sequence[int] | None = None,
         hidden_dim: int = 256,
     ) -> None:
         check_finite_numbers(start_time=start_time, stall=stall, stall_noise=stall_noise)
@@ -480,7 +440,7 @@ class ForecastStart(StartPoint, Learner):
         self.chunk_length = chunk_length
         self.time, self.noise_share = start_time, 1.0 - start_time
         self.stall, self.stall_noise = stall, stall_noise
-        self._set_widths(action_dim, observation_dim, observation_steps, hidden_dim)
+        self._set_widths(widths, hidden_dim)
 
     def build(self) -> None:
         """The forecaster."""

@@ -35,9 +35,6 @@ __all__ = ["METHODS", "Composition", "Method", "PointPrior"]
 PALETTE = ("#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", "#984ea3", "#17becf")
 """Colours of users' own priors."""
 
-WIDTHS = ("action_dim", "observation_dim", "observation_steps")
-"""Arguments that follow from the data, and are no options."""
-
 
 class PointPrior(GaussianPrior):
     """The source of a regression: the point 0."""
@@ -347,8 +344,8 @@ class Method:
     def _part(self, kind: Any, widths: Sequence[int]) -> Any:
         taken = _parameters(kind)
         options = {k: v for k, v in self.arguments.items() if k in taken}
-        if issubclass(kind, Learner):
-            options |= dict(zip(WIDTHS, widths, strict=False))
+        if widths and issubclass(kind, Learner):
+            options["widths"] = list(widths)
         return kind(self.chunk_length, **options)
 
     def _has_sigma(self) -> bool:
@@ -366,7 +363,7 @@ class Method:
 def _parameters(part: Any) -> dict[str, Any]:
     """Options of a constructor or function, with their defaults."""
     parameters = inspect.signature(part).parameters.values()
-    own = ("chunk_length", "teacher", *WIDTHS)
+    own = ("chunk_length", "teacher", "widths")  # these follow from the rest, and are no options
     return {
         p.name: p.default
         for p in parameters

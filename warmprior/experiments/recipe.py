@@ -579,7 +579,12 @@ class Recipe:
         for method in methods:
             played.update(method.allowed_nfes(self.evaluation.nfes))
             if not method.is_flow:
-                replace(self.training, times="start")  # refuses what needs a flow
+                try:
+                    replace(self.training, times="start")
+                except ValueError as error:
+                    raise ValueError(
+                        f"leave out {method.name}, which is no flow: {error}"
+                    ) from error
             if method.name == "ot" and self.training.batch_size < 2:
                 raise ValueError("ot pairs within a batch: --batch-size must be at least 2")
         if self.training.times != "uniform" and not any(m.is_flow for m in methods):

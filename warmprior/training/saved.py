@@ -54,26 +54,13 @@ CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 
 
 def _digest(config: dict[str, Any], weights: Path) -> str:
-    """Digest of a configuration and of the file of weights that belongs to it.
-
-    Args:
-        config: without the digest, or with it.
-        weights: the file.
-    """
+    """Digest of a configuration and of the file of weights that belongs to it."""
     text = json.dumps({k: v for k, v in config.items() if k != "sha256"}, sort_keys=True)
     return hashlib.sha256((text + file_digest(weights)).encode()).hexdigest()
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    """Read the configuration of a saved policy.
-
-    Args:
-        path: of the file.
-
-    Raises:
-        FileNotFoundError: if it is missing.
-        ValueError: if it is damaged, of another format version or of something else.
-    """
+    """Read the configuration of a saved policy."""
     if not path.exists():
         raise FileNotFoundError(f"no policy at {path.parent}: {path.name} is missing")
     config = read_json(path)
@@ -97,22 +84,7 @@ def _folder(
     token: str | None = None,
     endpoint: str | None = None,
 ) -> Path:
-    """Where the files of a policy lie, fetched from the hub if need be.
-
-    Args:
-        place: a folder; or, as text, ``"user/name"`` of a repository, where there is no such folder.
-
-    Keyword Args:
-        revision: branch, tag or commit of the repository.
-        token: for a private one.
-        endpoint: address of the hub.
-
-    Raises:
-        FileNotFoundError: if there is no such repository or revision, or no policy in it.
-        ValueError: if what is there is of something else, or a revision of a folder is asked for.
-        OSError: if it cannot be had.
-        ImportError: if huggingface_hub is not installed.
-    """
+    """Where the files of a policy lie, fetched from the hub if need be."""
     path = Path(place)
     remote = isinstance(place, str) and is_repository(place) and not path.exists()
     if not remote:
