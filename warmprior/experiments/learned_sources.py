@@ -95,20 +95,11 @@ class Learner(nn.Module):
     def learning_loss(
         self, windows: LearningWindows, generator: torch.Generator | None = None
     ) -> Tensor:
-        """What the networks minimise, a scalar.
-
-        Args:
-            windows: to learn from.
-            generator: source of randomness on their device.
-        """
+        """What the networks minimise on windows, a scalar."""
         raise NotImplementedError
 
     def calibrate(self, windows: LearningWindows) -> None:
-        """Correct the source by its error on windows that it did not learn from; nothing by default.
-
-        Args:
-            windows: of episodes that were held out.
-        """
+        """Correct the source by its error on windows that were held out; nothing by default."""
 
     @property
     def chunk_dim(self) -> int:

@@ -6,7 +6,7 @@ import inspect
 import json
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -28,6 +28,7 @@ from warmprior.modules.registry import find, options_of
 from warmprior.modules.start import StartPoint
 from warmprior.objectives.couplings import Coupling, OTCoupling, ReflowCoupling
 from warmprior.rl.anchor import has_anchor
+from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.history_observation import HistoryObservation
 
 __all__ = ["METHODS", "Composition", "Method", "PointPrior"]
@@ -243,7 +244,20 @@ class Method:
     @property
     def remembers(self) -> bool:
         """Whether its chunks depend on what was done before."""
-        return self.sees_history or self.has_anchor
+        part = self.composition.start or self.composition.prior
+        return self.sees_history or (self.has_anchor and getattr(part, "sees_history", True))
+
+    def recipe(self, training: TrainingConfig) -> TrainingConfig:
+        """A recipe of behaviour cloning as it is for this method.
+
+        A regression is trained at ``t = 0`` alone, and nothing is withheld where nothing is remembered.
+
+        Args:
+            training: that of all methods.
+        """
+        own: dict[str, Any] = {} if self.is_flow else {"times": "start"}
+        own |= {} if self.remembers else {"cold_probability": 0.0}
+        return replace(training, **own)
 
     @property
     def options(self) -> str:

@@ -7,7 +7,7 @@ import json
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -150,7 +150,7 @@ class Store:
                 prior,
                 observation_steps=steps,
                 coupling=self.coupling(method, training),
-                withhold=training.cold_probability,
+                withhold=method.recipe(training).cold_probability,
                 rest=copy.deepcopy(problem.rest),
             )
         actor = method.actor(
@@ -188,7 +188,7 @@ class Store:
             self.problem.data,
             iterations=max(1, round(LEARNING_SHARE * training.iterations)),
             observation_steps=self.network.observation_steps,
-            withhold=training.cold_probability,
+            withhold=method.recipe(training).cold_probability,
             seed=training.seed,
         )
         save_state(path, module_tensors(learner), method.config())
@@ -249,11 +249,10 @@ class Store:
                 # A worker process ends without the exit handlers that some loggers write in.
                 nullcontext() if logger is None else closing(logger),
             ):
-                own = training if method.is_flow else replace(training, times="start")
                 cloning = BehaviourCloning(
                     self.new_actor(method, training),
                     placed(self.problem.data, self.run.device),
-                    own,
+                    method.recipe(training),
                     folder,
                     observation_steps=self.network.observation_steps,
                     coupling=self.coupling(method, training),
