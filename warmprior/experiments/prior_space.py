@@ -250,7 +250,7 @@ PRIOR_SPACE_PRESETS: dict[str, PriorSpaceRecipe] = {
     # The navigation toy with a goal, three seeds: about two minutes.
     "unit": PriorSpaceRecipe(
         network=_TOY.network,
-        training=replace(_TOY.training, iterations=800, save_every=800),
+        training=replace(_TOY.training, iterations=800, save_every=800, cold_probability=0.0),
         sources=SourceOptions(prior=("past",)),
         evaluation=EvaluationOptions(seeds=3, episodes=128, nfe=(2,)),
         rl=AgentOptions(
