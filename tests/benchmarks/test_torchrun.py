@@ -40,8 +40,8 @@ def run(script, argv, launcher=TORCHRUN):
 
 
 @pytest.mark.slow
-def test_robomimic_has_the_rows_of_one_process(dataset, tmp_path):
-    """The same facts in the same order; episodes and measures of weights that differ by rounding."""
+def test_robomimic_trains_by_two_processes_and_plays_by_one(dataset, tmp_path):
+    """The facts of one process in the same order; each process draws its own part of a batch."""
     rows = {}
     for name, launcher in (("one", (sys.executable,)), ("two", TORCHRUN)):
         argv = options(dataset, tmp_path / name / "out", prior=["gaussian", "past"])
@@ -49,12 +49,9 @@ def test_robomimic_has_the_rows_of_one_process(dataset, tmp_path):
         assert code == 0, err
         assert out.count("Output folder") == 1 and out.count("Results, table and pictures") == 1
         rows[name] = stored(tmp_path / name / "out")["rows"]
-    assert [row["prior"] for row in rows["two"]] == ["gaussian", "past"]
-    for one, two in zip(rows["one"], rows["two"], strict=True):
-        assert one.keys() == two.keys()
-        for key, value in one.items():
-            close = pytest.approx(value, rel=1e-2, abs=1e-4) if isinstance(value, float) else value
-            assert two[key] == close, key
+    facts = ("prior", "sigma", "seed", "checkpoint", "nfe", "episodes")
+    told = {name: [[row[fact] for fact in facts] for row in mine] for name, mine in rows.items()}
+    assert told["one"] == told["two"]
 
 
 def second_process(parent, deadline=60):
