@@ -226,7 +226,7 @@ def test_the_state_of_a_worker_is_its_own():
 FAKED = """
 import torch
 from functools import partial
-from warmprior.io.workers import WorkerPool
+from warmprior.io.workers import WorkerPool, count_devices
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 def gradient(state, factor):
@@ -234,6 +234,7 @@ def gradient(state, factor):
     (factor * weight).backward()
     return weight.grad.item()
 
+count_devices()  # as a training does that compiles
 with FakeTensorMode():
     torch.ones(2)
 gradient(None, 1.0)
