@@ -86,9 +86,7 @@ def slug(source: Source) -> str:
 def is_asked(text: str, own: Method) -> bool:
     """Whether a method is what a ``--prior`` names; what is not said there is as the method has it."""
     sigma = None if "sigma" in options_of(text) else own.sigma
-    asked = Method.parse(text, own.chunk_length, sigma=sigma)
-    # Options at their defaults may be said or not.
-    return source_of_method(asked) == source_of_method(own) and asked.sigma == own.sigma
+    return Method.parse(text, own.chunk_length, sigma=sigma) == own
 
 
 def frozen_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], Frozen]:

@@ -38,7 +38,7 @@ def test_rows_and_tables_tell_absolute_actions_alone(finished):
     assert absolute["meta"]["problems"][0]["actions"] == "absolute"
     assert "actions" not in delta["meta"]["problems"][0]
     assert absolute["meta"]["identity"]["recipe"]["data"]["actions"] == "absolute"
-    assert "actions" not in delta["meta"]["identity"]["recipe"]["data"]
+    assert delta["meta"]["identity"]["recipe"]["data"]["actions"] == "delta"
     told = [(finished / name / "table.md").read_text() for name in ("absolute", "delta")]
     assert ["Lift-PH, absolute actions, measured" in text for text in told] == [True, False]
 

@@ -168,7 +168,12 @@ def test_results_of_another_recipe_are_not_continued(undisturbed):
         comparison(undisturbed, 1, resume=True, episodes=6)
 
 
-def test_what_rows_could_not_tell_is_refused(tmp_path):
-    twins = [Method("past", 3), Method("past", 3, {"correlation": 0.0})]
-    with pytest.raises(ValueError, match="rows tell policies apart by their task"):
-        comparison(tmp_path, 1, methods=twins)
+def test_options_at_their_defaults_make_no_other_method(tmp_path):
+    twins = [Method("past", 3), Method("past", 3, {"correlation": 0.0, "sigma": 0.5})]
+    assert twins[0] == twins[1] and hash(twins[0]) == hash(twins[1])
+    assert len(comparison(tmp_path, 1, methods=twins, seeds=1).contestants) == 1
+    ordered = [
+        Method.parse(f"step,{told}", 3)
+        for told in ("stall=1,start_time=0.7", "start_time=0.7,stall=1")
+    ]
+    assert ordered[0] == ordered[1] and ordered[0].config() == ordered[1].config()

@@ -59,8 +59,8 @@ class Comparison:
         failures: what failed in the last run, and why.
 
     Raises:
-        ValueError: if a method allows none of the NFEs, is longer than every demonstration, rows could not
-            tell two policies apart, or the folder's results belong to other options.
+        ValueError: if a method allows none of the NFEs, is longer than every demonstration, or the folder's
+            results belong to other options.
         OSError: if the folder cannot be written to.
 
     See Also:
@@ -127,7 +127,6 @@ class Comparison:
 
     def _contestants(self) -> list[Contestant]:
         found: dict[Path, Contestant] = {}  # two workers must not train the same policy
-        told: dict[tuple[Any, ...], Path] = {}
         for store in self.stores:
             longest = int(store.problem.data["episode"].flatten().bincount().max())
             for training in self.recipe.trainings():
@@ -140,13 +139,6 @@ class Comparison:
                     for seed in self.recipe.seeds:
                         chosen = replace(training, seed=seed)
                         contestant = Contestant(store, method, chosen)
-                        key = tuple(contestant.facts().values())
-                        if told.setdefault(key, contestant.folder) != contestant.folder:
-                            raise ValueError(
-                                "rows tell policies apart by their task, prior, options, sigma, chunk "
-                                f"length, iterations and seed: they would not tell {method} from another "
-                                f"{method.name}. Compare these in runs of their own"
-                            )
                         found.setdefault(contestant.folder, contestant)
         return list(found.values())
 

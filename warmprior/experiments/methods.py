@@ -110,7 +110,8 @@ class Method:
     Attributes:
         name: a key of :data:`METHODS`, or the name of a registered prior.
         chunk_length: ``H``.
-        arguments: other options, of whichever part takes them.
+        arguments: other options, of whichever part takes them; those at their defaults are left out, so
+            that equal methods are equal.
 
     Raises:
         ValueError: if there is no such method, or an option is unknown or out of range.
@@ -145,6 +146,9 @@ class Method:
                 f"{self.name} cannot be built from {', '.join(told)} ({error}): it takes "
                 f"{', '.join(['chunk_length', *known])}"
             ) from error
+        defaults = known | {"sigma": self.composition.prior.default_sigma}
+        own = {k: v for k, v in sorted(self.arguments.items()) if v != defaults.get(k)}
+        object.__setattr__(self, "arguments", own)
 
     @classmethod
     def parse(cls, text: str, chunk_length: int, *, sigma: float | None = None) -> Method:
@@ -222,14 +226,6 @@ class Method:
         return not self.composition.regresses
 
     @property
-    def learns(self) -> bool:
-        """Whether a part of it learns before the flow does."""
-        return any(
-            part is not None and issubclass(part, Learner)
-            for part in (self.composition.prior, self.composition.start)
-        )
-
-    @property
     def needs_vector(self) -> bool:
         """Whether it reads the observation, as one tensor: it cannot go with images."""
         parts = (self.composition.prior, self.composition.start)
@@ -262,12 +258,8 @@ class Method:
     @property
     def options(self) -> str:
         """The other arguments that are not at their defaults, as :meth:`parse` takes them."""
-        defaults = self._takes()
-        return ",".join(
-            f"{key}={json.dumps(value)}"
-            for key, value in self.arguments.items()
-            if key != "sigma" and defaults[key] != value
-        )
+        options = (item for item in self.arguments.items() if item[0] != "sigma")
+        return ",".join(f"{key}={json.dumps(value)}" for key, value in options)
 
     def describe(self) -> str:
         """The method in a few words, for progress bars and figures."""
@@ -276,8 +268,7 @@ class Method:
 
     def config(self) -> dict[str, Any]:
         """What it is, as JSON holds it; ``Method(**config)`` reverses it."""
-        arguments = {**self.arguments, "sigma": self.sigma} if self._has_sigma() else self.arguments
-        return {"name": self.name, "chunk_length": self.chunk_length, "arguments": dict(arguments)}
+        return {"name": self.name, "chunk_length": self.chunk_length, "arguments": self.arguments}
 
     def allowed_nfes(self, nfes: Sequence[int]) -> list[int]:
         """Those numbers of network evaluations per chunk for which its field means anything.
@@ -361,9 +352,6 @@ class Method:
         if widths and issubclass(kind, Learner):
             options["widths"] = list(widths)
         return kind(self.chunk_length, **options)
-
-    def _has_sigma(self) -> bool:
-        return "sigma" in self._takes()
 
     def _takes(self) -> dict[str, Any]:
         """All options of its parts, with their defaults."""
