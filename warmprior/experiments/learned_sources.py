@@ -349,10 +349,7 @@ class CVAEPrior(LearnedPrior):
         """The chunk of a latent."""
         return self.as_chunk(self.decoder(torch.cat([seen, z], -1)))
 
-    def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """None: cold everywhere."""
-        loc = torch.zeros_like(history["forecast"])
-        return loc, torch.zeros_like(loc[..., :1], dtype=torch.bool)
+    mean = GaussianPrior.mean  # none: cold everywhere
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
         """One that decodes a latent of its own for every draw."""

@@ -137,13 +137,13 @@ class Method:
             self.prior()
             if self.composition.start is not None:
                 self.start()
-            if self.composition.coupling is OTCoupling:
+            if self.pairs_in_batch:
                 self.coupling()
         except (TypeError, ValueError, ArithmeticError) as error:
-            told = [f"chunk_length={self.chunk_length!r}"]
-            told += [f"{key}={value!r}" for key, value in self.arguments.items()]
+            given = {"chunk_length": self.chunk_length, **self.arguments}
+            written = (f"{key}={value!r}" for key, value in given.items())
             raise ValueError(
-                f"{self.name} cannot be built from {', '.join(told)} ({error}): it takes "
+                f"{self.name} cannot be built from {', '.join(written)} ({error}): it takes "
                 f"{', '.join(['chunk_length', *known])}"
             ) from error
         defaults = known | {"sigma": self.composition.prior.default_sigma}
@@ -226,11 +226,16 @@ class Method:
         return not self.composition.regresses
 
     @property
+    def pairs_in_batch(self) -> bool:
+        """Whether the windows of a batch are paired, so that it needs two of them."""
+        return self.composition.coupling is OTCoupling
+
+    @property
     def needs_vector(self) -> bool:
         """Whether it reads the observation, as one tensor: it cannot go with images."""
         parts = (self.composition.prior, self.composition.start)
         seen = any(getattr(part, "sees_observation", False) for part in parts)
-        return seen or (self.name == "ot" and self.arguments.get("observation_weight", 1.0) > 0)
+        return seen or (self.pairs_in_batch and self.arguments.get("observation_weight", 1.0) > 0)
 
     @property
     def has_anchor(self) -> bool:
@@ -263,8 +268,8 @@ class Method:
 
     def describe(self) -> str:
         """The method in a few words, for progress bars and figures."""
-        told = f", {self.options}" if self.options else ""
-        return f"{self.name}, sigma {self.sigma:g}, H {self.chunk_length}{told}"
+        parts = [self.name, f"sigma {self.sigma:g}", f"H {self.chunk_length}", self.options]
+        return ", ".join(filter(None, parts))
 
     def config(self) -> dict[str, Any]:
         """What it is, as JSON holds it; ``Method(**config)`` reverses it."""

@@ -585,8 +585,10 @@ class Recipe:
                     raise ValueError(
                         f"leave out {method.name}, which is no flow: {error}"
                     ) from error
-            if method.name == "ot" and self.training.batch_size < 2:
-                raise ValueError("ot pairs within a batch: --batch-size must be at least 2")
+            if method.pairs_in_batch and self.training.batch_size < 2:
+                raise ValueError(
+                    f"{method.name} pairs within a batch: --batch-size must be at least 2"
+                )
         if self.training.times != "uniform" and not any(m.is_flow for m in methods):
             raise ValueError(
                 f"--times has no effect on {', '.join(dict.fromkeys(m.name for m in methods))}, trained at "

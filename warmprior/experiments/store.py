@@ -259,9 +259,9 @@ class Store:
                     logger=logger,
                     compile=self.run.compile,
                 )
-                told = f"train {method.describe()}, seed {training.seed}"
+                title = f"train {method.describe()}, seed {training.seed}"
                 whole = cloning.iteration == 0
-                cloning.run(told if progress is None else None, progress)
+                cloning.run(title if progress is None else None, progress)
             used = torch.tensor(time.process_time() - started, dtype=torch.float64)
             seconds = world_size() * mean_over_processes(used).item()
             if whole and not known and not rank():
@@ -405,10 +405,10 @@ def finished_policies(
     """
     meta = _facts_of(run)
     entries = [(Method(**entry["method"]), entry) for entry in meta["policies"]]
-    told = {(m.describe(), entry["iterations"]): (m.name, m.options) for m, entry in entries}
-    if len(set(told.values())) < len(told) or len(meta["problems"]) > 1:
+    compared = {(m.describe(), entry["iterations"]): (m.name, m.options) for m, entry in entries}
+    if len(set(compared.values())) < len(compared) or len(meta["problems"]) > 1:
         raise ValueError(
-            f"--run {run} compares {'; '.join(name for name, _ in told)} on {len(meta['problems'])} "
+            f"--run {run} compares {'; '.join(name for name, _ in compared)} on {len(meta['problems'])} "
             "problem(s): name a run of one task and style, with one sigma and one chunk length"
         )
     actors: dict[Method, dict[int, WarmPriorActor]] = {}

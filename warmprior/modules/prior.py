@@ -194,7 +194,7 @@ class Prior(Registered):
                 f"{type(self).__name__}.mean must return loc {expected} and warm {(*expected[:-1], 1)} of "
                 f"type bool, got {tuple(loc.shape)} and {tuple(warm.shape)} of {warm.dtype}"
             )
-        return loc, warm
+        return loc.to(actions.dtype), warm
 
 
 class GaussianPrior(Prior):

@@ -65,8 +65,8 @@ class Registered:
     def config(self) -> dict[str, Any]:
         """Name and constructor arguments as JSON holds them; :func:`from_config` reverses it.
 
-        One that was left to the constructor, as by ``sigma=None``, is what the object keeps under its name,
-        if that is a number or text; all others are told as they were given.
+        An argument that was left to the constructor, as by ``sigma=None``, is what the object keeps under its
+        name, if that is a number or text; all others are as they were given.
 
         Raises:
             TypeError: if an argument is nothing that JSON can hold.
@@ -83,14 +83,14 @@ class Registered:
         plain, resolved = (bool, int, float, str), dict(self._arguments)
         for name, value in self._arguments.items():
             kept = getattr(self, name, None)
-            # A number that was given is told as it was: what the constructor made of it, it would make again.
+            # A number that was given stays: what the constructor made of it, it would make again.
             if isinstance(kept, plain) and (not isinstance(value, plain) or kept == value):
                 resolved[name] = kept
         return resolved
 
     def __repr__(self) -> str:
-        told = (f"{key}={value!r}" for key, value in self._resolved().items())
-        return f"{type(self).__name__}({', '.join(told)})"
+        arguments = (f"{key}={value!r}" for key, value in self._resolved().items())
+        return f"{type(self).__name__}({', '.join(arguments)})"
 
 
 def registered[T: Registered](base: type[T]) -> Mapping[str, type[T]]:
@@ -159,11 +159,11 @@ def make[T: Registered](base: type[T], text: str, *args: Any, **kwargs: Any) -> 
             raise ValueError(f"{name} is given twice: also as {given[name]!r}")
         return found(*args, **given, **typed)
     except (TypeError, ValueError, ArithmeticError) as error:
-        told = [*map(repr, args), *(f"{k}={v!r}" for k, v in (given | typed).items())]
+        written = [*map(repr, args), *(f"{k}={v!r}" for k, v in (given | typed).items())]
         parameters = list(inspect.signature(found.__init__).parameters.values())[1:]  # without self
         taken = [f"**{p.name}" if p.kind is p.VAR_KEYWORD else p.name for p in parameters]
         raise ValueError(
-            f"{found.__name__} cannot be built from {', '.join(told) or 'nothing'} ({error}): it takes "
+            f"{found.__name__} cannot be built from {', '.join(written) or 'nothing'} ({error}): it takes "
             f"{', '.join(taken) or 'nothing'}"
         ) from error
 

@@ -88,7 +88,10 @@ def residual_sigma(actor: Any) -> float:
     """
     if not has_anchor(actor):
         return 1.0
-    return actor.prior.sigma if actor.start is None else actor.start.noise_share
+    if actor.start is not None:
+        return actor.start.noise_share
+    # A learned source whose sigma is a factor knows what it multiplies.
+    return actor.prior.sigma * float(getattr(actor.prior, "typical_scale", 1.0))
 
 
 class PriorAnchor(Transform):

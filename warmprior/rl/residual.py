@@ -41,7 +41,7 @@ class ResidualSampler(TensorDictModuleBase):
     Keyword Args:
         distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
             noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
-        sigma: that by default. A learned prior whose ``sigma`` is a factor needs its own here.
+        sigma: that by default.
         generator: source of randomness on the data's device; PyTorch's global one by default.
 
     Raises:
