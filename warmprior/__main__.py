@@ -12,7 +12,7 @@ from typing import Any
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
-from warmprior.modules.registry import find
+from warmprior.modules.registry import Registered, find
 
 UNPLAYED = ("episodes", "nfe", "top_k", "play_on", "grid")
 """Options of what is not played."""
@@ -23,7 +23,7 @@ def _policy(args: argparse.Namespace) -> WarmPriorActor:
     from warmprior.training.saved import load_policy
 
     for place in args.prior:
-        find(Prior, place)
+        find(Registered if ":" in place else Prior, place)
     return load_policy(args.folder, revision=args.revision)
 
 
@@ -39,6 +39,7 @@ def info(args: argparse.Namespace) -> None:
     )
     for name, value in {
         "prior": actor.prior,
+        "start": actor.start or "the source",
         "network": f"{config['network']} ({count:,} parameters)",
         "sampler": config["actor"],
         "normaliser": "kept" if actor.normalizer is not None else "none",

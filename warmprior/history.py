@@ -88,7 +88,7 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
             f"the chunk has shape {tuple(chunk.shape)}, but the history's forecast "
             f"{tuple(history['forecast'].shape)}: both need one prediction length"
         )
-    low, high = (int(value) for value in torch.aminmax(executed))
+    low, high = map(int, torch.aminmax(executed)) if executed.numel() else (0, 0)
     if not 0 <= low <= high <= min(remembered, length):
         raise ValueError(
             f"a decision executed {high if low >= 0 else low} actions, but the history remembers "

@@ -29,7 +29,9 @@ def flow_paths(
     *,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Integration paths of a policy, from source to prediction, for plots (Fig. 4).
+    """Integration paths of a policy's flow, from its source at ``t = 0`` on, for plots (Fig. 4).
+
+    Where a policy starts on the way (:class:`~warmprior.StartPoint`), these are not the paths that it takes.
 
     Args:
         policy: the policy.

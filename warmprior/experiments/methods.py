@@ -147,7 +147,11 @@ class Method:
                 f"{', '.join(['chunk_length', *known])}"
             ) from error
         defaults = known | {"sigma": self.composition.prior.default_sigma}
-        own = {k: v for k, v in sorted(self.arguments.items()) if v != defaults.get(k)}
+        own = {
+            k: v
+            for k, v in sorted(self.arguments.items())
+            if v is not None and v != defaults.get(k)
+        }
         object.__setattr__(self, "arguments", own)
 
     @classmethod
@@ -164,9 +168,14 @@ class Method:
         name = text.partition(",")[0]
         if name not in METHODS:
             try:
-                name = find(Prior, name).name
+                found = find(Prior, name)
             except ValueError as error:
                 raise ValueError(f"{error}; methods: {', '.join(METHODS)}") from error
+            name = found.name
+            if name in METHODS and METHODS[name].prior is not found:
+                raise ValueError(
+                    f"{found.__name__} has the name of the method {name!r}: set another class attribute name"
+                )
         arguments = options_of(text)
         if sigma is not None and cls.takes(text, "sigma"):
             if "sigma" in arguments:

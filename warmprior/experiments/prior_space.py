@@ -11,6 +11,7 @@ import tyro
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose
 
+from warmprior.diagnostics.flow import sees_history
 from warmprior.envs import GoalNavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.experiments.navigation1d import NAVIGATION_PRESETS
@@ -202,7 +203,9 @@ def _encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
 
 
 def _toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
-    transforms = policy_transforms(actor.prior, observation_steps=1)
+    transforms = policy_transforms(
+        actor.prior, observation_steps=1, see_history=sees_history(actor)
+    )
     transforms.append(PriorAnchor(actor, seed=seed))
     return TransformedEnv(GoalNavigationEnv(batch_size=[num_envs]), transforms)
 

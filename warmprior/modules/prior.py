@@ -15,7 +15,7 @@ from warmprior.history import check_history
 from warmprior.modules.checks import check_finite_numbers
 from warmprior.modules.registry import Registered
 
-__all__ = ["GaussianPrior", "PastPrior", "PreviewPrior", "Prior", "Source"]
+__all__ = ["GaussianPrior", "PastPrior", "PreviewPrior", "Prior", "Source", "checked_mean"]
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class Prior(Registered):
             ValueError: if the history has other lengths than the prior, or :meth:`mean` returns other
                 shapes than it should.
         """
-        loc, warm = self._checked_mean(history)
+        loc, warm = checked_mean(self, history)
         one = torch.ones((), dtype=loc.dtype, device=loc.device)
         loc, scale = torch.where(warm, loc, 0.0), torch.where(warm, self.sigma * one, one)
         return Source(loc, scale, warm, self.correlation)
@@ -184,17 +184,31 @@ class Prior(Registered):
         """
         return self.distribution(history, observation).sample(generator)
 
-    def _checked_mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-        check_history(history, self.history_length, self.prediction_length, self)
-        loc, warm = self.mean(history)
-        actions = history["actions"]
-        expected = (*actions.shape[:-2], self.prediction_length, actions.shape[-1])
-        if loc.shape != expected or warm.shape != (*expected[:-1], 1) or warm.dtype != torch.bool:
-            raise ValueError(
-                f"{type(self).__name__}.mean must return loc {expected} and warm {(*expected[:-1], 1)} of "
-                f"type bool, got {tuple(loc.shape)} and {tuple(warm.shape)} of {warm.dtype}"
-            )
-        return loc.to(actions.dtype), warm
+
+def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """What :meth:`Prior.mean` makes of a history, in the history's precision.
+
+    Raises:
+        KeyError: if an entry of the history is missing.
+        ValueError: if the history has other lengths than the prior, or the mean is not ``loc`` and ``warm``
+            of the shapes that they should have.
+    """
+    check_history(history, prior.history_length, prior.prediction_length, prior)
+    found = prior.mean(history)
+    loc, warm = found if isinstance(found, tuple) and len(found) == 2 else (None, None)
+    actions = history["actions"]
+    expected = (*actions.shape[:-2], prior.prediction_length, actions.shape[-1])
+    if not (isinstance(loc, Tensor) and isinstance(warm, Tensor)):
+        raise ValueError(
+            f"{type(prior).__name__}.mean must return two tensors, loc {expected} and warm "
+            f"{(*expected[:-1], 1)}, got {type(found).__name__}"
+        )
+    if loc.shape != expected or warm.shape != (*expected[:-1], 1) or warm.dtype != torch.bool:
+        raise ValueError(
+            f"{type(prior).__name__}.mean must return loc {expected} and warm {(*expected[:-1], 1)} of "
+            f"type bool, got {tuple(loc.shape)} and {tuple(warm.shape)} of {warm.dtype}"
+        )
+    return loc.to(actions.dtype), warm
 
 
 class GaussianPrior(Prior):

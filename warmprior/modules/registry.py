@@ -71,6 +71,10 @@ class Registered:
         Raises:
             TypeError: if an argument is nothing that JSON can hold.
         """
+        if "name" in self._arguments:
+            raise TypeError(
+                f"{type(self).__name__} takes an argument called name: call it otherwise"
+            )
         try:
             return json.loads(json.dumps({"name": self.name, **self._resolved()}, allow_nan=False))
         except (TypeError, ValueError) as error:

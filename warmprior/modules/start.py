@@ -13,7 +13,8 @@ __all__ = ["StartPoint"]
 class StartPoint(Registered, nn.Module):
     r"""Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
 
-    The flow is trained from the prior's source as ever; at decisions it is entered on the way.
+    The flow is trained from the prior's source as ever; at decisions it is entered on the way. What a point
+    has learnt it has learnt before, and is saved with the policy.
 
     Attributes:
         time: ``s``.

@@ -11,6 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior.io.extras import require
+from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 
@@ -128,11 +129,14 @@ class ReflowCoupling:
 
     def __init__(self, teacher: WarmPriorActor, nfe: int = 9) -> None:
         check_whole_numbers(nfe=nfe)
+        # Its flow alone: from the source at t = 0, whatever its samplers do beside.
+        teacher = teacher.replace(start=None, guidance=None)
         self.teacher, self.nfe = teacher.eval().requires_grad_(False), nfe
 
     def config(self) -> dict[str, Any]:
-        """What it depends on, beside the teacher's weights."""
-        return {"name": "reflow", "nfe": self.nfe}
+        """What it depends on, with a digest of the teacher's weights."""
+        weights = {name: value.tolist() for name, value in self.teacher.state_dict().items()}
+        return {"name": "reflow", "nfe": self.nfe, "teacher": digest_of(weights)}
 
     @torch.no_grad()
     def __call__(

@@ -213,6 +213,11 @@ class FlowMatchingLoss(LossModule):
             weighting=weighting,
             self_distillation=self_distillation,
         )
+        if times == "start" and self.start_time > 0:
+            raise ValueError(
+                "times = 'start' trains the field at t = 0 alone, but the policy starts at "
+                f"{self.start_time}: leave one of them out"
+            )
         if times == "start" and actor_network.ode.max_nfe != 1:
             raise ValueError(
                 "times = 'start' trains the field at t = 0 alone: build the policy with max_nfe=1"

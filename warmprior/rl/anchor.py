@@ -16,6 +16,7 @@ from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.history import check_history, window_history
+from warmprior.modules.prior import Prior, checked_mean
 
 __all__ = ["PriorAnchor", "has_anchor", "residual_sigma", "source_anchor"]
 
@@ -39,13 +40,15 @@ def has_anchor(actor: Any) -> bool:
         [False, True]
     """
     prior, width = actor.prior, getattr(actor.network, "action_dim", None) or 1
-    if actor.start is not None:
+    # A prior without a mean of the history has a source of its own, which moves.
+    if actor.start is not None or type(prior).mean is Prior.mean:
         return True
     chunk, target = (
         torch.zeros(length, width) for length in (prior.history_length, prior.prediction_length)
     )
     steps = torch.tensor([prior.history_length])
-    return bool(prior.mean(window_history(chunk, steps, target, prior.chunk_length))[1].any())
+    history = window_history(chunk, steps, target, prior.chunk_length)
+    return bool(checked_mean(prior, history)[1].any())
 
 
 def source_anchor(

@@ -48,8 +48,8 @@ class PriorDecoder(TensorDictModuleBase):
         noise_key: where the source goes, ``[*B, P, d_a]``.
 
     Raises:
-        ValueError: if ``delta`` is not a finite number > 0, the policy regresses (its field is defined at
-            a single source point) or is guided, or ``nfe`` does not suit it.
+        ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0``
+            alone or is guided, or ``nfe`` does not suit it.
         KeyError: (when called) if an input key is missing.
 
     Examples:

@@ -199,6 +199,11 @@ class BehaviourCloning:
     ) -> None:
         check_saveable(actor)  # before hours are spent on what would be lost
         check_batch(config.batch_size)
+        if actor.start is not None and any(p.requires_grad for p in actor.start.parameters()):
+            raise ValueError(
+                f"{type(actor.start).__name__} is not trained with the flow: train it before, and freeze it "
+                "with requires_grad_(False)"
+            )
         self.actor = actor
         self.config = config
         self.directory = Path(directory)
@@ -270,7 +275,9 @@ class BehaviourCloning:
         self.identity = {
             "config": asdict(config) | {"betas": list(config.betas)},
             "prior": actor.prior.config() | _fixed_identity(actor.prior),
-            "start": None if actor.start is None else actor.start.config(),
+            "start": None
+            if actor.start is None
+            else actor.start.config() | _fixed_identity(actor.start),
             "coupling": _coupling_identity(coupling),
             "network": _network_identity(actor.network),
             "data": _data_digest(data.select(observation_key, ACTION, EPISODE)),

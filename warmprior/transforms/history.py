@@ -181,6 +181,11 @@ class WithheldHistory(Transform):
         history = tensordict.get(keys.HISTORY, None)
         if history is None:
             raise KeyError("WithheldHistory found no history: append it after ActionWindow")
+        if tensordict.get(keys.CONDITIONED, None) is not None:
+            raise ValueError(
+                "the history is in the observation already: put WithheldHistory before HistoryObservation, "
+                "or take withhold= of window_replay_buffer"
+            )
         draw = torch.rand(
             history.batch_size, generator=self.generator, device=history["actions"].device
         )

@@ -1,0 +1,177 @@
+"""What a source, a start point and a coupling must not hide: each was accepted without a word once."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torch import nn
+
+from warmprior import (
+    FlowMatchingLoss,
+    GaussianPrior,
+    PastPrior,
+    PriorAnchor,
+    Source,
+    StartPoint,
+    VelocityMLP,
+    WarmPriorActor,
+    WithheldHistory,
+    window_replay_buffer,
+)
+from warmprior.experiments import Method
+from warmprior.history import advance, cold_history
+from warmprior.modules.prior import Prior
+from warmprior.modules.registry import Registered
+from warmprior.objectives import ReflowCoupling
+from warmprior.rl import has_anchor
+from warmprior.training import BehaviourCloning, TrainingConfig
+
+H, D_A, D_O = 4, 2, 3
+
+
+class FixedStart(StartPoint):
+    name = "tests.fixed-start"
+    time, noise_share = 0.5, 0.5
+
+    def __init__(self) -> None:
+        nn.Module.__init__(self)
+        self.shift = nn.Parameter(torch.zeros(D_A))
+
+    def centre(self, history, observation):
+        return torch.zeros_like(history["forecast"]) + self.shift
+
+    def forward(self, noise, history, observation):
+        return self.centre(history, observation) + self.noise_share * noise
+
+
+class OwnSource(Prior, nn.Module):
+    name = "tests.own-source"
+
+    def __init__(self, chunk_length: int) -> None:
+        nn.Module.__init__(self)
+        super().__init__(chunk_length)
+
+    def distribution(self, history, observation=None):
+        loc = torch.ones_like(history["forecast"])
+        return Source(loc, 0.1 * loc, torch.ones_like(loc[..., :1], dtype=torch.bool))
+
+
+class NoWarm(Prior):
+    name = "tests.no-warm"
+
+    def mean(self, history):
+        return history["actions"]
+
+
+class Impostor(PastPrior):
+    name = "step"
+
+
+def network():
+    return VelocityMLP(D_A, D_O, H, observation_steps=1, hidden_dim=8)
+
+
+def frozen(shift=0.0):
+    start = FixedStart().requires_grad_(False)
+    start.shift.fill_(shift)
+    return start
+
+
+@pytest.fixture
+def data():
+    draws = torch.Generator().manual_seed(0)
+    return TensorDict(
+        {
+            "observation": torch.randn(40, D_O, generator=draws),
+            "action": torch.randn(40, D_A, generator=draws),
+            "episode": torch.arange(40) // 20,
+        },
+        [40],
+    )
+
+
+def cloning(folder, data, **options):
+    actor = WarmPriorActor(network(), GaussianPrior(H), start=options.pop("start", None))
+    config = TrainingConfig(iterations=4, batch_size=8, checkpoints=1, save_every=2)
+    return BehaviourCloning(actor, data, config, folder, observation_steps=1, **options)
+
+
+def test_a_prior_with_the_name_of_another_method_is_refused():
+    with pytest.raises(ValueError, match="Impostor has the name of the method 'step'"):
+        Method.parse(f"{__name__}:Impostor", H)
+
+
+def test_agents_search_around_a_source_that_has_no_mean_of_the_history():
+    actor = WarmPriorActor(network(), OwnSource(H))
+    assert has_anchor(actor) and Method("tests.own-source", H).remembers
+    transform = PriorAnchor(actor)
+    data = transform._call(TensorDict({"history": cold_history([2], H, H, D_A)}, [2]))
+    assert (data["prior", "anchor"] == 1).all()
+
+
+def test_a_mean_that_is_no_pair_is_named():
+    actor = WarmPriorActor(network(), NoWarm(H))
+    history = cold_history([2], H, H, D_A)
+    for call in (lambda: PriorAnchor(actor), lambda: actor.prior.distribution(history)):
+        with pytest.raises(ValueError, match=r"NoWarm.mean must return two tensors.*got Tensor"):
+            call()
+
+
+def test_a_start_point_is_fixed_and_belongs_to_the_training(tmp_path, data):
+    with pytest.raises(ValueError, match=r"FixedStart is not trained with the flow.*freeze it"):
+        cloning(tmp_path / "free", data, start=FixedStart())
+    training = cloning(tmp_path / "one", data, start=frozen())
+    training.step()
+    training._save()
+    with pytest.raises(ValueError, match="start"):
+        cloning(tmp_path / "one", data, start=frozen(1.0))
+    assert cloning(tmp_path / "one", data, start=frozen()).iteration == 1
+
+
+def test_a_resumed_reflow_has_the_teacher_that_it_began_with(tmp_path, data):
+    teachers = [WarmPriorActor(network(), GaussianPrior(H)) for _ in range(2)]
+    training = cloning(tmp_path, data, coupling=ReflowCoupling(teachers[0], nfe=1))
+    training.step()
+    training._save()
+    with pytest.raises(ValueError, match="coupling"):
+        cloning(tmp_path, data, coupling=ReflowCoupling(teachers[1], nfe=1))
+
+
+def test_a_teachers_flow_starts_at_its_source_whatever_its_samplers_do():
+    whole = WarmPriorActor(network(), GaussianPrior(H))
+    a0, a1 = torch.randn(5, H, D_A), torch.zeros(5, H, D_A)
+    seen = torch.randn(5, 1, D_O)
+    expected = ReflowCoupling(whole)(a0, a1, seen)[1]
+    assert torch.equal(ReflowCoupling(whole.replace(start=frozen()))(a0, a1, seen)[1], expected)
+
+
+def test_regression_and_a_start_on_the_way_do_not_go_together():
+    actor = WarmPriorActor(network(), GaussianPrior(H), start=frozen(), max_nfe=1)
+    with pytest.raises(ValueError, match=r"at t = 0 alone, but the policy starts at 0.5"):
+        FlowMatchingLoss(actor, times="start")
+
+
+def test_nothing_is_withheld_behind_the_back_of_a_network_that_has_seen_it(data):
+    buffer = window_replay_buffer(
+        data, PastPrior(H), batch_size=8, observation_steps=1, see_history=True
+    )
+    buffer.append_transform(WithheldHistory(1.0))
+    with pytest.raises(ValueError, match="put WithheldHistory before HistoryObservation"):
+        buffer.sample()
+
+
+def test_no_rows_are_advanced_to_no_rows():
+    none = torch.zeros(0, 1, dtype=torch.int64)
+    moved = advance(cold_history([0], H, H, D_A), torch.zeros(0, H, D_A), none)
+    assert moved["actions"].shape == (0, H, D_A)
+
+
+def test_an_argument_called_name_is_refused():
+    class Thing(Registered): ...
+
+    class Named(Thing):
+        def __init__(self, name): ...
+
+    with pytest.raises(TypeError, match="an argument called name"):
+        Named("x").config()
