@@ -12,7 +12,7 @@ from typing import Any
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
-from warmprior.modules.registry import Registered, find
+from warmprior.modules.registry import find
 
 UNPLAYED = ("episodes", "nfe", "top_k", "play_on", "grid")
 """Options of what is not played."""
@@ -23,7 +23,7 @@ def _policy(args: argparse.Namespace) -> WarmPriorActor:
     from warmprior.training.saved import load_policy
 
     for place in args.prior:
-        find(Registered if ":" in place else Prior, place)
+        find(Prior, place)
     return load_policy(args.folder, revision=args.revision)
 
 
