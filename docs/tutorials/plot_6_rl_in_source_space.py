@@ -97,9 +97,9 @@ colors = dict(zip(policies, ("#7f7f7f", "#1f77b4"), strict=True))
 # agents alike.
 
 
-def make_env(actor, seed):
+def make_env(actor, seed):  # of the simulator; nothing in this one is random
     transforms = policy_transforms(actor.prior, observation_steps=1)
-    transforms.append(PriorAnchor(actor, seed=seed))
+    transforms.append(PriorAnchor(actor))
     return TransformedEnv(
         GoalNavigationEnv((1, 1), batch_size=[32]), transforms
     )

@@ -241,7 +241,7 @@ def test_residuals_around_its_means(policy, prior):
     actor = actor_of(policy("pi05"), prior, nfe=1)
     decoder = PriorDecoder(actor, delta=0.5)
     env = environment(prior)
-    env.append_transform(PriorAnchor(actor, seed=0))
+    env.append_transform(PriorAnchor(actor))
     rollout = env.rollout(3, TensorDictSequential(ResidualSampler(decoder), decoder))
     anchor, executed = rollout["prior", "anchor"], rollout["history", "actions"]
     assert torch.equal(rollout["prior", "noise"], anchor + rollout["prior", "delta"])

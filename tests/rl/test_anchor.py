@@ -64,7 +64,7 @@ def build(place, prior, **options):
     batched = SerialEnv if "serial" in place else partial(ParallelEnv, mp_start_method="fork")
     if place.endswith("outside"):
         return anchored(batched(2, [partial(CountingEnv, n) for n in LENGTHS]), prior, **options)
-    workers = [partial(single, prior, n, seed_offset=i, **options) for i, n in enumerate(LENGTHS)]
+    workers = [partial(single, prior, n, **options) for n in LENGTHS]
     return batched(2, workers)
 
 
@@ -90,7 +90,7 @@ def test_everywhere(place, prior_class, execute):
         data, other = rollouts
         assert torch.equal(data["prior", "anchor"], other["prior", "anchor"])
         env.set_seed(6)
-        torch.manual_seed(0)
+        torch.manual_seed(1)
         new = env.rollout(9, break_when_any_done=False)
         assert not torch.equal(new["prior", "anchor"], data["prior", "anchor"])
         for part in (data, data["next"]):
@@ -211,113 +211,90 @@ def test_one_environment_may_reset_alone():
     assert not torch.equal(data["prior", "anchor"][0], kept[0])
 
 
-def test_workers_with_one_seed_differ_by_offset():
-    env = build("serial-inside", PastPrior(H))
-    env.set_seed(3, static_seed=True)
-    first, second = env.reset()["prior", "anchor"]
-    assert not torch.equal(first, second)
+@pytest.mark.parametrize("prior_class", [PastPrior, PreviewPrior])
+@pytest.mark.parametrize("place", ["serial-outside", "serial-inside"])
+def test_rows_that_rest_keep_their_anchor(place, prior_class):
+    env = build(place, prior_class(H), execute=2)  # not warm after one decision: all of it is noise
+    data = env.rand_action(env.reset())
+    before = data["prior", "anchor"].clone()
+    data["_step"] = torch.tensor([True, False])
+    after = env.step(data)["next", "prior", "anchor"]
+    assert torch.equal(after[1], before[1])
+    assert not torch.isclose(after[0, H - 1], before[0, H - 1]).any()
 
 
-@pytest.mark.parametrize("batched", [partial(ParallelEnv, mp_start_method="fork"), SerialEnv])
-def test_unseeded_environments_differ(batched):
-    """Forked workers begin with one state of PyTorch's generator."""
-    env = batched(2, [partial(single, PastPrior(H), n) for n in LENGTHS])
+def test_a_partial_step_without_the_anchor_is_an_error():
+    env = build("serial-outside", PastPrior(H))
+    data = env.rand_action(env.reset()).exclude(("prior", "anchor"))
+    with pytest.raises(KeyError, match="anchor"):
+        env.step(data.set("_step", torch.tensor([True, False])))
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def test_noise_is_of_the_generator_and_leaves_the_global_one():
+    expected = torch.randn(H, ACTION_DIM, generator=generator(3))
+    env = build("single", PastPrior(H), generator=generator(3))
+    state = torch.get_rng_state()
+    assert torch.equal(env.reset()["prior", "anchor"], expected)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_noise_is_of_the_global_generator_without_one():
+    env = build("single", PastPrior(H))
+    torch.manual_seed(4)
+    anchor = env.reset()["prior", "anchor"]
+    torch.manual_seed(4)
+    assert torch.equal(anchor, torch.randn(H, ACTION_DIM))
+
+
+@pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+def test_a_copy_continues_by_itself(copy_of):
+    env = build("single", PastPrior(H), generator=generator())
+    twin = copy_of(env)
+    drawn = torch.randn(H, ACTION_DIM, generator=generator())
+    assert torch.equal(twin.reset()["prior", "anchor"], drawn)
+    assert torch.equal(env.reset()["prior", "anchor"], drawn)
+
+
+def test_in_spawned_workers():
+    draws = [generator(i) for i in range(2)]
+    workers = [
+        partial(single, PastPrior(H), n, generator=g) for n, g in zip(LENGTHS, draws, strict=True)
+    ]
+    env = ParallelEnv(2, workers, mp_start_method="spawn")
     try:
-        first, second = env.reset()["prior", "anchor"]
-        assert not torch.equal(first, second)
+        anchor = env.reset()["prior", "anchor"]
+        expected = [torch.randn(H, ACTION_DIM, generator=generator(i)) for i in range(2)]
+        assert torch.equal(anchor, torch.stack(expected))
     finally:
         env.close()
 
 
-def test_an_unseeded_anchor_follows_the_global_generator():
-    anchors = []
-    for _ in range(2):
-        torch.manual_seed(4)
-        anchors.append(build("single", PastPrior(H)).reset()["prior", "anchor"])
-    assert torch.equal(*anchors)
-
-
-def test_global_generator_is_not_used_after_a_seed():
-    env = build("single", PastPrior(H), seed=0)
-    torch.manual_seed(0)
-    state = torch.get_rng_state()
-    env.reset()
-    assert torch.equal(torch.get_rng_state(), state)
-
-
-def test_set_seed_still_returns_the_next_seed():
-    env = build("serial-outside", PastPrior(H))
-    base = SerialEnv(2, [partial(CountingEnv, n) for n in LENGTHS])
-    assert env.set_seed(3) == base.set_seed(3)
-    assert env.set_seed(3, static_seed=True) == 3
-
-
-def test_nested_and_extended_environments_are_seeded():
-    anchors = []
-    for wrap in (False, True):
-        env = build("serial-outside", PastPrior(H))
-        if wrap:
-            env = TransformedEnv(env, Compose(), auto_unwrap=False)
-        env.set_seed(8)
-        anchors.append(env.reset()["prior", "anchor"])
-    late = TransformedEnv(SerialEnv(2, [partial(CountingEnv, n) for n in LENGTHS]))
-    for transform in (*history(PastPrior(H)), PriorAnchor(actor_for(PastPrior(H)))):
-        late.append_transform(transform)
-    late.set_seed(8)
-    anchors.append(late.reset()["prior", "anchor"])
-    assert torch.equal(anchors[0], anchors[1]) and torch.equal(anchors[0], anchors[2])
-
-
-def test_every_anchor_of_an_environment_is_seeded():
-    prior = PastPrior(H)
-    anchors = [PriorAnchor(actor_for(prior), seed_offset=i, anchor_key=str(i)) for i in range(2)]
-    env = TransformedEnv(CountingEnv(7), Compose(*history(prior), *anchors))
-    env.set_seed(4)
-    first = env.reset()
-    env.set_seed(4)
-    again = env.reset()
-    assert torch.equal(first["0"], again["0"]) and torch.equal(first["1"], again["1"])
-    assert not torch.equal(first["0"], first["1"])
-
-
-def test_a_detached_anchor_hears_no_seed():
-    env = build("single", PastPrior(H))
-    env.set_seed(4)
-    expected = env.reset()["prior", "anchor"]
-    env.set_seed(4)
-    anchor = env.transform[-1]
-    env.transform = Compose(*history(PastPrior(H)))
-    assert env.set_seed(5) == CountingEnv(LENGTHS[0]).set_seed(5)
-    env.append_transform(anchor)
-    assert torch.equal(env.reset()["prior", "anchor"], expected)
-
-
-@pytest.mark.parametrize("copy_of", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
-def test_a_copy_is_seeded_by_itself(copy_of):
-    env = build("single", PastPrior(H))
-    env.set_seed(4)
-    expected = env.reset()["prior", "anchor"]
-    env.set_seed(4)
-    twin = copy_of(env)
-    twin.set_seed(5)
-    assert not torch.equal(twin.reset()["prior", "anchor"], expected)
-    assert torch.equal(env.reset()["prior", "anchor"], expected)
-    del env
-    twin.set_seed(4)
-    assert torch.equal(twin.reset()["prior", "anchor"], expected)
-
-
-def test_a_clone_draws_by_itself():
-    """Transforms are cloned into evaluation environments: what these draw must not reach the training."""
-    env = build("single", PastPrior(H))
-    env.set_seed(4)
-    expected = env.reset()["prior", "anchor"]
-    env.set_seed(4)
-    twin = TransformedEnv(CountingEnv(LENGTHS[0]), env.transform.clone())
-    assert torch.equal(twin.reset()["prior", "anchor"], expected)  # it goes on from the same state
-    twin.set_seed(5)
-    assert not torch.equal(twin.reset()["prior", "anchor"], expected)
-    assert torch.equal(env.reset()["prior", "anchor"], expected)
+@pytest.mark.parametrize(
+    ("batched", "seeds"),
+    [
+        (SerialEnv, False),
+        (partial(ParallelEnv, mp_start_method="fork"), True),
+        (partial(ParallelEnv, mp_start_method="fork", use_buffers=False), False),
+    ],
+)
+def test_what_torchrl_seeds(batched, seeds):
+    """The global generators of a ParallelEnv's workers: what the docstring says."""
+    env = batched(2, [partial(single, PastPrior(H), n) for n in LENGTHS])
+    try:
+        env.reset()
+        state = torch.get_rng_state()
+        env.set_seed(5, static_seed=True)
+        assert torch.equal(torch.get_rng_state(), state)
+        anchor = env.reset()["prior", "anchor"]
+        torch.manual_seed(5)
+        expected = torch.randn(H, ACTION_DIM)
+        assert all(torch.equal(row, expected) == seeds for row in anchor)
+    finally:
+        env.close()
 
 
 def test_in_a_collector():

@@ -79,7 +79,7 @@ def environment(policy: WarmPriorActor, seed: int = 0) -> TransformedEnv:
     inner = SerialEnv(2, [lambda base=base: base for base in bases])
     transforms = policy_transforms(policy.prior, observation_steps=1)
     encode = EncodeObservation(policy)
-    return TransformedEnv(inner, Compose(transforms, encode, PriorAnchor(policy, seed=seed)))
+    return TransformedEnv(inner, Compose(transforms, encode, PriorAnchor(policy)))
 
 
 def test_features_are_those_of_the_policy_in_evaluation_mode(policy):

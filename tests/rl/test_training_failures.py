@@ -229,7 +229,7 @@ def test_a_killed_worker_ends_the_training(tmp_path):
 
     def mortal(seed):
         transforms = partial(policy_transforms, actor.prior, observation_steps=1)
-        env = TransformedEnv(parallel_env(MortalEnv, transforms, 2), PriorAnchor(actor, seed=seed))
+        env = TransformedEnv(parallel_env(MortalEnv, transforms, 2), PriorAnchor(actor))
         env.set_seed(seed or EVALUATION_SEED, static_seed=True)
         return env
 

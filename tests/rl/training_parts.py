@@ -67,7 +67,7 @@ def make_env(seed, actor=None, truncate=True, hook=None, device="cpu", **chunkin
         see_history=actor.in_keys[0] == keys.CONDITIONED,
         **chunking,
     )
-    transforms.append(PriorAnchor(actor, seed=seed))
+    transforms.append(PriorAnchor(actor))
     return TransformedEnv(SerialEnv(2, [lambda base=base: base for base in bases]), transforms)
 
 

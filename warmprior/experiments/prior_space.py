@@ -202,11 +202,11 @@ def _encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
     return [EncodeObservation(actor)] if getattr(actor.network, "encodes", False) else []
 
 
-def _toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
+def _toy(actor: WarmPriorActor, num_envs: int, _seed: int) -> EnvBase:
     transforms = policy_transforms(
         actor.prior, observation_steps=1, see_history=sees_history(actor)
     )
-    transforms.append(PriorAnchor(actor, seed=seed))
+    transforms.append(PriorAnchor(actor))
     return TransformedEnv(GoalNavigationEnv(batch_size=[num_envs]), transforms)
 
 
@@ -215,7 +215,7 @@ def _simulators(
 ) -> EnvBase:
     # Outside of the workers: one anchor draws for all of them, and one encoder serves them.
     workers = parallel_env(make_env, make_transforms, num_envs)
-    env = TransformedEnv(workers, Compose(*_encoding(actor), PriorAnchor(actor, seed=seed)))
+    env = TransformedEnv(workers, Compose(*_encoding(actor), PriorAnchor(actor)))
     env.set_seed(seed, static_seed=True)
     return env
 

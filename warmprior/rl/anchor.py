@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import multiprocessing
-import random
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -17,6 +15,7 @@ from torchrl.envs.transforms import Transform
 from warmprior import keys
 from warmprior.history import check_history, window_history
 from warmprior.modules.prior import Prior, checked_mean
+from warmprior.transforms.inner_step import keep_resting
 
 __all__ = ["PriorAnchor", "has_anchor", "residual_sigma", "source_anchor"]
 
@@ -114,10 +113,14 @@ class PriorAnchor(Transform):
 
     Append it after :class:`ActionHistory`, inside or outside of batched environments.
 
+    Rows that rest in a partial step keep their anchor.
+
     .. note::
-        ``env.set_seed`` seeds the noise too. Workers of a batched environment that all get the same seed
-        (``static_seed=True``) need different ``seed_offset``; outside of the workers one
-        transform draws for all of them.
+        ``env.set_seed`` seeds simulators. Of PyTorch's global generator, the noise's source by default,
+        TorchRL seeds that of each worker of a ``ParallelEnv`` (not with ``use_buffers=False``) and of a
+        ``MultiCollector``, and never that of your own process: call ``torch.manual_seed``. Workers without a
+        seed, or with one for all (``static_seed=True``), draw alike: append the transform outside of
+        them, where one draws for all.
 
     Args:
         actor: the policy. What its prior has learnt is copied, as it is now: the copy goes where the
@@ -127,10 +130,8 @@ class PriorAnchor(Transform):
         cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise where there
             is an anchor (:func:`~warmprior.rl.has_anchor`) and zero elsewhere, which gives vanilla DSRL:
             :math:`a_0 = \Delta`.
-        seed: of the noise until ``env.set_seed`` is called. By default it is drawn from PyTorch's global
-            generator with the first noise, and differs between the workers of a batched environment,
-            whose generators are alike.
-        seed_offset: mixed with the seed.
+        generator: source of the noise, on the CPU: one seed gives one noise on every device. PyTorch's
+            global one by default. A copy of the environment, in a worker too, continues from its state.
         anchor_key: where the anchor is written, ``[*B, P, d_a]``.
 
     Raises:
@@ -159,8 +160,7 @@ class PriorAnchor(Transform):
         actor: Any,
         *,
         cold: Literal["noise", "zero"] | None = None,
-        seed: int | None = None,
-        seed_offset: int = 0,
+        generator: torch.Generator | None = None,
         anchor_key: NestedKey = keys.ANCHOR,
     ) -> None:
         super().__init__(in_keys=list(actor.in_keys), out_keys=[anchor_key])
@@ -174,67 +174,14 @@ class PriorAnchor(Transform):
         self.moves = has_anchor(actor)
         self.cold = cold or ("noise" if self.moves else "zero")
         self.observation_key = actor.in_keys[0]
-        self.seed_offset = seed_offset
+        self.generator = generator
         self.anchor_key = unravel_key(anchor_key)
-        self.generator: torch.Generator | None = None
-        if seed is not None:
-            self.set_seed(seed)
-
-    def set_seed(self, seed: int | str) -> None:
-        """Start the noise again from a seed; ``env.set_seed`` calls it.
-
-        Args:
-            seed: anything that has one text; mixed with ``seed_offset``.
-        """
-        state = random.Random(f"{seed}/{self.seed_offset}").getrandbits(62)
-        self.generator = torch.Generator().manual_seed(state)
-
-    def clone(self) -> Self:
-        """A copy without environment, whose noise continues by itself."""
-        twin = super().clone()
-        if self.generator is not None:
-            twin.generator = self.generator.clone_state()
-        return twin
-
-    def _environment(self) -> Any:
-        try:
-            return self.container
-        except ValueError:  # of a chain that has none yet
-            return None
-
-    def set_container(self, container: Any) -> None:
-        """Attach the transform, and have it told the seeds that its environment is given."""
-        super().set_container(container)
-        env = self._environment()
-        if env is not None:
-            # TorchRL hands seeds to the base environment alone. A method is copied with its object, so that
-            # copies of the environment seed themselves.
-            env.__dict__["set_seed"] = self._set_env_seed
-
-    def reset_parent(self) -> None:
-        """Detach the transform, whose environment gets its own ``set_seed`` back."""
-        env = self._environment()
-        if env is not None:
-            env.__dict__.pop("set_seed", None)
-        super().reset_parent()
-
-    def _set_env_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
-        env = self._environment()
-        if seed is not None:
-            for transform in env.transform.modules():
-                if isinstance(transform, PriorAnchor):
-                    transform.set_seed(seed)
-        return type(env).set_seed(env, seed, static_seed=static_seed)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         history = next_tensordict.get(keys.HISTORY, None)
         check_history(history, self.prior.history_length, self.prior.prediction_length, self.prior)
         forecast = history["forecast"]
         if self.cold == "noise":
-            if self.generator is None:
-                drawn = int(torch.randint(2**62, ()))
-                self.set_seed(f"{drawn}/{multiprocessing.current_process().name}")
-            # Drawn on the CPU: one seed gives one noise on every device.
             cold = torch.randn(forecast.shape, generator=self.generator, dtype=forecast.dtype)
             cold = cold.to(forecast.device)
         else:
@@ -247,6 +194,9 @@ class PriorAnchor(Transform):
                 )
             anchor = torch.where(known, mean, cold)
         return next_tensordict.set(self.anchor_key, anchor)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return keep_resting(tensordict, self._call(next_tensordict), [self.anchor_key])
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

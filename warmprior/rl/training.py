@@ -78,7 +78,7 @@ class PriorSpaceTraining:
         >>> actor = WarmPriorActor(network, PastPrior(8))
         >>> def make_env(seed):
         ...     transforms = policy_transforms(actor.prior, observation_steps=1)
-        ...     transforms.append(PriorAnchor(actor, seed=seed))
+        ...     transforms.append(PriorAnchor(actor))
         ...     return TransformedEnv(GoalNavigationEnv((1, 1), batch_size=[2]), transforms)
         >>> config = PriorSpaceConfig(
         ...     environment_steps=40, warmup_steps=20, evaluate_every=40, evaluation_episodes=2,

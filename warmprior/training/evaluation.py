@@ -177,13 +177,12 @@ def watched(env: EnvBase) -> Iterator[None]:
 
 @contextmanager
 def _acting(policy: TensorDictModuleBase, seed: int, nfe: int | None) -> Iterator[Act]:
-    """A policy that draws from a seed, while all other draws stay as they were."""
+    """A policy that draws from a seed, and so do environments; later draws stay as they were."""
     options: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
     device = _device(policy)
     if "generator" in inspect.signature(policy.forward).parameters:
         options["generator"] = torch.Generator(device).manual_seed(seed)
-        yield lambda data: policy(data, **options)
-        return
+        seed ^= 1  # environments draw something else
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
         yield lambda data: policy(data, **options)
@@ -305,9 +304,9 @@ def evaluate(
         episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
         first_seed: seed of the first episode; keep it away from the data's seeds.
         nfe: network evaluations per chunk of a :class:`~warmprior.WarmPriorActor`; its own by default.
-        policy_seed: of the policy's random draws: those of one that takes a ``generator``, such as a
-            :class:`~warmprior.WarmPriorActor`, or those that another module takes from PyTorch's global
-            generator. The latter goes on afterwards as if nothing had been played.
+        policy_seed: of what is drawn in this process: by a policy that takes a ``generator``, such as a
+            :class:`~warmprior.WarmPriorActor`, and by what draws from PyTorch's global generator. The latter
+            goes on afterwards as if nothing had been played.
         description: of the progress bar; no bar if ``None``.
 
     Returns:

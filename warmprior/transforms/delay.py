@@ -13,6 +13,7 @@ from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.modules.real_time_chunking import with_leftover
+from warmprior.transforms.inner_step import keep_resting
 
 __all__ = ["InferenceDelay", "check_delay", "executed_chunk"]
 
@@ -149,15 +150,11 @@ class InferenceDelay(Transform):
         executed = next_tensordict.get(self.executed_key)
         if (executed > self.execute).any():
             raise RuntimeError(
-                f"a decision executed {int(executed.max())} actions, and InferenceDelay was told "
+                f"a decision executed {int(executed.max())} actions, and InferenceDelay has "
                 f"execute={self.execute}: give it the number that ChunkStep has"
             )
-        delay = torch.full_like(executed, self.delay)
-        rows = tensordict.get("_step", None)
-        if rows is not None:  # a partial step: the others were not asked
-            asked = rows.view(next_tensordict.batch_size).unsqueeze(-1)
-            delay = torch.where(asked, delay, tensordict.get(keys.DELAY))
-        return next_tensordict.set(keys.DELAY, delay)
+        next_tensordict.set(keys.DELAY, torch.full_like(executed, self.delay))
+        return keep_resting(tensordict, next_tensordict, [keys.DELAY])
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, expand_as_right, unravel_key
+from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
@@ -12,6 +12,7 @@ from torchrl.envs.transforms import Transform
 from warmprior import keys
 from warmprior.history import ENTRIES, advance, cold_history, without
 from warmprior.modules.checks import check_finite_numbers
+from warmprior.transforms.inner_step import keep_resting
 
 __all__ = ["ActionHistory", "WithheldHistory"]
 
@@ -87,15 +88,10 @@ class ActionHistory(Transform):
                 f"ActionHistory found no {self.executed_key!r} after the step: append it after ChunkStep"
             )
         moved = advance(history, tensordict.get(self.chunk_key), executed)
-        rows = tensordict.get("_step", None)
         for name in ENTRIES:
-            value, before = moved[name], history[name]
-            if rows is not None:
-                # A partial step: the others were not asked, and what lies in their chunk was not executed.
-                asked = expand_as_right(rows.view(next_tensordict.batch_size), before)
-                value = torch.where(asked, value, before)
-            next_tensordict.set((keys.HISTORY, name), value)
-        return next_tensordict
+            next_tensordict.set((keys.HISTORY, name), moved[name])
+        # The others' chunks were not executed.
+        return keep_resting(tensordict, next_tensordict, HISTORY_KEYS)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
-__all__ = ["InnerStep", "rows_where", "set_aside"]
+__all__ = ["InnerStep", "keep_resting", "rows_where", "set_aside"]
 
 KEPT = "_kept"
 """Where :func:`set_aside` puts observations, at the root of a step's input."""
@@ -114,6 +114,27 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
             # Entries nested under the key may have been set aside before.
             kept.update(tensordict.select(key))
             tensordict.del_(key)
+
+
+def keep_resting(
+    tensordict: TensorDictBase, next_tensordict: TensorDictBase, names: Iterable[NestedKey]
+) -> TensorDictBase:
+    """Put back, after a partial step, what the rows had that were not asked to step.
+
+    Args:
+        tensordict: the step's input, ``[*B]``.
+        next_tensordict: what a transform made of all rows, changed in place.
+        names: of the entries that it wrote.
+
+    Raises:
+        KeyError: if a partial step's input lacks one.
+    """
+    rows = tensordict.get("_step", None)
+    for name in names if rows is not None else ():
+        before, after = tensordict[name], next_tensordict[name]
+        asked = expand_as_right(rows.view(next_tensordict.batch_size), after)
+        next_tensordict.set(name, torch.where(asked, after, before))
+    return next_tensordict
 
 
 def rows_where(mask: Tensor, new: TensorDictBase, old: TensorDictBase) -> TensorDictBase:
