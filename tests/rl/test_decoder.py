@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.envs import Compose, TransformedEnv
+from torchrl.modules.models.utils import _reset_parameters_recursive
 
 from tests.toy_env import ACTION_DIM, CountingEnv, random_history
 from warmprior import (
@@ -109,6 +110,12 @@ def unchanged(module, before):
     return before.keys() == after.keys() and all(torch.equal(before[k], after[k]) for k in before)
 
 
+@torch.no_grad()
+def zero(module):
+    for tensor in (*module.parameters(recurse=False), *module.buffers(recurse=False)):
+        tensor.zero_()
+
+
 @pytest.mark.parametrize("network", ["mlp", "transformer"])
 def test_nothing_can_change_the_decoder(network):
     prior = PastPrior(H)
@@ -128,6 +135,9 @@ def test_nothing_can_change_the_decoder(network):
     assert not any(module.training for module in decoder.modules())
     assert not list(decoder.parameters()) and not any(b.requires_grad for b in decoder.buffers())
     policy.reset_parameters_recursive()
+    _reset_parameters_recursive(policy)  # TorchRL's other one
+    policy.apply(zero)  # PyTorch's way to draw initial weights
+    assert not any("reset_parameters" in vars(module) for module in decoder.modules())
     optimizer = torch.optim.SGD(policy.parameters(), lr=1.0)
     chunk = policy(batch(prior, 4))["vla_action", "chunk"]
     assert not chunk.requires_grad
@@ -176,7 +186,11 @@ def test_copies_and_devices():
     assert torch.equal(
         decoder(data.clone())["vla_action", "chunk"], again(data.clone())["vla_action", "chunk"]
     )
-    assert all(value.device.type == "meta" for value in again.to("meta").state_dict().values())
+    moved = TensorDictSequential(again.double()).to("meta").state_dict()
+    assert moved.keys() == {f"module.0.{key}" for key in decoder.state_dict()}
+    assert all(value.device.type == "meta" for value in moved.values())
+    assert {value.dtype for value in moved.values()} == {torch.float64}
+    assert {value.dtype for value in decoder.state_dict().values()} == {torch.float32}
 
 
 def test_gradient_of_the_residual_by_finite_differences():

@@ -116,11 +116,10 @@ class PriorAnchor(Transform):
     Rows that rest in a partial step keep their anchor.
 
     .. note::
-        ``env.set_seed`` seeds simulators. Of PyTorch's global generator, the noise's source by default,
-        TorchRL seeds that of each worker of a ``ParallelEnv`` (not with ``use_buffers=False``) and of a
-        ``MultiCollector``, and never that of your own process: call ``torch.manual_seed``. Workers without a
-        seed, or with one for all (``static_seed=True``), draw alike: append the transform outside of
-        them, where one draws for all.
+        ``env.set_seed`` seeds simulators. TorchRL seeds PyTorch's global generator with it in the workers of
+        a ``ParallelEnv`` (not with ``use_buffers=False``) and of a ``MultiCollector``, and nowhere else: in
+        your own process call ``torch.manual_seed``. Workers without a seed, or with one for all
+        (``static_seed=True``), draw alike: append the transform outside of them, where one draws for all.
 
     Args:
         actor: the policy. What its prior has learnt is copied, as it is now: the copy goes where the

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Iterator
 
 import torch
 from tensordict import TensorDictBase
@@ -31,9 +32,10 @@ class PriorDecoder(TensorDictModuleBase):
     `DSRL <https://arxiv.org/abs/2506.15799>`_.
 
     Place it behind the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
-    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` on a copy of the policy's network whose
-    parameters have become buffers. So it is never in ``parameters()`` of whatever contains it, cannot be
-    switched to training mode, unfrozen or re-initialised, and does not change when the policy does.
+    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` on a copy of the policy's network, in
+    evaluation mode, whose parameters have become buffers. They move and are saved with it, and are never in
+    ``parameters()`` of whatever contains it. ``children()`` is empty: PyTorch and TorchRL walk through
+    these to switch to training mode, apply a function or draw new weights.
 
     Args:
         actor: the policy; copied. Or what has its parts, such as :class:`~warmprior.lerobot.LeRobotActor`.
@@ -116,7 +118,7 @@ class PriorDecoder(TensorDictModuleBase):
 
     @property
     def action_dim(self) -> int | None:
-        """``d_a``, or ``None`` if the network does not tell."""
+        """``d_a``, or ``None`` if the network does not say."""
         return getattr(self.ode.network, "action_dim", None)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -170,9 +172,20 @@ class PriorDecoder(TensorDictModuleBase):
                 f"predicts {expected}"
             )
 
+    def named_children(self) -> Iterator[tuple[str, nn.Module]]:
+        """None: what changes a policy from outside stops here."""
+        return iter(())
+
     def train(self, mode: bool = True) -> PriorDecoder:
         """Stays in evaluation mode."""
         return super().train(False)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PriorDecoder:
+        # Moves to another device or type, which walk through the children as well.
+        for part in self._modules.values() if recurse else ():
+            if part is not None:
+                part._apply(fn)
+        return super()._apply(fn, recurse)
 
 
 def _freeze(module: nn.Module) -> None:
@@ -183,11 +196,4 @@ def _freeze(module: nn.Module) -> None:
             buffer = frozen.setdefault(id(parameter), parameter.detach())
             delattr(child, name)
             child.register_buffer(name, buffer)
-        # TorchRL's losses and modules draw new weights for all they reach.
-        if hasattr(child, "reset_parameters"):
-            child.__dict__["reset_parameters"] = _keep_weights
-    module.train(False)
-
-
-def _keep_weights() -> None:
-    """Stands for ``reset_parameters``."""
+        child.train(False)
