@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
 import shutil
+import sys
 from importlib.metadata import version
 
 import pytest
@@ -12,7 +14,7 @@ import pytest
 from tests.data.synthetic import write_robomimic_file
 from tests.io.hub_server import TOKEN, model_hub
 from tests.processes import apart
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from warmprior import PastPrior, StartPoint, VelocityMLP, WarmPriorActor
 from warmprior.__main__ import main
 from warmprior.training.saved import save_policy
 
@@ -137,7 +139,34 @@ def test_version(capsys):
     assert capsys.readouterr().out == f"warmprior {version('warmprior')}\n"
 
 
-def test_info_tells_who_wrote_it(saved, tmp_path, capsys):
+STARTS = """
+import torch
+from warmprior import StartPoint
+
+class Middle(StartPoint):
+    name = "tests.middle"
+    time, noise_share = 0.5, 0.5
+
+    def centre(self, history, observation):
+        return torch.zeros_like(history["forecast"])
+"""
+
+
+def test_info_of_a_policy_with_parts_of_ones_own(tmp_path, capsys, monkeypatch):
+    (tmp_path / "my_starts.py").write_text(STARTS)
+    monkeypatch.syspath_prepend(tmp_path)
+    start = importlib.import_module("my_starts").Middle()
+    network = VelocityMLP(7, 19, 8, hidden_dim=8)
+    save_policy(WarmPriorActor(network, PastPrior(8), start=start), tmp_path / "policy")
+    del sys.modules["my_starts"], StartPoint._classes["tests.middle"]
+    assert main(["info", str(tmp_path / "policy")]) == 2
+    assert "unknown startpoint 'tests.middle'" in capsys.readouterr().err
+    assert main(["info", str(tmp_path / "policy"), "--import", "my_starts"]) == 0
+    assert "start        Middle()" in capsys.readouterr().out
+    del StartPoint._classes["tests.middle"]
+
+
+def test_info_says_who_wrote_it(saved, tmp_path, capsys):
     """A policy of an earlier version is read, and is not said to be of this one."""
     folder = tmp_path / "earlier"
     shutil.copytree(saved[0], folder)
@@ -151,7 +180,7 @@ def test_info_tells_who_wrote_it(saved, tmp_path, capsys):
     assert "written by   warmprior 0.1.0, format 4" in capsys.readouterr().out
 
 
-def test_what_a_user_can_mend_is_told_in_one_line(saved, tmp_path, capsys):
+def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
     bare = tmp_path / "bare"
     network = VelocityMLP(7, 19, 8, hidden_dim=8)
     save_policy(WarmPriorActor(network, PastPrior(8)), bare)
@@ -161,12 +190,12 @@ def test_what_a_user_can_mend_is_told_in_one_line(saved, tmp_path, capsys):
         (["evaluate", str(saved[0]), "--nfe", "0"], "nfe"),
         (["evaluate", str(saved[0]), "--grid", "sparse"], "unknown grid 'sparse'"),
         (["evaluate", str(saved[0]), "--episodes", "0"], "episodes must be at least 1"),
-        (["evaluate", str(saved[0]), "--prior", "no.such:Prior"], "no prior at no.such:Prior"),
+        (["evaluate", str(saved[0]), "--import", "no.such"], "No module named 'no'"),
         (["info", str(tmp_path / "missing")], "no policy at"),
     ):
         assert main(argv) == 2
-        told = capsys.readouterr().err
-        assert message in told and told.startswith("warmprior: error: ") and told.count("\n") == 1
+        said = capsys.readouterr().err
+        assert message in said and said.startswith("warmprior: error: ") and said.count("\n") == 1
 
 
 def test_train(tmp_path, capsys):

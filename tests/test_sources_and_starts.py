@@ -102,6 +102,20 @@ def test_a_prior_with_the_name_of_another_method_is_refused():
         Method.parse(f"{__name__}:Impostor", H)
 
 
+BASES = {
+    "Prior": "warmprior.modules.prior",
+    "LearnedPrior": "warmprior.experiments.learned_sources",
+}
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_a_base_class_is_no_method(base):
+    with pytest.raises(ValueError, match=f"unknown prior '{base}'"):
+        Method.parse(base, H)
+    with pytest.raises(ValueError, match="is no prior that can be built"):
+        Method.parse(f"{BASES[base]}:{base}", H)
+
+
 def test_agents_search_around_a_source_that_has_no_mean_of_the_history():
     actor = WarmPriorActor(network(), OwnSource(H))
     assert has_anchor(actor) and Method("tests.own-source", H).remembers

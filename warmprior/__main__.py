@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib
 import sys
 from collections.abc import Callable
 from importlib.metadata import version
@@ -11,8 +12,6 @@ from typing import Any
 
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
-from warmprior.modules.registry import find
 
 UNPLAYED = ("episodes", "nfe", "top_k", "play_on", "grid")
 """Options of what is not played."""
@@ -22,8 +21,8 @@ def _policy(args: argparse.Namespace) -> WarmPriorActor:
     import warmprior.experiments.learned_sources  # noqa: F401  # imported, they can be loaded by name
     from warmprior.training.saved import load_policy
 
-    for place in args.prior:
-        find(Prior, place)
+    for module in args.modules:
+        importlib.import_module(module)
     return load_policy(args.folder, revision=args.revision)
 
 
@@ -182,11 +181,12 @@ def make_parser() -> argparse.ArgumentParser:
             add("--dry-run", action="store_true", help="print the card, and send nothing")
         add("--revision", help="branch, tag or commit of the repository (default: main)")
         add(
-            "--prior",
+            "--import",
+            dest="modules",
             action="append",
             default=[],
-            metavar="MODULE:CLASS",
-            help="where to import a prior of your own from; may be repeated",
+            metavar="MODULE",
+            help="where your own prior, start point or network is defined; may be repeated",
         )
     from warmprior.envs.tasks import EVALUATION_SEED, TASKS
 

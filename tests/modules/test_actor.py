@@ -166,4 +166,8 @@ def test_what_is_replaced_and_what_stays():
     assert again.start is actor.start and again.ode.clip == [0.1, 0.2]
     # What was not chosen follows from the rest, and what was stays.
     assert actor.replace(max_nfe=1).ode.nfe == 1
+    four = actor.replace(nfe=4)  # as of a saved policy, whose number was chosen
+    assert four.replace(max_nfe=1).ode.nfe == 1 and four.replace(max_nfe=8).ode.nfe == 4
+    with pytest.raises(ValueError, match="at most 1 network evaluation"):
+        four.replace(max_nfe=1, nfe=4)
     assert actor.replace(nfe=4).replace(prior=GaussianPrior(H)).ode.nfe == 4

@@ -165,7 +165,14 @@ def test_arguments_without_names_are_refused():
 def test_found_by_name_or_place():
     place = f"{__name__}:Anchor"
     assert find(Prior, "anchor-of-the-tests") is find(Prior, place) is Anchor
-    for wrong in ("nothing", "no.such.module:Anchor", f"{__name__}:Missing", f"{__name__}:data"):
+    for wrong in (
+        "nothing",
+        "no.such.module:Anchor",
+        f"{__name__}:Missing",
+        f"{__name__}:data",
+        "Prior",
+        "warmprior.modules.prior:Prior",
+    ):
         with pytest.raises(ValueError, match="prior"):
             find(Prior, wrong)
     # A file may name a prior, but never a place to import.

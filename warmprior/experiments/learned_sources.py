@@ -150,7 +150,7 @@ class Learner(nn.Module):
         return out.unflatten(-1, (self.chunk_length, self.action_dim))
 
 
-class LearnedPrior(PastPrior, Learner):
+class LearnedPrior(PastPrior, Learner, abstract=True):
     """A learned source around which agents can search: warm where the network is, that is everywhere.
 
     Args:

@@ -120,7 +120,7 @@ class WarmPriorActor(TensorDictModuleBase):
         self.normalizer = normalizer
         self.environment = environment
         guided = [] if guidance is None else [keys.DELAY]
-        self.in_keys = [observation_key, *self.sampler.in_keys, *guided]
+        self.in_keys = list(dict.fromkeys([observation_key, *self.sampler.in_keys, *guided]))
         self.out_keys = [*self.sampler.out_keys, *self.ode.out_keys]
 
     @property
@@ -170,7 +170,7 @@ class WarmPriorActor(TensorDictModuleBase):
 
         Args:
             changes: constructor arguments, such as ``nfe`` and ``generator`` where a policy is handed to
-                what calls it, or another ``network``.
+                what calls it, or another ``network``. A smaller ``max_nfe`` lowers ``nfe``.
 
         Examples:
             >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -197,4 +197,7 @@ class WarmPriorActor(TensorDictModuleBase):
             "chunk_key": self.chunk_key,
             "path_key": ode.path_key,
         }
-        return type(self)(**(mine | changes))
+        options = mine | changes
+        if "nfe" not in changes and ode.nfe > (options["max_nfe"] or ode.nfe):
+            options["nfe"] = None
+        return type(self)(**options)

@@ -19,7 +19,8 @@ _NEXT_OPTION = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
 class Registered:
     """A class whose subclasses are known by name, and whose objects remember their constructor's arguments.
 
-    A class that derives from this one directly has a registry of its own.
+    A class that derives from this one directly has a registry of its own. It is in none itself, as are
+    subclasses with ``abstract=True`` behind their bases.
 
     Raises:
         ValueError: when a subclass takes the name of another, or one that no file can have.
@@ -38,10 +39,12 @@ class Registered:
     _classes: ClassVar[dict[str, type[Any]]]
     _arguments: dict[str, Any]
 
-    def __init_subclass__(cls, **kwargs: Any) -> None:
+    def __init_subclass__(cls, *, abstract: bool = False, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
         if Registered in cls.__bases__:
             cls._classes = {}
+            return
+        if abstract:
             return
         cls.name = cls.__dict__.get("name", cls.__name__)
         if not re.fullmatch(r"[\w.+-]+", cls.name):
@@ -132,8 +135,8 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"there is no {base.__name__.lower()} at {name}: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, base)):
-        raise ValueError(f"{name} is no subclass of {base.__name__}")
+    if found not in base._classes.values():
+        raise ValueError(f"{name} is no {base.__name__.lower()} that can be built")
     return found
 
 

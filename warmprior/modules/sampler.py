@@ -25,8 +25,8 @@ class PriorSampler(TensorDictModuleBase):
 
     Keyword Args:
         start: the point from which samplers start, if that is not the source itself.
-        observation_key: key of the observation, ``[*B, To, d_o]``; without one the prior is given none,
-            as the paper's sources need none.
+        observation_key: key of the observation, ``[*B, To, d_o]``, which only a start point, or a prior that
+            overrides :meth:`~Prior.distribution`, is given.
         noise_key: key written, ``[*B, P, d_a]``.
         generator: source of randomness; PyTorch's global generator by default. Per call:
             ``sampler(data, generator=...)``.
@@ -64,8 +64,10 @@ class PriorSampler(TensorDictModuleBase):
         self.prior = prior
         self.start = start
         self.generator = generator
-        self.observation_key = observation_key
-        self.in_keys = [(keys.HISTORY, name) for name in ENTRIES]
+        reads = start is not None or type(prior).distribution is not Prior.distribution
+        self.observation_key = observation_key if reads else None
+        observed = [] if self.observation_key is None else [self.observation_key]
+        self.in_keys = [*((keys.HISTORY, name) for name in ENTRIES), *observed]
         self.out_keys = [keys.LOC, keys.WARM, noise_key]
 
     def source(self, tensordict: TensorDictBase) -> Source:
