@@ -276,7 +276,7 @@ def test_a_mean_of_another_shape_or_type(wrong):
     try:
         with pytest.raises(
             ValueError,
-            match=r"Wrong.mean must return loc \(4, 3, 2\) and warm \(4, 3, 1\) of .*bool",
+            match=r"Wrong.mean must return two tensors, loc \(4, 3, 2\) and warm \(4, 3, 1\) of .*bool",
         ):
             Wrong(3).distribution(random_history(PastPrior(3), 4))
     finally:

@@ -178,14 +178,14 @@ def check_history(history: Any, history_length: int, prediction_length: int, who
         KeyError: if there is none, or an entry is missing.
         ValueError: naming the lengths.
     """
-    found = None if history is None else set(history.keys())
-    if found is None or not found.issuperset(ENTRIES):
-        missing = [f'("history", "{name}")' for name in ENTRIES if name not in (found or ())]
+    found = () if history is None else history.keys()
+    missing = [f'("history", "{name}")' for name in ENTRIES if name not in found]
+    if missing:
         raise KeyError(
             f"{whose} needs the history; missing: {', '.join(missing)}. ActionHistory writes it in an "
             "environment, ActionWindow in a replay buffer"
         )
-    lengths = history["actions"].shape[-2], history["forecast"].shape[-2]
+    lengths = history.get("actions").shape[-2], history.get("forecast").shape[-2]
     if lengths != (history_length, prediction_length):
         raise ValueError(
             f"{whose} needs {history_length} remembered actions and forecasts of {prediction_length}, but "

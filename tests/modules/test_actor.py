@@ -6,6 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.toy_env import random_history
 from warmprior import (
@@ -171,3 +172,26 @@ def test_what_is_replaced_and_what_stays():
     with pytest.raises(ValueError, match="at most 1 network evaluation"):
         four.replace(max_nfe=1, nfe=4)
     assert actor.replace(nfe=4).replace(prior=GaussianPrior(H)).ode.nfe == 4
+
+
+class Operations(TorchDispatchMode):
+    """Counts what torch computes."""
+
+    count = 0
+
+    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
+        self.count += 1
+        return function(*args, **(kwargs or {}))
+
+
+def test_a_decision_costs_few_operations_beside_the_network():
+    """At batch 1 each takes as long as a layer of a small network."""
+
+    class Still(nn.Module):
+        def forward(self, t, a, observation):
+            return a
+
+    actor, data = WarmPriorActor(Still(), PastPrior(H), nfe=1), batch(PastPrior(H), 1)
+    with torch.no_grad(), Operations() as operations:
+        actor(data)
+    assert operations.count <= 16

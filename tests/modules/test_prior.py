@@ -9,6 +9,7 @@ import torch
 
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
+from warmprior.history import window_history
 from warmprior.modules.registry import find, from_config, registered
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
@@ -124,3 +125,12 @@ def test_config_round_trip(prior_class):
 def test_unknown_name_lists_the_known_ones():
     with pytest.raises(ValueError, match=r"unknown prior 'nope'.*gaussian.*past.*preview"):
         from_config(Prior, {"name": "nope", "chunk_length": 2})
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_width_has_the_precision_of_the_history(dtype):
+    history = window_history(
+        torch.zeros(1, 2, 1, dtype=dtype), torch.tensor([[2]]), torch.zeros(1, 2, 1, dtype=dtype), 2
+    )
+    scale = PastPrior(2, sigma=0.1).distribution(history).scale
+    assert torch.equal(scale.flatten(), torch.tensor([0.1, 0.1], dtype=dtype))

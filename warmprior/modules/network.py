@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import chain
 from typing import Any, ClassVar
 
 import torch
@@ -188,8 +187,8 @@ def velocity_field(
         observation: ``[B, To, *]``, or a tensordict of such entries; whole numbers, such as pixels, are
             left as they are.
     """
-    seen = encoded(network, observation)
     dtype = _precision(network)
+    seen = _encoded(network, observation, dtype)
     if dtype is None:
         return lambda t, a: network(t, a, seen)
     return lambda t, a: network(t.to(dtype), a.to(dtype), seen).to(a.dtype)
@@ -202,8 +201,10 @@ def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor 
         network: see :func:`velocity_field`.
         observation: see :func:`velocity_field`.
     """
-    dtype = _precision(network)
+    return _encoded(network, observation, _precision(network))
 
+
+def _encoded(network: nn.Module, observation: Any, dtype: torch.dtype | None) -> Any:
     def cast(value: Tensor) -> Tensor:
         return value.to(dtype) if value.is_floating_point() else value
 
@@ -217,8 +218,19 @@ def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor 
 
 
 def _precision(network: nn.Module) -> torch.dtype | None:
-    tensors = chain(network.parameters(), network.buffers())  # a frozen network has buffers alone
-    return next((value.dtype for value in tensors if value.is_floating_point()), None)
+    # A frozen network has buffers alone.
+    return _first_precision(network, "_parameters") or _first_precision(network, "_buffers")
+
+
+def _first_precision(module: nn.Module, kind: str) -> torch.dtype | None:
+    # In the order of parameters(), which takes several times as long: as much as a small network's layer.
+    for value in getattr(module, kind).values():
+        if value is not None and value.is_floating_point():
+            return value.dtype
+    found = (
+        _first_precision(child, kind) for child in module._modules.values() if child is not None
+    )
+    return next(filter(None, found), None)
 
 
 def network_observation(
@@ -230,6 +242,8 @@ def network_observation(
         observation: ``[*B, To, *]``, or a tensordict ``[*B]`` of such entries.
         batch: ``*B``.
     """
+    if len(batch) == 1:
+        return observation
     if isinstance(observation, TensorDictBase):
         return observation.reshape(batch.numel()) if batch else observation.unsqueeze(0)
     return observation.reshape(-1, *observation.shape[len(batch) :])

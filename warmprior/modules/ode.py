@@ -29,6 +29,11 @@ MAX_NFE = 10_000
 GUIDED_BY = (keys.FORECAST, keys.FORECAST_STEPS, keys.DELAY)
 """What guidance reads beside the inputs of every policy."""
 
+GUIDED_BY_WHOM = (
+    ". The delay is written by InferenceDelay in an environment, as by policy_transforms(prior, "
+    "delay=0), and by AsyncExecutor on a robot"
+)
+
 Velocity = Callable[[Tensor, Tensor], Tensor]
 
 
@@ -70,7 +75,7 @@ def _steps(nfe: int, solver: str) -> int:
 def _combine(a: Tensor, h: float, weights: tuple[float, ...], slopes: list[Tensor]) -> Tensor:
     for weight, slope in zip(weights, slopes, strict=False):
         if weight:
-            a = a + (h * weight) * slope
+            a = a + (slope if h * weight == 1.0 else (h * weight) * slope)
     return a
 
 
@@ -234,16 +239,6 @@ class ODEActor(TensorDictModuleBase):
             self.in_keys += GUIDED_BY
         self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
 
-    @staticmethod
-    def _told(missing: Sequence[NestedKey]) -> str:
-        """Who writes what guidance reads, if that is what is missing."""
-        if not set(GUIDED_BY) & set(missing):
-            return ""
-        return (
-            ". The delay is written by InferenceDelay in an environment, as by policy_transforms(prior, "
-            "delay=0), and by AsyncExecutor on a robot"
-        )
-
     def check_nfe(self, nfe: int) -> None:
         """Whether the solver and the network can spend ``nfe`` network evaluations.
 
@@ -273,12 +268,12 @@ class ODEActor(TensorDictModuleBase):
         """
         nfe = self.nfe if nfe is None else nfe
         self.check_nfe(nfe)
-        a0, observation, *rest = (tensordict.get(key, None) for key in self.in_keys)
-        missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
+        inputs = [tensordict.get(key, None) for key in self.in_keys]
+        missing = [key for key, value in zip(self.in_keys, inputs, strict=True) if value is None]
         if missing:
-            raise KeyError(
-                f"ODEActor needs the keys {self.in_keys}; missing: {missing}{self._told(missing)}"
-            )
+            about = GUIDED_BY_WHOM if set(GUIDED_BY) & set(missing) else ""
+            raise KeyError(f"ODEActor needs the keys {self.in_keys}; missing: {missing}{about}")
+        a0, observation, *rest = inputs
         batch = a0.shape[:-2]
         observation = network_observation(observation, batch)
         velocity = velocity_field(self.network, observation)

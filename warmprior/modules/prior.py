@@ -165,9 +165,8 @@ class Prior(Registered):
                 shapes than it should.
         """
         loc, warm = checked_mean(self, history)
-        one = torch.ones((), dtype=loc.dtype, device=loc.device)
-        loc, scale = torch.where(warm, loc, 0.0), torch.where(warm, self.sigma * one, one)
-        return Source(loc, scale, warm, self.correlation)
+        scale = torch.where(warm, self.sigma, loc.new_ones(()))  # a number alone has no precision
+        return Source(torch.where(warm, loc, 0.0), scale, warm, self.correlation)
 
     def sample(
         self,
@@ -195,20 +194,21 @@ def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]
     """
     check_history(history, prior.history_length, prior.prediction_length, prior)
     found = prior.mean(history)
-    loc, warm = found if isinstance(found, tuple) and len(found) == 2 else (None, None)
-    actions = history["actions"]
-    expected = (*actions.shape[:-2], prior.prediction_length, actions.shape[-1])
-    if not (isinstance(loc, Tensor) and isinstance(warm, Tensor)):
+    loc, warm = found if isinstance(found, tuple) and len(found) == 2 else (found, None)
+    forecast = history.get("forecast")  # of the same shape
+    if not (
+        isinstance(loc, Tensor)
+        and isinstance(warm, Tensor)
+        and loc.shape == forecast.shape
+        and warm.shape == (*forecast.shape[:-1], 1)
+        and warm.dtype == torch.bool
+    ):
+        got = [f"{tuple(v.shape)} of {v.dtype}" for v in (loc, warm) if isinstance(v, Tensor)]
         raise ValueError(
-            f"{type(prior).__name__}.mean must return two tensors, loc {expected} and warm "
-            f"{(*expected[:-1], 1)}, got {type(found).__name__}"
+            f"{type(prior).__name__}.mean must return two tensors, loc {tuple(forecast.shape)} and warm "
+            f"{(*forecast.shape[:-1], 1)} of type bool, got {type(found).__name__} {' and '.join(got)}"
         )
-    if loc.shape != expected or warm.shape != (*expected[:-1], 1) or warm.dtype != torch.bool:
-        raise ValueError(
-            f"{type(prior).__name__}.mean must return loc {expected} and warm {(*expected[:-1], 1)} of "
-            f"type bool, got {tuple(loc.shape)} and {tuple(warm.shape)} of {warm.dtype}"
-        )
-    return loc.to(actions.dtype), warm
+    return loc.to(forecast.dtype), warm
 
 
 class GaussianPrior(Prior):
