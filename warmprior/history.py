@@ -26,6 +26,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import expand_as_right
 from torch import Tensor
 
 __all__ = ["ENTRIES", "advance", "check_history", "cold_history", "window_history", "without"]
@@ -36,29 +37,18 @@ ENTRIES = ("actions", "steps", "forecast", "forecast_steps")
 def cold_history(
     batch_size: Any, history_length: int, prediction_length: int, action_dim: int, **like: Any
 ) -> TensorDict:
-    """The history of robots that did nothing yet.
-
-    Args:
-        batch_size: ``B``.
-        history_length: how many actions are remembered, usually ``H``.
-        prediction_length: ``P``.
-        action_dim: ``d_a``.
-        like: ``dtype`` of the actions, and ``device``.
+    """The history of robots that did nothing yet, with ``dtype`` and ``device`` as in ``torch.zeros``.
 
     Examples:
-        >>> cold_history([5], 4, 8, 2)["forecast"].shape
+        >>> cold_history([5], history_length=4, prediction_length=8, action_dim=2)["forecast"].shape
         torch.Size([5, 8, 2])
     """
-    device = like.get("device")
     actions, forecast = (
         torch.zeros(*batch_size, length, action_dim, **like)
         for length in (history_length, prediction_length)
     )
-    none = torch.zeros(*batch_size, 1, dtype=torch.int64, device=device)
-    return TensorDict(
-        {"actions": actions, "steps": none, "forecast": forecast, "forecast_steps": none.clone()},
-        batch_size,
-    )
+    none = torch.zeros(*batch_size, 1, dtype=torch.int64, device=like.get("device"))
+    return _history(batch_size, actions, none, forecast, none.clone())
 
 
 def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorDict:
@@ -81,12 +71,12 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
         >>> {key: value.flatten().tolist() for key, value in sorted(history.items())}
         {'actions': [0.0, 1.0], 'forecast': [2.0, 3.0, 4.0, 0.0], 'forecast_steps': [3], 'steps': [1]}
     """
-    before, length = history["actions"], history["forecast"].shape[-2]
-    remembered = before.shape[-2]
-    if chunk.shape != history["forecast"].shape:
+    before, shape = history["actions"], history["forecast"].shape
+    remembered, length = before.shape[-2], shape[-2]
+    if chunk.shape != shape:
         raise ValueError(
-            f"the chunk has shape {tuple(chunk.shape)}, but the history's forecast "
-            f"{tuple(history['forecast'].shape)}: both need one prediction length"
+            f"the chunk has shape {tuple(chunk.shape)}, but the history's forecast {tuple(shape)}: both need "
+            "one prediction length"
         )
     low, high = map(int, torch.aminmax(executed)) if executed.numel() else (0, 0)
     if not 0 <= low <= high <= min(remembered, length):
@@ -99,15 +89,9 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
     line = torch.cat([before, chunk, torch.zeros_like(chunk[..., :remembered, :])], -2)
     index = (executed + torch.arange(remembered + length, device=executed.device)).unsqueeze(-1)
     moved = line.gather(-2, index.expand(*index.shape[:-1], line.shape[-1]))
-    return TensorDict(
-        {
-            "actions": moved[..., :remembered, :],
-            "steps": (history["steps"] + executed).clamp(max=remembered),
-            "forecast": moved[..., remembered:, :],
-            "forecast_steps": length - executed,
-        },
-        history.batch_size,
-    )
+    actions, forecast = moved[..., :remembered, :], moved[..., remembered:, :]
+    steps = (history["steps"] + executed).clamp(max=remembered)
+    return _history(history.batch_size, actions, steps, forecast, length - executed)
 
 
 def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: int) -> TensorDict:
@@ -127,15 +111,8 @@ def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: 
     """
     known = target.shape[-2] - chunk_length
     forecast = torch.cat([target[..., :known, :], torch.zeros_like(target[..., known:, :])], -2)
-    return TensorDict(
-        {
-            "actions": before,
-            "steps": steps.clamp(max=before.shape[-2]),
-            "forecast": forecast,
-            "forecast_steps": torch.full_like(steps, known),
-        },
-        target.shape[:-2],
-    )
+    steps = steps.clamp(max=before.shape[-2])
+    return _history(target.shape[:-2], before, steps, forecast, torch.full_like(steps, known))
 
 
 def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
@@ -151,32 +128,23 @@ def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
         >>> without(history, torch.tensor([True, False]))["forecast_steps"].flatten().tolist()
         [0, 1]
     """
-    step = rows.unsqueeze(-1)
-    return TensorDict(
-        {
-            name: torch.where(
-                step if name.endswith("steps") else step.unsqueeze(-1),
-                torch.zeros((), dtype=history[name].dtype, device=history[name].device),
-                history[name],
-            )
-            for name in ENTRIES
-        },
-        history.batch_size,
-    )
+    values = (history[name] for name in ENTRIES)
+    kept = (value.masked_fill(expand_as_right(rows, value), 0) for value in values)
+    return _history(history.batch_size, *kept)
+
+
+def _history(batch_size: Any, *values: Tensor) -> TensorDict:
+    return TensorDict(dict(zip(ENTRIES, values, strict=True)), batch_size)
 
 
 def check_history(history: Any, history_length: int, prediction_length: int, whose: Any) -> None:
-    """Refuse a history that is missing, incomplete or of other lengths.
+    """Refuse a history that is missing or incomplete (``KeyError``), or of other lengths (``ValueError``).
 
     Args:
         history: what was found.
         history_length: actions that have to be remembered.
         prediction_length: ``P``.
         whose: what reads it, for the message.
-
-    Raises:
-        KeyError: if there is none, or an entry is missing.
-        ValueError: naming the lengths.
     """
     found = () if history is None else history.keys()
     missing = [f'("history", "{name}")' for name in ENTRIES if name not in found]

@@ -20,7 +20,7 @@ __all__ = ["GaussianPrior", "PastPrior", "PreviewPrior", "Prior", "Source", "che
 
 @dataclass(frozen=True)
 class Source:
-    r"""A source :math:`a_0 = \mu + s \varepsilon` of given histories, as :meth:`Prior.distribution` gives it.
+    r"""A source :math:`a_0 = \mu + s \varepsilon`, as :meth:`Prior.distribution` gives it.
 
     Attributes:
         loc: :math:`\mu`, ``[*B, P, d_a]``, normalised action space.
@@ -43,11 +43,7 @@ class Source:
         return iter((self.loc, self.scale, self.warm))
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        """Draw ``a_0``, ``[*B, P, d_a]``.
-
-        Args:
-            generator: source of randomness on ``loc``'s device; PyTorch's global one by default.
-        """
+        """Draw ``a_0``, ``[*B, P, d_a]``; of PyTorch's global generator by default."""
         loc = self.loc
         like: dict[str, Any] = {"dtype": loc.dtype, "device": loc.device, "generator": generator}
         eps = torch.randn(loc.shape, **like)
@@ -69,11 +65,9 @@ class Prior(Registered):
         a_0[\tau] = \varepsilon_\tau \;\; (\tau \in C), \qquad \varepsilon \sim N(0, I).
 
     The mean is a function of the history (:mod:`warmprior.history`), which training windows, environments
-    and robots write alike: it cannot differ between them. A prior has no state. Overriding
-    :meth:`distribution` gives another source, such as a learned one: a subclass that is an ``nn.Module`` as
-    well (call ``nn.Module.__init__`` first) is trained, saved and frozen with the policy.
-
-    The constructor's arguments are remembered, so that :meth:`config` is complete for any subclass.
+    and robots write alike: it cannot differ between them. Overriding :meth:`distribution` gives another
+    source, such as a learned one: a subclass that is an ``nn.Module`` as well (call ``nn.Module.__init__``
+    first) is trained, saved and frozen with the policy.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
@@ -90,12 +84,9 @@ class Prior(Registered):
             in [0, 1].
 
     See Also:
-        - :class:`~warmprior.PastPrior`: the paper's first one.
-        - :class:`~warmprior.PriorSampler`: draws from it.
-        - :class:`~warmprior.ActionHistory`: writes what it reads.
+        :class:`~warmprior.PriorSampler`: draws from it.
 
     Examples:
-        >>> import torch
         >>> from warmprior.history import advance, cold_history
         >>> class LastAction(Prior):  # hold the last action
         ...     def mean(self, history):
@@ -153,11 +144,11 @@ class Prior(Registered):
     def distribution(
         self, history: TensorDictBase, observation: Tensor | TensorDictBase | None = None
     ) -> Source:
-        """The source of given histories (Eq. 1); unpacks into ``loc``, ``scale`` and ``warm``.
+        """The source of histories (Eq. 1); unpacks into ``loc``, ``scale`` and ``warm``.
 
         Args:
             history: ``[*B]``, see :mod:`warmprior.history`.
-            observation: what the network sees, ``[*B, To, d_o]``; the paper's sources make no use of it.
+            observation: what the network sees, ``[*B, To, d_o]``, and the paper's sources do not read.
 
         Raises:
             KeyError: if an entry of the history is missing.
@@ -174,24 +165,12 @@ class Prior(Registered):
         observation: Tensor | TensorDictBase | None = None,
         generator: torch.Generator | None = None,
     ) -> Tensor:
-        """Draw the source ``a_0`` from :meth:`distribution`, ``[*B, P, d_a]``.
-
-        Args:
-            history: see :meth:`distribution`.
-            observation: see :meth:`distribution`.
-            generator: source of randomness on the history's device; PyTorch's global one by default.
-        """
+        """Draw the source ``a_0`` from :meth:`distribution`, ``[*B, P, d_a]``."""
         return self.distribution(history, observation).sample(generator)
 
 
 def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """What :meth:`Prior.mean` makes of a history, in the history's precision.
-
-    Raises:
-        KeyError: if an entry of the history is missing.
-        ValueError: if the history has other lengths than the prior, or the mean is not ``loc`` and ``warm``
-            of the shapes that they should have.
-    """
+    """What :meth:`Prior.mean` makes of a history, in its precision, once both are checked."""
     check_history(history, prior.history_length, prior.prediction_length, prior)
     found = prior.mean(history)
     loc, warm = found if isinstance(found, tuple) and len(found) == 2 else (found, None)
@@ -215,11 +194,7 @@ class GaussianPrior(Prior):
     """The usual standard normal source: nothing is ever warm. The baseline of every comparison.
 
     Args:
-        chunk_length: ``H``.
-
-    See Also:
-        - :class:`~warmprior.PastPrior`: starts from what was executed last.
-        - :class:`~warmprior.PreviewPrior`: starts from the policy's own forecast.
+        chunk_length: see :class:`Prior`.
 
     Examples:
         >>> from warmprior.history import cold_history
@@ -241,21 +216,12 @@ class GaussianPrior(Prior):
 class PastPrior(Prior):
     r"""WP-Past: the mean is the last ``H`` executed actions, ``sigma`` 0.5 by default (Equation 2).
 
-    Nothing is warm before ``H`` actions of the episode were executed.
-
-    Args:
-        chunk_length: ``H``.
-
-    Keyword Args:
-        sigma: see :class:`Prior`.
-        correlation: see :class:`Prior`.
+    Nothing is warm before ``H`` actions of the episode were executed. Arguments as of :class:`Prior`.
 
     See Also:
-        - :class:`~warmprior.PreviewPrior`: starts from the policy's own forecast instead.
-        - :class:`~warmprior.HistoryObservation`: lets the network see the last actions instead.
+        :class:`~warmprior.HistoryObservation`: lets the network see the last actions instead.
 
     Examples:
-        >>> import torch
         >>> from warmprior.history import window_history
         >>> before, target = torch.tensor([[[1.0], [2.0]]]), torch.zeros(1, 2, 1)
         >>> loc, scale, warm = PastPrior(2).distribution(
@@ -286,18 +252,9 @@ class PreviewPrior(Prior):
         decision of every episode. :class:`~warmprior.WithheldHistory` repairs that; it matters for small
         ``sigma``.
 
-    Args:
-        chunk_length: ``H``.
-
-    Keyword Args:
-        sigma: see :class:`Prior`.
-        correlation: see :class:`Prior`.
-
-    See Also:
-        :class:`~warmprior.PastPrior`: starts from what was executed instead.
+    Arguments as of :class:`Prior`.
 
     Examples:
-        >>> import torch
         >>> from warmprior.history import advance, cold_history
         >>> chunk = torch.arange(4.0).view(1, 4, 1)
         >>> loc, scale, warm = PreviewPrior(2).distribution(

@@ -7,20 +7,16 @@ import inspect
 import json
 import re
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
-__all__ = ["Registered", "find", "from_config", "make", "options_of", "registered"]
-
-_NEXT_OPTION = re.compile(r",(?=\s*[^\W\d]\w*\s*=)")
-"""What separates options behind a name; other commas belong to a value."""
+__all__ = ["Registered", "find", "from_config", "make", "options_of"]
 
 
 class Registered:
     """A class whose subclasses are known by name, and whose objects remember their constructor's arguments.
 
-    A class that derives from this one directly has a registry of its own. It is in none itself, as are
-    subclasses with ``abstract=True`` behind their bases.
+    A class that derives from this one directly has a registry of its own: of its subclasses, but for those
+    with ``abstract=True`` behind their bases.
 
     Raises:
         ValueError: when a subclass takes the name of another, or one that no file can have.
@@ -43,26 +39,39 @@ class Registered:
         super().__init_subclass__(**kwargs)
         if Registered in cls.__bases__:
             cls._classes = {}
-            return
-        if abstract:
-            return
-        cls.name = cls.__dict__.get("name", cls.__name__)
-        if not re.fullmatch(r"[\w.+-]+", cls.name):
-            raise ValueError(
-                f"the name of {cls.__name__} becomes that of files: {cls.name!r} cannot"
-            )
-        taken = cls._classes.get(cls.name)
-        # The same class once more, as when a notebook's cell runs again, replaces itself.
-        if taken is not None and _place(taken) != _place(cls):
-            raise ValueError(
-                f"{cls.name!r} is the name of {_place(taken)}: choose another name for {_place(cls)}"
-            )
-        cls._classes[cls.name] = cls
+        elif not abstract:
+            cls.name = name = cls.__dict__.get("name", cls.__name__)
+            if not re.fullmatch(r"[\w.+-]+", name):
+                raise ValueError(
+                    f"the name of {cls.__name__} becomes that of files: {name!r} cannot"
+                )
+            taken = cls._classes.get(name, cls)
+            # The same class once more, as when a notebook's cell runs again, replaces itself.
+            if (taken.__module__, taken.__qualname__) != (cls.__module__, cls.__qualname__):
+                raise ValueError(f"{name!r} is the name of {taken}: choose another for {cls}")
+            cls._classes[name] = cls
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Remember the arguments, whatever the subclass does with them."""
+        """Remember the arguments by name, whatever the subclass does with them."""
         self = super().__new__(cls)
-        self.__dict__["_arguments"] = _bound(cls, args, kwargs)
+        arguments: dict[str, Any] = {}
+        self.__dict__["_arguments"] = arguments
+        signature = inspect.signature(cls.__init__)
+        try:
+            bound = signature.bind(self, *args, **kwargs)
+        except TypeError:  # a copy, which brings its arguments along, or a mistake: the call fails
+            return self
+        bound.apply_defaults()
+        for name, parameter in list(signature.parameters.items())[1:]:
+            value = bound.arguments[name]
+            if parameter.kind is parameter.VAR_KEYWORD:
+                arguments |= value
+            elif parameter.kind is not parameter.VAR_POSITIONAL:
+                arguments[name] = value
+            elif value:
+                raise TypeError(
+                    f"{cls.__name__} must name its arguments: *{name} could not be saved"
+                )
         return self
 
     def config(self) -> dict[str, Any]:
@@ -96,13 +105,7 @@ class Registered:
         return resolved
 
     def __repr__(self) -> str:
-        arguments = (f"{key}={value!r}" for key, value in self._resolved().items())
-        return f"{type(self).__name__}({', '.join(arguments)})"
-
-
-def registered[T: Registered](base: type[T]) -> Mapping[str, type[T]]:
-    """All imported subclasses by name."""
-    return MappingProxyType(base._classes)
+        return f"{type(self).__name__}({', '.join(_written(self._resolved()))})"
 
 
 def find[T: Registered](base: type[T], name: str) -> type[T]:
@@ -115,7 +118,7 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
         name: of the subclass, or ``"module:Class"``.
 
     Raises:
-        ValueError: if there is none.
+        ValueError: if there is none, or it is a base class.
 
     Examples:
         >>> from warmprior import Prior
@@ -124,54 +127,42 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
     """
     module, colon, attribute = name.partition(":")
     if not colon:
-        if name in base._classes:
-            return base._classes[name]
-        known = ", ".join(sorted(base._classes))
-        raise ValueError(
-            f"unknown {base.__name__.lower()} {name!r}: it is none of {known}; name your own as "
-            "package.module:Class"
-        )
+        return _known(base, name, "name your own as package.module:Class")
+    kind = base.__name__.lower()
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
-        raise ValueError(f"there is no {base.__name__.lower()} at {name}: {error}") from error
+        raise ValueError(f"there is no {kind} at {name}: {error}") from error
     if found not in base._classes.values():
-        raise ValueError(f"{name} is no {base.__name__.lower()} that can be built")
+        raise ValueError(f"{name} is no {kind} that can be built")
     return found
 
 
-def make[T: Registered](base: type[T], text: str, *args: Any, **kwargs: Any) -> T:
-    """Build what a user typed: a name, and perhaps options of the constructor behind it.
+def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
+    """Build what a user typed.
 
     Args:
         base: of the registry.
-        text: what :func:`find` takes, with options as in ``"preview,correlation=0.5"``
-            (:func:`options_of`).
+        text: what :func:`find` takes, perhaps with options behind it, see :func:`options_of`.
         args: further arguments of the constructor.
-        kwargs: likewise; those that are ``None`` are left out.
 
     Raises:
-        ValueError: if there is no such name, or an argument is out of range, given twice or unknown, naming
-            it and what the constructor takes.
+        ValueError: if there is no such class, or an argument is out of range or unknown, naming it and what
+            the constructor takes.
 
     Examples:
         >>> from warmprior import Prior
-        >>> make(Prior, "past,correlation=0.5", 8, sigma=None)
+        >>> make(Prior, "past,correlation=0.5", 8)
         PastPrior(chunk_length=8, sigma=0.5, correlation=0.5)
     """
-    found, typed = find(base, text.partition(",")[0]), options_of(text)
-    given = {name: value for name, value in kwargs.items() if value is not None}
+    found, options = find(base, text.partition(",")[0]), options_of(text)
     try:
-        for name in typed.keys() & given.keys():
-            raise ValueError(f"{name} is given twice: also as {given[name]!r}")
-        return found(*args, **given, **typed)
+        return found(*args, **options)
     except (TypeError, ValueError, ArithmeticError) as error:
-        written = [*map(repr, args), *(f"{k}={v!r}" for k, v in (given | typed).items())]
-        parameters = list(inspect.signature(found.__init__).parameters.values())[1:]  # without self
-        taken = [f"**{p.name}" if p.kind is p.VAR_KEYWORD else p.name for p in parameters]
+        written = ", ".join([*map(repr, args), *_written(options)]) or "nothing"
+        taken = ", ".join(list(inspect.signature(found.__init__).parameters)[1:]) or "nothing"
         raise ValueError(
-            f"{found.__name__} cannot be built from {', '.join(written) or 'nothing'} ({error}): it takes "
-            f"{', '.join(taken) or 'nothing'}"
+            f"{found.__name__} cannot be built from {written} ({error}): it takes {taken}"
         ) from error
 
 
@@ -192,7 +183,7 @@ def options_of(text: str) -> dict[str, Any]:
     """
     options: dict[str, Any] = {}
     _, comma, rest = text.partition(",")
-    for part in _NEXT_OPTION.split(rest) if comma else ():
+    for part in re.split(r",(?=\s*[^\W\d]\w*\s*=)", rest) if comma else ():
         key, equals, value = part.partition("=")
         key = key.strip()
         if not equals or not key.isidentifier():
@@ -219,35 +210,17 @@ def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
     """
     arguments = dict(config)
     name = arguments.pop("name", None)
+    return _known(base, name, "import the module that defines it")(**arguments)
+
+
+def _known[T: Registered](base: type[T], name: Any, advice: str) -> type[T]:
     if name not in base._classes:
         known = ", ".join(sorted(base._classes))
         raise ValueError(
-            f"unknown {base.__name__.lower()} {name!r}; known: {known}. Import the module that defines it "
-            "before loading it"
+            f"unknown {base.__name__.lower()} {name!r}: it is none of {known}; {advice}"
         )
-    return base._classes[name](**arguments)
+    return base._classes[name]
 
 
-def _place(cls: type) -> str:
-    return f"{cls.__module__}.{cls.__qualname__}"
-
-
-def _bound(cls: type, args: tuple[Any, ...], kwargs: dict[str, Any]) -> dict[str, Any]:
-    """Constructor arguments by name, defaults included."""
-    signature = inspect.signature(cls.__init__)  # type: ignore[misc]
-    try:
-        bound = signature.bind(None, *args, **kwargs)
-    except TypeError:
-        # A copy, which brings its arguments along; or a mistake that the call itself tells.
-        return {}
-    bound.apply_defaults()
-    arguments: dict[str, Any] = {}
-    for name, parameter in list(signature.parameters.items())[1:]:  # without self
-        value = bound.arguments[name]
-        if parameter.kind is parameter.VAR_KEYWORD:
-            arguments |= value
-        elif parameter.kind is not parameter.VAR_POSITIONAL:
-            arguments[name] = value
-        elif value:
-            raise TypeError(f"{cls.__name__} must name its arguments: *{name} could not be saved")
-    return arguments
+def _written(arguments: Mapping[str, Any]) -> list[str]:
+    return [f"{name}={value!r}" for name, value in arguments.items()]

@@ -36,13 +36,11 @@ class PriorSampler(TensorDictModuleBase):
         ValueError: if the history has other lengths than the prior.
 
     See Also:
-        - :class:`~warmprior.ODEActor`: integrates what it draws.
-        - :class:`~warmprior.WarmPriorActor`: both in one.
+        :class:`~warmprior.ODEActor`: integrates what it draws.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
-        >>> from warmprior import PastPrior, PriorSampler
+        >>> from warmprior import PastPrior
         >>> from warmprior.history import window_history
         >>> sampler = PriorSampler(PastPrior(2, sigma=0.0))
         >>> executed, steps = torch.ones(3, 2, 1), torch.full((3, 1), 2)
@@ -61,9 +59,7 @@ class PriorSampler(TensorDictModuleBase):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        self.prior = prior
-        self.start = start
-        self.generator = generator
+        self.prior, self.start, self.generator = prior, start, generator
         reads = start is not None or type(prior).distribution is not Prior.distribution
         self.observation_key = observation_key if reads else None
         observed = [] if self.observation_key is None else [self.observation_key]
@@ -71,13 +67,8 @@ class PriorSampler(TensorDictModuleBase):
         self.out_keys = [keys.LOC, keys.WARM, noise_key]
 
     def source(self, tensordict: TensorDictBase) -> Source:
-        """The source of decisions or windows.
-
-        Args:
-            tensordict: ``[*B]``, with the history and what the prior sees beside it.
-        """
-        history = tensordict.get(keys.HISTORY, None)
-        return self.prior.distribution(history, self._observation(tensordict))
+        """The source of decisions or windows, ``[*B]``."""
+        return self.prior.distribution(*self._inputs(tensordict))
 
     def forward(
         self, tensordict: TensorDictBase, generator: torch.Generator | None = None
@@ -86,11 +77,11 @@ class PriorSampler(TensorDictModuleBase):
         source = self.source(tensordict)
         point = source.sample(self.generator if generator is None else generator)
         if self.start is not None:
-            point = self.start(point, tensordict[keys.HISTORY], self._observation(tensordict))
+            point = self.start(point, *self._inputs(tensordict))
         for key, value in zip(self.out_keys, (source.loc, source.warm, point), strict=True):
             tensordict.set(key, value)
         return tensordict
 
-    def _observation(self, tensordict: TensorDictBase) -> Any:
-        key = self.observation_key
-        return None if key is None else tensordict.get(key, None)
+    def _inputs(self, tensordict: TensorDictBase) -> tuple[Any, Any]:
+        history, key = tensordict.get(keys.HISTORY, None), self.observation_key
+        return history, None if key is None else tensordict.get(key, None)

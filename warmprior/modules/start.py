@@ -13,8 +13,8 @@ __all__ = ["StartPoint"]
 class StartPoint(Registered, nn.Module):
     r"""Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
 
-    The flow is trained from the prior's source as ever; at decisions it is entered on the way. What a point
-    has learnt it has learnt before, and is saved with the policy.
+    The flow is trained from the prior's source as ever; at decisions it is entered on the way. A point learns
+    before the flow does, and is saved with the policy.
 
     Attributes:
         time: ``s``.
@@ -24,12 +24,10 @@ class StartPoint(Registered, nn.Module):
         :class:`~warmprior.WarmPriorActor`: takes one as ``start``.
 
     Examples:
-        >>> import torch
         >>> class Halved(StartPoint):
-        ...     time = 0.5
-        ...     noise_share = 0.5
+        ...     time = noise_share = 0.5
         ...     def centre(self, history, observation):
-        ...         return torch.zeros_like(history["forecast"])
+        ...         return 0.0 * history["forecast"]
         ...     def forward(self, noise, history, observation):
         ...         return self.centre(history, observation) + self.noise_share * noise
         >>> Halved().config()
@@ -40,20 +38,9 @@ class StartPoint(Registered, nn.Module):
     noise_share: float
 
     def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """Mean of the point, around which an agent searches, ``[*B, P, d_a]``.
-
-        Args:
-            history: ``[*B]``, see :mod:`warmprior.history`.
-            observation: what the network sees, ``[*B, To, d_o]``.
-        """
+        """Mean of the point, around which an agent searches, ``[*B, P, d_a]``; of what a prior is given."""
         raise NotImplementedError
 
     def forward(self, noise: Tensor, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """The point, ``[*B, P, d_a]``.
-
-        Args:
-            noise: a draw of the prior's source, ``[*B, P, d_a]``.
-            history: see :meth:`centre`.
-            observation: see :meth:`centre`.
-        """
+        """The point, ``[*B, P, d_a]``, of a draw of the prior's source, ``[*B, P, d_a]``."""
         raise NotImplementedError

@@ -23,9 +23,8 @@ class ActionHistory(Transform):
     """Writes the history for the next decision after each step, and a cold one at resets.
 
     A function of the step's own tensordict, without state: it gives the same in ``env.rollout``,
-    collectors and batched environments, inside or outside of workers, with any policy (random ones
-    included), and per sub-environment when some of them reset. Append it after :class:`ChunkStep`,
-    which tells how many actions were executed. It knows no prior: :mod:`warmprior.history` has the layout.
+    collectors and batched environments, inside or outside of workers, with any policy, and per
+    sub-environment when some of them reset. :mod:`warmprior.history` has the layout.
 
     Args:
         history_length: how many executed actions are remembered, usually ``H``.
@@ -39,12 +38,11 @@ class ActionHistory(Transform):
         KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks the history.
 
     See Also:
-        - :class:`~warmprior.ActionWindow`: writes the same layout in training windows.
-        - :class:`~warmprior.Prior`: makes the mean of it.
+        :class:`~warmprior.ActionWindow`: writes the same layout in training windows.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv, Compose
-        >>> from warmprior import ActionHistory, ChunkStep
+        >>> from warmprior import ChunkStep
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(4)))
         >>> rollout = env.rollout(3)
         >>> rollout["history", "steps"].flatten().tolist()
@@ -74,22 +72,18 @@ class ActionHistory(Transform):
         self._chunk = None
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        history, executed = (
-            tensordict.get(keys.HISTORY, None),
-            next_tensordict.get(self.executed_key),
-        )
+        history = tensordict.get(keys.HISTORY, None)
         if history is None:
             raise KeyError(
                 f"ActionHistory found no {keys.HISTORY!r} in a step's input: hand over what the reset or the "
                 "step before gave, with the chunk"
             )
+        executed = next_tensordict.get(self.executed_key)
         if executed is None:
             raise KeyError(
                 f"ActionHistory found no {self.executed_key!r} after the step: append it after ChunkStep"
             )
-        moved = advance(history, tensordict.get(self.chunk_key), executed)
-        for name in ENTRIES:
-            next_tensordict.set((keys.HISTORY, name), moved[name])
+        _write(next_tensordict, advance(history, tensordict.get(self.chunk_key), executed))
         # The others' chunks were not executed.
         return keep_resting(tensordict, next_tensordict, HISTORY_KEYS)
 
@@ -98,16 +92,7 @@ class ActionHistory(Transform):
     ) -> TensorDictBase:
         # Everywhere: TorchRL merges these rows into the sub-environments that were reset only.
         chunk = self._chunk or self._check_chunk()
-        cold = cold_history(
-            tensordict_reset.batch_size,
-            self.history_length,
-            *chunk.shape[-2:],
-            dtype=chunk.dtype,
-            device=tensordict_reset.device,
-        )
-        for name in ENTRIES:
-            tensordict_reset.set((keys.HISTORY, name), cold[name])
-        return tensordict_reset
+        return _write(tensordict_reset, self._cold(chunk, tensordict_reset))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Does nothing: in data the history is already there."""
@@ -115,13 +100,14 @@ class ActionHistory(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the history."""
-        chunk, batch = self._check_chunk(), observation_spec.shape
-        cold = cold_history((), self.history_length, *chunk.shape[-2:], dtype=chunk.dtype)
-        for name, value in cold.items():
-            observation_spec[(keys.HISTORY, name)] = Unbounded(
-                (*batch, *value.shape), dtype=value.dtype, device=observation_spec.device
-            )
+        for name, value in self._cold(self._check_chunk(), observation_spec).items():
+            spec = Unbounded(value.shape, dtype=value.dtype, device=observation_spec.device)
+            observation_spec[keys.HISTORY, name] = spec
         return observation_spec
+
+    def _cold(self, chunk: TensorSpec, place: TensorDictBase | TensorSpec) -> TensorDictBase:
+        lengths, like = (self.history_length, *chunk.shape[-2:]), {"device": place.device}
+        return cold_history(place.shape, *lengths, dtype=chunk.dtype, **like)
 
     def _check_chunk(self) -> TensorSpec:
         actions = self.parent.full_action_spec
@@ -133,6 +119,12 @@ class ActionHistory(Transform):
         # Kept because resets are frequent and TorchRL rebuilds specs on every access.
         self._chunk = actions[self.chunk_key]
         return self._chunk
+
+
+def _write(tensordict: TensorDictBase, history: TensorDictBase) -> TensorDictBase:
+    for name in ENTRIES:
+        tensordict.set((keys.HISTORY, name), history[name])
+    return tensordict
 
 
 class WithheldHistory(Transform):
@@ -153,7 +145,6 @@ class WithheldHistory(Transform):
         :func:`~warmprior.window_replay_buffer`: appends it, with ``withhold``.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior.history import window_history
         >>> steps = torch.full((1000, 1), 2)
@@ -182,7 +173,6 @@ class WithheldHistory(Transform):
                 "the history is in the observation already: put WithheldHistory before HistoryObservation, "
                 "or take withhold= of window_replay_buffer"
             )
-        draw = torch.rand(
-            history.batch_size, generator=self.generator, device=history["actions"].device
-        )
+        device = history["actions"].device
+        draw = torch.rand(history.batch_size, generator=self.generator, device=device)
         return tensordict.set(keys.HISTORY, without(history, draw < self.probability))

@@ -39,10 +39,8 @@ class HistoryObservation(Transform):
         >>> transforms = policy_transforms(GaussianPrior(2), observation_steps=1, see_history=True)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), transforms)
         >>> seen = env.rollout(2)["prior", "observation"]  # 3 observations, 2 actions, whether there are 2
-        >>> seen.shape, seen[:, 0, -1].tolist()
-        (torch.Size([2, 1, 6]), [0.0, 1.0])
-        >>> 3 + HistoryObservation.width(2, action_dim=1)
-        6
+        >>> seen.shape, seen[:, 0, -1].tolist(), 3 + HistoryObservation.width(2, action_dim=1)
+        (torch.Size([2, 1, 6]), [0.0, 1.0], 6)
     """
 
     def __init__(
@@ -56,23 +54,21 @@ class HistoryObservation(Transform):
 
     @staticmethod
     def width(history_length: int, action_dim: int) -> int:
-        """By how much the observation becomes wider: ``H * d_a + 1``.
-
-        Args:
-            history_length: ``H``.
-            action_dim: ``d_a``.
-        """
+        """By how much the observation becomes wider: ``H * d_a + 1``."""
         return history_length * action_dim + 1
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the extended observation."""
         observation, actions, steps = self._read(tensordict)
-        if isinstance(observation, TensorDictBase):
-            vector = _extended(observation.get(keys.STATE), actions, steps)
-            extended: Any = observation.copy().set(keys.STATE, vector)
-        else:
-            extended = _extended(observation, actions, steps)
-        return tensordict.set(self.out_keys[0], extended)
+        known = steps >= actions.shape[-2]
+        seen = torch.where(known.unsqueeze(-1), actions, 0.0).flatten(-2)
+        context = torch.cat([seen, known.to(seen)], dim=-1).unsqueeze(-2)
+
+        def extend(vector: Tensor) -> Tensor:
+            added = context.expand(*vector.shape[:-1], context.shape[-1]).to(vector.dtype)
+            return torch.cat([vector, added], dim=-1)
+
+        return tensordict.set(self.out_keys[0], _with_vector(observation, extend))
 
     def _read(self, place: TensorDictBase | Composite) -> list[Any]:
         """What lies under the input keys, values or their specs."""
@@ -83,15 +79,7 @@ class HistoryObservation(Transform):
                 f"HistoryObservation needs the keys {self.in_keys}; missing: {missing}. In an environment "
                 "append it after ActionHistory"
             )
-        found = [place[key] for key in self.in_keys]
-        several = isinstance(found[0], (TensorDictBase, Composite))
-        if several and keys.STATE not in found[0].keys():  # noqa: SIM118
-            raise ValueError(
-                "HistoryObservation appends the last actions to an observation vector [*B, To, d_o], but "
-                f"{self.in_keys[0]!r} has the entries {sorted(map(str, found[0].keys(True, True)))}: "
-                f"concatenate them before, or call one {keys.STATE!r}"
-            )
-        return found
+        return [place[key] for key in self.in_keys]
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
@@ -104,21 +92,25 @@ class HistoryObservation(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the extended observation."""
         observation, actions, _ = self._read(observation_spec)
-        several = isinstance(observation, Composite)
-        vector = observation[keys.STATE] if several else observation
-        width = vector.shape[-1] + self.width(*actions.shape[-2:])
-        extended = Unbounded((*vector.shape[:-1], width), dtype=vector.dtype, device=vector.device)
-        if several:
-            whole = observation.clone()
-            whole[keys.STATE] = extended
-            extended = whole
-        observation_spec[self.out_keys[0]] = extended
+
+        def extend(vector: Unbounded) -> Unbounded:
+            shape = (*vector.shape[:-1], vector.shape[-1] + self.width(*actions.shape[-2:]))
+            return Unbounded(shape, dtype=vector.dtype, device=vector.device)
+
+        observation_spec[self.out_keys[0]] = _with_vector(observation, extend)
         return observation_spec
 
 
-def _extended(observation: Tensor, actions: Tensor, steps: Tensor) -> Tensor:
-    known = steps >= actions.shape[-2]
-    seen = torch.where(known.unsqueeze(-1), actions, 0.0).flatten(-2)
-    context = torch.cat([seen, known.to(seen)], dim=-1).unsqueeze(-2)
-    context = context.expand(*observation.shape[:-1], context.shape[-1])
-    return torch.cat([observation, context.to(observation.dtype)], dim=-1)
+def _with_vector(observation: Any, extend: Any) -> Any:
+    """An observation or its spec, a vector or several entries, with its vector extended."""
+    if not isinstance(observation, TensorDictBase | Composite):
+        return extend(observation)
+    if keys.STATE not in observation.keys():  # noqa: SIM118
+        raise ValueError(
+            "HistoryObservation appends the last actions to an observation vector [*B, To, d_o], but it has "
+            f"the entries {sorted(map(str, observation.keys(True, True)))}: concatenate them before, or "
+            f"call one {keys.STATE!r}"
+        )
+    whole = observation.clone() if isinstance(observation, Composite) else observation.copy()
+    whole[keys.STATE] = extend(observation[keys.STATE])
+    return whole
