@@ -147,14 +147,14 @@ def test_withheld_rows_are_those_of_robots_that_did_nothing():
 
 
 @pytest.mark.parametrize(
-    ("executed", "told"),
+    ("executed", "message"),
     [
         ([[1], [3]], r"executed 3 actions, but the history remembers 2 .* between 0 and 2"),
         ([[-1], [0]], r"executed -1 actions.* between 0 and 2"),
     ],
 )
-def test_more_executed_than_remembered_or_less_than_nothing(executed, told):
-    with pytest.raises(ValueError, match=told):
+def test_more_executed_than_remembered_or_less_than_nothing(executed, message):
+    with pytest.raises(ValueError, match=message):
         advance(cold_history([2], 2, 4, 1), torch.zeros(2, 4, 1), torch.tensor(executed))
 
 
@@ -168,8 +168,10 @@ def test_a_chunk_of_another_shape(shape):
 def test_a_history_that_lacks_an_entry(missing):
     with pytest.raises(KeyError) as caught:
         GaussianPrior(2).distribution(cold_history([1], 2, 2, 1).exclude(missing))
-    told = rf'^GaussianPrior.* missing: \("history", "{missing}"\)\. ActionHistory .*ActionWindow'
-    assert re.search(told, caught.value.args[0])
+    message = (
+        rf'^GaussianPrior.* missing: \("history", "{missing}"\)\. ActionHistory .*ActionWindow'
+    )
+    assert re.search(message, caught.value.args[0])
 
 
 # ------------------------------------------------------------------------------------------ the priors
@@ -239,15 +241,15 @@ def test_a_mean_does_not_write_into_the_history(prior_class):
 
 
 @pytest.mark.parametrize(
-    ("prior", "lengths", "told"),
+    ("prior", "lengths", "message"),
     [
         (PastPrior(3), (4, 3), r"needs 3 remembered .* of 3, but .*\"actions\"\) has 4 .* has 3"),
         (PastPrior(3), (3, 6), r"needs 3 .* forecasts of 3.*\"forecast\"\) has 6: make windows"),
         (PreviewPrior(3), (3, 3), r"PreviewPrior.*needs 3 .* of 6.*\"forecast\"\) has 3"),
     ],
 )
-def test_a_history_of_other_lengths(prior, lengths, told):
-    with pytest.raises(ValueError, match=told):
+def test_a_history_of_other_lengths(prior, lengths, message):
+    with pytest.raises(ValueError, match=message):
         prior.distribution(cold_history([2], *lengths, 2))
 
 

@@ -59,9 +59,9 @@ def saved(tmp_path_factory):
 def test_evaluate_plays_the_same_episodes(saved, capsys):
     folder, episode = saved
     assert main(["evaluate", str(folder), "--episodes", "1", "--nfe", "1"]) == 0
-    told = capsys.readouterr().out
-    assert f"{int(episode.success)} of 1 episodes solved" in told
-    assert f" {episode.steps} control steps on average" in told
+    printed = capsys.readouterr().out
+    assert f"{int(episode.success)} of 1 episodes solved" in printed
+    assert f" {episode.steps} control steps on average" in printed
 
 
 @pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
@@ -95,8 +95,8 @@ def test_another_grid_is_played(saved, capsys, monkeypatch):
 
 def test_info(saved, capsys):
     assert main(["info", str(saved[0])]) == 0
-    told = capsys.readouterr().out
-    assert "PastPrior(chunk_length=8" in told and "Lift" in told and "VelocityMLP" in told
+    printed = capsys.readouterr().out
+    assert "PastPrior(chunk_length=8" in printed and "Lift" in printed and "VelocityMLP" in printed
 
 
 def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, monkeypatch):
@@ -128,8 +128,8 @@ def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, mon
             (["push", str(folder), "me/lift", "--run", str(tmp_path)], "has no results.json"),
         ):
             assert main(argv) == 2
-            told = capsys.readouterr().err
-            assert message in told and told.splitlines()[-1].startswith("warmprior: error: ")
+            printed = capsys.readouterr().err
+            assert message in printed and printed.splitlines()[-1].startswith("warmprior: error: ")
 
 
 def test_version(capsys):

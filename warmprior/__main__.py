@@ -160,8 +160,8 @@ def convert(args: argparse.Namespace) -> None:
 def make_parser() -> argparse.ArgumentParser:
     """The commands and their options."""
     parser = argparse.ArgumentParser(prog="python -m warmprior", description=__doc__)
-    told = f"warmprior {version('warmprior')}"
-    parser.add_argument("--version", action="version", version=told, help="tell it, and end")
+    written = f"warmprior {version('warmprior')}"
+    parser.add_argument("--version", action="version", version=written, help="print it, and end")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
 
     def command(run: Callable[[argparse.Namespace], None]) -> Callable[..., Any]:
@@ -228,7 +228,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; what a user can mend is told in one line.
+    """Run a command; what a user can mend is said in one line.
 
     Args:
         argv: the command line, without the program.

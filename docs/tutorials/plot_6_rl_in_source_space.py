@@ -274,7 +274,7 @@ plt.show()
 # %%
 # What to notice: grey is the time in which the agents do not learn. What they do then differs from the
 # frozen policy, for their first residuals take the place of its noise. Nothing much changes
-# until enough of what they collected has told them where the reward is, and then they solve
+# until enough of what they collected shows where the reward is, and then they solve
 # every episode. They begin from very different levels. The frozen WP-Past earns a reward in a
 # third of its episodes, the Gaussian policy in one of twenty, so that the second agent has to find its
 # few successes first.

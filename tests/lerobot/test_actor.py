@@ -48,8 +48,8 @@ class Arm(EnvBase):
         self.at = self.at + tensordict["action"][:STATE]
         self.steps += 1
         done = torch.tensor([self.steps >= self.length])
-        told = {"reward": torch.zeros(1), "done": done, "terminated": done}
-        return self._observed().update(told)
+        results = {"reward": torch.zeros(1), "done": done, "terminated": done}
+        return self._observed().update(results)
 
     def _set_seed(self, seed):
         return seed
@@ -69,7 +69,7 @@ class WithSuccess(Arm):
 NAMES = {"state": "observation.state", "top": CAMERA}
 
 
-def told(batch):
+def preprocessed(batch):
     """What a preprocessor would add: the task in tokens."""
     size = len(batch["observation.state"])
     tokens = torch.full((size, 5), 7)
@@ -88,7 +88,9 @@ def history_of(actions):
 
 def actor_of(made, prior, **options):
     generator = torch.Generator().manual_seed(0)
-    return LeRobotActor(made, prior, names=NAMES, preprocess=told, generator=generator, **options)
+    return LeRobotActor(
+        made, prior, names=NAMES, preprocess=preprocessed, generator=generator, **options
+    )
 
 
 def environment(prior, base=None):
@@ -123,7 +125,7 @@ def test_rollouts_start_from_the_mean(policy, family, prior):
 
 def test_several_observations_and_the_lead_of_a_chunk(policy):
     made, prior = policy("multi_task_dit"), PastPrior(LENGTH - 1, sigma=0.0)
-    actor = LeRobotActor(made, prior, names=NAMES, preprocess=told)
+    actor = LeRobotActor(made, prior, names=NAMES, preprocess=preprocessed)
     data = TensorDict(
         {
             "observation": {"state": torch.randn(3, 2, STATE)},
@@ -181,7 +183,7 @@ def test_evaluation_draws_from_its_seeds_whatever_generator_an_actor_has(policy)
 
 def test_a_single_observation_of_a_policy_that_may_see_several(policy):
     made, prior = policy("multi_task_dit", n_obs_steps=1), PastPrior(LENGTH, sigma=0.0)
-    actor = LeRobotActor(made, prior, names=NAMES, preprocess=told)
+    actor = LeRobotActor(made, prior, names=NAMES, preprocess=preprocessed)
     data = TensorDict(
         {
             "observation": {"state": torch.randn(3, 1, STATE)},

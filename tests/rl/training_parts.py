@@ -109,7 +109,7 @@ def check_transitions(training, *, lengths=LENGTHS, offset=1.0, time_outs=False)
         training: of WP-Past.
         lengths: of the episodes of its environments.
         offset: of rewards.
-        time_outs: whether episodes end by time-outs that are told from terminations.
+        time_outs: whether episodes end by time-outs apart from terminations.
     """
     stored = training.buffer[:]
     expected = hand_rollout(len(stored) // len(lengths), lengths)

@@ -164,8 +164,8 @@ class PriorSpaceTraining:
                 before, self.steps = self.steps, self.steps + executed
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
-                    told = self.agent.learn(self.buffer)
-                    bar.set_postfix(told | self._last_success(), refresh=False)
+                    found = self.agent.learn(self.buffer)
+                    bar.set_postfix(found | self._last_success(), refresh=False)
                 due = self.steps // config.evaluate_every > before // config.evaluate_every
                 if due or self.steps >= config.environment_steps:
                     self.agent.state()  # Raises for an agent that is not worth an evaluation.

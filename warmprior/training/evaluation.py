@@ -391,13 +391,13 @@ def _play_batched(
             if not active.all():
                 data.set("_step", active.to(home))
             data = env.step(act(data.to(device)).to(home))
-            told = data["next"].select("done", keys.SUCCESS, keys.EXECUTED).cpu()
-            done = told["done"].flatten() & active
+            found = data["next"].select("done", keys.SUCCESS, keys.EXECUTED).cpu()
+            done = found["done"].flatten() & active
             decided = _decision(data, chunk_key)
             for i in active.nonzero().flatten().tolist():
                 decisions[i].append(decided[i])
-                success[i] |= bool(told[keys.SUCCESS][i])
-                steps[i] += int(told[keys.EXECUTED][i])
+                success[i] |= bool(found[keys.SUCCESS][i])
+                steps[i] += int(found[keys.EXECUTED][i])
             for i in done.nonzero().flatten().tolist():
                 episode = i + num_envs * played[i]
                 report(Episode(seeds[episode], success[i], steps[i], _rollout(decisions[i])))
