@@ -13,33 +13,22 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+
+from common import Policy, observations_of, policies_of, replace_rows
+from options import PRESETS, HeldOut, MeasuredOptions, check_single, parse, started, study
+from plots import plot_budget
+from report import budget_table, write_report
+from robomimic import compare
 
 from warmprior.diagnostics import SharedObservations, action_error, encoded_windows
-from warmprior.experiments import (
-    PRESETS,
-    Comparison,
-    HeldOutOptions,
-    MeasuredRecipe,
-    Row,
-    comparison_preset,
-    mean_known,
-    parse,
-    plot_budget,
-    started,
-    success_cell,
-    table,
-    write_report,
-)
-from warmprior.experiments.recipe import check_counts
-from warmprior.experiments.tables import source_at_nfe
+from warmprior.io.files import read_lines
 from warmprior.io.script import run_script
 from warmprior.training import TrainingConfig
+from warmprior.training.options import check_counts
 
 
 @dataclass(frozen=True)
-class BudgetRecipe(MeasuredRecipe):
+class BudgetOptions(MeasuredOptions):
     """A comparison at several lengths of training.
 
     Attributes:
@@ -51,81 +40,53 @@ class BudgetRecipe(MeasuredRecipe):
     def check(self) -> None:
         """Refuse what cannot work, before any work."""
         super().check()
-        self.check_single(sigma=True)
+        check_single(self, "sigma")
         check_counts(self, "budgets")
         if not self.budgets:
             raise ValueError("--budgets needs at least one number of iterations")
 
     def trainings(self) -> list[TrainingConfig]:
         """One per budget, the shortest first, each with its last policy alone."""
-        return [
-            replace(self.training, iterations=n, checkpoints=1) for n in sorted(set(self.budgets))
-        ]
+        budgets = sorted(set(self.budgets))
+        return [replace(self.training, iterations=n, checkpoints=1) for n in budgets]
 
 
-def with_errors(comparison: Comparison, observations: SharedObservations) -> list[Row]:
-    """The rows, with the error of their policies on demonstrations that none was trained on."""
-    errors: dict[tuple[Any, ...], float] = {}
-    for contestant in comparison.contestants:
-        player = comparison.player(contestant)
-        windows = observations.windows(player.prior, see_history=contestant.method.sees_history)
-        windows = encoded_windows(player, windows)
-        found = action_error(player, windows, nfes=comparison.nfes)
-        for nfe, error in found.items():
-            errors[(*contestant.facts().values(), nfe)] = error
-    names = (*comparison.contestants[0].facts(), "nfe")
-    return [
-        replace(
-            row, measures={**row.measures, "action_error": errors[tuple(row[n] for n in names)]}
-        )
-        for row in comparison.rows
-    ]
-
-
-def make_table(rows: Sequence[Row], top_k: int) -> str:
-    success = success_cell(top_k)
-    return table(
-        sorted(rows, key=lambda row: (row["iterations"], -row["nfe"])),
-        lambda row: str(row["iterations"]),
-        source_at_nfe(rows),
-        {"": lambda cell: f"{success(cell)} ({mean_known(cell, 'action_error'):.4f})"},
-        head="iterations",
-        notes=[
-            "Success in percent; in parentheses the mean squared error of the executed actions on held-out "
-            "demonstrations, given the mean of the training, in squared normalised action units. The error "
-            "prefers the average of what could be done, and grows with NFE where the data leave a choice."
-        ],
-    )
+def errors(
+    policies: Sequence[Policy], observations: SharedObservations, nfes: Sequence[int]
+) -> dict[tuple[str, int], float]:
+    """Errors on demonstrations that no policy was trained on, by policy and NFE."""
+    found: dict[tuple[str, int], float] = {}
+    for policy in (policy for policy in policies if policy.is_trained):
+        actor = policy.load()
+        windows = observations.windows(actor.prior, see_history=policy.method.parts.sees_history)
+        allowed = policy.method.nfes(nfes)
+        error = action_error(actor, encoded_windows(actor, windows), nfes=allowed)
+        found |= {(policy.name, nfe): value for nfe, value in error.items()}
+    return found
 
 
 def run(argv: Sequence[str] | None) -> None:
-    presets = {
-        name: BudgetRecipe.of(preset, held_out=HeldOutOptions(observations=1_000))
-        for name, preset in PRESETS.items()
-    }
-    recipe = parse(
-        presets,
-        argv,
-        study="budget",
-        description=__doc__,
-        preset=partial(comparison_preset, presets=presets),
-        # Every budget is a number of iterations, with its last policy; no curvature is measured.
-        unused=("iterations", "checkpoints", "steps", "draws"),
-    )
-    with started(recipe, "budget") as out:
-        comparison = Comparison(recipe, "budget")
+    """Train and play a policy per source and number of iterations."""
+    few = HeldOut(observations=1_000)
+    presets = {name: study(BudgetOptions, base, held_out=few) for name, base in PRESETS.items()}
+    options = parse(presets, argv, "budget", __doc__)
+    with started(options, "budget") as out:
+        policies = policies_of(options, options.sources.methods())
         # Before the hours of training: what cannot be measured on is better known now.
-        observations, source = comparison.observe(recipe.held_out)
-        comparison.results.meta["observations"] = source
-        comparison.run()
-        rows = with_errors(comparison, observations)
-        comparison.results.add(*rows)
-        top_k = recipe.evaluation.top_k
-        plot_budget(rows, out / "budget.png", top_k=top_k, title=comparison.title)
-        write_report(out, make_table(rows, top_k), comparison.failures)
+        observations, source = observations_of(options, policies[0])
+        _, failures = compare(options, policies)
+        error = errors(policies, observations, options.evaluation.nfe)
+        played = read_lines(out / "results.jsonl")
+        measured = [{**row, "action_error": error[row["policy"], row["nfe"]]} for row in played]
+        rows = replace_rows(out / "results.jsonl", measured)
+        top_k, title = options.evaluation.top_k, policies[0].task().title
+        plot_budget(rows, out / "budget.png", top_k=top_k, title=title)
+        table = budget_table(rows, top_k) + f"- Error: on {source}.\n"
+        write_report(out, table, table, rows, failures)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the study."""
     return run_script(lambda: run(argv), "budget.py")
 
 

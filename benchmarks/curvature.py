@@ -9,48 +9,25 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
-from pathlib import Path
 from typing import Annotated, Any
 
 import torch
+from common import finished_policies, observations_of, policies_of, replace_rows, trained_actors
+from measures import held_out, straightness
+from options import PRESETS, Flat, HeldOut, MeasuredOptions, PolicyOptions, parse, started, study
+from plots import plot_flow_paths
+from report import curvature_table, labelled, write_report
+from robomimic import train_all
 
-from warmprior import WarmPriorActor
 from warmprior.diagnostics import SharedObservations, encoded_windows, flow_paths
 from warmprior.diagnostics.flow import sees_history
-from warmprior.experiments import (
-    PRESETS,
-    Comparison,
-    HeldOutOptions,
-    MeasuredRecipe,
-    PolicyOptions,
-    Results,
-    Row,
-    comparison_preset,
-    curvature_table,
-    finished_policies,
-    grouped,
-    observe,
-    parse,
-    record,
-    source_labels,
-    started,
-    straightness,
-    write_report,
-)
-from warmprior.experiments.labels import with_space
-from warmprior.experiments.methods import Method
-from warmprior.experiments.navigation_figures import plot_flow_paths
-from warmprior.experiments.recipe import Flat
-from warmprior.experiments.record import refuse_ignored
-from warmprior.experiments.results import facts_of_machine
 from warmprior.io.script import run_script
 
 SHOWN = 40
 
 
 @dataclass(frozen=True)
-class CurvatureRecipe(MeasuredRecipe):
+class CurvatureOptions(MeasuredOptions):
     """What to measure.
 
     Attributes:
@@ -67,116 +44,69 @@ class CurvatureRecipe(MeasuredRecipe):
         run = self.policies.run
         return super().name if run is None else run.resolve().name
 
-    def check(self) -> None:
-        """Refuse what cannot work, or has no effect, before any work."""
-        super().check()
-        if self.policies.run is not None:
-            base = PRESETS[self.run.preset]
-            parts = ["data", "network", "training", "evaluation", "run"]
-            # Priors of one's own are not what to compare, but what to import for it.
-            parts += [] if all(":" in name for name in self.sources.prior) else ["sources"]
-            told = "--run measures policies as they were trained"
-            refuse_ignored(self, base, parts, told, but=["preset", "device"])
-        elif not any(method.is_flow for method in self.sources.methods()):
-            raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
 
-
-@dataclass
-class Measured:
-    """What is measured: the facts of the problem, policies, and observations with their name."""
-
-    results: Results
-    facts: dict[str, Any]
-    actors: dict[Method, dict[int, WarmPriorActor]]
-    observations: SharedObservations
-    source: str
-
-
-def own_run(recipe: CurvatureRecipe) -> Measured:
-    """The policies of these options: those of earlier runs where they exist, or trained now."""
-    comparison = Comparison(recipe, "curvature")
-    # Before the training: what cannot be measured on is better known now.
-    observations, source = comparison.observe(recipe.held_out)
-    check_coordinate(recipe, observations)
-    comparison.train()
-    facts = comparison.results.meta["problems"][0]
-    return Measured(comparison.results, facts, comparison.policies(), observations, source)
-
-
-def finished_run(recipe: CurvatureRecipe, run: Path) -> Measured:
-    """The last policies of a run of robomimic.py."""
-    facts, actors = finished_policies(run, recipe.run.device)
-    first = next(iter(next(iter(actors.values())).values()))
-    observations, source = observe(
-        recipe.held_out,
-        facts,
-        first.normalizer,
-        chunk_length=first.prior.chunk_length,
-        observation_steps=first.network.observation_steps,
-        device=recipe.run.device,
-    )
-    check_coordinate(recipe, observations)
-    identity = {"study": "curvature", "recipe": record(recipe)}
-    meta = facts_of_machine() | {"problems": [facts]}
-    results = Results(recipe.run.directory / "results.json", meta, identity)
-    return Measured(results, facts, actors, observations, source)
-
-
-def check_coordinate(recipe: CurvatureRecipe, observations: SharedObservations) -> None:
+def check_coordinate(options: CurvatureOptions, observations: SharedObservations) -> None:
+    """Refuse a coordinate that actions do not have."""
     width = observations.data["action"].shape[-1]
-    if not 0 <= recipe.coordinate < width:
-        raise ValueError(f"--coordinate must be in [0, {width}), got {recipe.coordinate}")
-
-
-def draw(recipe: CurvatureRecipe, measured: Measured, rows: Sequence[Row]) -> None:
-    observations, paths = measured.observations, {}
-    few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
-    label = source_labels(rows)
-    for policy, group in grouped(rows, lambda row: row["policy"]).items():
-        actor = next(iter(next(g for m, g in measured.actors.items() if str(m) == policy).values()))
-        generator = torch.Generator(recipe.run.device).manual_seed(0)
-        windows = few.windows(actor.prior, see_history=sees_history(actor))
-        windows = encoded_windows(actor, windows)
-        path = flow_paths(actor, windows, recipe.held_out.steps, generator=generator)
-        paths[label(group[0])] = path[..., 0, recipe.coordinate].cpu()
-    facts = measured.facts
-    told = with_space(f"{facts['task']} {facts['style']}", facts)
-    title = f"{told}: action coordinate {recipe.coordinate} "
-    plot_flow_paths(
-        paths,
-        recipe.run.directory / "flow_paths.png",
-        title=f"{title}along the flow,\n{measured.source}",
-    )
+    if not 0 <= options.coordinate < width:
+        raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
 
 
 def run(argv: Sequence[str] | None) -> None:
-    held_out = HeldOutOptions(observations=2_000)
-    presets = {n: CurvatureRecipe.of(p, held_out=held_out) for n, p in PRESETS.items()}
-    recipe = parse(
-        presets,
-        argv,
-        study="curvature",
-        description=__doc__,
-        preset=partial(comparison_preset, presets=presets),
-        unused=("episodes", "nfe", "top_k", "play_on", "grid", "checkpoints"),
-    )
-    with started(recipe, "curvature") as out:
-        folder = recipe.policies.run
-        measured = own_run(recipe) if folder is None else finished_run(recipe, folder)
-        rows = straightness(
-            measured.actors,
-            measured.observations,
-            n_steps=recipe.held_out.steps,
-            draws=recipe.held_out.draws,
-            description="curvature",
+    """Train the policies, or take those of a run, and measure how straight their flows are."""
+    many = HeldOut(observations=2_000)
+    presets = {n: study(CurvatureOptions, base, held_out=many) for n, base in PRESETS.items()}
+    options = parse(presets, argv, "curvature", __doc__)
+    if not any(method.is_flow for method in options.sources.methods()):
+        raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
+    with started(options, "curvature") as out:
+        if options.policies.run is None:
+            policies = policies_of(options, options.sources.methods())
+            # Before the training: what cannot be measured on is better known now.
+            observations, source = observations_of(options, policies[0])
+            check_coordinate(options, observations)
+            train_all(options, policies)
+            task = policies[0].task()
+            name, style, facts = task.name, task.style, task.facts
+            actors = trained_actors(policies)
+        else:
+            name, style, facts, actors = finished_policies(options.policies.run, options.run.device)
+            first: Any = next(iter(next(iter(actors.values())).values()))
+            observations, source = held_out(
+                options.held_out,
+                name,
+                style,
+                facts,
+                first.normalizer,
+                chunk_length=first.prior.chunk_length,
+                observation_steps=first.network.observation_steps,
+                device=options.run.device,
+            )
+            check_coordinate(options, observations)
+        measured = straightness(
+            actors, observations, n_steps=options.held_out.steps, draws=options.held_out.draws
         )
-        measured.results.meta["observations"] = measured.source
-        measured.results.add(*rows)
-        draw(recipe, measured, rows)
-        write_report(out, curvature_table(rows, measured.facts, source=measured.source))
+        rows = replace_rows(out / "curvature.jsonl", measured)
+
+        few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
+        labels = dict(zip(rows.policy, labelled(rows).method, strict=True))
+        paths = {}
+        for method, by_seed in actors.items():
+            if str(method) in labels:
+                actor = by_seed[min(by_seed)]
+                generator = torch.Generator(options.run.device).manual_seed(0)
+                windows = few.windows(actor.prior, see_history=sees_history(actor))
+                windows = encoded_windows(actor, windows)
+                path = flow_paths(actor, windows, options.held_out.steps, generator=generator)
+                paths[labels[str(method)]] = path[..., 0, options.coordinate].cpu()
+        title = f"{name} {style}: action coordinate {options.coordinate} along the flow,\n{source}"
+        plot_flow_paths(paths, out / "flow_paths.png", title=title)
+        table = curvature_table(rows, {"task": name, "data": style, **facts}, source)
+        write_report(out, table, table, rows)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the study."""
     return run_script(lambda: run(argv), "curvature.py")
 
 

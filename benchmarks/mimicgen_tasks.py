@@ -14,42 +14,39 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
-from functools import partial
-from typing import Any
 
-from warmprior.experiments import PRESETS, DataOptions, Recipe, comparison_preset, study_success
+from options import PRESETS, Options, adapted, with_parts
+from robomimic import run
+
 from warmprior.io.script import run_script
 
-
-def few(preset: Recipe, iterations: int, **data: Any) -> Recipe:
-    """A preset for ten demonstrations, the paper's number."""
-    return replace(
-        preset,
-        data=DataOptions(task=("stack",), demonstrations=(10,), **data),
-        training=replace(preset.training, iterations=iterations, batch_size=128),
-    )
-
-
+# The paper's number of demonstrations, and a training for so few.
 FEW = {
-    "quick": few(PRESETS["quick"], 5_000),
-    "cpu": few(PRESETS["cpu"], 5_000),
-    "paper": few(PRESETS["paper"], 50_000, obs="image"),
+    name: with_parts(
+        preset,
+        data={
+            "task": ("stack",),
+            "demonstrations": (10,),
+            "obs": "image" if name == "paper" else "state",
+        },
+        training={"iterations": 50_000 if name == "paper" else 5_000, "batch_size": 128},
+    )
+    for name, preset in PRESETS.items()
 }
 
 
-def preset(asked: Recipe) -> Recipe:
-    """That of what is asked for: without a file robosuite's Stack, which has a scripted expert."""
-    chosen = comparison_preset(asked, FEW)
+def adapt(preset: Options, asked: Options) -> Options:
+    """Without a file the task is robosuite's Stack, which has a scripted expert."""
+    chosen = adapted(preset, asked)
     if asked.data.generated:
         return chosen
     tasks = () if asked.data.dataset else ("stack_d0", "coffee_d0", "threading_d0")
-    return replace(chosen, data=replace(chosen.data, task=tasks, data=("source",)))
+    return with_parts(chosen, data={"task": tasks, "data": ("source",)})
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    options = {"study": "mimicgen", "description": __doc__, "preset": preset}
-    script = partial(study_success, FEW, argv, **options)
+    """Run the benchmark."""
+    script = lambda: run(argv, FEW, "mimicgen", __doc__ or "", adapt=adapt)  # noqa: E731
     return run_script(script, "mimicgen_tasks.py", together=True)
 
 

@@ -10,143 +10,159 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import pandas as pd
 import torch
+from common import Policy, policies_of, replace_rows, trained_actors
+from measures import straightness
+from options import Evaluation, Options, Sources, check_single, parse, started
+from plots import plot_flow_paths, plot_navigation
+from report import labelled, navigation_table, write_report
+from robomimic import beside, train_all
 
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
-from warmprior.experiments import (
-    Comparison,
-    Row,
-    Store,
-    mean_cell,
-    navigation_problem,
-    parse,
-    plot_flow_paths,
-    plot_navigation,
-    select,
-    source_labels,
-    started,
-    straightness,
-    table,
-    write_report,
-)
-from warmprior.experiments.navigation1d import (
-    NAVIGATION_PRESETS,
+from warmprior.io.script import run_script
+from warmprior.training import (
+    NetworkOptions,
+    TrainingConfig,
     judge_navigation,
     play_navigation,
 )
-from warmprior.experiments.record import variation_notes
-from warmprior.io.script import run_script
 
-COLUMNS = {
-    "switches at boundaries": "switch_rate",
-    "rollouts on one side": "commit_rate",
-    "collisions": "collision_rate",
-    "route entropy (bit)": "route_entropy",
-    "distance to data": "distance",
-    "jump ratio": "jump_ratio",
-    "kappa (H)": "kappa_executed",
-    "kappa (H) / speed": "relative_executed",
-    "collisions, history shifted": "shifted_collision_rate",
-    "distance, history shifted": "shifted_distance",
+STEPS = 32  # half of an episode: the longest chunk
+
+# The paper's Algorithm 1 withholds no history; PreviewPrior says why small sigma needs it.
+WITHHELD = 0.1
+
+
+@dataclass(frozen=True)
+class NavigationOptions(Options):
+    """A comparison of sources on the toy; its episodes are rollouts."""
+
+    @property
+    def name(self) -> str:
+        """Of the output folder."""
+        return f"h{'-'.join(map(str, self.sources.chunk))}"
+
+    def check(self) -> None:
+        """Refuse what cannot work, before any work."""
+        super().check()
+        check_single(self, "chunk")
+        if self.sources.chunk[0] > STEPS:
+            raise ValueError(f"--chunk must be at most {STEPS}, got {self.sources.chunk[0]}")
+
+
+SHARED = {
+    "sources": Sources(("gaussian", "regression", "history", "past", "preview"), (4,), (0.1, 0.5)),
+    "evaluation": Evaluation(episodes=256, nfe=(9, 1)),
+}
+NAVIGATION_PRESETS = {
+    # All policies in a few minutes on two cores.
+    "quick": NavigationOptions(
+        network=NetworkOptions(hidden_dim=128, observation_steps=1),
+        training=TrainingConfig(
+            iterations=3_000,
+            batch_size=256,
+            learning_rate=2e-3,
+            warmup_ratio=0.0,
+            checkpoints=1,
+            save_every=3_000,
+            cold_probability=WITHHELD,
+        ),
+        **SHARED,  # type: ignore[arg-type]
+    ),
+    # The paper's network and iterations: hours on a CPU.
+    "wide": NavigationOptions(
+        network=NetworkOptions(hidden_dim=1024, observation_steps=1),
+        training=TrainingConfig(
+            iterations=50_000, batch_size=256, checkpoints=1, cold_probability=WITHHELD
+        ),
+        **SHARED,  # type: ignore[arg-type]
+    ),
 }
 
 
-def judge(comparison: Comparison) -> list[Row]:
-    """What every policy does, at every number of network evaluations."""
-    rollouts = comparison.recipe.evaluation.episodes
-    rows = []
-    for contestant in comparison.contestants:
-        actor, seed = comparison.player(contestant).to("cpu"), contestant.training.seed
-        for nfe in contestant.method.allowed_nfes(comparison.nfes):
-            measures = judge_navigation(actor, seed, nfe=nfe, rollouts=rollouts)
-            rows.append(Row(contestant.facts() | {"nfe": nfe}, measures))
-    return rows
-
-
-def curvatures(comparison: Comparison, observations: SharedObservations) -> list[Row]:
-    """Of the flows, seed by seed: the source samples belong to the seed."""
-    rows = []
-    for seed in comparison.recipe.seeds:
-        policies = {
-            method: {seed: group[seed].to("cpu")} for method, group in comparison.policies().items()
-        }
-        rows += straightness(policies, observations, draws=4, seed=seed)
-    return rows
-
-
-def make_table(rows: Sequence[Row], notes: Sequence[str] = ()) -> str:
-    """A line per policy and number of network evaluations; curvature is that of the first."""
-    played = select(rows, "collision_rate")
-    label, first = source_labels(played), max(row["nfe"] for row in played)
-    curved = [
-        Row({**row.facts, "nfe": first}, row.measures)
-        for row in select(rows, "kappa_executed", mean="training")
-    ]
-    return table(
-        [*played, *curved],
-        lambda row: f"{label(row)}, NFE {row['nfe']}",
-        None,
-        {name: mean_cell(measure, ".3f") for name, measure in COLUMNS.items()},
-        head="policy",
-        notes=notes,
-    )
-
-
-def draw(comparison: Comparison, rows: Sequence[Row], observations: SharedObservations) -> None:
-    out, recipe = comparison.directory, comparison.recipe
-    seed, chunk = recipe.seeds[0], recipe.sources.chunk[0]
-    told = f"H = {chunk}, {recipe.network.hidden_dim}-d network, {recipe.training.iterations} iterations"
-    told += f", seed {seed}"
-    label = source_labels(rows)
+def draw(
+    options: NavigationOptions,
+    policies: Sequence[Policy],
+    rows: pd.DataFrame,
+    observations: SharedObservations,
+) -> None:
+    """What the policies of the first seed execute, and the paths of their flows."""
+    seed, chunk = options.training.seed, options.sources.chunk[0]
     panels, paths = {}, {}
-    for contestant in comparison.contestants:
-        if contestant.training.seed != seed:
-            continue
-        method, actor = contestant.method, comparison.player(contestant).to("cpu")
-        nfe = max(method.allowed_nfes(comparison.nfes))
-        (row,) = select(rows, "collision_rate", **contestant.facts(), nfe=nfe)
-        text = [f"collides {row['collision_rate']:.0%}"]
-        if row["switch_rate"] is not None:
-            text[0] = f"switches sides at {row['switch_rate']:.1%} of boundaries, {text[0]}"
+    shown = labelled(rows).set_index(["policy", "nfe"])
+    for policy in (policy for policy in policies if policy.training.seed == seed):
+        method, actor = policy.method, policy.load()
+        nfe = max(method.nfes(options.evaluation.nfe))
+        row = shown.loc[policy.name, nfe]
+        text = [f"collides {row.collision_rate:.0%}"]
+        if pd.notna(row.switch_rate):
+            text[0] = f"switches sides at {row.switch_rate:.1%} of boundaries, {text[0]}"
         if method.remembers:
-            text.append(f"with its history shifted: collides {row['shifted_collision_rate']:.0%}")
+            text.append(f"with its history shifted: collides {row.shifted_collision_rate:.0%}")
         rollout = play_navigation(actor, seed, nfe=nfe)
-        panels[label(row)] = (executed_actions(rollout)[0].squeeze(-1), text)
+        panels[row.method] = (executed_actions(rollout)[0].squeeze(-1), text)
         if method.is_flow:
             # One window of a demonstration, above the first obstacle, from many source samples.
-            window = observations.windows(actor.prior, see_history=method.sees_history)
+            window = observations.windows(actor.prior, see_history=method.parts.sees_history)
             index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
             batch = window[index : index + 1].expand(48).contiguous()
             generator = torch.Generator().manual_seed(seed)
-            paths[label(row)] = flow_paths(actor, batch, 100, generator=generator)[..., 0, 0]
-    title = f"One-dimensional navigation: {told}"
+            paths[row.method] = flow_paths(actor, batch, 100, generator=generator)[..., 0, 0]
+    network, iterations = options.network.hidden_dim, options.training.iterations
+    what = f"H = {chunk}, {network}-d network, {iterations} iterations, seed {seed}"
+    out = options.run.folder
+    title = f"One-dimensional navigation: {what}"
     plot_navigation(panels, out / "navigation1d.png", chunk_length=chunk, title=title)
-    title = f"Paths of the flow above the first obstacle, after a demonstrated history: {told}"
+    title = f"Paths of the flow above the first obstacle, after a demonstrated history: {what}"
     plot_flow_paths(paths, out / "flow_paths.png", title=title)
 
 
 def run(argv: Sequence[str] | None) -> None:
-    recipe = parse(
-        NAVIGATION_PRESETS,
-        argv,
-        study="navigation1d",
-        description=__doc__,
-        unused=("observation_steps", "top_k", "checkpoints"),
+    """Train the policies, roll them out and measure their flows."""
+    options = parse(
+        NAVIGATION_PRESETS, argv, "navigation1d", __doc__, adapt=lambda base, asked: base
     )
-    with started(recipe, "navigation1d") as out:
-        problem = navigation_problem()
-        comparison = Comparison(recipe, "navigation1d", stores=[Store.of(recipe, problem)])
-        comparison.train()
-        observations = SharedObservations(problem.data, recipe.sources.chunk[0])
-        rows = [*judge(comparison), *curvatures(comparison, observations)]
-        comparison.results.add(*rows)
+    with started(options, "navigation1d") as out:
+        policies = policies_of(options, options.sources.methods(), ("navigation", "toy"), only=True)
+        train_all(options, policies)
+        judged = [
+            {
+                **policy.facts,
+                "nfe": nfe,
+                **judge_navigation(
+                    policy.load(),
+                    policy.training.seed,
+                    nfe=nfe,
+                    rollouts=options.evaluation.episodes,
+                ),
+            }
+            for policy in policies
+            for nfe in policy.method.nfes(options.evaluation.nfe)
+        ]
+        rows = replace_rows(out / "results.jsonl", judged)
+        observations = SharedObservations(policies[0].task().data, options.sources.chunk[0])
+        flows = [
+            row  # seed by seed: the source samples belong to the seed
+            for seed in options.seeds
+            for row in straightness(
+                trained_actors([p for p in policies if p.training.seed == seed]),
+                observations,
+                draws=4,
+                seed=seed,
+            )
+        ]
+        curvatures = replace_rows(out / "curvature.jsonl", flows)
+        table = navigation_table(rows, curvatures, beside(options, Options()))
         # Before the pictures, which are the lesser loss: the trainings took the time.
-        write_report(out, make_table(rows, variation_notes(recipe)))
-        draw(comparison, rows, observations)
+        write_report(out, table, table, pd.concat([rows, curvatures]))
+        draw(options, policies, rows, observations)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the toy."""
     return run_script(lambda: run(argv), "navigation1d.py", together=True)
 
 

@@ -10,266 +10,396 @@ A frozen policy per source and seed comes from --run (a finished run of robomimi
 
 from __future__ import annotations
 
-import json
-import re
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import MISSING, asdict, dataclass, field, fields, make_dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, get_type_hints
 
-from warmprior import WarmPriorActor
-from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.experiments import (
-    Comparison,
-    Results,
-    Row,
-    Store,
-    finished_policies,
-    mean_cell,
-    navigation_problem,
+import tyro
+from common import Rows, finished_policies, policies_of, slug, trained_actors
+from methods import Method
+from navigation1d import NAVIGATION_PRESETS
+from options import (
+    PRESETS,
+    Evaluation,
+    Flat,
+    Options,
+    PolicyOptions,
+    Sources,
+    check_single,
     parse,
-    plot_reinforcement,
-    plot_success,
-    record,
-    select,
     started,
-    table,
-    write_report,
+    study,
+    with_parts,
 )
-from warmprior.experiments.figures import agent_label
-from warmprior.experiments.labels import source_of, space_of, with_space
-from warmprior.experiments.methods import Method
-from warmprior.experiments.prior_space import (
-    PRIOR_SPACE_PRESETS,
-    PriorSpaceRecipe,
-    agent_environment,
-    agent_policy,
-    prior_space_preset,
-)
-from warmprior.experiments.results import facts_of_machine, grouped
-from warmprior.io.files import digest_of, read_json, write_atomic
+from plots import plot_agents, plot_success
+from report import agent_table, problem_title, read_rows, write_report
+from robomimic import train_all
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.transforms import Compose
+
+from warmprior import PriorAnchor, WarmPriorActor, policy_transforms
+from warmprior.diagnostics.flow import sees_history
+from warmprior.envs import GoalNavigationEnv
+from warmprior.envs.description import environment_parts
+from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.files import read_json
 from warmprior.io.script import run_script
 from warmprior.modules.registry import options_of
-from warmprior.rl import PriorSpaceTraining, has_anchor
-from warmprior.training import load_policy, save_policy
+from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining, has_anchor
+from warmprior.training import DataOptions, parallel_env
+from warmprior.training.options import check_counts
 from warmprior.training.threads import torch_threads
+from warmprior.transforms import EncodeObservation
 
-Source = tuple[str, str]
-"""Name and options of a method: agents of several options of one are compared like those of several."""
+TOY = "navigation"
 
-Frozen = dict[Source, dict[int, WarmPriorActor]]
-"""Policies by source and training seed."""
-
-
-def source_of_method(method: Method) -> Source:
-    return method.name, method.options
-
-
-def told(source: Source) -> str:
-    """A source in words, as ``--prior`` takes it."""
-    return ",".join(filter(None, source))
-
-
-def slug(source: Source) -> str:
-    """A source in the names of folders: two sources never share one, nor a name that is too long."""
-    name, options = source
-    if not options:
-        return name
-    # Numbers and the like stay readable; texts and lists could become the same as others.
-    plain = re.fullmatch(r"[\w.=+,-]{1,60}", options, re.ASCII) is not None
-    short = re.sub(r"[^\w.=+-]+", "-", options, flags=re.ASCII)[:60]
-    return f"{name}-{short}" if plain else f"{name}-{short}-{digest_of(options)[:8]}"
+# The recipe of an agent, without what the options that all experiments share say.
+HINTS = get_type_hints(PriorSpaceConfig)
+SHARED = ("algorithm", "seed", "nfe", "evaluation_episodes")
+AgentOptions: Any = make_dataclass(
+    "AgentOptions",
+    [
+        (f.name, HINTS[f.name], field(default=f.default))
+        for f in fields(PriorSpaceConfig)
+        if f.name not in SHARED and f.default is not MISSING
+    ],
+    frozen=True,
+    namespace={"__doc__": PriorSpaceConfig.__doc__},
+)
 
 
-def is_asked(text: str, own: Method) -> bool:
-    """Whether a method is what a ``--prior`` names; what is not said there is as the method has it."""
-    sigma = None if "sigma" in options_of(text) else own.sigma
-    return Method.parse(text, own.chunk_length, sigma=sigma) == own
+@dataclass(frozen=True)
+class GroupOptions:
+    """The agents to compare.
 
-
-def frozen_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], Frozen]:
-    """The facts of the problem, and the policies: of --run, or trained now where they are not yet."""
-    run, device, methods = recipe.policies.run, recipe.run.device, recipe.sources.methods()
-    if run is not None:
-        facts, actors = finished_policies(run, device)
-        if recipe.data.task not in ((), (facts["task"],)):
-            raise ValueError(f"--run {run} is of {facts['task']}, not of {recipe.data.task[0]}")
-        taken: Frozen = {}
-        missing = []
-        for text, source in zip(
-            dict.fromkeys(recipe.sources.prior), map(source_of_method, methods), strict=True
-        ):
-            found = [group for method, group in actors.items() if is_asked(text, method)]
-            if found:
-                taken[source] = found[0]
-            else:
-                missing.append(text)
-        if missing:
-            have, lack = "; ".join(told(source_of_method(m)) for m in actors), "; ".join(missing)
-            raise ValueError(f"--run {run} has policies of {have}, but none of {lack}")
-        return facts, taken
-    stores = None
-    if recipe.is_toy:
-        policies, logs = out.parent / "policies", out / "logs"
-        stores = [Store(navigation_problem(), recipe.network, policies, logs, recipe.run)]
-    comparison = Comparison(recipe, "frozen policies", stores=stores, directory=out / "frozen")
-    comparison.train()
-    (store,) = comparison.stores
-    frozen = {
-        source_of_method(method): {
-            seed: store.policy(method, replace(recipe.training, seed=seed)) for seed in recipe.seeds
-        }
-        for method in methods
-    }
-    return comparison.results.meta["problems"][0], frozen
-
-
-def kept_policies(recipe: PriorSpaceRecipe, out: Path) -> tuple[dict[str, Any], Frozen]:
-    """Copies of the frozen policies that belong to the agents.
-
-    To continue, they must find the very policies they began with, whatever has become of those, or would
-    be trained by now.
+    Attributes:
+        algorithm: of their learning.
+        horizon: time limit in control steps (default: the task's).
+        base_delta: half the agent's box around zero, where --rl.delta is not given (default: 1.5).
+        num_envs: parallel environments of an agent.
+        threads: of an agent's training; more than one only wait for each other in small networks.
+        collectors: Ray actors that collect, with num-envs environments each, with --engine ray (default:
+            none, the training itself collects).
     """
-    sources = dict.fromkeys(map(source_of_method, recipe.sources.methods()))
-    folders = {
-        (source, seed): out / "policies" / f"{slug(source)}-seed{seed}"
-        for source, seed in product(sources, recipe.seeds)
-    }
-    facts = out / "policies" / "problem.json"
-    if not (recipe.run.resume and facts.exists()):
-        problem, frozen = frozen_policies(recipe, out)
-        for (source, seed), folder in folders.items():
-            group = frozen[source]
-            if seed not in group:
-                print(
-                    f"--run has {len(group)} seeds of {told(source)}: agent {seed} shares a policy"
+
+    algorithm: tuple[Literal["dsrl-na", "dsrl-sac"], ...] = ("dsrl-na",)
+    horizon: int | None = None
+    base_delta: float | None = None
+    num_envs: int = 4
+    threads: int | None = None
+    collectors: int | None = None
+
+    def __post_init__(self) -> None:
+        check_counts(self, "horizon", "num_envs", "threads", "collectors")
+        if (
+            self.collectors is not None and self.collectors > 10
+        ):  # their seeds are apart from others'
+            raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
+
+
+@dataclass(frozen=True)
+class AgentsOptions(Options):
+    """A comparison of agents; the frozen policies are those of a comparison of sources.
+
+    Attributes:
+        policies: of a finished run, instead of those of the options.
+        rl: what all agents share.
+        agents: what is compared.
+    """
+
+    policies: Annotated[PolicyOptions, Flat] = field(default_factory=PolicyOptions)
+    # With their prefix: gradient steps, say, are those of behaviour cloning in all experiments.
+    rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
+    agents: Annotated[GroupOptions, Flat] = field(default_factory=GroupOptions)
+
+    @property
+    def is_toy(self) -> bool:
+        """Whether it is of the navigation toy."""
+        return self.data.task == (TOY,)
+
+    @property
+    def name(self) -> str:
+        """Of the output folder."""
+        return TOY if self.is_toy else super().name
+
+    def check(self) -> None:
+        """Refuse what cannot work, before any work."""
+        if self.is_toy != (self.run.preset == "unit"):
+            raise ValueError(f"--task {TOY} and --preset unit belong together")
+        check_single(self, "task", "data", "chunk", "sigma", "nfe")
+        if self.agents.collectors is not None and self.run.engine != "ray":
+            raise ValueError("--collectors belongs to --engine ray")
+        if not self.is_toy and self.policies.run is None:
+            self.data.check()
+            self.network.check(self.data)
+        for method in self.sources.methods():
+            if not method.is_flow:
+                raise ValueError(
+                    f"--prior {method.name} is no flow: there is no source space to act in"
                 )
-            of_seeds = list(group.values())
-            save_policy(group.get(seed, of_seeds[seed % len(of_seeds)]), folder)
-        text = json.dumps(problem) + "\n"
-        write_atomic(facts, lambda path: path.write_text(text))
-    loaded: Frozen = {}
-    for (source, seed), folder in folders.items():
-        actor = load_policy(folder, device=recipe.run.device)
-        loaded.setdefault(source, {})[seed] = actor
-    return read_json(facts), loaded
+            for algorithm in self.agents.algorithm:
+                self.agent(method.has_anchor, algorithm, 0)
+
+    def agent(self, anchored: bool, algorithm: str, seed: int) -> PriorSpaceConfig:
+        """The recipe of one agent, around an anchor or around zero."""
+        shared: Mapping[str, Any] = asdict(self.rl)
+        own: dict[str, Any] = {
+            "algorithm": algorithm,
+            "seed": seed,
+            "nfe": self.evaluation.nfe[0],
+            "evaluation_episodes": self.evaluation.episodes,
+            "backup_entropy": shared["backup_entropy"] or algorithm == "dsrl-sac",
+        }
+        if shared["delta"] is None and not anchored:
+            own["delta"] = self.agents.base_delta
+        return PriorSpaceConfig(**{**shared, **own})
 
 
-def make_table(rows: Sequence[Row]) -> str:
-    """Success before and after, mean and standard deviation over seeds."""
-    percent = mean_cell("success_rate", ".1f", 100)
+TOY_PRESET = NAVIGATION_PRESETS["quick"]
+AGENT_PRESETS: dict[str, AgentsOptions] = {
+    # Lift from a weak policy, WP-Past against the base, two seeds: half an hour.
+    "quick": AgentsOptions(
+        network=PRESETS["quick"].network,
+        training=PRESETS["quick"].training,
+        sources=Sources(prior=("gaussian", "past")),
+        evaluation=Evaluation(seeds=2, episodes=40, nfe=(1,)),
+        rl=AgentOptions(
+            environment_steps=24_000,
+            warmup_steps=3_000,
+            updates=4,
+            noise_critic_steps=2,
+            learning_rate=1e-3,
+            gamma=0.97,
+            hidden_dim=128,
+            # At 1, the entropy of 56 coordinates outweighs the 8 control steps of a decision: the agent
+            # would be paid for not solving the task, until the temperature has fallen.
+            alpha_init=0.05,
+            evaluate_every=6_000,
+        ),
+        agents=GroupOptions(threads=1),
+    ),
+    # The navigation toy with a goal, three seeds: about two minutes.
+    "unit": AgentsOptions(
+        data=DataOptions(task=(TOY,)),
+        network=TOY_PRESET.network,
+        training=replace(TOY_PRESET.training, iterations=800, save_every=800, cold_probability=0.0),
+        sources=Sources(prior=("past",)),
+        evaluation=Evaluation(seeds=3, episodes=128, nfe=(2,)),
+        rl=AgentOptions(
+            environment_steps=12_000,
+            warmup_steps=3_000,
+            updates=12,
+            noise_critic_steps=4,
+            learning_rate=1e-3,
+            tau=0.05,
+            gamma=1.0,
+            hidden_dim=128,
+            num_layers=2,
+            # Failure ends the episode: entropy in the targets would pay for not failing, whatever the reward.
+            backup_entropy=False,
+            alpha_init=0.02,
+            reward_offset=0.0,
+            evaluate_every=6_000,
+        ),
+        agents=GroupOptions(num_envs=32, threads=1),
+    ),
+    # DSRL's hyper-parameters per task, three seeds: needs a GPU.
+    "paper": study(
+        AgentsOptions,
+        PRESETS["paper"],
+        sources=Sources(chunk=(4,)),
+        evaluation=Evaluation(seeds=3, episodes=200, nfe=(1,)),
+        # Success ends the episode here, unlike in DSRL: entropy in the targets would pay for not solving it.
+        rl=AgentOptions(environment_steps=1_000_000, backup_entropy=False, evaluate_every=50_000),
+    ),
+}
 
-    def last(kind: str) -> Callable[[list[Row]], str | None]:
-        def cell(rows: list[Row]) -> str | None:
-            ended = grouped(select(rows, evaluation=kind), lambda row: row["seed"])
-            return percent([group[-1] for group in ended.values()])
+# What a preset does differently on a task.
+BY_TASK: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
+    # Weak policies: solved in 0.3 to 0.8 of the episodes.
+    ("quick", "lift"): {
+        "data": {"demonstrations": (5,)},
+        "training": {"iterations": 300},
+        "agents": {"horizon": 90},
+    },
+    ("quick", "can"): {"training": {"iterations": 500}},
+    ("paper", "lift"): {"rl": {"updates": 30}, "agents": {"horizon": 300}},
+    ("paper", "can"): {"agents": {"horizon": 300}},
+    ("paper", "square"): {
+        "rl": {"gamma": 0.999, "warmup_steps": 32_000},
+        "agents": {"horizon": 400},
+    },
+    # DSRL's own choice there is SAC.
+    ("paper", "transport"): {
+        "rl": {"hidden_dim": 128, "warmup_steps": 640_000},
+        "sources": {"chunk": (8,)},
+        "agents": {"horizon": 800, "base_delta": 1.0, "algorithm": ("dsrl-na", "dsrl-sac")},
+    },
+}
 
-        return cell
 
-    seeds = {
-        agent: len(grouped(g, lambda r: r["seed"])) for agent, g in grouped(rows, agent_of).items()
-    }
-    return table(
-        rows,
-        lambda row: agent_label(row, seeds[agent_of(row)]),
-        None,
-        {
-            "delta": lambda rows: f"{rows[0]['delta']:g}",
-            "control steps": lambda rows: str(max(row["environment_steps"] for row in rows)),
-            "frozen policy (%)": last("base"),
-            "greedy agent (%)": last("greedy"),
-            "stochastic agent (%)": last("stochastic"),
-        },
-        head="agent",
+def adapt(preset: AgentsOptions, asked: AgentsOptions) -> AgentsOptions:
+    """The preset with the hyper-parameters of the task."""
+    name, given, run = asked.run.preset, asked.data.task, asked.policies.run
+    if name == "unit":
+        return preset
+    if run is not None and (run / "tasks.json").exists():
+        given = given or (read_json(run / "tasks.json")[0]["task"],)
+    elif name == "quick" and asked.data.dataset is None:
+        given = given or ("lift",)
+    if name == "paper" and not given:
+        raise ValueError("--preset paper has hyper-parameters per task: add the --task")
+    changed = with_parts(preset, **BY_TASK.get((name, next(iter(given), "")), {}))
+    return with_parts(changed, data={"task": given})
+
+
+def frozen_policies(
+    options: AgentsOptions,
+) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
+    """The task, and the frozen policies by method and seed: of --run, or trained now."""
+    run, methods = options.policies.run, options.sources.methods()
+    if run is None:
+        policies = policies_of(options, methods)
+        train_all(options, policies)
+        task = policies[0].task()
+        return {"task": task.name, "data": task.style, **task.facts}, trained_actors(policies)
+    name, style, facts, actors = finished_policies(run, options.run.device)
+    if options.data.task not in ((), (name,)):
+        raise ValueError(f"--run {run} is of {name}, not of {options.data.task[0]}")
+    found = {}
+    for text in options.sources.prior:
+        # What is not typed is as the method of the run has it.
+        asked = [
+            own
+            for own in actors
+            if own
+            == Method(text, own.chunk_length, None if "sigma" in options_of(text) else own.sigma)
+        ]
+        if not asked:
+            raise ValueError(
+                f"--run {run} has policies of {'; '.join(map(str, actors))}, none of {text}"
+            )
+        group = actors[asked[0]]
+        if missing := set(options.seeds) - group.keys():
+            print(
+                f"--run has {len(group)} seeds of {text}: agents {sorted(missing)} share policies"
+            )
+        known = list(group.values())
+        found[asked[0]] = {
+            seed: group.get(seed, known[seed % len(known)]) for seed in options.seeds
+        }
+    return {"task": name, "data": style, **facts}, found
+
+
+def environment(options: AgentsOptions, actor: WarmPriorActor) -> Callable[[int], EnvBase]:
+    """The environment of agents around a frozen policy, as a function of its seed."""
+    if options.is_toy:
+        return partial(toy, actor, options.agents.num_envs)
+    make_env, make_transforms = environment_parts(actor)
+    make_env = partial(make_env, horizon=options.agents.horizon, **options.evaluation.environment)
+    return partial(simulators, actor, make_env, make_transforms, options.agents.num_envs)
+
+
+def toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
+    """The toy, in which nothing but the anchor is random."""
+    transforms = policy_transforms(
+        actor.prior, observation_steps=1, see_history=sees_history(actor)
     )
+    transforms.append(PriorAnchor(actor))
+    return TransformedEnv(GoalNavigationEnv(batch_size=[num_envs]), transforms)
 
 
-def agent_of(row: Row) -> tuple[str, Source]:
-    return row["algorithm"], source_of(row)
+def simulators(
+    actor: WarmPriorActor, make_env: Any, make_transforms: Any, num_envs: int, seed: int
+) -> EnvBase:
+    """Simulators in workers. Outside of them one anchor draws for all, and one encoder serves all."""
+    workers = parallel_env(make_env, make_transforms, num_envs)
+    env = TransformedEnv(workers, Compose(*encoding(actor), PriorAnchor(actor)))
+    env.set_seed(seed, static_seed=True)
+    return env
 
 
-def draw(rows: Sequence[Row], out: Path, title: str, warmup: int) -> None:
-    """The curves, and the posteriors of the greedy agents."""
-    plot_reinforcement(rows, out / "curves.png", title=title, warmup_steps=warmup)
-    ends = grouped(select(rows, evaluation="greedy"), lambda row: (*agent_of(row), row["seed"]))
-    plot_success(
-        [group[-1] for group in ends.values()],
-        out / "success.png",
-        title=f"{title}: greedy agents",
-        group=lambda row: row["algorithm"].upper(),
+def encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
+    """What turns images into features, for agents of a policy that sees images."""
+    return [EncodeObservation(actor)] if getattr(actor.network, "encodes", False) else []
+
+
+def learn(
+    options: AgentsOptions,
+    actor: WarmPriorActor,
+    algorithm: str,
+    seed: int,
+    folder: Path,
+    name: str,
+) -> PriorSpaceTraining:
+    """Train an agent, or continue it where it was interrupted."""
+    encoders = encoding(actor)  # one that sees images reads their features, as the agent does
+    training = PriorSpaceTraining(
+        actor.replace(observation_key=encoders[0].out_keys[0]) if encoders else actor,
+        environment(options, actor),
+        options.agent(has_anchor(actor), algorithm, seed),
+        folder,
+        evaluation_seed=EVALUATION_SEED,
+        description=name,
+        collectors=options.agents.collectors,
+        ray_address=options.run.ray_address,
     )
+    with torch_threads(options.agents.threads):
+        training.run()
+    return training
 
 
 def run(argv: Sequence[str] | None) -> None:
-    recipe = parse(
-        PRIOR_SPACE_PRESETS,
-        argv,
-        study="rl",
-        description=__doc__,
-        preset=prior_space_preset,
-        unused=("top_k", "checkpoints", "grid"),
-    )
-    with started(recipe, "rl") as out:
-        problem, frozen = kept_policies(recipe, out)
-        meta = facts_of_machine(torch_threads=recipe.agents.threads) | {"problems": [problem]}
-        identity = {"study": "rl", "recipe": record(recipe)}
-        results = Results(out / "results.json", meta, identity, resume=recipe.run.resume)
-        # Rows of earlier versions have no options, and are to be replaced by those that have.
-        results.rows = [replace(row, facts={"options": "", **row.facts}) for row in results.rows]
-        results.save()  # from now on there is something to continue
-        diverged: dict[tuple[str, Source, int], str] = {}
-        for seed, algorithm, source in product(recipe.seeds, recipe.agents.algorithm, frozen):
-            agent, actor = f"{algorithm} {told(source)}, seed {seed}", frozen[source][seed]
-            config = recipe.agent(has_anchor(actor), algorithm, seed)
-            training = PriorSpaceTraining(
-                agent_policy(actor),
-                agent_environment(recipe, actor),
-                config,
-                out / f"{algorithm}-{slug(source)}-seed{seed}",
-                evaluation_seed=EVALUATION_SEED,
-                description=agent,
-                collectors=recipe.agents.collectors,
-                ray_address=recipe.run.ray_address,
-            )
-            try:
-                with torch_threads(recipe.agents.threads):
-                    training.run()
-            except FloatingPointError as error:  # no reason to keep the other agents from learning
-                diverged[algorithm, source, seed] = f"{agent}: {error}"
-            facts = {
-                "task": problem["task"],
-                "data": problem["style"],
-                **space_of(problem),
+    """Train an agent per algorithm, source and seed, and compare their success."""
+    options = parse(AGENT_PRESETS, argv, "rl", __doc__, adapt=adapt)
+    with started(options, "rl") as out:
+        task, frozen = frozen_policies(options)
+        rows = Rows(out / "results.jsonl")
+        failures = []
+        for seed, algorithm, method in product(options.seeds, options.agents.algorithm, frozen):
+            source = ",".join(filter(None, (method.name, method.options)))
+            name, actor = f"{algorithm} {source}, seed {seed}", frozen[method][seed]
+            folder = out / f"{algorithm}-{slug(source)}-seed{seed}"
+            facts: dict[str, Any] = {
+                "task": task["task"],
+                "data": task["data"],
+                **{space: task[space] for space in ("actions", "obs") if space in task},
                 "algorithm": algorithm,
-                "prior": source[0],
-                "options": source[1],
-                "sigma": actor.prior.sigma,
-                "chunk": actor.prior.chunk_length,
-                "nfe": config.nfe,
-                "delta": training.decoder.delta,
+                "prior": method.name,
+                "options": method.options,
+                "sigma": method.sigma,
+                "chunk": method.chunk_length,
+                "nfe": options.evaluation.nfe[0],
                 "seed": seed,
             }
-            results.add(*(evaluated(facts, point) for point in training.curve))
-        complete = [row for row in results.rows if (*agent_of(row), row["seed"]) not in diverged]
-        if complete:
-            name = with_space(f"{problem['task']} {problem['style']}", problem)
-            title = f"{name}, NFE {recipe.evaluation.nfe[0]}"
-            draw(complete, out, title, recipe.rl.warmup_steps)
-            write_report(out, make_table(complete))
-        if diverged:
-            raise FloatingPointError("; ".join(diverged.values()))
-
-
-def evaluated(facts: dict[str, Any], point: dict[str, Any]) -> Row:
-    """The row of one evaluation of an agent."""
-    told = {name: point[name] for name in ("environment_steps", "evaluation")}
-    counted = ("episodes", "successes", "success_rate")
-    return Row(facts | told, {name: point[name] for name in counted})
+            try:
+                training = learn(options, actor, algorithm, seed, folder, name)
+            except FloatingPointError as error:  # no reason to keep the other agents from learning
+                failures.append(f"{name}: {error}")
+                continue
+            rows.rows = [row for row in rows.rows if not facts.items() <= row.items()]
+            rows.add(
+                *({**facts, "delta": training.decoder.delta, **point} for point in training.curve)
+            )
+        if not rows.rows:
+            raise FloatingPointError("; ".join(failures))
+        found = read_rows(rows.path)
+        title = f"{problem_title(task)}, NFE {options.evaluation.nfe[0]}"
+        plot_agents(found, out / "curves.png", title=title, warmup_steps=options.rl.warmup_steps)
+        greedy = found[found.evaluation == "greedy"]
+        ends = greedy.groupby(["algorithm", "prior", "options", "seed"], sort=False).tail(1)
+        title = f"{title}: greedy agents"
+        plot_success(ends, out / "success.png", title=title, group="algorithm")
+        table = agent_table(found)
+        write_report(out, table, table, found, failures)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the comparison."""
     return run_script(lambda: run(argv), "prior_space_rl.py")
 
 

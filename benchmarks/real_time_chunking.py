@@ -14,89 +14,128 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import fields, replace
-from functools import partial
+from dataclasses import dataclass, field, fields, replace
+from typing import Literal
 
-from warmprior.experiments import (
-    PRESETS,
-    Comparison,
-    DelayedRecipe,
-    Recipe,
-    Row,
-    Store,
-    comparison_preset,
-    grouped,
-    guided_labels,
-    mean_cell,
-    parse,
-    plot_delays,
-    started,
-    success_cell,
-    table,
-    write_report,
-)
-from warmprior.experiments.tables import last_checkpoints
+from common import Cell, policies_of
+from methods import Method
+from options import PRESETS, Options, check_single, parse, started, study
+from plots import plot_delays
+from report import delay_table, write_report
+from robomimic import compare
+
 from warmprior.io.script import run_script
+from warmprior.modules.checks import check_whole_numbers
+from warmprior.modules.real_time_chunking import RealTimeChunking
+from warmprior.transforms.delay import check_delay
 
 STUDY = "real-time-chunking"
 
 
-def study(preset: Recipe) -> DelayedRecipe:
-    """A preset at nine network evaluations per chunk: guidance corrects step by step."""
-    parts = {f.name: getattr(preset, f.name) for f in fields(preset)}
-    return DelayedRecipe(**parts | {"evaluation": replace(preset.evaluation, nfe=(9,))})
+@dataclass(frozen=True)
+class DelayOptions(Options):
+    """A comparison under injected latency.
 
+    Attributes:
+        delay: control steps until chunks take effect, an evaluation each.
+        execute: actions executed per decision, the same at all delays (default: as many as the largest
+            delay leaves of H).
+        guidance: without any, and by Real-Time Chunking.
+        toy: the navigation toy: beside the tasks, alone, or not at all.
+        rtc: of the guidance.
+    """
 
-def make_table(rows: Sequence[Row], recipe: DelayedRecipe) -> str:
-    jump, label = mean_cell("boundary_jump", ".3f"), guided_labels(rows)
-    inner, top_k = mean_cell("inner_jump", ".3f"), recipe.evaluation.top_k
-    told = ", ".join(
-        f"{f.name.replace('_', ' ')} {value}"
-        for f in fields(recipe.rtc)
-        if (value := getattr(recipe.rtc, f.name)) is not None
-    )
-    return table(
-        sorted(rows, key=lambda row: (row["task"], row["data"], -row["nfe"], row["delay"])),
-        lambda row: f"{row['task']} {row['data']}, NFE {row['nfe']}, delay {row['delay']}",
-        label,
-        {
-            "success (%)": success_cell(top_k),
-            "jump": lambda rows: jump(last_checkpoints(rows)),
-            "step inside": lambda rows: inner(last_checkpoints(rows)),
-        },
-        notes=[
-            f"- H = {rows[0]['chunk']}; {rows[0]['execute']} actions per decision at every delay, which "
-            f"is told in control steps; {recipe.evaluation.seeds} seed(s), {rows[0]['episodes']} episodes "
-            "per cell.",
-            "- Jump: mean distance between consecutive actions where a chunk takes effect; step inside: "
-            "elsewhere. In normalised action units, of the last checkpoints.",
-            f"- RTC: {told}; the weight is that of the source's own width where sigma is not told.",
-        ],
-    )
+    delay: tuple[int, ...] = (0, 2, 4)
+    execute: int | None = None
+    guidance: tuple[Literal["none", "rtc"], ...] = ("none", "rtc")
+    toy: Literal["beside", "alone", "no"] = "beside"
+    rtc: RealTimeChunking = field(default_factory=RealTimeChunking)
+
+    @property
+    def name(self) -> str:
+        """Of the output folder."""
+        if self.toy == "alone":
+            return "navigation"
+        return super().name + ("-navigation" if self.toy == "beside" else "")
+
+    def check(self) -> None:
+        """Refuse what cannot work, before any work."""
+        super().check()
+        check_single(self, "chunk")
+        for name in ("delay", "guidance"):
+            if not getattr(self, name):
+                raise ValueError(f"--{name} needs at least one value")
+        if self.execute is not None:
+            check_whole_numbers(**{"--execute": self.execute})
+        if self.toy != "no" and self.evaluation.play_on:
+            raise ValueError("the toy has an end of its own: leave out --play-on, or add --toy no")
+        for method in self.sources.methods():
+            cells = self.conditions(method)
+            if not cells:
+                raise ValueError(
+                    f"{method.name} is no flow to guide: add --guidance none, or leave it out"
+                )
+            for delay, execute, guidance in ((c.delay, c.execute, c.guidance) for c in cells):
+                assert delay is not None and execute is not None
+                left = method.prediction_length - execute
+                try:
+                    if execute > method.chunk_length or delay < 0:
+                        raise ValueError(
+                            f"need 0 <= delay and execute <= H = {method.chunk_length}"
+                        )
+                    check_delay(delay, execute, method.prediction_length)
+                    if guidance is not None:
+                        guidance.check_delay(delay, left)
+                except ValueError as error:
+                    raise ValueError(
+                        f"--delay {delay} with --execute {execute} and {method.name}, which predicts "
+                        f"{method.prediction_length}: {error}"
+                    ) from error
+
+    def conditions(self, method: Method) -> list[Cell]:
+        """Every delay, without and with guidance, where there is a flow to guide."""
+        execute = self.execute or max(1, self.sources.chunk[0] - max(self.delay))
+        guidances = {"none": None, "rtc": self.rtc}
+        return [
+            Cell(0, 0, delay, execute, guidances[name])
+            for delay in sorted(set(self.delay))
+            for name in dict.fromkeys(self.guidance)
+            if name == "none" or method.is_flow
+        ]
 
 
 def run(argv: Sequence[str] | None) -> None:
-    presets = {name: study(preset) for name, preset in PRESETS.items()}
-    seen = partial(comparison_preset, presets=presets)
-    recipe = parse(presets, argv, study=STUDY, description=__doc__, preset=seen)
-    with started(recipe, STUDY) as out:
-        stores = [Store.of(recipe, problem) for problem in recipe.problems()]
-        comparison = Comparison(recipe, STUDY, stores=stores)
-        comparison.run()
-        rows = comparison.rows
-        for nfe, mine in grouped(rows, lambda row: row["nfe"]).items():
-            end = f"_nfe{nfe}.png" if len(comparison.nfes) > 1 else ".png"
-            plot_delays(
-                mine,
-                out / f"real_time_chunking{end}",
-                label=guided_labels(mine),
-                top_k=recipe.evaluation.top_k,
-                title=f"{mine[0]['execute']} actions per decision, {recipe.evaluation.seeds} seed(s)",
+    """Train the policies, and play them at every delay."""
+    # Nine network evaluations per chunk: guidance corrects step by step.
+    presets = {
+        name: study(DelayOptions, base, evaluation=replace(base.evaluation, nfe=(9,)))
+        for name, base in PRESETS.items()
+    }
+    options = parse(presets, argv, STUDY, __doc__)
+    with started(options, STUDY) as out:
+        toy = [] if options.toy == "no" else [("navigation", "toy")]
+        alone = options.toy == "alone"
+        policies = policies_of(options, options.sources.methods(), *toy, only=alone)
+        rows, failures = compare(options, policies, options.conditions)
+        top_k, several = options.evaluation.top_k, rows.nfe.nunique() > 1
+        for nfe, mine in rows.groupby("nfe"):
+            end = f"_nfe{nfe}.png" if several else ".png"
+            title = (
+                f"{mine.execute.iloc[0]} actions per decision, {options.evaluation.seeds} seed(s)"
             )
-        write_report(out, make_table(rows, recipe), comparison.failures)
+            plot_delays(mine, out / f"real_time_chunking{end}", top_k=top_k, title=title)
+        given = {
+            f.name.replace("_", " "): getattr(options.rtc, f.name) for f in fields(options.rtc)
+        }
+        guidance = ", ".join(
+            f"{name} {value}" for name, value in given.items() if value is not None
+        )
+        table = delay_table(rows, top_k, guidance)
+        write_report(out, table, table, rows, failures)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
+    """Run the comparison."""
     return run_script(lambda: run(argv), "real_time_chunking.py")
 
 

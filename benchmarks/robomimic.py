@@ -10,18 +10,237 @@ python benchmarks/robomimic.py --resume --out runs/paper         # after an inte
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
+from itertools import product
+from typing import Any
 
-from warmprior.experiments import PRESETS, comparison_preset, study_success
-from warmprior.io.script import run_script
+import pandas as pd
+from common import Cell, Policy, Rows, batches, measure, play, policies_of, row, train
+from jobs import Jobs
+from methods import Method
+from options import PRESETS, Options, parse, started
+from pictures import draw
+from report import success_report, summary, terminal_table, write_report
+
+from warmprior.io.distributed import go_on_alone, rank, world_size
+from warmprior.io.files import write_atomic
+from warmprior.io.script import PartialFailure, run_script
+from warmprior.training import Episode
+
+
+def run(
+    argv: Sequence[str] | None, presets: Mapping[str, Options], study: str, doc: str, **parsing: Any
+) -> None:
+    """The whole benchmark: options, data, training and playing, table and pictures."""
+    options = parse(presets, argv, study, doc, **parsing)
+    with started(options, study) as out:
+        # Demonstrations: generated, downloaded, or read from --dataset. On them a policy per task, method and
+        # seed: network, recipe and data are equal, and the source differs.
+        policies = policies_of(options, options.sources.methods())
+
+        # A row per policy, checkpoint and NFE: what it is, how it was played, and what came out.
+        rows, failures = compare(options, policies)
+
+        # The table, and what the flows look like.
+        results = summary(rows, options.evaluation.top_k)
+        source = policies[0].task().facts.get("source")
+        notes = beside(options, presets["paper"]) + smaller(options, presets["paper"])
+        full = success_report(results, notes, source)
+        draw(options, policies, rows)
+        write_report(out, terminal_table(results), full, results, failures)
+
+
+def compare(
+    options: Options,
+    policies: Sequence[Policy],
+    conditions: Callable[[Method], Sequence[Cell]] = lambda method: [Cell(0, 0)],
+) -> tuple[pd.DataFrame, list[str]]:
+    """Train, measure and play what is missing; the rows so far, and what failed.
+
+    Rows do not depend on who computes them, nor in which order. `conditions` lists how else policies are
+    played: a row for each.
+    """
+    evaluation, places = options.evaluation, {p.name: i for i, p in enumerate(policies)}
+
+    def order(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        delays = row.get("delay") or 0, row.get("guidance") or ""
+        return places[row["policy"]], row["checkpoint"], -row["nfe"], *delays
+
+    describe(options, policies)
+    rows = Rows(options.run.folder / "results.jsonl", order)
+    if others := {row["policy"] for row in rows.rows} - places.keys():
+        raise ValueError(
+            f"{rows.path} has rows of {min(others)}: it was begun with other versions or data. Finish it "
+            "with those, or choose another --out"
+        )
+    failures = train_together(policies)
+    folders = [options.run.folder, *{policy.directory for policy in policies}]
+    with Jobs(options.run, folders) as jobs:
+        for policy in sorted(policies, key=lambda policy: policy.training.seed):
+            if str(policy) in failures:
+                continue
+            cells = [
+                replace(condition, checkpoint=checkpoint, nfe=nfe)
+                for checkpoint, nfe, condition in product(
+                    policy.training.checkpoint_iterations,
+                    policy.method.nfes(evaluation.nfe),
+                    conditions(policy.method),
+                )
+            ]
+            missing = [cell for cell in cells if not rows.find(policy.facts | cell.facts())]
+            collected = Collected(policy, missing, options, rows, jobs.say)
+            trained = jobs.submit(
+                f"train {policy}",
+                train,
+                policy,
+                group=str(policy),
+                training=True,
+                status=policy.status,
+                then=collected.trained,
+            )
+            if any(cell.checkpoint == policy.training.iterations for cell in missing):
+                name = f"measure {policy}"
+                nfes = evaluation.nfe
+                jobs.submit(
+                    name,
+                    measure,
+                    policy,
+                    nfes,
+                    after=trained,
+                    group=str(policy),
+                    then=collected.measured,
+                )
+            for cell, seeds in product(missing, batches(evaluation)):
+                jobs.submit(
+                    f"play {policy}, {cell}",
+                    play,
+                    policy,
+                    cell,
+                    evaluation,
+                    seeds,
+                    after=trained,
+                    group=str(policy),
+                    then=partial(collected.played, cell),
+                )
+        failures |= jobs.wait()
+    reasons = [f"{policy}: {reason}" for policy, reason in failures.items()]
+    if not rows.rows:
+        raise PartialFailure("; ".join(reasons))
+    return pd.DataFrame(rows.rows), reasons
+
+
+def train_all(options: Options, policies: Sequence[Policy]) -> None:
+    """Train what is missing, and play nothing."""
+    describe(options, policies)
+    failures = train_together(policies)
+    folders = [options.run.folder, *{policy.directory for policy in policies}]
+    with Jobs(options.run, folders) as jobs:
+        for policy in policies:
+            jobs.submit(str(policy), train, policy, training=True, status=policy.status)
+        if failures := failures or jobs.wait():
+            raise PartialFailure("; ".join(f"{name}: {why}" for name, why in failures.items()))
+
+
+def describe(options: Options, policies: Sequence[Policy]) -> None:
+    """Write `tasks.json`: what the demonstrations are."""
+    tasks = {policy.place: policy.task() for policy in policies}.values()
+    facts = [{"task": task.name, "data": task.style, **task.facts} for task in tasks]
+    text = json.dumps(facts, indent=1) + "\n"
+    if not rank():
+        write_atomic(options.run.folder / "tasks.json", lambda path: path.write_text(text))
+
+
+def train_together(policies: Sequence[Policy]) -> dict[str, str]:
+    """Under torchrun all processes train each policy together, and the first one goes on; what failed."""
+    failures = {}
+    for policy in policies if world_size() > 1 else ():
+        try:
+            train(policy)
+        except (FloatingPointError, ValueError) as error:  # in all processes alike
+            failures[str(policy)] = str(error)
+            print(f"FAILED {policy}: {error}", flush=True)
+    go_on_alone()
+    return failures
+
+
+class Collected:
+    """What the jobs of one policy have given so far: a cell whose episodes are complete becomes a row."""
+
+    def __init__(
+        self,
+        policy: Policy,
+        cells: Sequence[Cell],
+        options: Options,
+        rows: Rows,
+        say: Callable[[str], None],
+    ) -> None:
+        self.policy, self.rows, self.say = policy, rows, say
+        self.wanted = options.evaluation.episodes
+        self.episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
+        self.measures: dict[int, dict[str, Any]] | None = None
+        self.found = policy.is_trained
+
+    def trained(self, nothing: None) -> None:
+        """The policy is there."""
+        done = "found" if self.found else "trained"
+        self.say(f"{done} {self.policy}, {self.policy.training.iterations} iterations")
+
+    def measured(self, measures: dict[int, dict[str, Any]]) -> None:
+        """The last checkpoint is measured; the others are only played."""
+        self.measures = measures
+        self._complete()
+
+    def played(self, cell: Cell, episodes: list[Episode]) -> None:
+        """Some episodes of a cell are played."""
+        self.episodes[cell] += episodes
+        self._complete()
+
+    def _complete(self) -> None:
+        for cell, episodes in list(self.episodes.items()):
+            last = cell.checkpoint == self.policy.training.iterations
+            if len(episodes) == self.wanted and not (last and self.measures is None):
+                del self.episodes[cell]
+                measures = (self.measures or {}).get(cell.nfe, {}) if last else {}
+                made = row(self.policy, cell, episodes, measures)
+                self.rows.add(made)
+                solved = f"{made['successes']} of {made['episodes']} solved"
+                self.say(f"played {self.policy}, {cell}: {solved}")
+
+
+def beside(options: Options, usual: Options) -> list[str]:
+    """What a table says of options that are not the usual ones, such as the paper's."""
+    parts = {
+        "data": ("actions", "obs", "cameras", "image_size", "fast_rendering"),
+        "network": ("precondition", "encoder", "crop_size", "share_encoder"),
+        "training": ("times", "objective", "weighting", "self_distillation", "precision"),
+        "evaluation": ("grid",),
+    }
+    given = [
+        f"--{name.replace('_', '-')} {value}"
+        for part, names in parts.items()
+        for name in names
+        if (value := getattr(getattr(options, part), name)) != getattr(getattr(usual, part), name)
+    ]
+    return [f"Beside the paper, for all sources: {', '.join(given)}."] if given else []
+
+
+def smaller(options: Options, paper: Options) -> list[str]:
+    """What a table says of a smaller budget than the paper's."""
+    same = options.network.network == paper.network.network and options.network.hidden_dim is None
+    if same and options.training.iterations >= paper.training.iterations:
+        return []
+    return ["Network and training budget are smaller than the paper's."]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    options = {"study": "robomimic", "description": __doc__, "preset": comparison_preset}
-    script = partial(study_success, PRESETS, argv, **options)
-    return run_script(script, "robomimic.py", together=True)
+    """Run the benchmark."""
+    return run_script(
+        lambda: run(argv, PRESETS, "robomimic", __doc__ or ""), "robomimic.py", together=True
+    )
 
 
 if __name__ == "__main__":

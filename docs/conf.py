@@ -10,7 +10,7 @@ from furo.navigation import get_navigation_tree
 from sphinx.util.inspect import signature as _signature
 from sphinx.util.inspect import stringify_signature
 
-_sys.path.insert(0, str(_Path(__file__).parent))  # error_messages, tutorial_state
+_sys.path.insert(0, str(_Path(__file__).parent))  # tutorial_state
 
 project = "warmprior"
 author = "the warmprior developers"
@@ -28,7 +28,6 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "sphinx-mathjax-offline",  # formulas need no internet
-    "error_messages",
 ]
 templates_path = ["_templates"]
 html_theme = "furo"

@@ -54,6 +54,6 @@ def ray_address():
         env={**os.environ, "PYTHONPATH": root, "RAY_AUTH_MODE": "disabled"},
     )
     with process:
-        told = (line.split() for line in process.stdout)
-        yield next(words[1] for words in told if words[:1] == ["address"])
+        said = (line.split() for line in process.stdout)
+        yield next(words[1] for words in said if words[:1] == ["address"])
         process.stdin.write("\n")

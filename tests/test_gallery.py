@@ -11,15 +11,16 @@ ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "gallery.md").read_text()
 FILES = ROOT / "docs" / "_static" / "gallery"
 LIMIT, FILM_LIMIT = 4_000_000, 250_000
-DRAWS = re.compile(r"\b(?:plot_\w+|new_figure|study_success)\b")
+DRAWS = re.compile(r"\b(?:plot_\w+|new_figure|draw)\(|from robomimic import run\b")
+SHARED = ("plots.py", "pictures.py")  # no benchmarks
 # "name.png", and f"name_{...}" of names that tell what they are of.
 DRAWN = re.compile(r'/ f?"([a-z0-9_]+?)_?(?:\{[^"]*|\.png|\.mp4)"')
 
 
 def _drawing() -> dict[str, str]:
-    """Benchmarks that draw by the library's figures, and their source: not throughput.py, which times."""
+    """Benchmarks that draw, and their source: not throughput.py, which times."""
     scripts = (ROOT / "benchmarks").glob("[!_]*.py")
-    found = {script.name: script.read_text() for script in scripts}
+    found = {script.name: script.read_text() for script in scripts if script.name not in SHARED}
     return {name: source for name, source in found.items() if DRAWS.search(source)}
 
 
@@ -42,8 +43,8 @@ def test_every_benchmark_that_draws_has_a_section_with_a_command_and_a_picture()
 
 
 def test_every_kind_of_picture_is_named():
-    study = (ROOT / "warmprior" / "experiments" / "success_study.py").read_text()
-    sources = _drawing() | {"robomimic.py": study}
+    pictures = (ROOT / "benchmarks" / "pictures.py").read_text()
+    sources = _drawing() | {"robomimic.py": pictures}
     kinds = {name: set(DRAWN.findall(source)) for name, source in sources.items()}
     assert kinds["robomimic.py"] == {"success", "learning_curves", "filmstrip", "film"}
     assert kinds["chunking.py"] == {"chunk_lengths", "bars", "violins"}

@@ -83,10 +83,9 @@ ROOMS = (
     "deploy",
     "envs",
     "data",
+    "diagnostics",
     "training",
     "rl",
-    "diagnostics",
-    "experiments",
 )
 """Each may import those before it alone."""
 

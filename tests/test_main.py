@@ -14,16 +14,20 @@ import pytest
 from tests.data.synthetic import write_robomimic_file
 from tests.io.hub_server import TOKEN, model_hub
 from tests.processes import apart
-from warmprior import PastPrior, StartPoint, VelocityMLP, WarmPriorActor
+from warmprior import PastPrior, StartPoint, VelocityMLP, WarmPriorActor, policy_transforms
 from warmprior.__main__ import main
 from warmprior.training.saved import save_policy
 
 pytest.importorskip("robosuite")
 from warmprior.envs import RobosuiteEnv, rendering_backend
 from warmprior.envs.tasks import TaskSpec
-from warmprior.experiments import NetworkOptions, RunOptions, Store, robosuite_problem
-from warmprior.experiments.methods import Method
-from warmprior.training import TrainingConfig, play_episode
+from warmprior.training import (
+    NetworkOptions,
+    TrainingConfig,
+    play_episode,
+    robosuite_task,
+    train_policy,
+)
 from warmprior.training.behaviour_cloning import policy_path
 
 
@@ -41,27 +45,27 @@ def saved(tmp_path_factory):
     path = folder / "lift.hdf5"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
     training = TrainingConfig(iterations=3, batch_size=8, checkpoints=1)
-    problem, network = robosuite_problem(path), NetworkOptions(hidden_dim=16)
-    run = RunOptions(logger="none")
-    store = Store(problem, network, folder / "policies", folder / "logs", run)
-    method = Method.parse("past", 8)
-    actor = store.policy(method, training)
-    env = problem.make_env().append_transform(store.transforms(method)())
+    task, prior = robosuite_task(path), PastPrior(8)
+    network = NetworkOptions(hidden_dim=16)
+    actor = train_policy(
+        task, prior, folder / "policy", network=network, training=training, description=None
+    )
+    env = task.make_env().append_transform(policy_transforms(prior, normalizer=task.normalizer))
     episode = play_episode(actor, env, 10_000_000, nfe=1)
     env.close()
     kept = folder / "kept"
-    shutil.copytree(policy_path(store.folder(method, training), 3), kept)
+    shutil.copytree(policy_path(folder / "policy", 3), kept)
     path.unlink()
-    shutil.rmtree(store.directory)
+    shutil.rmtree(folder / "policy")
     return kept, episode
 
 
 def test_evaluate_plays_the_same_episodes(saved, capsys):
     folder, episode = saved
     assert main(["evaluate", str(folder), "--episodes", "1", "--nfe", "1"]) == 0
-    printed = capsys.readouterr().out
-    assert f"{int(episode.success)} of 1 episodes solved" in printed
-    assert f" {episode.steps} control steps on average" in printed
+    said = capsys.readouterr().out
+    assert f"{int(episode.success)} of 1 episodes solved" in said
+    assert f" {episode.steps} control steps on average" in said
 
 
 @pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
@@ -95,8 +99,8 @@ def test_another_grid_is_played(saved, capsys, monkeypatch):
 
 def test_info(saved, capsys):
     assert main(["info", str(saved[0])]) == 0
-    printed = capsys.readouterr().out
-    assert "PastPrior(chunk_length=8" in printed and "Lift" in printed and "VelocityMLP" in printed
+    said = capsys.readouterr().out
+    assert "PastPrior(chunk_length=8" in said and "Lift" in said and "VelocityMLP" in said
 
 
 def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, monkeypatch):
@@ -125,11 +129,11 @@ def test_a_policy_is_pushed_and_played_from_the_hub(saved, tmp_path, capsys, mon
             (["info", "me/lift", "--revision", "v2"], "no branch, tag or commit v2"),
             (["push", "me/lift", "me/lift"], "there is no such folder"),
             (["push", str(folder), "lift"], "use user/name"),
-            (["push", str(folder), "me/lift", "--run", str(tmp_path)], "has no results.json"),
+            (["push", str(folder), "me/lift", "--run", str(tmp_path)], "has no results.jsonl"),
         ):
             assert main(argv) == 2
-            printed = capsys.readouterr().err
-            assert message in printed and printed.splitlines()[-1].startswith("warmprior: error: ")
+            said = capsys.readouterr().err
+            assert message in said and said.splitlines()[-1].startswith("warmprior: error: ")
 
 
 def test_version(capsys):
@@ -198,16 +202,36 @@ def test_what_a_user_can_mend_is_said_in_one_line(saved, tmp_path, capsys):
         assert message in said and said.startswith("warmprior: error: ") and said.count("\n") == 1
 
 
-def test_train(tmp_path, capsys):
+def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
     path, out = tmp_path / "lift.hdf5", tmp_path / "out"
     write_robomimic_file(path, lengths=(30, 40), task="lift")
-    small = ["--iterations", "2", "--hidden-dim", "8", "--prior", "past", "--logger", "none"]
-    assert main(["train", "--dataset", str(path), "--out", str(out), *small]) == 0
-    folder = capsys.readouterr().out.splitlines()[-1].split(": ")[-1]
+    argv = ["train", "--dataset", str(path), "--out", str(out), "--hidden-dim", "8", "--seed", "3"]
+    small = [*argv, "--iterations", "2", "--prior", "past,correlation=0.5,sigma=0.3"]
+    assert main(small) == 0
+    folder = capsys.readouterr().out.splitlines()[-1]
+    assert folder == str(out / "lift-ph-past-seed3" / "policy_000002")
     assert main(["info", folder]) == 0
-    assert "PastPrior(chunk_length=8" in capsys.readouterr().out
-    assert main(["train", "--dataset", str(path), "--out", str(out)]) == 2
-    assert "add --resume" in capsys.readouterr().err
+    assert "PastPrior(chunk_length=8, sigma=0.3, correlation=0.5)" in capsys.readouterr().out
+    written = {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")}
+    assert main(small) == 0  # there is nothing to do
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")} == written
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--prior nobodys", "unknown prior 'nobodys'"),
+        ("--task tool_hang", "no scripted expert for tool_hang: add --download"),
+        ("--dataset missing.hdf5", "--dataset missing.hdf5: no such file"),
+        ("--encoder small", "--encoder belong to --obs image"),
+        ("--chunk 0", "chunk_length"),
+    ],
+)
+def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, message):
+    assert main(["train", *words.split(), "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert message in said and said.startswith("warmprior: error: ")
+    assert not (tmp_path / "out").exists()
 
 
 def test_demonstrations(tmp_path, capsys):

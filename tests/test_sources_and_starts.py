@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from methods import Method
 from tensordict import TensorDict
 from torch import nn
 
@@ -19,7 +20,6 @@ from warmprior import (
     WithheldHistory,
     window_replay_buffer,
 )
-from warmprior.experiments import Method
 from warmprior.history import advance, cold_history
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import Registered
@@ -99,26 +99,26 @@ def cloning(folder, data, **options):
 
 def test_a_prior_with_the_name_of_another_method_is_refused():
     with pytest.raises(ValueError, match="Impostor has the name of the method 'step'"):
-        Method.parse(f"{__name__}:Impostor", H)
+        Method(f"{__name__}:Impostor", H)
 
 
 BASES = {
     "Prior": "warmprior.modules.prior",
-    "LearnedPrior": "warmprior.experiments.learned_sources",
+    "LearnedPrior": "learned_sources",
 }
 
 
 @pytest.mark.parametrize("base", BASES)
 def test_a_base_class_is_no_method(base):
     with pytest.raises(ValueError, match=f"unknown prior '{base}'"):
-        Method.parse(base, H)
+        Method(base, H)
     with pytest.raises(ValueError, match="is no prior that can be built"):
-        Method.parse(f"{BASES[base]}:{base}", H)
+        Method(f"{BASES[base]}:{base}", H)
 
 
 def test_agents_search_around_a_source_that_has_no_mean_of_the_history():
     actor = WarmPriorActor(network(), OwnSource(H))
-    assert has_anchor(actor) and Method("tests.own-source", H).remembers
+    assert has_anchor(actor) and Method(f"{__name__}:OwnSource", H).remembers
     transform = PriorAnchor(actor)
     data = transform._call(TensorDict({"history": cold_history([2], H, H, D_A)}, [2]))
     assert (data["prior", "anchor"] == 1).all()

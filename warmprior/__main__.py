@@ -6,19 +6,27 @@ import argparse
 import importlib
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
-
-UNPLAYED = ("episodes", "nfe", "top_k", "play_on", "grid")
-"""Options of what is not played."""
+from warmprior.modules.prior import Prior
+from warmprior.modules.registry import make
+from warmprior.training import (
+    DataOptions,
+    NetworkOptions,
+    TrainingConfig,
+    find_tasks,
+    train_policy,
+)
+from warmprior.training.behaviour_cloning import policy_path
+from warmprior.training.options import SMALL
 
 
 def _policy(args: argparse.Namespace) -> WarmPriorActor:
-    import warmprior.experiments.learned_sources  # noqa: F401  # imported, they can be loaded by name
     from warmprior.training.saved import load_policy
 
     for module in args.modules:
@@ -98,7 +106,7 @@ def evaluate(args: argparse.Namespace) -> None:
 
 def push(args: argparse.Namespace) -> None:
     """Send a saved policy to the Hugging Face hub, with a card that tells what is known of it."""
-    from warmprior.experiments import model_card, policy_results
+    from warmprior.training.card import model_card, policy_results
     from warmprior.training.saved import push_policy
 
     branch, args.revision = args.revision, None  # of the repository, not of the folder
@@ -115,24 +123,56 @@ def push(args: argparse.Namespace) -> None:
     print(f"{args.repository}: commit {commit}")
 
 
-def train(args: argparse.Namespace) -> None:
-    """Train policies, and play nothing: the options of benchmarks/robomimic.py."""
-    from warmprior.experiments import PRESETS, Comparison, comparison_preset, parse, started
+@dataclass(frozen=True)
+class Train:
+    """Train a policy on demonstrations, and play nothing.
 
-    recipe = parse(
-        PRESETS,
-        args.options,
-        study="train",
-        program="python -m warmprior train",
+    Attributes:
+        data: what it is trained on.
+        network: the velocity network.
+        training: the recipe.
+        prior: its source (gaussian, past, preview, or package.module:Class of your own); options follow as in
+            past,sigma=0.3.
+        chunk: chunk length H.
+        out: folder of the trainings (default: policies); an interrupted one continues.
+        device: of the network, such as cuda.
+    """
+
+    data: DataOptions
+    network: NetworkOptions
+    training: TrainingConfig
+    prior: str = "past"
+    chunk: int = 8
+    out: Path | None = None
+    device: str = "cpu"
+
+
+def train(args: argparse.Namespace) -> None:
+    """Train a policy on demonstrations, and play nothing."""
+    import tyro
+
+    options = tyro.cli(
+        tyro.conf.OmitArgPrefixes[Train],
+        prog="python -m warmprior train",
         description=train.__doc__,
-        preset=comparison_preset,
-        unused=UNPLAYED,
+        args=args.options,
+        default=Train(DataOptions(), NetworkOptions(hidden_dim=384), SMALL),
     )
-    with started(recipe, "train"):
-        comparison = Comparison(recipe, "train")
-        comparison.train()
-    for contestant in comparison.contestants:
-        print(f"{contestant.method.describe()}, seed {contestant.training.seed}: {contestant.path}")
+    options.network.check(options.data)
+    prior = make(Prior, options.prior, options.chunk)
+    for task in find_tasks(options.data, options.network.observation_steps):
+        name = f"{task.name}-{task.style}-{prior.name}-seed{options.training.seed}"
+        folder = (options.out or Path("policies")) / name
+        train_policy(
+            task,
+            prior,
+            folder,
+            network=options.network,
+            training=options.training,
+            device=options.device,
+            description=name,
+        )
+        print(policy_path(folder, options.training.iterations))
 
 
 def demonstrations(args: argparse.Namespace) -> None:

@@ -5,12 +5,14 @@ python docs/figures/what_changes.py        # trains the toy's policies, two minu
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.envs.navigation1d import (
     HALF_HEIGHT,
@@ -18,16 +20,18 @@ from warmprior.envs.navigation1d import (
     OBSTACLES,
     navigation_positions,
 )
-from warmprior.experiments import NAVIGATION_PRESETS, Method, Store, navigation_problem
-from warmprior.experiments.figures import new_figure
-from warmprior.experiments.navigation1d import play_navigation
+from warmprior.training import navigation_task, play_navigation, train_policy
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from navigation1d import NAVIGATION_PRESETS
+from plots import new_figure
 
 OUT = Path(__file__).parents[1] / "_static" / "what_changes.png"
 ABOVE, BELOW = "#1f77b4", "#d95f02"
 SOURCES = {
-    "Gaussian noise": Method("gaussian", 16),
-    "WP-Past: what was just executed": Method("past", 16),
-    "WP-Preview: its own earlier forecast": Method("preview", 16),
+    "Gaussian noise": GaussianPrior(16),
+    "WP-Past: what was just executed": PastPrior(16),
+    "WP-Preview: its own earlier forecast": PreviewPrior(16),
 }
 AHEAD = 4
 """The coordinate of the chunk that is shown."""
@@ -35,15 +39,17 @@ AHEAD = 4
 
 def main() -> None:
     """Train, and draw."""
-    recipe, problem = NAVIGATION_PRESETS["quick"], navigation_problem()
-    data = SharedObservations(problem.data, 16)
+    options, task = NAVIGATION_PRESETS["quick"], navigation_task()
+    data = SharedObservations(task.data, 16)
     figure, axes = new_figure(11.0, 5.4, 2, 3)
     flows, paths = axes[:3], axes[3:]
     with tempfile.TemporaryDirectory() as folder:
-        store = Store(problem, recipe.network, Path(folder), Path(folder))
-        store.run = replace(store.run, logger="none")
-        for column, (name, method) in enumerate(SOURCES.items()):
-            actor = store.policy(method, recipe.training)
+        for column, (name, prior) in enumerate(SOURCES.items()):
+            place = Path(folder) / prior.name
+            # Nothing is withheld from a source that remembers nothing.
+            withheld = options.training.cold_probability if column else 0.0
+            training = replace(options.training, cold_probability=withheld)
+            actor = train_policy(task, prior, place, network=options.network, training=training)
             window = data.windows(actor.prior)
             # Of a demonstration that passes above the first obstacle, while it does.
             index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())

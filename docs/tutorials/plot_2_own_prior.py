@@ -1,35 +1,27 @@
 """
-2. Your own prior, up to a row in the benchmark's table
-=======================================================
+2. Your own prior, up to a comparison
+=====================================
 
 A prior answers one question: where does the flow of a chunk start, after what the robot did? This
-tutorial writes one in a few lines, looks at what it does, and puts it into the same table as the
-library's own.
+tutorial writes one in a few lines, looks at what it does, and compares it with the library's own.
 """
 
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
 
-from warmprior import PastPrior, Prior
+from warmprior import GaussianPrior, PastPrior, Prior
 from warmprior.diagnostics import SharedObservations, executed_actions
 from warmprior.envs import navigation_demonstrations, navigation_positions
-from warmprior.experiments import (
-    NAVIGATION_PRESETS,
-    Comparison,
-    Method,
-    Row,
-    RunOptions,
-    Store,
+from warmprior.training import (
+    NetworkOptions,
+    TrainingConfig,
     judge_navigation,
-    mean_cell,
-    navigation_problem,
+    navigation_task,
     play_navigation,
-    source_labels,
-    table,
+    train_policy,
 )
 
 torch.manual_seed(0)
@@ -112,68 +104,44 @@ plt.show()
 
 # %%
 # What to notice: the past arrives four steps late, the line arrives in time and overshoots where
-# the curve turns. Which one makes the better policy is not told by the distance alone: it takes a
+# the curve turns. The distance alone does not say which one makes the better policy: that takes a
 # comparison.
 #
-# The benchmark's table
-# ---------------------
-# :class:`~warmprior.experiments.Comparison` is what all benchmarks run on. It takes a *recipe*
-# (network, training, evaluation), a :class:`~warmprior.experiments.Store` for the trained policies,
-# so that nothing is trained twice, and *methods*, named compositions of a source with what else may
-# differ, the base of the comparison first. A prior of your own is a method under its name. Here it
-# is the recipe of ``benchmarks/navigation1d.py``, made smaller.
+# A comparison
+# ------------
+# :func:`~warmprior.training.train_policy` takes a task, a source and a recipe. The three policies here
+# differ in their source alone. Network and recipe are those of ``benchmarks/navigation1d.py``, made
+# smaller.
 
 folder = tempfile.TemporaryDirectory()
-recipe = NAVIGATION_PRESETS["quick"]
-recipe = replace(
-    recipe,
-    network=replace(recipe.network, hidden_dim=64),
-    training=replace(
-        recipe.training,
-        iterations=1000,
-        learning_rate=4e-3,
-        save_every=1000,
-        cold_probability=0.1,
-    ),
-    run=RunOptions(out=Path(folder.name) / "run", envs=1, logger="none"),
+network = NetworkOptions(hidden_dim=64, observation_steps=1)
+recipe = TrainingConfig(
+    iterations=1000,
+    batch_size=256,
+    learning_rate=4e-3,
+    warmup_ratio=0.0,
+    checkpoints=1,
+    cold_probability=0.1,
 )
-problem = navigation_problem()
-methods = [
-    Method.parse(name, 4, sigma=0.1)
-    for name in ("gaussian", "past", "momentum")
-]
-comparison = Comparison(
-    recipe,
-    "navigation1d",
-    stores=[Store.of(recipe, problem)],
-    methods=methods,
-)
-comparison.train()
-
-rows = []
-for contestant in comparison.contestants:
-    actor = comparison.player(contestant)
-    for nfe in (9, 1):
-        measures = judge_navigation(actor, seed=0, nfe=nfe, rollouts=256)
-        rows.append(Row(contestant.facts() | {"nfe": nfe}, measures))
-
-columns = {
-    "switches sides": mean_cell("switch_rate", ".3f"),
-    "collisions": mean_cell("collision_rate", ".3f"),
-    "distance to data": mean_cell("distance", ".3f"),
-    "jump ratio": mean_cell("jump_ratio", ".2f"),
-    "collisions, history shifted": mean_cell("shifted_collision_rate", ".3f"),
-}
-label = source_labels(rows)
-print(
-    table(
-        rows,
-        lambda row: f"{label(row)}, NFE {row['nfe']}",
-        None,
-        columns,
-        head="policy",
+actors = {}
+for name, prior in {"Gaussian": GaussianPrior(4), **priors}.items():
+    actors[name] = train_policy(
+        navigation_task(),
+        prior,
+        Path(folder.name) / name,
+        network=network,
+        training=recipe,
+        description=None,
     )
-)
+
+columns = ("switch_rate", "collision_rate", "distance", "jump_ratio")
+columns += ("shifted_collision_rate",)
+print(f"{'':16}", *(f"{name:>24}" for name in columns))
+for name, actor in actors.items():
+    for nfe in (9, 1):
+        row = judge_navigation(actor, seed=0, nfe=nfe, rollouts=256)
+        numbers = (f"{row[column]:24.3f}" for column in columns)
+        print(f"{name + ', NFE ' + str(nfe):16}", *numbers)
 
 # %%
 # What to notice: both warm sources keep their side at nine network evaluations per chunk (NFE 9).
@@ -184,12 +152,10 @@ print(
 # The same rows as pictures, with one network evaluation:
 
 figure, axes = plt.subplots(1, 3, figsize=(10, 2.8), sharey=True)
-for axis, contestant, color in zip(
-    axes, comparison.contestants, colors, strict=True
+for axis, (name, actor), color in zip(
+    axes, actors.items(), colors, strict=True
 ):
-    played = play_navigation(
-        comparison.player(contestant), seed=0, nfe=1, rollouts=40
-    )
+    played = play_navigation(actor, seed=0, nfe=1, rollouts=40)
     heights = executed_actions(played)[0].squeeze(-1)
     for centre in (-0.45, 0.45):
         axis.fill_between(
@@ -203,7 +169,7 @@ for axis, contestant, color in zip(
         alpha=0.6,
     )
     axis.set(
-        title=f"{contestant.method.label}, NFE 1",
+        title=f"{name}, NFE 1",
         xlabel="position",
         xlim=(-1, 1),
     )

@@ -25,7 +25,7 @@ from warmprior import (
 )
 from warmprior.diagnostics import SharedObservations, curvature, source_leak
 from warmprior.envs import navigation_demonstrations
-from warmprior.experiments import judge_navigation
+from warmprior.training import judge_navigation
 
 torch.manual_seed(0)
 demos = navigation_demonstrations()

@@ -8,65 +8,44 @@ change: not a weight, and not a row. This tutorial runs a small grid side by sid
 checks that promise, and shows what was measured on larger ones.
 """
 
+import json
+import subprocess
+import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import torch
 
-from warmprior.experiments import (
-    NAVIGATION_PRESETS,
-    Comparison,
-    Method,
-    RunOptions,
-    Store,
-    judge_navigation,
-    navigation_problem,
-)
+from warmprior.training import load_policy
 
 torch.manual_seed(0)
 
 # %%
 # A grid, side by side
 # --------------------
-# :class:`~warmprior.experiments.Comparison` of :doc:`tutorial 2 <plot_2_own_prior>` trains in worker
-# processes, as many as :class:`~warmprior.experiments.RunOptions` says by ``envs`` (one per core by
-# default). A worker takes one cell after another and computes with one thread. On the command line
-# that is ``--envs 2 --seeds 2``.
+# Every benchmark trains and plays in worker processes, as many as ``--envs`` says (one per core by
+# default). A worker takes one job after another and computes with one thread. Here are the toy's
+# policies from two sources, with a small network and two seeds.
 
 folder = tempfile.TemporaryDirectory()
+script = Path("../../benchmarks/navigation1d.py")
+small = "--prior gaussian past --sigma 0.1 --hidden-dim 64 --iterations 300 --nfe 3 --logger none"
 
 
 def compare(run, seeds, envs):
-    """The toy, two sources, with a small recipe."""
-    recipe = NAVIGATION_PRESETS["quick"]
-    recipe = replace(
-        recipe,
-        network=replace(recipe.network, hidden_dim=64),
-        training=replace(
-            recipe.training,
-            iterations=300,
-            learning_rate=4e-3,
-            save_every=300,
-            cold_probability=0.1,
-        ),
-        evaluation=replace(recipe.evaluation, seeds=seeds),
-        run=RunOptions(out=Path(folder.name) / run, envs=envs, logger="none"),
-    )
-    methods = [
-        Method.parse(name, 4, sigma=0.1) for name in ("gaussian", "past")
-    ]
-    return Comparison(
-        recipe,
-        "grid",
-        stores=[Store.of(recipe, navigation_problem())],
-        methods=methods,
-    )
+    """The rows of a comparison on the toy, and what it printed."""
+    out = Path(folder.name) / run
+    options = f"{small} --seeds {seeds} --envs {envs} --out {out}".split()
+    command = [sys.executable, str(script), *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    lines = (out / "results.jsonl").read_text().splitlines()
+    return [json.loads(line) for line in lines], done.stdout
 
 
-first = compare("grid/two_seeds", seeds=2, envs=2)
-first.train()
+rows, _ = compare("grid/two_seeds", seeds=2, envs=2)
+for row in rows:
+    print(row["policy"], row["collision_rate"])
 
 # %%
 # Nothing is trained twice
@@ -75,14 +54,12 @@ first.train()
 # runs. A run with a third seed finds the other four policies there, and trains two.
 
 policies = Path(folder.name) / "grid" / "policies"
-found = {path.name for path in policies.iterdir()}
-saved = {name: (policies / name).stat().st_mtime_ns for name in found}
+saved = {path: path.stat().st_mtime_ns for path in policies.glob("*/state*")}
 
-more = compare("grid/three_seeds", seeds=3, envs=2)
-more.train()
-for path in sorted(policies.iterdir()):
-    kept = saved.get(path.name) == path.stat().st_mtime_ns
-    print(path.name, "as it was" if kept else "new")
+more, _ = compare("grid/three_seeds", seeds=3, envs=2)
+for path in sorted(policies.glob("*/state*")):
+    kept = saved.get(path) == path.stat().st_mtime_ns
+    print(path.parent.name, "as it was" if kept else "new")
 
 # %%
 # It is the same after an interruption: ``--resume`` continues a training from its last saved state,
@@ -91,39 +68,30 @@ for path in sorted(policies.iterdir()):
 # Nothing depends on who computes
 # -------------------------------
 # Here is one seed again, elsewhere, in a single worker. If the number of workers had a say, the
-# weights would differ in the last bits.
+# weights would differ in the last bits, and so would what the policies do.
+# :func:`~warmprior.training.load_policy` reads both.
 
-alone = compare("alone/run", seeds=1, envs=1)
-alone.train()
-for contestant in alone.contestants:
-    (same,) = [
-        other
-        for other in more.contestants
-        if other.facts() == contestant.facts()
-    ]
-    pairs = zip(
-        contestant.policy().parameters(),
-        same.policy().parameters(),
-        strict=True,
+alone, _ = compare("alone/run", seeds=1, envs=1)
+print("the same rows:", alone == [row for row in more if row["seed"] == 0])
+for row in alone:
+    places = [policies, Path(folder.name) / "alone" / "policies"]
+    one, other = (
+        load_policy(place / row["policy"] / "policy_000300")
+        for place in places
     )
-    equal = all(torch.equal(one, other) for one, other in pairs)
-    print(contestant.method.label, "has the same weights:", equal)
+    pairs = zip(one.parameters(), other.parameters(), strict=True)
+    equal = all(torch.equal(mine, theirs) for mine, theirs in pairs)
+    print(row["prior"], "has the same weights:", equal)
 
 # %%
 # What the cells are for: the spread between seeds is part of the result.
 
 figure, axis = plt.subplots(figsize=(6, 2.4))
-for place, (method, color) in enumerate(
-    zip(more.methods, ("#7f7f7f", "#1f77b4"), strict=True)
-):
-    rates = [
-        judge_navigation(c.policy(), seed=0, nfe=3, rollouts=128)
-        for c in more.contestants
-        if c.method == method
-    ]
-    rates = [row["collision_rate"] for row in rates]
+sources = {"gaussian": "#7f7f7f", "past": "#1f77b4"}
+for place, (name, color) in enumerate(sources.items()):
+    rates = [row["collision_rate"] for row in more if row["prior"] == name]
     axis.plot(rates, [place] * len(rates), "o", color=color, ms=8)
-axis.set_yticks([0, 1], [method.label for method in more.methods])
+axis.set_yticks([0, 1], ["Base", "WP-Past"])
 axis.set(xlabel="episodes that collide, NFE 3", xlim=(-0.03, 1.03))
 axis.set(ylim=(-0.5, 1.5), title="Three training seeds of each source")
 plt.show()
@@ -132,7 +100,7 @@ folder.cleanup()
 # %%
 # How far that goes
 # -----------------
-# ``python benchmarks/scaling.py POLICY`` plays a saved policy in one and more processes, and from the
+# ``python benchmarks/dev/scaling.py POLICY`` plays a saved policy in one and more processes, and from the
 # recorded durations of its decisions and control steps puts together what more cores would take.
 # These numbers are WP-Past's on square, 24 episodes, two cores, at commit 9447452: how many times as
 # fast as one core, and the seconds that were measured.
@@ -200,8 +168,8 @@ plt.show()
 #
 # One large network
 # -----------------
-# Where a single training is what takes long, several processes share its batches. The weights are
-# those of one process up to rounding, and any number of processes goes on from a saved state:
+# Where a single training is what takes long, several processes share its batches. Each draws a part of
+# every batch, so the weights depend on their number:
 #
 # .. code-block:: console
 #

@@ -1,11 +1,59 @@
-"""What the tests of the manipulation benchmarks share."""
+"""What the tests of the benchmarks share."""
 
 from __future__ import annotations
+
+from concurrent.futures import Future
+from importlib.util import find_spec
 
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
 from warmprior.envs.tasks import TaskSpec
+
+
+class Inline:
+    """An engine that computes in this process: fresh ones import for seconds, and know no patches."""
+
+    def __init__(self, workers=1, device="cpu"):
+        self.workers = 1
+
+    def takes(self, job):
+        return True
+
+    def submit(self, job):
+        import jobs
+
+        future = Future()
+        future.set_result(jobs._call(job.function, job.args))
+        return future
+
+    def close(self, kill):
+        pass
+
+
+@pytest.fixture(scope="module", autouse=True)
+def inline(request):
+    """Jobs are computed here, and nothing is filmed, unless a test asks for it."""
+    if find_spec("tyro") is None or request.path.name == "test_jobs.py":
+        yield
+        return
+    import common
+    import jobs
+    import pictures
+
+    with pytest.MonkeyPatch.context() as patch:
+        local = jobs.Local
+        patch.setattr(jobs, "Local", Inline)
+        patch.setattr(pictures, "rendering_backend", lambda: None)
+        yield local
+    for cached in (common.cached_task, common.prepared, common.simulator):
+        cached.cache_clear()
+
+
+@pytest.fixture
+def processes(inline, monkeypatch):
+    """Jobs are computed in fresh processes, as users have it."""
+    monkeypatch.setattr("jobs.Local", inline)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -33,12 +81,11 @@ def validation(tmp_path_factory):
 @pytest.fixture
 def no_work(monkeypatch):
     """Nothing is generated, downloaded or trained."""
-    pytest.importorskip("tyro")
-    from warmprior.experiments import Store, problem
 
     def never(*args, **options):
         raise AssertionError("work was begun")
 
-    monkeypatch.setattr(Store, "train", never)
-    for name in ("generate_demonstrations", "download_robomimic", "download_mimicgen"):
-        monkeypatch.setattr(problem, name, never)
+    places = ["common.train_policy", "robomimic.train", "measures.generate_demonstrations"]
+    loaders = ("generate_demonstrations", "download_robomimic", "download_mimicgen")
+    for place in [*places, *(f"warmprior.training.task.{name}" for name in loaders)]:
+        monkeypatch.setattr(place, never)

@@ -34,25 +34,21 @@ def options(path, out, **extra):
 def refused(main, argv, capsys):
     """The line in which a script refuses a command line."""
     code = main([str(word) for word in argv])
-    told = capsys.readouterr().err
-    assert code == 2 and "Traceback" not in told, told
-    line = told.splitlines()[-1]  # below the bars of what was begun
-    assert re.match(r"\w+\.py: error: ", line), told
+    said = capsys.readouterr().err
+    assert code == 2 and "Traceback" not in said, said
+    line = said.splitlines()[-1]  # below the bars of what was begun
+    assert re.match(r"\w+\.py: error: ", line), said
     return line
 
 
-def stored(out):
-    """The results in an output folder, with rows of facts and measures together."""
-    result = json.loads((out / "results.json").read_text())
-    for row in result["rows"]:
-        assert set(row) - {"outcomes"} == {"facts", "measures"}
-        assert not row["facts"].keys() & row["measures"].keys()
-    return result | {"rows": [row["facts"] | row["measures"] for row in result["rows"]]}
+def stored(out, name="results"):
+    """The rows of a file in an output folder."""
+    return [json.loads(line) for line in (out / f"{name}.jsonl").read_text().splitlines()]
 
 
-def having(rows, measure):
-    """The rows that have a measure."""
-    return [row for row in rows if measure in row]
+def described(out, name):
+    """Another file of an output folder: options or tasks."""
+    return json.loads((out / f"{name}.json").read_text())
 
 
 def written(folder):

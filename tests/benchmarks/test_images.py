@@ -1,31 +1,33 @@
-"""Policies that see images through the benchmarks: trained, played, told in rows, and loaded again."""
+"""Policies that see images through the benchmarks: trained, played, named in rows, and loaded again."""
 
 from __future__ import annotations
-
-import importlib
 
 import pytest
 import torch
 
-from tests.benchmarks.script_parts import options, refused, stored
+from tests.benchmarks.script_parts import described, options, refused, stored
 from tests.processes import apart
 from warmprior import ImageEncoder
 from warmprior.data import RobomimicExperienceReplay, generate_demonstrations
 from warmprior.diagnostics import encoded_windows
-from warmprior.training.saved import load_policy
+from warmprior.training import load_policy
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
 
+import budget
+import curvature
+import robomimic
+
 from warmprior.envs import environment_of, rendering_backend
 from warmprior.envs.tasks import TaskSpec
-from warmprior.experiments import success_study
 
 pytestmark = [
     pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here"),
     pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move"),
 ]
 IMAGES = {"obs": "image", "image_size": 16, "crop_size": 12, "encoder": "small", "iterations": 4}
+FAST = ["--fast-rendering"]
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -40,23 +42,20 @@ def recorded(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def finished(recorded, tmp_path_factory):
-    robomimic = importlib.import_module("robomimic")
+def finished(inline, recorded, tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WARMPRIOR_CACHE", str(folder / "cache"))
-        patch.setattr(success_study, "rendering_backend", lambda: None)
         patch.setattr(TaskSpec, "horizon", lambda spec, style: 9)  # episodes of two decisions
         argv = options(recorded, folder / "run", prior=["gaussian", "past", "history"], **IMAGES)
-        assert robomimic.main([*argv, "--fast-rendering"]) == 0
+        assert apart(robomimic.main)([*argv, *FAST]) == 0
     return folder
 
 
-def test_rows_tables_and_policies_tell_that_they_saw_images(finished):
-    result = stored(finished / "run")
-    assert [row["obs"] for row in result["rows"]] == ["image"] * 3
-    assert result["meta"]["problems"][0]["images"]["fast_rendering"] is True
-    text = (finished / "run" / "table.md").read_text()
+def test_rows_and_tables_say_that_images_were_seen(finished):
+    assert [row["obs"] for row in stored(finished / "run")] == ["image"] * 3
+    assert described(finished / "run", "tasks")[0]["images"]["fast_rendering"] is True
+    text = (finished / "run" / "report.md").read_text()
     assert "| Lift-PH, image observations, measured (file data) |" in text
 
 
@@ -101,17 +100,14 @@ def test_diagnostics_see_what_the_encoder_makes_of_images(finished):
     [
         ({"actions": "absolute"}, "--obs image goes with --actions delta"),
         ({"obs": "state", "cameras": "agentview"}, "--cameras and --fast-rendering belong to"),
-        ({"crop_size": 20}, "--crop-size 20 does not fit into --image-size 16"),
+        ({"crop_size": 20}, "--crop-size 20 must be at least 8 and at most --image-size 16"),
         ({"prior": "forecast"}, "reads observations that are one vector"),
+        ({"prior": "ot"}, "ot reads observations that are one vector"),
     ],
 )
-def test_what_cannot_be_is_refused(recorded, finished, tmp_path, capsys, monkeypatch, extra, said):
-    monkeypatch.setenv("WARMPRIOR_CACHE", str(finished / "cache"))
-    monkeypatch.setattr("warmprior.data.render.compare_images", lambda *args: None)
-    main = importlib.import_module("robomimic").main
+def test_what_cannot_be_is_refused(recorded, no_work, tmp_path, capsys, extra, said):
     argv = options(recorded, tmp_path / "run", **IMAGES | {"prior": "past"} | extra)
-    fast = [] if "cameras" in extra else ["--fast-rendering"]
-    assert said in refused(main, [*argv, *fast], capsys)
+    assert said in refused(robomimic.main, [*argv, *([] if "cameras" in extra else FAST)], capsys)
 
 
 def test_studies_measure_on_what_the_encoder_makes_of_images(
@@ -120,12 +116,11 @@ def test_studies_measure_on_what_the_encoder_makes_of_images(
     monkeypatch.setenv("WARMPRIOR_CACHE", str(finished / "cache"))
     monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 9)
     held_out = ["--validation", str(recorded), "--observations", "6"]
-    curvature, budget = (importlib.import_module(name) for name in ("curvature", "budget"))
     flow = ["--run", str(finished / "run"), *held_out, "--steps", "3", "--out"]
-    assert curvature.main([*flow, str(tmp_path / "curvature")]) == 0
-    told = stored(tmp_path / "curvature")["rows"]
-    assert {row["prior"] for row in told} == {"gaussian", "past", "history"}
+    assert apart(curvature.main)([*flow, str(tmp_path / "curvature")]) == 0
+    seen = stored(tmp_path / "curvature", "curvature")
+    assert {row["prior"] for row in seen} == {"gaussian", "past", "history"}
     given = IMAGES | {"iterations": None, "budgets": [2, 4]}
     argv = options(recorded, finished / "budget", prior="past", **given)
-    assert budget.main([*argv, "--fast-rendering", *held_out]) == 0
-    assert all(row["action_error"] > 0 for row in stored(finished / "budget")["rows"])
+    assert apart(budget.main)([*argv, *FAST, *held_out]) == 0
+    assert all(row["action_error"] > 0 for row in stored(finished / "budget"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import subprocess
 import sys
@@ -10,21 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.script_parts import command_line, options, refused, stored
+from tests.benchmarks.script_parts import command_line, described, options, refused, stored
 from tests.data.synthetic import env_args_14, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
 
-from warmprior.experiments import paper_success, parse, success_study
+import mimicgen_tasks as script
+from options import parse
+from paper import paper_success
 
-SCRIPT = Path(__file__).parents[2] / "benchmarks" / "mimicgen_tasks.py"
-
-
-@pytest.fixture(scope="module")
-def script():
-    return importlib.import_module("mimicgen_tasks")
+SCRIPT = Path(script.__file__)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -38,46 +34,44 @@ def package(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path / "site")
 
 
-def read(script, out, *argv):
-    words = [*argv, "--out", str(out)]
-    return parse(script.FEW, words, study="mimicgen", preset=script.preset)
+def read(out, *argv):
+    return parse(script.FEW, [*argv, "--out", str(out)], "mimicgen", None, adapt=script.adapt)
 
 
-def test_papers_recipe(script, package, tmp_path, monkeypatch):
+def test_papers_recipe(package, tmp_path, monkeypatch):
     """Table 4 of the paper, MimicGen's column."""
-    monkeypatch.setattr("warmprior.experiments.recipe.require_rendering", lambda: None)
-    for place in ("recipe", "presets"):
-        monkeypatch.setattr(f"warmprior.experiments.{place}.imagenet_weights", dict)
-    recipe = read(script, tmp_path, "--preset", "paper", "--download")
-    training, network = recipe.training, recipe.network
+    monkeypatch.setattr("warmprior.training.options.require_rendering", lambda: None)
+    for place in ("warmprior.training.options", "options"):
+        monkeypatch.setattr(f"{place}.imagenet_weights", dict)
+    found = read(tmp_path, "--preset", "paper", "--download")
+    training, network = found.training, found.network
     assert (training.batch_size, training.iterations) == (128, 50_000)
     assert (training.learning_rate, training.warmup_ratio) == (1e-4, 0.2)
     assert (network.network, network.encoder) == ("chi_transformer", "resnet18-imagenet")
-    assert (recipe.data.obs, network.crop_size, recipe.data.image_size) == ("image", 76, 84)
-    assert recipe.data.task == ("stack_d0", "coffee_d0", "threading_d0")
-    assert recipe.data.data == ("source",) and recipe.data.first("source") is None
+    assert (found.data.obs, network.crop_size, found.data.image_size) == ("image", 76, 84)
+    assert found.data.task == ("stack_d0", "coffee_d0", "threading_d0")
+    assert found.data.data == ("source",) and found.data.first("source") is None
     assert paper_success("coffee_d0", "source", "preview", 1, seen="image") == 29.4
     assert paper_success("threading_d0", "source", "past", 3, seen="image") == 16.6
 
 
-def test_what_can_be_had_decides_the_task(script, package, tmp_path):
-    quick = read(script, tmp_path)
+def test_what_can_be_had_decides_the_task(package, tmp_path):
+    quick = read(tmp_path)
     assert quick.data.task == ("stack",) and quick.data.count("ph") == 10
     assert (quick.training.iterations, quick.training.batch_size) == (5_000, 128)
     core = ["--download", "--task", "coffee_d0", "--data", "core", "--demonstrations", "10"]
-    assert read(script, tmp_path, *core).data.first("core") == 10
+    assert read(tmp_path, *core).data.first("core") == 10
 
 
-def test_tasks_without_an_expert_say_where_data_are(script, tmp_path, capsys, no_work):
+def test_tasks_without_an_expert_say_where_data_are(tmp_path, capsys, no_work):
     argv = command_line(task="coffee_d0", out=tmp_path / "out")
     assert "no scripted expert for coffee_d0: add --download" in refused(script.main, argv, capsys)
     argv = command_line(task="coffee", out=tmp_path / "out")
-    assert "choose one of lift, " in (told := refused(script.main, argv, capsys))
-    assert "coffee_d0" in told
-    assert not (tmp_path / "out" / "results.json").exists()
+    assert "choose one of lift, " in (said := refused(script.main, argv, capsys))
+    assert "coffee_d0" in said and not list(tmp_path.glob("out/*"))
 
 
-def test_without_the_package_nothing_is_begun(script, tmp_path, capsys, no_work, monkeypatch):
+def test_without_the_package_nothing_is_begun(tmp_path, capsys, no_work, monkeypatch):
     monkeypatch.setattr("warmprior.envs.mimicgen.find_spec", lambda name: None)
     file = tmp_path / "stack.hdf5"
     write_robomimic_file(file, task="stack_d0")
@@ -86,9 +80,8 @@ def test_without_the_package_nothing_is_begun(script, tmp_path, capsys, no_work,
         assert "need NVlabs' package" in refused(script.main, argv, capsys)
 
 
-def test_robosuites_stack_from_scripted_demonstrations(script, tmp_path, capsys, monkeypatch):
+def test_robosuites_stack_from_scripted_demonstrations(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(success_study, "rendering_backend", lambda: None)
     argv = command_line(
         demonstrations=3,
         iterations=20,
@@ -100,10 +93,10 @@ def test_robosuites_stack_from_scripted_demonstrations(script, tmp_path, capsys,
         out=tmp_path / "out",
     )
     assert script.main(argv) == 0
-    (row,) = stored(tmp_path / "out")["rows"]
+    (row,) = stored(tmp_path / "out")
     assert (row["task"], row["data"], row["iterations"]) == ("stack", "ph", 20)
-    (problem,) = stored(tmp_path / "out")["meta"]["problems"]
-    assert problem["demonstrations"] == 3 and problem["source"] == "scripted"
+    (task,) = described(tmp_path / "out", "tasks")
+    assert task["demonstrations"] == 3 and task["source"] == "scripted"
     assert "paper (official data)" not in capsys.readouterr().out  # it has another Stack
 
 
@@ -125,8 +118,8 @@ def test_a_file_in_mimicgens_environment(tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    (row,) = stored(out)["rows"]
+    (row,) = stored(out)
     assert (row["task"], row["data"]) == ("stack_d0", "source")
-    (problem,) = stored(out)["meta"]["problems"]
-    assert problem["demonstrations"] == 2 and problem["steps"] == 50
+    (task,) = described(out, "tasks")
+    assert task["demonstrations"] == 2 and task["steps"] == 50
     assert "paper (official data)" not in done.stdout  # its policies see images

@@ -58,15 +58,15 @@ def test_the_script(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(peers, "find_spec", lambda name: None if name == "diffusers" else name)
     argv = ["--parameters", "3e4", "--batch-size", "4", "--repeats", "1", "--out", str(tmp_path)]
     assert peers.main(argv) == 0
-    told = capsys.readouterr().out
-    assert "lerobot_diffusion: skipped, needs diffusers" in told
+    said = capsys.readouterr().out
+    assert "lerobot_diffusion: skipped, needs diffusers" in said
     rows = json.loads((tmp_path / "peers.json").read_text())["rows"]
-    assert [row["facts"]["policy"].split(":")[0] for row in rows] == [
+    assert [row["policy"].split(":")[0] for row in rows] == [
         "warmprior",
         "warmprior",
         "torchrl",
     ]
-    assert all(row["measures"]["samples_per_second"] > 0 for row in rows)
+    assert all(row["samples_per_second"] > 0 for row in rows)
     assert (tmp_path / "peers.png").stat().st_size > 10_000
 
 

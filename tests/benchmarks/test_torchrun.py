@@ -47,11 +47,11 @@ def test_robomimic_trains_by_two_processes_and_plays_by_one(dataset, tmp_path):
         argv = options(dataset, tmp_path / name / "out", prior=["gaussian", "past"])
         code, out, err = run("robomimic.py", argv, launcher)
         assert code == 0, err
-        assert out.count("Output folder") == 1 and out.count("Results, table and pictures") == 1
-        rows[name] = stored(tmp_path / name / "out")["rows"]
+        assert out.count("Output folder") == 1 and out.count("results.csv and pictures") == 1
+        rows[name] = stored(tmp_path / name / "out")
     facts = ("prior", "sigma", "seed", "checkpoint", "nfe", "episodes")
-    told = {name: [[row[fact] for fact in facts] for row in mine] for name, mine in rows.items()}
-    assert told["one"] == told["two"]
+    said = {name: [[row[fact] for fact in facts] for row in mine] for name, mine in rows.items()}
+    assert said["one"] == said["two"]
 
 
 def second_process(parent, deadline=60):
@@ -86,9 +86,9 @@ def test_a_killed_process_ends_all_and_one_process_resumes(tmp_path):
     assert process.returncode != 0 and "navigation1d.py" in err
     reached = load_state(states[0])[1]["iteration"]
     assert 0 < reached < 2000
-    code, told, err = run("navigation1d.py", ["--resume", "--out", out], (sys.executable,))
+    code, said, err = run("navigation1d.py", ["--resume", "--out", out], (sys.executable,))
     assert code == 0, err
-    assert load_state(states[0])[1]["iteration"] == 2000 and "WP-Past" in told
+    assert load_state(states[0])[1]["iteration"] == 2000 and "WP-Past" in said
 
 
 def test_scripts_of_one_process_refuse_several(tmp_path):

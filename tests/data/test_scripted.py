@@ -8,6 +8,8 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from unittest.mock import MagicMock
 
@@ -125,7 +127,7 @@ def test_cached_file_is_returned_at_once(lift_file, monkeypatch):
     def fail(*_):
         raise AssertionError("generated again")
 
-    monkeypatch.setattr(generate_module, "WorkerPool", fail)
+    monkeypatch.setattr(generate_module, "working", fail)
     folder = lift_file.parent.parent
     assert generate_demonstrations("lift", n=3, cache_dir=folder) == lift_file
     monkeypatch.setenv("WARMPRIOR_CACHE", str(folder))
@@ -135,10 +137,18 @@ def test_cached_file_is_returned_at_once(lift_file, monkeypatch):
             generate_demonstrations("lift", **options)
 
 
+@contextmanager
+def in_threads(count, state):
+    """As `working`, where patches are known."""
+    with ThreadPoolExecutor(count) as pool:
+        yield lambda job: pool.submit(job, state)
+
+
 def test_interruption_leaves_nothing(tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
+    monkeypatch.setattr(generate_module, "working", in_threads)
     monkeypatch.setattr(generate_module, "run_episode", interrupted)
     with pytest.raises(KeyboardInterrupt):
         generate_demonstrations("lift", n=2, cache_dir=tmp_path, workers=1, progress=False)
@@ -183,6 +193,7 @@ def generated(monkeypatch, path, run_episode, **options):
     def write(path, episodes, **facts):
         kept.extend(episodes)
 
+    monkeypatch.setattr(generate_module, "working", in_threads)
     monkeypatch.setattr(generate_module, "expert_loop", MagicMock())
     monkeypatch.setattr(generate_module, "run_episode", run_episode)
     monkeypatch.setattr(generate_module, "write_robomimic", write)

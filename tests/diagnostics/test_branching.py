@@ -8,11 +8,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from learned_sources import CVAEPrior
 
 from tests.diagnostics.fields import H, batch, policy, remember
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import branching_bound, branching_cost
-from warmprior.experiments.learned_sources import CVAEPrior
 
 
 def windows(mean, target):

@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from learned_sources import CVAEPrior
 from tensordict import TensorDict
 
 from tests.diagnostics.fields import remember
@@ -17,7 +18,6 @@ from warmprior import (
     WarmPriorActor,
 )
 from warmprior.diagnostics import source_coverage
-from warmprior.experiments.learned_sources import CVAEPrior
 from warmprior.history import cold_history
 
 H, D_A, N = 3, 2, 20_000

@@ -6,13 +6,13 @@ import math
 
 import pytest
 import torch
+from learned_sources import CVAEPrior, ForecastPrior
 from tensordict import TensorDict
 from torch import nn
 
 from tests.diagnostics.fields import remember
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, WarmPriorActor
 from warmprior.diagnostics import mean_error, mean_revision
-from warmprior.experiments.learned_sources import CVAEPrior, ForecastPrior
 from warmprior.history import cold_history
 
 H, D_A = 2, 3

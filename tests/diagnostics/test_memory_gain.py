@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from learned_sources import ForecastPrior, ForecastStart
 from tensordict import TensorDict
 
 from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember, seeing_network
@@ -19,7 +20,6 @@ from warmprior import (
     keys,
 )
 from warmprior.diagnostics import HistoryShift, encoded_windows, memory_gain
-from warmprior.experiments.learned_sources import ForecastPrior, ForecastStart
 
 N = 20_000
 
@@ -31,7 +31,7 @@ def windows(prior, n=50, warm=True, **extra):
 
 
 def seen_mean(observation):
-    """The mean in what a network is told of it."""
+    """The mean in what a network is said of it."""
     return observation[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A))
 
 
@@ -166,8 +166,8 @@ def test_a_network_that_sees_images_and_the_mean():
 
     def act(moved, generator):
         a0 = torch.randn(n, H, D_A, generator=generator)
-        told = HistoryObservation()(moved)["prior", "observation"]
-        return a0 + network(torch.zeros(n), a0, told)
+        said = HistoryObservation()(moved)["prior", "observation"]
+        return a0 + network(torch.zeros(n), a0, said)
 
     assert abs(found) > 1e-4
     assert found == pytest.approx(by_hand(act, data, shift=0.5), rel=1e-3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 from functools import partial
 
 import numpy as np
@@ -17,7 +16,7 @@ from tests.processes import apart
 from warmprior.envs import RobosuiteEnv, rendering_backend
 from warmprior.envs.rendering import CameraRenderer, require_rendering
 from warmprior.envs.simulator import import_robosuite, task_env_args
-from warmprior.io.workers import WorkerPool
+from warmprior.io.processes import working
 
 pytestmark = pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
 
@@ -134,11 +133,8 @@ def test_a_process_forked_from_one_that_has_rendered_says_so(lift):
 def test_workers_of_a_process_that_has_rendered_render(lift):
     """They are started afresh."""
     expected = shown(lift)
-    with WorkerPool(1, None) as pool:
-        pool.submit(fresh_image)
-        ((_, found),) = pool.wait()
-    assert found == expected
-    assert multiprocessing.active_children() == []
+    with working(1, None) as call:
+        assert call(fresh_image).result() == expected
 
 
 def fresh_image(state):

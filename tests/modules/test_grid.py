@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from itertools import pairwise
 
@@ -138,7 +139,10 @@ def test_policies_keep_their_grid(tmp_path):
     path = tmp_path / "config.json"
     config = json.loads(path.read_text())
     config["actor"]["grid"] = "dense-jump:7"
-    del config["sha256"]  # that of the file as it was
+    del config["sha256"]  # that of the file as it was: sign it anew
+    weights = hashlib.sha256((tmp_path / "model.safetensors").read_bytes()).hexdigest()
+    text = json.dumps(config, sort_keys=True) + weights
+    config["sha256"] = hashlib.sha256(text.encode()).hexdigest()
     path.write_text(json.dumps(config))
     with pytest.raises(ValueError, match=r"config\.json .*must start in \(0, 1\)"):
         load_policy(tmp_path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import multiprocessing
 import os
 import resource
 import threading
@@ -169,7 +170,7 @@ def test_a_user_s_prior_travels(tmp_path):
     saved(tmp_path, Still(H))
     assert type(load_policy(tmp_path).prior) is Still
     del Prior._classes["still-for-this-test"]
-    with pytest.raises(ValueError, match=r"unknown prior 'still-for-this-test'.*Import the module"):
+    with pytest.raises(ValueError, match=r"unknown prior 'still-for-this-test'.*import the module"):
         load_policy(tmp_path)
 
 
@@ -433,3 +434,36 @@ def test_only_regular_files_are_opened(tmp_path, name):
     thread.join(10)
     assert errors and isinstance(errors[0], ValueError)
     assert f"{name} is not a regular file" in str(errors[0])
+
+
+def save_in_turn(folder, seconds):
+    """Save two policies in turn over each other, in a process of its own."""
+    network = VelocityMLP(D_A, D_O, H, hidden_dim=64)
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        for sigma in (0.25, 0.75):
+            with torch.no_grad():
+                for parameter in network.parameters():
+                    parameter.fill_(sigma)
+            save_policy(WarmPriorActor(network, PastPrior(H, sigma=sigma)), folder)
+
+
+def test_a_policy_that_is_saved_over_is_the_old_one_or_the_new_one(tmp_path):
+    saver = multiprocessing.get_context("fork").Process(target=save_in_turn, args=(tmp_path, 4.0))
+    saver.start()
+    seen, refused = [], 0
+    while saver.is_alive():
+        try:
+            actor = load_policy(tmp_path)
+        except FileNotFoundError:  # of the first save
+            continue
+        except ValueError:  # between two writes, again and again
+            refused += 1
+            continue
+        values = {float(v) for p in actor.parameters() for v in p.detach().flatten()[:2]}
+        assert values == {
+            actor.prior.sigma
+        }  # never the weights of one and the configuration of the other
+        seen.append(actor.prior.sigma)
+    saver.join()
+    assert set(seen) == {0.25, 0.75} and refused <= len(seen) // 10

@@ -155,7 +155,7 @@ def test_without_a_digest_it_is_refused(hub, actor, tmp_path):
     config = json.loads((tmp_path / "kept" / "config.json").read_text())
     del config["sha256"]
     put(hub, actor, tmp_path / "kept", **{"config.json": json.dumps(config).encode()})
-    with pytest.raises(ValueError, match=f"{NAME} at the hub holds no policy.*lacks the digest"):
+    with pytest.raises(ValueError, match=f"{NAME} at the hub holds no policy.*lacks sha256"):
         load_policy(NAME)
 
 

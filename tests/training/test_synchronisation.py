@@ -6,6 +6,7 @@ import dataclasses
 
 import pytest
 import torch
+from learned_sources import ForecastPrior
 from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -18,7 +19,6 @@ from warmprior import (
     VisionNetwork,
     WarmPriorActor,
 )
-from warmprior.experiments.learned_sources import ForecastPrior
 from warmprior.training import precondition
 
 READS = ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "lift_fresh")

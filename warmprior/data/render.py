@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping, Sequence
+from concurrent.futures import as_completed
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import version
@@ -29,7 +30,8 @@ from warmprior.io.files import (
     file_digest,
     write_atomic,
 )
-from warmprior.io.workers import WorkerPool, available_cores
+from warmprior.io.processes import working
+from warmprior.io.workers import available_cores
 
 __all__ = ["compare_first_images", "compare_images", "render_demonstrations", "renderer_versions"]
 
@@ -126,7 +128,7 @@ def render_demonstrations(
         missing = [demo for demo in index.demos if not illustrator.part(demo).exists()]
         workers = max(1, min(len(missing), workers or available_cores()))
         with (
-            WorkerPool(workers, illustrator) as pool,
+            working(workers, illustrator) as call,
             tqdm(
                 total=len(index.demos),
                 initial=len(index.demos) - len(missing),
@@ -135,13 +137,10 @@ def render_demonstrations(
                 disable=not progress,
             ) as bar,
         ):
-            # Before hours are spent. In a worker, for no process that has rendered can fork others that do.
-            pool.submit(_Illustrator.check)
-            pool.wait()
-            for demo in missing:
-                pool.submit(_Render(demo))
-            while pool.running:
-                bar.update(len(pool.wait()))
+            call(_Illustrator.check).result()  # before hours are spent
+            for future in as_completed([call(_Render(demo)) for demo in missing]):
+                future.result()
+                bar.update()
         write_atomic(out, lambda temporary: _write(temporary, illustrator, kept))
         for demo in index.demos:
             illustrator.part(demo).unlink()
@@ -404,6 +403,6 @@ def compare_first_images(
         return
     by_camera = {key.removesuffix("_image"): image for key, image in images.items()}
     illustrator = _Illustrator(index, tuple(by_camera), index.image_size, fast, path)
-    with WorkerPool(1, illustrator) as pool:
-        pool.submit(_Compare(state, by_camera, str(path), advice))
-        pool.wait()
+    # In a process of its own: one that has rendered cannot fork others that do.
+    with working(1, illustrator) as call:
+        call(_Compare(state, by_camera, str(path), advice)).result()

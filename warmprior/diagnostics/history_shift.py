@@ -31,7 +31,7 @@ class HistoryShift(TensorDictModuleBase):
         ValueError: if ``std < 0``.
 
     See Also:
-        - :func:`~warmprior.experiments.judge_navigation`: plays policies with and without it.
+        - :func:`~warmprior.training.judge_navigation`: plays policies with and without it.
         - :class:`~warmprior.PastPrior`: whose mean it disturbs.
 
     Examples:

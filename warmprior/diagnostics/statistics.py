@@ -39,8 +39,7 @@ def success_posterior(successes: int, episodes: int) -> Any:
         ImportError: if scipy is missing.
 
     See Also:
-        - :func:`~warmprior.diagnostics.probability_better`: compares two rates.
-        - :func:`~warmprior.experiments.plot_success`: draws it.
+        :func:`~warmprior.diagnostics.probability_better`: compares two rates.
 
     Examples:
         >>> round(float(success_posterior(9, 10).mean()), 3)  # (9 + 1) / (10 + 2)
@@ -254,7 +253,7 @@ def bootstrap_ratio(
         ValueError: if the shapes differ, or an option is out of range.
 
     See Also:
-        :func:`~warmprior.experiments.straightness`: curvatures relative to a baseline's, with such intervals.
+        :func:`~warmprior.diagnostics.curvature`: a measure whose ratio it judges.
 
     Examples:
         >>> import torch

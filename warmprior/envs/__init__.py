@@ -9,6 +9,7 @@ from warmprior.envs.env_args import (
     delta_conventions,
     modernize_env_args,
 )
+from warmprior.envs.gymnasium import gym_env
 from warmprior.envs.navigation1d import (
     NavigationEnv,
     NavigationMetrics,
@@ -38,6 +39,7 @@ __all__ = [
     "environment_description",
     "environment_of",
     "get_task",
+    "gym_env",
     "modernize_env_args",
     "navigation_collides",
     "navigation_demonstrations",

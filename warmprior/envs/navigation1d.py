@@ -300,7 +300,7 @@ def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
 
     See Also:
         - :func:`~warmprior.diagnostics.executed_actions`: the heights of a rollout.
-        - :func:`~warmprior.experiments.judge_navigation`: plays and judges a policy.
+        - :func:`~warmprior.training.judge_navigation`: plays and judges a policy.
 
     Examples:
         >>> metrics = navigation_metrics(navigation_heights(), chunk_length=4)

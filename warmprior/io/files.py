@@ -26,10 +26,10 @@ __all__ = [
     "digest_of",
     "exclusive",
     "file_digest",
-    "load_file",
     "read_json",
+    "read_lines",
+    "read_tensors",
     "save_file",
-    "tensor_shapes",
     "write_atomic",
 ]
 
@@ -61,20 +61,16 @@ def save_file(
         raise OSError(str(error)) from error
 
 
-def load_file(path: Path) -> dict[str, Any]:
-    """Read the tensors of a safetensors file."""
-    from safetensors.torch import load_file as load
+def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors and metadata of a safetensors file, from its bytes.
 
-    return load(path)
+    The format's own reader opens a path twice, and may find another file the second time. So whoever reads
+    a file that may be replaced reads its bytes once.
+    """
+    from safetensors.torch import load
 
-
-def tensor_shapes(path: Path) -> dict[str, tuple[int, ...]]:
-    """Read the names and shapes of the tensors of a safetensors file, and none of them."""
-    from safetensors import safe_open
-
-    with safe_open(path, framework="pt") as file:
-        names = list(file.keys())
-        return {name: tuple(file.get_slice(name).get_shape()) for name in names}
+    header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+    return load(data), header.get("__metadata__", {})
 
 
 def check_regular(path: Path) -> None:
@@ -122,6 +118,26 @@ def read_json(path: Path) -> Any:
         return json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:  # text that is not UTF-8 included
         raise ValueError(f"{path} is not valid JSON: {error}") from error
+
+
+def read_lines(path: Path) -> list[dict[str, Any]]:
+    """Read a file of JSON objects, one per line.
+
+    Raises:
+        ValueError: naming the file and the line that is damaged.
+    """
+    check_regular(path)
+    records = []
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        try:
+            records.append(json.loads(line))
+            if not isinstance(records[-1], dict):
+                raise ValueError("it is no JSON object")
+        except (ValueError, RecursionError) as error:
+            raise ValueError(
+                f"{path}, line {number} is damaged ({error}): remove that line, and continue with --resume"
+            ) from error
+    return records
 
 
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType
 
 from warmprior import keys
-from warmprior.io.ray_pool import ray_cluster
+from warmprior.io.ray_cluster import ray_cluster
 from warmprior.io.workers import WorkerError, stop_forking
 
 __all__ = ["WarmUpSwitch", "ray_rounds"]
@@ -115,7 +115,7 @@ def ray_rounds(
         collectors: how many actors.
         num_envs: environments of each.
         seed: of all that is drawn.
-        address: of the cluster, see :func:`~warmprior.io.ray_pool.check_ray`.
+        address: of the cluster, see :func:`~warmprior.io.ray_cluster.check_ray`.
 
     Yields:
         An iterator over rounds, ``[collectors, num_envs, 1]``.

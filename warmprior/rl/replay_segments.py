@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 
-from warmprior.io.files import load_file, save_file, write_atomic
+from warmprior.io.files import read_tensors, save_file, write_atomic
 
 __all__ = ["ReplaySegments"]
 
@@ -74,7 +74,7 @@ class ReplaySegments:
         for index in range(self.committed):
             path = self._path(index)
             try:
-                tensors = load_file(path)
+                tensors, _ = read_tensors(path.read_bytes())
             except Exception as error:
                 raise ValueError(
                     f"{path}, a part of the replay buffer, is missing or damaged ({error}): restore it, "

@@ -59,7 +59,7 @@ from warmprior.training.saved import check_saveable, load_policy, save_policy
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer, without_images
 
-__all__ = ["BehaviourCloning", "precondition"]
+__all__ = ["BehaviourCloning", "data_digest", "policy_path", "precondition"]
 
 TREND_BATCHES = 16
 """Of 1,024 windows, to which a :class:`PoseTrend` is fitted."""
@@ -280,7 +280,7 @@ class BehaviourCloning:
             else actor.start.config() | _fixed_identity(actor.start),
             "coupling": _coupling_identity(coupling),
             "network": _network_identity(actor.network),
-            "data": _data_digest(data.select(observation_key, ACTION, EPISODE)),
+            "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
             "policy": {"observation_steps": observation_steps, "clip": actor.ode.clip},
             "format": STATE_FORMAT,
         }
@@ -623,7 +623,8 @@ def _fixed_identity(part: object) -> dict[str, str]:
     return {"buffers": digest}
 
 
-def _data_digest(data: TensorDictBase) -> str:
+def data_digest(data: TensorDictBase) -> str:
+    """Digest of demonstrations: of the names and values of all entries."""
     digest = hashlib.sha256()
     for key, value in sorted(data.items(True, True), key=lambda item: str(item[0])):
         digest.update(str(key).encode())

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import inspect
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -39,6 +39,7 @@ class Episode:
         seed: simulator seed of the reset.
         success: whether the task was solved at any step.
         steps: control steps executed.
+        measures: what was asked for besides, see :func:`play_episode`.
         decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, whatever the policy's own
             key for it, the mean of its source and where that is warm, if it has one, under ``"next"``
             ``"executed_steps"`` and ``"done"``, and the delay with what was left of the chunk before, if
@@ -59,6 +60,39 @@ class Episode:
     success: bool
     steps: int
     decisions: TensorDictBase = field(compare=False, repr=False)
+    measures: Mapping[str, float] = field(default_factory=dict)
+
+
+Measures = Mapping[str, Literal["max", "sum", "last"]]
+"""Keys of an environment, and how an episode combines their values."""
+
+
+class _Tally:
+    """What is known of an episode under way."""
+
+    def __init__(self, success: NestedKey, measures: Measures) -> None:
+        self._success_key, self._how = success, measures
+        self._solved, self._steps = False, 0
+        self._values: dict[str, float] = {}
+        self._decisions: list[TensorDictBase] = []
+
+    def add(self, after: TensorDictBase, decision: TensorDictBase) -> None:
+        """A decision, and what the environment says after it."""
+        self._decisions.append(decision)
+        self._solved |= bool(after[self._success_key])
+        self._steps += int(after[keys.EXECUTED])
+        for key, how in self._how.items():
+            value = float(after[key])
+            before = self._values.get(key, value if how == "max" else 0.0)
+            combined = {"max": max(before, value), "sum": before + value, "last": value}
+            self._values[key] = combined[how]
+
+    def episode(self, seed: int) -> Episode:
+        """The episode, which has ended."""
+        done = torch.zeros(len(self._decisions), 1, dtype=torch.bool)
+        done[-1] = True
+        rollout = TensorDictBase.stack(self._decisions).set(("next", "done"), done)
+        return Episode(seed, self._solved, self._steps, rollout, self._values)
 
 
 def _transformed(
@@ -218,6 +252,8 @@ def play_episode(
     *,
     nfe: int | None = None,
     policy_seed: int = 0,
+    success: NestedKey = keys.SUCCESS,
+    measures: Measures | None = None,
 ) -> Episode:
     """Play the episode of one seed.
 
@@ -228,17 +264,22 @@ def play_episode(
 
     Args:
         policy: as for :func:`evaluate`.
-        env: an environment without batch dimensions, with the policy's transforms; it tells
-            ``"success"`` and starts the same episode after every ``set_seed(seed)``.
+        env: an environment without batch dimensions, with the policy's transforms; it starts the same
+            episode after every ``set_seed(seed)``.
         seed: of the environment, at least 0.
 
     Keyword Args:
         nfe: as for :func:`evaluate`.
         policy_seed: of the policy's random draws, at least 0.
+        success: the environment's key for whether the task is solved, one flag; solved at any step is solved.
+            The key of an ``info`` works as well, where the environment reads it
+            (``GymEnv(...).auto_register_info_dict()``).
+        measures: further keys, one number each, and what an episode reports of their values: the
+            ``"max"``, ``"sum"`` or ``"last"``. Give both to :func:`~warmprior.policy_transforms` too.
 
     Raises:
         ValueError: if the environment has batch dimensions, or a seed is negative.
-        KeyError: if it does not tell ``"success"``, or lacks the policy's transforms.
+        KeyError: if it lacks ``success``, one of ``measures``, or the policy's transforms.
 
     See Also:
         - :func:`~warmprior.training.evaluate`: many of them, one by one or side by side.
@@ -257,23 +298,20 @@ def play_episode(
     """
     if env.batch_size:
         raise ValueError(f"play_episode needs a single environment, got {env.batch_size}")
-    _check_keys(env)
+    _check_keys(env, success, measures or {})
     policy.eval()
     device = _device(policy)
     home = env.device or torch.device("cpu")
     chunk_key = _chunk_key(policy, env)
-    decisions: list[TensorDictBase] = []
-    success, steps = False, 0
+    tally = _Tally(success, measures or {})
     with acting_in_episode(policy, seed, nfe=nfe, policy_seed=policy_seed) as act:
         env.set_seed(seed)
         data = env.reset()
         while True:
             data = env.step(act(data.to(device)).to(home))
-            decisions.append(_decision(data, chunk_key))
-            success |= bool(data["next", keys.SUCCESS])
-            steps += int(data["next", keys.EXECUTED])
+            tally.add(data["next"], _decision(data, chunk_key))
             if data["next", "done"].all():
-                return Episode(seed, success, steps, _rollout(decisions))
+                return tally.episode(seed)
             data = env.step_mdp(data)
 
 
@@ -285,6 +323,8 @@ def evaluate(
     first_seed: int,
     nfe: int | None = None,
     policy_seed: int = 0,
+    success: NestedKey = keys.SUCCESS,
+    measures: Measures | None = None,
     description: str | None = None,
 ) -> list[Episode]:
     """Play episodes and report each one's outcome.
@@ -307,6 +347,8 @@ def evaluate(
         policy_seed: of what is drawn in this process: by a policy that takes a ``generator``, such as a
             :class:`~warmprior.WarmPriorActor`, and by what draws from PyTorch's global generator. The latter
             goes on afterwards as if nothing had been played.
+        success: see :func:`play_episode`.
+        measures: likewise.
         description: of the progress bar; no bar if ``None``.
 
     Returns:
@@ -316,7 +358,7 @@ def evaluate(
     Raises:
         ValueError: if ``episodes < 1``, or the environment has several batch dimensions, cannot play the
             episodes of given seeds in its rows, or adds an offset to them.
-        KeyError: if it does not tell ``"success"``, or lacks the policy's transforms.
+        KeyError: if it lacks ``success``, one of ``measures``, or the policy's transforms.
         WorkerError: if a worker process dies, a ``RuntimeError``.
 
     See Also:
@@ -353,10 +395,11 @@ def evaluate(
     seeds = range(first_seed, first_seed + episodes)
     with bar:
         if env.batch_size:
-            _play_batched(policy, env, seeds, nfe, policy_seed, report)
+            _play_batched(policy, env, seeds, nfe, policy_seed, success, measures or {}, report)
         else:
+            wanted: dict[str, Any] = {"success": success, "measures": measures}
             for seed in seeds:
-                report(play_episode(policy, env, seed, nfe=nfe, policy_seed=policy_seed))
+                report(play_episode(policy, env, seed, nfe=nfe, policy_seed=policy_seed, **wanted))
     return sorted(outcomes, key=lambda outcome: outcome.seed)
 
 
@@ -367,17 +410,18 @@ def _play_batched(
     seeds: range,
     nfe: int | None,
     policy_seed: int,
+    success: NestedKey,
+    measures: Measures,
     report: Callable[[Episode], None],
 ) -> None:
     num_envs = env.batch_size[0]
-    _check_keys(env)
+    _check_keys(env, success, measures)
     policy.eval()
     device = _device(policy)
     home = env.device or torch.device("cpu")
     chunk_key = _chunk_key(policy, env)
     played = [0] * num_envs
-    success, steps = [False] * num_envs, [0] * num_envs
-    decisions: list[list[TensorDictBase]] = [[] for _ in played]
+    tallies = [_Tally(success, measures) for _ in played]
     # The simulators need the cores; a policy's call is small, and its idle threads would spin.
     with torch_threads(1), watched(env), _acting(policy, policy_seed, nfe) as act:
         env.set_seed(seeds.start, static_seed=True)
@@ -391,17 +435,15 @@ def _play_batched(
             if not active.all():
                 data.set("_step", active.to(home))
             data = env.step(act(data.to(device)).to(home))
-            found = data["next"].select("done", keys.SUCCESS, keys.EXECUTED).cpu()
-            done = found["done"].flatten() & active
+            after = data["next"].select("done", success, keys.EXECUTED, *measures).cpu()
+            done = after["done"].flatten() & active
             decided = _decision(data, chunk_key)
             for i in active.nonzero().flatten().tolist():
-                decisions[i].append(decided[i])
-                success[i] |= bool(found[keys.SUCCESS][i])
-                steps[i] += int(found[keys.EXECUTED][i])
+                tallies[i].add(after[i], decided[i])
             for i in done.nonzero().flatten().tolist():
                 episode = i + num_envs * played[i]
-                report(Episode(seeds[episode], success[i], steps[i], _rollout(decisions[i])))
-                decisions[i], success[i], steps[i] = [], False, 0
+                report(tallies[i].episode(seeds[episode]))
+                tallies[i] = _Tally(success, measures)
                 played[i] += 1
                 if episode + num_envs < len(seeds):
                     seed_row(i, seeds[episode + num_envs])
@@ -442,10 +484,14 @@ def _has_offset(make_env: object) -> bool:
     )
 
 
-def _check_keys(env: EnvBase) -> None:
+def _check_keys(env: EnvBase, success: NestedKey, measures: Measures) -> None:
     known = env.observation_spec.keys(True, True)
-    if keys.SUCCESS not in known:
-        raise KeyError(f"the environment does not tell {keys.SUCCESS!r}, bool [*B, 1]")
+    for key in (success, *measures):
+        if key not in known and key not in env.reward_keys:
+            raise KeyError(
+                f"the environment does not write {key!r}, it writes {sorted(map(str, known))}: name the key "
+                "with success= or measures="
+            )
     if keys.EXECUTED not in known or keys.ACTIONS not in known:
         raise KeyError(
             f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: give it the policy's transforms, "
@@ -469,10 +515,3 @@ def _decision(data: TensorDictBase, chunk_key: NestedKey) -> TensorDictBase:
     late = [keys.DELAY, keys.FORECAST] if data.get(keys.DELAY, None) is not None else []
     kept = data.select(keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED), strict=False).cpu()
     return kept.set(keys.CHUNK, data[chunk_key].cpu())
-
-
-def _rollout(decisions: list[TensorDictBase]) -> TensorDictBase:
-    """The decisions of an episode, ``[D]``, of which the last one is done."""
-    done = torch.zeros(len(decisions), 1, dtype=torch.bool)
-    done[-1] = True
-    return TensorDictBase.stack(decisions).set(("next", "done"), done)

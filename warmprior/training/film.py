@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 from tensordict import TensorDictBase
+from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Transform
 
 from warmprior.envs.description import environment_of
 from warmprior.envs.rendering import EnvRenderers, require_rendering
-from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, write_atomic
+from warmprior.keys import SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.evaluation import play_episode
 
@@ -24,15 +25,15 @@ __all__ = ["Filmstrip", "check_video", "record_filmstrip", "record_video"]
 
 
 class _Recorder(Transform):
-    """Keeps the simulator's state after the reset and after every control step."""
+    """Keeps what a function sees after the reset and after every control step."""
 
-    def __init__(self, env: RobosuiteEnv) -> None:
+    def __init__(self, look: Callable[[], Any]) -> None:
         super().__init__()
-        self.__dict__["env"] = env  # no submodule: the environment contains this
-        self.states: list[Any] = []
+        self.look = look
+        self.seen: list[Any] = []
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        self.states.append(self.env.loop.state())
+        self.seen.append(self.look())
         return next_tensordict
 
     def _reset(
@@ -43,49 +44,75 @@ class _Recorder(Transform):
 
 @dataclass(frozen=True)
 class _Played:
-    """An episode that :func:`play_episode` played, and the simulator to show it in."""
+    """An episode that :func:`play_episode` played, and how to show it.
 
-    env: RobosuiteEnv
-    states: Sequence[Any]
+    Attributes:
+        seen: what was kept after the reset and after every control step.
+        success: whether the task was solved.
+        frame: the picture of what was kept, uint8 ``[size, size, 3]``, for strips.
+        quick: the same for films, a frame per control step: in full quality they would take ten times as
+            long as the episode.
+    """
+
+    seen: Sequence[Any]
     success: bool
-
-    def frame(self, step: int, size: int) -> np.ndarray:
-        """The picture after a control step, uint8 ``[h, w, 3]``."""
-        return self.env.render_frame(size=size, state=self.states[step])
+    frame: Callable[[Any, int], np.ndarray]
+    quick: Callable[[Any, int], np.ndarray]
 
     def write(self, path: Path, size: int, rate: int) -> None:
         """A film of it, with as many control steps per second."""
         av = require("av", "lerobot")
-        simulator = self.env.loop.env
-        # A frame per control step: in full quality they would take ten times as long as the episode.
-        renderer, nq = EnvRenderers(simulator, fast=True), simulator.sim.model.nq
 
         def write(temporary: Path) -> None:
             with av.open(str(temporary), "w", format="mp4") as container:
                 stream = container.add_stream("h264", rate=rate)
                 stream.width = stream.height = size
                 stream.pix_fmt = "yuv420p"
-                for state in self.states:
-                    image = renderer.render(self.env.cameras[0], size, size, state[1 : 1 + nq])
-                    picture = av.VideoFrame.from_ndarray(image, format="rgb24")
+                for kept in self.seen:
+                    picture = av.VideoFrame.from_ndarray(self.quick(kept, size), format="rgb24")
                     container.mux(stream.encode(picture))
                 container.mux(stream.encode())
 
         write_atomic(path, write)
 
 
+def _resized(image: np.ndarray, size: int) -> np.ndarray:
+    from PIL import Image
+
+    return np.asarray(Image.fromarray(image).convert("RGB").resize((size, size)))
+
+
 @contextmanager
 def _played(
-    actor: WarmPriorActor, seed: int, nfe: int | None, policy_seed: int, options: dict[str, Any]
+    actor: WarmPriorActor,
+    seed: int,
+    nfe: int | None,
+    policy_seed: int,
+    env: TransformedEnv | None,
+    options: dict[str, Any],
 ) -> Iterator[_Played]:
-    require_rendering()
-    env = environment_of(actor, **options)
-    recorder = _Recorder(env.base_env)
+    success = options.pop("success", SUCCESS)
+    frame: Callable[[Any, int], np.ndarray] = _resized
+    quick: Callable[[Any, int], np.ndarray] = _resized
+    if env is None:
+        require_rendering()
+        env = environment_of(actor, **options)
+        simulator, loop = env.base_env, env.base_env.loop
+        look, frame = loop.state, lambda state, size: simulator.render_frame(size=size, state=state)
+        renderer, nq = EnvRenderers(loop.env, fast=True), loop.env.sim.model.nq
+
+        def drawn(state: np.ndarray, size: int) -> np.ndarray:
+            return renderer.render(simulator.cameras[0], size, size, state[1 : 1 + nq])
+
+        quick = drawn
+    else:
+        look = env.base_env.render
     # First, and so one of the transforms that run at every control step inside of a chunk.
+    recorder = _Recorder(look)
     env.transform.insert(0, recorder)
     try:
-        outcome = play_episode(actor, env, seed, nfe=nfe, policy_seed=policy_seed)
-        yield _Played(env.base_env, recorder.states, outcome.success)
+        outcome = play_episode(actor, env, seed, nfe=nfe, policy_seed=policy_seed, success=success)
+        yield _Played(recorder.seen, outcome.success, frame, quick)
     finally:
         env.close()
 
@@ -101,7 +128,7 @@ class Filmstrip:
 
     See Also:
         - :func:`~warmprior.training.record_filmstrip`: makes it.
-        - :func:`~warmprior.experiments.plot_filmstrip`: draws it.
+        - :func:`~warmprior.training.record_video`: films one.
 
     Examples:
         >>> frames = [np.zeros((160, 160, 3), np.uint8) for _ in range(3)]
@@ -124,6 +151,8 @@ def record_filmstrip(
     frames: int = 9,
     size: int = 160,
     video: Path | None = None,
+    env: TransformedEnv | None = None,
+    rate: int | None = None,
     **options: Any,
 ) -> Filmstrip:
     """Play the episode of one seed and render it at evenly spaced control steps.
@@ -140,7 +169,11 @@ def record_filmstrip(
         frames: how many pictures.
         size: side of a picture in pixels, even for a video.
         video: where to write an MP4 of the same episode as well; needs PyAV.
-        options: further ones of :class:`~warmprior.envs.RobosuiteEnv`.
+        env: another environment than the one that the policy describes, with the policy's transforms; its
+            base has a method ``render`` that gives a picture, uint8 ``[h, w, 3]``. It is closed at the end.
+        rate: control steps per second of a video; that of robosuite's environment by default.
+        options: further ones of :class:`~warmprior.envs.RobosuiteEnv`; and ``success``, see
+            :func:`play_episode`.
 
     Raises:
         RuntimeError: if nothing on this machine can render; the message names the packages to install.
@@ -157,11 +190,11 @@ def record_filmstrip(
     """
     if video is not None:
         _check_size(size)
-    with _played(actor, seed, nfe, policy_seed, options) as played:
-        steps = np.unique(np.linspace(0, len(played.states) - 1, frames).round().astype(int))
-        pictures = [played.frame(step, size) for step in steps]
+    with _played(actor, seed, nfe, policy_seed, env, options) as played:
+        steps = np.unique(np.linspace(0, len(played.seen) - 1, frames).round().astype(int))
+        pictures = [played.frame(played.seen[step], size) for step in steps]
         if video is not None:
-            played.write(video, size, _rate(actor))
+            played.write(video, size, rate or _rate(actor))
     return Filmstrip(pictures, steps.tolist(), played.success)
 
 
@@ -221,7 +254,7 @@ def record_video(
         ValueError: the side of a video must be an even number of pixels, got 255
     """
     _check_size(size)
-    with _played(actor, seed, nfe, policy_seed, options) as played:
+    with _played(actor, seed, nfe, policy_seed, None, options) as played:
         played.write(path, size, _rate(actor))
     return played.success
 

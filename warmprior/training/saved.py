@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
+import time
 from collections.abc import Mapping
 from importlib.metadata import version
 from itertools import chain
@@ -18,11 +19,9 @@ from torch import Tensor, nn
 from warmprior.io.files import (
     as_json,
     check_regular,
-    file_digest,
-    load_file,
     read_json,
+    read_tensors,
     save_file,
-    tensor_shapes,
     write_atomic,
 )
 from warmprior.io.hub import explained, is_repository, snapshot, upload
@@ -53,10 +52,14 @@ FORMAT = 4
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
 
 
-def _digest(config: dict[str, Any], weights: Path) -> str:
-    """Digest of a configuration and of the file of weights that belongs to it."""
+ATTEMPTS = 5
+"""How often a policy is read whose two files do not belong together: it may be being saved."""
+
+
+def _digest(config: dict[str, Any], weights: bytes) -> str:
+    """Digest of a configuration and of the weights that belong to it."""
     text = json.dumps({k: v for k, v in config.items() if k != "sha256"}, sort_keys=True)
-    return hashlib.sha256((text + file_digest(weights)).encode()).hexdigest()
+    return hashlib.sha256((text + hashlib.sha256(weights).hexdigest()).encode()).hexdigest()
 
 
 def _read_config(path: Path) -> dict[str, Any]:
@@ -70,7 +73,16 @@ def _read_config(path: Path) -> dict[str, Any]:
             f"{path} has format {found}, this version of warmprior reads {FORMAT}: "
             "save the policy again with a matching version"
         )
-    parts = ("prior", "start", "network", "actor", "normalizer", "environment", "precision")
+    parts = (
+        "prior",
+        "start",
+        "network",
+        "actor",
+        "normalizer",
+        "environment",
+        "precision",
+        "sha256",
+    )
     missing = [part for part in parts if part not in config]
     if missing:
         raise ValueError(f"{path} is incomplete: it lacks {', '.join(missing)}")
@@ -98,9 +110,7 @@ def _folder(
     # The small file first: a repository of something else may be large.
     folder = _fetched(name, CONFIG, revision, token, endpoint)
     try:
-        config = _read_config(folder / CONFIG)
-        if not isinstance(config.get("sha256"), str):
-            raise ValueError(f"it lacks the digest that push_policy writes into {CONFIG}")
+        _read_config(folder / CONFIG)
     except ValueError as error:
         raise ValueError(f"{name} at the hub holds no policy of warmprior: {error}") from error
     # Of the same commit, whatever happens to the branch meanwhile.
@@ -265,7 +275,8 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
     directory = Path(directory)
     weights = directory / WEIGHTS
     write_atomic(weights, lambda path: save_file(tensors, path))
-    text = json.dumps(config | {"sha256": _digest(config, weights)}, indent=2) + "\n"
+    digest = _digest(config, weights.read_bytes())
+    text = json.dumps(config | {"sha256": digest}, indent=2) + "\n"
     write_atomic(directory / CONFIG, lambda path: path.write_text(text))
 
 
@@ -287,7 +298,7 @@ def push_policy(
         repository: such as ``"user/name"``.
 
     Keyword Args:
-        card: text of its ``README.md``, such as :func:`~warmprior.experiments.model_card` writes; by
+        card: text of its ``README.md``, such as :func:`~warmprior.training.model_card` writes; by
             default what is there stays.
         private: whether a new repository is private; by default what the account has set.
         revision: branch; the main one by default.
@@ -396,21 +407,28 @@ def load_policy(
 def _read(directory: Path, prior: Prior | None) -> WarmPriorActor:
     """The policy in a folder, checked."""
     path, weights = directory / CONFIG, directory / WEIGHTS
-    config = _read_config(path)
-    if not weights.exists():
-        raise FileNotFoundError(f"no policy weights at {weights}")
-    check_regular(weights)
+    # Each file is read once, and what is checked is what is loaded: another process may replace them.
+    for attempt in range(ATTEMPTS):
+        config = _read_config(path)
+        if not weights.exists():
+            raise FileNotFoundError(f"no policy weights at {weights}")
+        check_regular(weights)
+        data = weights.read_bytes()
+        whole = config["sha256"] == _digest(config, data)
+        if whole:
+            break
+        time.sleep(0.02 * 2**attempt)
     try:
-        shapes = tensor_shapes(weights)
-        built = _built(config, shapes)
-        misfit = built and _difference(built, shapes)
+        tensors, _ = read_tensors(data)
+        built = _built(config, {name: tuple(value.shape) for name, value in tensors.items()})
+        misfit = built and _difference(built, tensors)
     except Exception as error:  # the format's own, that of a blueprint, or a failing disk
         misfit = str(error)
     if misfit:
         raise ValueError(
             f"{weights} does not fit {path}: it is damaged or belongs to another network ({misfit})"
         )
-    if config.get("sha256") is not None and config["sha256"] != _digest(config, weights):
+    if not whole:
         raise ValueError(
             f"{weights} or {path} is damaged or was changed since the policy was saved: copy the "
             "folder again. To change a setting, pass it to the call, or save the policy anew."
@@ -424,7 +442,6 @@ def _read(directory: Path, prior: Prior | None) -> WarmPriorActor:
         raise ValueError(
             f"the policy at {directory} was trained with {actor.prior}, not with {prior}"
         )
-    tensors = load_file(weights)
     problem = _difference(actor.state_dict(), tensors) or _bad_value(actor, tensors)
     if problem:
         raise ValueError(f"{weights}: {problem}. It is damaged: copy the policy again.")

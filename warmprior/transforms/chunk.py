@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -55,6 +55,8 @@ class ChunkStep(Transform):
         executed_key: where ``k`` is written, int64 ``[*B, 1]``.
         event_keys: flags, bool, that hold after a chunk if they held after any of its executed steps;
             those that the environment does not write are passed over.
+        measures: further keys whose values after a chunk are the ``"max"``, ``"sum"`` or ``"last"`` of those
+            after its executed steps.
 
     Raises:
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, or (in an environment) an
@@ -85,6 +87,7 @@ class ChunkStep(Transform):
         chunk_key: NestedKey = keys.CHUNK,
         executed_key: NestedKey = keys.EXECUTED,
         event_keys: Sequence[NestedKey] = (keys.SUCCESS,),
+        measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
     ) -> None:
         super().__init__(in_keys_inv=[action_key], out_keys_inv=[chunk_key])
         execute = chunk_length if execute is None else execute
@@ -103,6 +106,7 @@ class ChunkStep(Transform):
         self.chunk_key = unravel_key(chunk_key)
         self.executed_key = unravel_key(executed_key)
         self.event_keys = [unravel_key(key) for key in event_keys]
+        self.measures = {key: how for key, how in (measures or {}).items() if how != "last"}
         self._input: TensorDictBase | None = None
         self._inner: tuple[Any, InnerStep, LateTransforms | None, NestedKey] | None = None
 
@@ -133,7 +137,7 @@ class ChunkStep(Transform):
                     "ChunkStep needs one reward and a root 'done', the environment has "
                     f"rewards {rewards} and done keys {dones}"
                 )
-            read = (*dones, rewards[0], *self.event_keys)
+            read = (*dones, rewards[0], *self.event_keys, *self.measures)
             late = LateTransforms.of(inner, self.action_key, read)
             self._inner = (parent, inner, late, rewards[0])
         return self._inner[1:]
@@ -159,6 +163,7 @@ class ChunkStep(Transform):
             results = late(current, next_tensordict, chunk[..., 1:, :], reward_key)
             next_tensordict = results[-1]
         earned = [result.get(reward_key) for result in results]
+        ran = [alive] * len(results)  # which rows made each of these steps
         steps = torch.full(batch, len(results), dtype=torch.int64, device=chunk.device)
         steps = steps if alive is None else alive.long()
         for i in range(len(results), self.execute):
@@ -180,6 +185,7 @@ class ChunkStep(Transform):
                 next_tensordict = rows_where(alive, result, next_tensordict)
                 steps += alive
             earned.append(reward)
+            ran.append(alive)
             results.append(next_tensordict)
         if preset is not None:
             # A policy may preset other keys under "next", which the inner steps do not return.
@@ -188,6 +194,16 @@ class ChunkStep(Transform):
             if next_tensordict.get(key, None) is not None:
                 flags = torch.stack([result.get(key) for result in results])
                 next_tensordict.set(key, flags.any(0))
+        for key, how in self.measures.items():
+            values = [result.get(key) for result in results]
+            if how == "max":
+                next_tensordict.set(key, torch.stack(values).amax(0))
+                continue
+            counted = [
+                value if rows is None else torch.where(expand_as_right(rows, value), value, 0)
+                for rows, value in zip(ran, values, strict=True)
+            ]
+            next_tensordict.set(key, torch.stack(counted).sum(0))
         next_tensordict.set(reward_key, self._return(earned))
         return next_tensordict.set(self.executed_key, steps.unsqueeze(-1))
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Literal
+
 from tensordict.utils import NestedKey
 from torchrl.envs.transforms import Compose, Transform
 
@@ -31,6 +34,8 @@ def policy_transforms(
     observation_key: NestedKey = keys.OBSERVATION,
     action_key: NestedKey = keys.ACTION,
     chunk_key: NestedKey = keys.CHUNK,
+    success: NestedKey = keys.SUCCESS,
+    measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
 ) -> Compose:
     """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
 
@@ -59,6 +64,8 @@ def policy_transforms(
         observation_key: as for :class:`~warmprior.WarmPriorActor`, also for the following.
         action_key: the single action that the environment takes.
         chunk_key: the chunk.
+        success: the environment's key for whether the task is solved, which counts at any step of a chunk.
+        measures: see :class:`ChunkStep`.
 
     Raises:
         ValueError: for numbers that do not go together, see :class:`ChunkStep` and :class:`InferenceDelay`.
@@ -93,6 +100,8 @@ def policy_transforms(
             gamma=gamma,
             action_key=action_key,
             chunk_key=chunk_key,
+            event_keys=(success,),
+            measures=measures,
         ),
         ActionHistory(prior.history_length, chunk_key=chunk_key),
         *seen,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,7 +26,8 @@ from warmprior.envs.simulator import import_robosuite, task_env_args
 from warmprior.envs.tasks import EVALUATION_SEED, get_task
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder
-from warmprior.io.workers import WorkerPool, available_cores
+from warmprior.io.processes import working
+from warmprior.io.workers import available_cores
 
 __all__ = ["GENERATOR_VERSION", "SEEDS_PER_FILE", "generate_demonstrations"]
 
@@ -109,16 +111,15 @@ def generate_demonstrations(
     import_robosuite()
     workers = min(n, workers or available_cores())
     with (
-        WorkerPool(workers, _Player(task, style)) as pool,
+        working(workers, _Player(task, style)) as call,
         require("tqdm", "sim").tqdm(
             total=n, desc=f"{task}/{style}", unit="demo", disable=not progress
         ) as bar,
     ):
-        pool.submit(_Player.model)
-        ((_, model_file),) = pool.wait()
+        model_file = call(_Player.model).result()
         write_robomimic(
             path,
-            _successes(pool, style, n, seed * SEEDS_PER_FILE, bar.update),
+            _successes(call, 2 * workers, style, n, seed * SEEDS_PER_FILE, bar.update),
             env_args=task_env_args(task),
             model_file=model_file,
             seed=seed,
@@ -128,31 +129,32 @@ def generate_demonstrations(
 
 
 def _successes(
-    pool: WorkerPool[_Player], style: str, n: int, first: int, report: Callable[[int], Any]
+    call: Callable[[Callable[[_Player], Episode]], Future[Episode]],
+    ahead: int,
+    style: str,
+    n: int,
+    first: int,
+    report: Callable[[int], Any],
 ) -> Iterator[Episode]:
     """Yield the first ``n`` successes in seed order, the same number from each operator."""
     operators = len(OPERATORS) if style == "mh" else 1
     wanted = [n // operators + (i < n % operators) for i in range(operators)]
     limit = min(SEEDS_PER_FILE, 20 * n + 100 * operators)
     upcoming = iter(range(first, first + limit))
-    running: deque[_Play] = deque()
-    ended: dict[_Play, Episode] = {}
+    running: deque[Future[Episode]] = deque()
     played = 0
     while any(wanted):
-        while len(running) < 2 * pool.num_workers:
+        while len(running) < ahead:
             # Whoever has contributed enough is skipped, which never changes what is kept.
             following = next((s for s in upcoming if wanted[operator_of(style, s)]), None)
             if following is None:
                 break
-            running.append(_Play(following))
-            pool.submit(running[-1])
+            running.append(call(_Play(following)))
         if not running:
             raise RuntimeError(
                 f"only {n - sum(wanted)} of {n} demonstrations succeeded in {played} episodes"
             )
-        while running[0] not in ended:
-            ended |= pool.wait()
-        episode = ended.pop(running.popleft())
+        episode = running.popleft().result()
         played += 1
         if episode.success and wanted[episode.operator]:
             wanted[episode.operator] -= 1

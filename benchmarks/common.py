@@ -1,0 +1,527 @@
+"""What the benchmarks share: policies, and the jobs that train, measure and play them.
+
+A policy lies in a folder named by a digest of everything that determines it, so runs with the same options
+share it. What is measured of it is a row: one JSON object in `results.jsonl`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache, lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from filelock import FileLock
+from learned_sources import Learner, learn
+from measures import held_out, measured
+from methods import Method
+from options import Evaluation, MeasuredOptions, Options
+from report import read_rows
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.record.loggers import get_logger
+
+from warmprior import WarmPriorActor
+from warmprior.diagnostics import SharedObservations, mean_revision, smoothness
+from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.io.distributed import from_leader, leader_first, rank
+from warmprior.io.files import check_writable, digest_of, read_json, read_lines, write_atomic
+from warmprior.modules.real_time_chunking import RealTimeChunking
+from warmprior.training import (
+    DataOptions,
+    Episode,
+    NetworkOptions,
+    Task,
+    TrainingConfig,
+    load_policy,
+    load_task,
+    play_episode,
+    train_policy,
+)
+from warmprior.training.behaviour_cloning import STATE_FORMAT, policy_path
+from warmprior.training.checkpoint import (
+    check_identity,
+    load_state,
+    module_tensors,
+    restore_module,
+    restoring,
+    save_state,
+)
+from warmprior.training.task import task_places
+from warmprior.transforms import policy_transforms
+
+LEARNING_SHARE = 0.25
+"""Gradient steps of sources that learn before the flow, per step of the flow."""
+
+EPISODES_PER_JOB = 5
+"""Few enough that all cores stay busy to the end, and enough that a policy is loaded seldom."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """A policy of a comparison, trained or not. A worker process builds all of it from these options."""
+
+    place: tuple[str | None, str]  # of the task: what `load_task` takes
+    data: DataOptions
+    network: NetworkOptions
+    method: Method
+    training: TrainingConfig  # with its seed
+    device: str
+    compile: bool
+    logger: str
+    grid: str
+    directory: Path  # where all policies lie
+    logs: Path
+    name: str = ""  # of its own folder
+    facts: dict[str, Any] = field(default_factory=dict, compare=False)  # what every row of it says
+
+    @property
+    def folder(self) -> Path:
+        """Where its training lies, or will lie."""
+        return self.directory / self.name
+
+    def __str__(self) -> str:
+        return (
+            f"{self.facts['task']} {self.facts['data']}, {self.method}, seed {self.training.seed}"
+        )
+
+    @property
+    def path(self) -> Path:
+        """Where its last policy of averaged weights lies, or will lie."""
+        return policy_path(self.folder, self.training.iterations)
+
+    @property
+    def is_trained(self) -> bool:
+        """Whether that policy is there, and whole: its configuration is written last."""
+        return (self.path / "config.json").is_file()
+
+    @property
+    def status(self) -> Path:
+        """How far its training is, and the processor time that it took."""
+        return self.folder / "status.json"
+
+    def task(self) -> Task:
+        """What it is trained for; read once per process."""
+        return cached_task(self.data, *self.place, self.network.observation_steps)
+
+    def teacher(self) -> Policy | None:
+        """The policy that it learns from, if any."""
+        method = self.method.teacher
+        return None if method is None else policy_of(self.task(), self, method)
+
+    def load(self, checkpoint: int | None = None) -> WarmPriorActor:
+        """The policy of averaged weights, on the CPU, as it is played here."""
+        path = policy_path(self.folder, checkpoint or self.training.iterations)
+        return load_policy(path).replace(grid=self.grid)
+
+    @property
+    def losses(self) -> list[tuple[int, float]]:
+        """The training curve."""
+        return load_state(self.folder / "state.safetensors")[1]["losses"]
+
+    @property
+    def seconds(self) -> float | None:
+        """Processor time of its training, with its teacher's; None if it is not trained."""
+        teacher = self.teacher()
+        own = read_json(self.status)["seconds"] if self.status.exists() else None
+        others = 0.0 if teacher is None else teacher.seconds
+        return None if own is None or others is None else own + others
+
+
+cached_task = cache(load_task)
+
+
+def policies_of(
+    options: Options, methods: Sequence[Method], *more: tuple[str, str], only: bool = False
+) -> list[Policy]:
+    """One policy per task, recipe, method and seed, the baseline's first; demonstrations are read, or made.
+
+    The tasks are those that the options name and `more`, or with `only` the latter alone.
+    """
+    parent = options.run.folder.absolute().parent / "policies"
+    check_writable(parent)
+    with leader_first():  # other processes find what it has generated, rendered or downloaded
+        places = [*([] if only else task_places(options.data)), *more]
+        steps = options.network.observation_steps
+        tasks = {place: cached_task(options.data, *place, steps) for place in places}
+    found = []
+    for place, task in tasks.items():
+        for training in options.trainings():
+            for method in methods:
+                if method.chunk_length > task.longest:
+                    raise ValueError(
+                        f"{method} predicts more steps than the longest demonstration of {task.title} has, "
+                        f"{task.longest}: choose a shorter --chunk"
+                    )
+                for seed in options.seeds:
+                    run = options.run
+                    like = Policy(
+                        place,
+                        options.data,
+                        options.network if task.images else options.network.without_images(),
+                        method,
+                        replace(training, seed=seed),
+                        run.device,
+                        run.compile,
+                        run.logger,
+                        options.evaluation.grid,
+                        parent,
+                        run.folder.absolute() / "logs",
+                    )
+                    found.append(policy_of(task, like, method))
+    return list({policy.folder: policy for policy in found}.values())
+
+
+def policy_of(task: Task, like: Policy, method: Method) -> Policy:
+    """The policy of another method on a task, with the options of a policy; names its folder."""
+    digest = digest_of(
+        task.identity,
+        asdict(like.training),
+        method.config(),
+        asdict(like.network),
+        like.device,
+        like.compile,
+        version("torch"),
+        version("warmprior"),
+        STATE_FORMAT,
+    )
+    source = slug(",".join(filter(None, (method.name, method.options))))
+    name = f"{task.name}-{task.style}-{source}-seed{like.training.seed}-{digest[:10]}"
+    facts = {
+        "task": task.name,
+        "data": task.style,
+        **task.space,
+        "prior": method.name,
+        "options": method.options,
+        "sigma": method.sigma,
+        "chunk": method.chunk_length,
+        "seed": like.training.seed,
+        "iterations": like.training.iterations,
+    }
+    return replace(like, method=method, name=name, facts={**facts, "policy": name})
+
+
+def slug(text: str) -> str:
+    """A text as part of a folder's name; no two texts have the same."""
+    plain = re.sub(r"[^\w.=+,-]+", "-", text, flags=re.ASCII)[:60]
+    return plain if plain == text else f"{plain}-{digest_of(text)[:8]}"
+
+
+def train(policy: Policy) -> None:
+    """Train a policy, or find it trained. Whoever else asks for it waits.
+
+    What it needs before, a teacher or a source that learns, is trained here as well.
+    """
+    policy.folder.mkdir(parents=True, exist_ok=True)
+    if (teacher := policy.teacher()) is not None:
+        train(teacher)
+    with FileLock(policy.folder / ".lock") if not rank() else nullcontext():
+        if from_leader(lambda: policy.is_trained):
+            return
+        task, method = policy.task(), policy.method
+        # A worker that trains on a GPU sees no other.
+        device = torch.device(policy.device).type
+        training = method.recipe(policy.training)
+        widths = (
+            task.data["action"].shape[-1],
+            0 if task.images else task.vector.shape[-1],
+            policy.network.observation_steps,
+        )
+        prior, start = method.prior(widths), method.start(widths)
+        progress = Status(policy.status, training.iterations)
+        for part in (prior, start):
+            if isinstance(part, Learner):
+                with leader_first():
+                    learned(part, policy, training)
+        logger = None
+        if policy.logger != "none" and not rank():
+            logger = get_logger(
+                policy.logger, logger_name=str(policy.logs), experiment_name=policy.folder.name
+            )
+        train_policy(
+            task,
+            prior,
+            policy.folder,
+            network=policy.network,
+            training=training,
+            start=start,
+            coupling=method.coupling(teacher.load().to(device) if teacher else None),
+            see_history=method.parts.sees_history,
+            max_nfe=None if method.is_flow else 1,
+            device=device,
+            compile=policy.compile,
+            logger=logger,
+            description=None,
+            progress=progress,
+        )
+        progress.write()
+    if torch.cuda.is_initialized():
+        torch.cuda.empty_cache()  # for the next training, which may be another worker's
+
+
+class Status:
+    """Writes how far a training is, once a second, and the processor time, of earlier starts as well."""
+
+    def __init__(self, path: Path, iterations: int) -> None:
+        self.path, self.iteration, self.iterations = path, 0, iterations
+        before = read_json(path)["seconds"] if path.exists() else 0.0
+        self._began, self._wrote = time.process_time() - before, time.monotonic()
+
+    def __call__(self, iteration: int) -> None:
+        """Called after every gradient step."""
+        self.iteration = iteration
+        if time.monotonic() - self._wrote > 1.0:
+            self.write()
+
+    def write(self) -> None:
+        """Write it now."""
+        if rank():
+            return
+        self._wrote = time.monotonic()
+        seconds = time.process_time() - self._began
+        status = {"iteration": self.iteration, "iterations": self.iterations, "seconds": seconds}
+        write_atomic(self.path, lambda path: path.write_text(json.dumps(status)))
+
+
+def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
+    """Let a source learn, or take what it learnt when the training was begun."""
+    path, identity = policy.folder / "learner.safetensors", policy.method.config()
+    if path.exists():
+        tensors, facts = load_state(path)
+        check_identity(path, facts, identity)
+        with restoring(path):
+            restore_module(learner, tensors)
+        return
+    learn(
+        learner,
+        policy.task().data,
+        iterations=max(1, round(LEARNING_SHARE * training.iterations)),
+        observation_steps=policy.network.observation_steps,
+        withhold=training.cold_probability,
+        seed=training.seed,
+    )
+    save_state(path, module_tensors(learner), identity)
+
+
+def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
+    """Measure the last checkpoint of a policy on its training data, by NFE."""
+    return measured(
+        policy.load(),
+        policy.task().data,
+        policy.method.nfes(nfes),
+        chunk_length=policy.method.chunk_length,
+        observation_steps=policy.network.observation_steps,
+        coupled=policy.method.parts.coupling is not None,
+    )
+
+
+def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
+    """Observations that no policy was trained on, where there are some, and what they are in words."""
+    task, chunk_length = policy.task(), policy.method.chunk_length
+    steps = policy.network.observation_steps
+    if task.normalizer is None or "file" not in task.facts:  # of a task of one's own
+        shared = SharedObservations(
+            task.data.to(policy.device),
+            chunk_length,
+            observation_steps=steps,
+            count=options.held_out.observations,
+            generator=torch.Generator().manual_seed(0),
+        )
+        return shared, "the TRAINING demonstrations (not held out)"
+    return held_out(
+        options.held_out,
+        task.name,
+        task.style,
+        task.facts,
+        task.normalizer,
+        chunk_length=chunk_length,
+        observation_steps=steps,
+        device=policy.device,
+    )
+
+
+def trained_actors(policies: Sequence[Policy]) -> dict[Method, dict[int, WarmPriorActor]]:
+    """The last policies by method and seed; a method of which a seed failed would not compare."""
+    seeds = {policy.training.seed for policy in policies}
+    found: dict[Method, dict[int, WarmPriorActor]] = {}
+    for policy in policies:
+        if policy.is_trained:
+            actor = policy.load().to(policy.device)
+            found.setdefault(policy.method, {})[policy.training.seed] = actor
+    return {method: actors for method, actors in found.items() if actors.keys() == seeds}
+
+
+def finished_policies(
+    run: Path, device: str
+) -> tuple[str, str, dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
+    """Of a finished run of one task: its name, style and facts, and the last policies by method and seed."""
+    paths = run / "results.jsonl", run / "tasks.json"
+    if not all(path.is_file() for path in paths):
+        raise FileNotFoundError(f"--run {run}: it has no results.jsonl; name a run of robomimic.py")
+    tasks = read_json(paths[1])
+    policies = {row["policy"]: row for row in read_lines(paths[0])}
+    actors: dict[Method, dict[int, WarmPriorActor]] = {}
+    variants: dict[tuple[str, str], set[Any]] = {}
+    for name, row in policies.items():
+        text = ",".join(filter(None, (row["prior"], row["options"])))
+        method = Method(text, row["chunk"], row["sigma"])
+        path = policy_path(run.resolve().parent / "policies" / name, row["iterations"])
+        if not path.is_dir():
+            raise FileNotFoundError(f"{path} is missing: finish the run with --resume --out {run}")
+        actors.setdefault(method, {})[row["seed"]] = load_policy(path, device=device)
+        same = row["sigma"], row["chunk"], row["iterations"]
+        variants.setdefault((method.name, method.options), set()).add(same)
+    if len(tasks) > 1 or any(len(found) > 1 for found in variants.values()):
+        raise ValueError(
+            f"--run {run}: name a run of one task and style, with one sigma and chunk length"
+        )
+    facts = tasks[0]
+    return facts.pop("task"), facts.pop("data"), facts, actors
+
+
+@dataclass(frozen=True)
+class Cell:
+    """How a policy is played: the episodes of a cell make one row."""
+
+    checkpoint: int  # of the policy's training, an iteration
+    nfe: int  # network evaluations per chunk
+    delay: int | None = None  # control steps until chunks take effect; None: the simulator waits
+    execute: int | None = None  # actions per decision; all H by default
+    guidance: RealTimeChunking | None = None
+
+    def facts(self) -> dict[str, Any]:
+        """What the row says of it."""
+        found: dict[str, Any] = {"checkpoint": self.checkpoint, "nfe": self.nfe}
+        if self.delay is not None:
+            guidance = "none" if self.guidance is None else "rtc"
+            found |= {"execute": self.execute, "delay": self.delay, "guidance": guidance}
+        return found
+
+    def __str__(self) -> str:
+        return ", ".join(f"{name} {value}" for name, value in self.facts().items())
+
+
+def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int]) -> list[Episode]:
+    """Play episodes. Their noise is that of the policy's seed and the episode's, wherever they are played."""
+    actor, env = prepared(policy, cell.checkpoint, replace(cell, nfe=1), evaluation.play_on)
+    seed = policy.training.seed
+    task = policy.task()
+    return [
+        play_episode(
+            actor,
+            env,
+            episode,
+            nfe=cell.nfe,
+            policy_seed=seed,
+            success=task.success,
+            measures=task.measures,
+        )
+        for episode in seeds
+    ]
+
+
+@lru_cache(maxsize=1)
+def prepared(
+    policy: Policy, checkpoint: int, cell: Cell, play_on: bool
+) -> tuple[WarmPriorActor, EnvBase]:
+    """A policy and its environment: an episode after one of the same policy needs no preparation."""
+    key = (policy.data, *policy.place, policy.network.observation_steps)
+    actor = policy.load(checkpoint).replace(guidance=cell.guidance)
+    return actor, environment(policy, simulator(key, play_on), cell)
+
+
+def environment(policy: Policy, base: EnvBase, cell: Cell) -> TransformedEnv:
+    """The environment of a task as a policy is played in it."""
+    task = policy.task()
+    transforms = policy_transforms(
+        policy.method.prior(),
+        normalizer=task.normalizer,
+        **task.adapters,
+        observation_steps=policy.network.observation_steps,
+        see_history=policy.method.parts.sees_history,
+        execute=cell.execute,
+        delay=cell.delay,
+        success=task.success,
+        measures=task.measures,
+    )
+    # A task's environment may have transforms of its own; they stay inside.
+    return TransformedEnv(base, transforms, auto_unwrap=False)
+
+
+@lru_cache(maxsize=1)
+def simulator(task: tuple[Any, ...], play_on: bool) -> EnvBase:
+    """The environment of a task; building a simulator takes a second, so it serves all policies."""
+    return cached_task(*task).make_env(**({"terminate_on_success": False} if play_on else {}))
+
+
+def row(
+    policy: Policy, cell: Cell, episodes: Iterable[Episode], measures: Mapping[str, Any]
+) -> dict[str, Any]:
+    """The row of a cell: what the policy is, how it was played, and what came out."""
+    # Sums depend on the order: that of the seeds, not that in which the episodes ended.
+    episodes = sorted(episodes, key=lambda episode: episode.seed)
+    decisions = torch.cat([episode.decisions for episode in episodes])
+    # Episodes of a single decision have no boundary between chunks.
+    several = any(len(episode.decisions) > 1 for episode in episodes)
+    smooth = smoothness(decisions) if several else None
+    solved = [episode.success for episode in episodes]
+    own = {name: [episode.measures[name] for episode in episodes] for name in episodes[0].measures}
+    return {
+        **policy.facts,
+        **cell.facts(),
+        "episodes": len(solved),
+        "successes": sum(solved),
+        "success_rate": sum(solved) / len(solved),
+        "mean_steps": sum(episode.steps for episode in episodes) / len(solved),
+        "boundary_jump": None if smooth is None else smooth.boundary_jump,
+        "inner_jump": None if smooth is None else smooth.inner_jump,
+        "mean_revision": mean_revision(decisions),
+        **{name: sum(values) / len(values) for name, values in own.items()},
+        **measures,
+        "training_seconds": policy.seconds,
+        "outcomes": "".join("01"[solved] for solved in solved),
+    }
+
+
+def batches(evaluation: Evaluation) -> list[range]:
+    """The seeds of the evaluation episodes, a few per job."""
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)
+    return [seeds[i : i + EPISODES_PER_JOB] for i in range(0, len(seeds), EPISODES_PER_JOB)]
+
+
+class Rows:
+    """`results.jsonl`: the rows of a run, in a given order, written atomically after each."""
+
+    def __init__(self, path: Path, order: Callable[[dict[str, Any]], Any] = lambda row: 0) -> None:
+        self.path, self.order = path, order
+        self.rows: list[dict[str, Any]] = read_lines(path) if path.exists() else []
+
+    def find(self, facts: Mapping[str, Any]) -> dict[str, Any] | None:
+        """The row of these facts, if there is one."""
+        known = (row for row in self.rows if all(row.get(k) == v for k, v in facts.items()))
+        return next(known, None)
+
+    def add(self, *rows: Mapping[str, Any]) -> None:
+        """Add rows, and write all."""
+        self.rows = sorted([*self.rows, *map(dict, rows)], key=self.order)
+        replace_rows(self.path, self.rows)
+
+
+def replace_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Write a file of rows, and read it again as a table."""
+    # JSON has no NaN: what is not known is null.
+    known = [
+        {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}
+        for row in rows
+    ]
+    text = "".join(json.dumps(row, allow_nan=False) + "\n" for row in known)
+    write_atomic(path, lambda path: path.write_text(text))
+    return read_rows(path)

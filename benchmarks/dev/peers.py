@@ -1,0 +1,428 @@
+"""Training and inference beside LeRobot's and TorchRL's policies: the same windows, networks of equal size.
+
+python benchmarks/dev/peers.py                                   # minutes on two cores
+python benchmarks/dev/peers.py --parameters 2e6 --batch-size 64
+python benchmarks/dev/peers.py --device cuda --batch-size 1024
+
+Peers run as their packages ship them, in one process and on one thread (on a CPU), with the same
+optimiser. Every training step takes a batch from the same replay buffer of windows; what a peer's own data
+loader costs is left out. What is not installed is skipped by name.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import pandas as pd
+import torch
+from matplotlib.figure import Figure
+from tensordict import TensorDict, TensorDictBase
+from throughput import Clock
+from torch import nn
+from torch.utils.flop_counter import FlopCounterMode
+from tqdm import tqdm
+from training_figures import D_A, D_O, PRIOR, TO, H, steps
+
+from warmprior import (
+    ChiTransformer,
+    FlowMatchingLoss,
+    VelocityMLP,
+    VelocityNetwork,
+    WarmPriorActor,
+    window_replay_buffer,
+)
+from warmprior.history import window_history
+from warmprior.io.distributed import check_device
+from warmprior.io.machine import facts_of_machine
+from warmprior.io.script import run_script
+
+NFES = (1, 3, 9)
+VECTOR, OBJECTS = 9, D_O - 9
+"""Widths of the robot's own state and of the objects'."""
+
+Batch = TensorDictBase
+Row = dict[str, Any]
+
+
+@dataclass
+class Peer:
+    """A policy to be measured.
+
+    Attributes:
+        name: of the row.
+        module: what is trained.
+        loss: of a batch of windows.
+        decide: makes a chunk for one observation, with a number of network evaluations.
+        own_steps: the number of evaluations that the package would take.
+        network_pass: the network alone on a batch, where operations of the loss cannot be counted.
+    """
+
+    name: str
+    module: nn.Module
+    loss: Callable[[Batch], torch.Tensor]
+    decide: Callable[[int], object]
+    own_steps: int
+    network_pass: Callable[[Batch], torch.Tensor] | None = None
+
+    @property
+    def parameters(self) -> int:
+        """How many are trained."""
+        return sum(p.numel() for p in self.module.parameters() if p.requires_grad)
+
+
+def nearest(make: Callable[[int], nn.Module], widths: Sequence[int], parameters: float) -> int:
+    """The width whose network has the number of parameters that is closest."""
+
+    def excess(width: int) -> float:
+        with torch.device("meta"):
+            network = make(width)
+        return abs(sum(p.numel() for p in network.parameters()) - parameters)
+
+    return min(widths, key=excess)
+
+
+def ours(name: str, make: Callable[[int], VelocityNetwork], width: int, device: str) -> Peer:
+    """FlowMatchingLoss on one of this library's networks."""
+    network = make(width).to(device)
+    actor = WarmPriorActor(network, PRIOR)
+    loss = FlowMatchingLoss(actor)
+    history = window_history(
+        torch.zeros(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H
+    )
+    data = TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
+    return Peer(
+        f"warmprior: FlowMatchingLoss, {name}",
+        network,
+        lambda batch: loss(batch)["loss_flow_matching"],
+        lambda nfe: actor(data, nfe=nfe),
+        1,
+        lambda batch: network(
+            torch.rand(len(batch), device=device),
+            batch["vla_action", "chunk"],
+            batch["observation"],
+        ),
+    )
+
+
+def warmprior_transformer(parameters: float, device: str) -> Peer:
+    """The paper's network."""
+
+    def make(width: int) -> VelocityNetwork:
+        return ChiTransformer(D_A, D_O, H, TO, embedding_dim=width)
+
+    width = nearest(make, range(48, 1024, 24), parameters)
+    return ours("ChiTransformer", make, width, device)
+
+
+def warmprior_mlp(parameters: float, device: str) -> Peer:
+    """The network of the small presets."""
+
+    def make(width: int) -> VelocityNetwork:
+        return VelocityMLP(D_A, D_O, H, TO, hidden_dim=width)
+
+    return ours("VelocityMLP", make, nearest(make, range(64, 4096, 32), parameters), device)
+
+
+def torchrl(parameters: float, device: str) -> Peer:
+    """DiffusionBCLoss and DiffusionActor on a chunk in one vector, with an MLP."""
+    from torchrl.modules import DiffusionActor
+    from torchrl.objectives import DiffusionBCLoss
+
+    chunk, observed = H * D_A, TO * D_O
+
+    def make(width: int) -> nn.Module:
+        layers: list[nn.Module] = [nn.Linear(chunk + observed + 1, width), nn.SiLU()]
+        for _ in range(4):
+            layers += [nn.Linear(width, width), nn.SiLU()]
+        return nn.Sequential(*layers, nn.Linear(width, chunk))
+
+    network = make(nearest(make, range(64, 4096, 32), parameters)).to(device)
+
+    def actor(num_steps: int) -> nn.Module:
+        return DiffusionActor(chunk, score_network=network, num_steps=num_steps).to(device)
+
+    loss = DiffusionBCLoss(actor(100))
+    actors = {nfe: actor(nfe) for nfe in (*NFES, 100)}
+    data = TensorDict({"observation": torch.randn(1, observed)}, [1]).to(device)
+
+    def of(batch: Batch) -> torch.Tensor:
+        action = batch["vla_action", "chunk"].flatten(1)
+        flat = {"observation": batch["observation"].flatten(1), "action": action}
+        return loss(TensorDict(flat, batch.batch_size))["loss_diffusion_bc"]
+
+    width = chunk + observed + 1
+    return Peer(
+        "torchrl: DiffusionBCLoss, MLP",
+        network,
+        of,
+        lambda nfe: actors[nfe](data.copy()),
+        100,
+        lambda batch: network(torch.zeros(len(batch), width, device=device)),
+    )
+
+
+def features(objects: bool) -> dict[str, Any]:
+    """What LeRobot's configurations are told of the windows."""
+    from lerobot.configs.types import FeatureType, PolicyFeature
+
+    state = VECTOR if objects else D_O
+    inputs = {"observation.state": PolicyFeature(type=FeatureType.STATE, shape=(state,))}
+    if objects:
+        shape = (OBJECTS,)
+        inputs["observation.environment_state"] = PolicyFeature(type=FeatureType.ENV, shape=shape)
+    outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(D_A,))}
+    return {"input_features": inputs, "output_features": outputs, "n_obs_steps": TO, "horizon": H}
+
+
+def lerobot_diffusion(parameters: float, device: str) -> Peer:
+    """LeRobot's Diffusion Policy: a U-Net over the chunk, conditioned on state vectors."""
+    from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
+    from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
+
+    def make(width: int) -> nn.Module:
+        options = features(objects=True) | {"device": device, "n_action_steps": H - TO + 1}
+        dims = (width, 2 * width, 4 * width)
+        return DiffusionPolicy(DiffusionConfig(**options, down_dims=dims))
+
+    policy = make(nearest(make, range(16, 513, 16), parameters)).to(device)
+
+    def lerobots(batch: Batch) -> dict[str, torch.Tensor]:
+        state, objects = batch["observation"].split((VECTOR, OBJECTS), dim=-1)
+        return {
+            "observation.state": state,
+            "observation.environment_state": objects,
+            "action": batch["vla_action", "chunk"],
+            "action_is_pad": batch["action_is_pad"],
+        }
+
+    now = {
+        "observation.state": torch.randn(1, VECTOR, device=device),
+        "observation.environment_state": torch.randn(1, OBJECTS, device=device),
+    }
+
+    def decide(nfe: int) -> None:
+        policy.diffusion.num_inference_steps = nfe
+        policy.reset()
+        policy.select_action(dict(now))
+
+    return Peer("lerobot: diffusion (U-Net)", policy, lambda b: policy(lerobots(b))[0], decide, 100)
+
+
+def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
+    """LeRobot's multi_task_dit with flow matching, behind a language encoder that costs next to nothing."""
+    from lerobot.policies.multi_task_dit import modeling_multi_task_dit as modeling
+    from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
+    from transformers import CLIPTextConfig
+
+    # Its own comes with weights from a hub; this one is two layers of width 32, with random ones.
+    small = CLIPTextConfig(
+        vocab_size=64,
+        hidden_size=32,
+        intermediate_size=64,
+        num_hidden_layers=2,
+        num_attention_heads=2,
+        eos_token_id=2,
+    )
+
+    def make(width: int) -> nn.Module:
+        options = features(objects=False) | {"device": device, "n_action_steps": H - TO + 1}
+        flow = {"objective": "flow_matching", "hidden_dim": width}
+        return modeling.MultiTaskDiTPolicy(MultiTaskDiTConfig(**options, **flow))
+
+    encoder = classmethod(lambda kind, *args, **kwargs: kind(small))
+    with mock.patch.object(modeling.CLIPTextModel, "from_pretrained", encoder):
+        policy = make(nearest(make, range(64, 769, 64), parameters)).to(device)
+    token = {
+        "observation.language.tokens": torch.zeros(1, 1, dtype=torch.long, device=device),
+        "observation.language.attention_mask": torch.ones(1, 1, dtype=torch.bool, device=device),
+    }
+
+    def lerobots(batch: Batch) -> dict[str, torch.Tensor]:
+        told = {k: v.expand(len(batch), 1) for k, v in token.items()}
+        state, action = batch["observation"], batch["vla_action", "chunk"]
+        pad = batch["action_is_pad"]
+        return told | {"observation.state": state, "action": action, "action_is_pad": pad}
+
+    now = {"observation.state": torch.randn(1, D_O, device=device), **token}
+
+    def decide(nfe: int) -> None:
+        policy.config.num_integration_steps = nfe
+        policy.reset()
+        policy.select_action(dict(now))
+
+    return Peer("lerobot: multi_task_dit", policy, lambda b: policy(lerobots(b))[0], decide, 100)
+
+
+PEERS: dict[str, tuple[Callable[[float, str], Peer], tuple[str, ...]]] = {
+    "warmprior_transformer": (warmprior_transformer, ()),
+    "warmprior_mlp": (warmprior_mlp, ()),
+    "torchrl": (torchrl, ()),
+    "lerobot_diffusion": (lerobot_diffusion, ("lerobot", "diffusers")),
+    "lerobot_multi_task_dit": (lerobot_multi_task_dit, ("lerobot", "diffusers", "transformers")),
+}
+"""By name: how to build it, and the packages that it needs."""
+
+
+def found(names: Sequence[str]) -> Iterator[str]:
+    """Those of the peers whose packages are installed; the others are told."""
+    for name in names:
+        missing = [package for package in PEERS[name][1] if not find_spec(package)]
+        if missing:
+            print(f"{name}: skipped, needs {' and '.join(missing)} (warmprior[vla])")
+        else:
+            yield name
+
+
+def synchronised(function: Callable[[], object], device: str) -> Callable[[], object]:
+    """A function that is over when the device is."""
+    if torch.device(device).type != "cuda":
+        return function
+
+    def call() -> None:
+        function()
+        torch.cuda.synchronize(device)
+
+    return call
+
+
+def training_step(peer: Peer, sample: Callable[[], Batch], device: str) -> Callable[[], object]:
+    """A step: windows, loss, backward, optimiser."""
+    trained = [p for p in peer.module.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(trained, fused=True)
+
+    def step() -> None:
+        peer.module.train()
+        loss = peer.loss(sample())
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    return synchronised(step, device)
+
+
+def flop_of(peer: Peer, batch: Batch) -> int:
+    """Floating-point operations of a training step, without the optimiser."""
+    compute = peer.loss if peer.network_pass is None else peer.network_pass
+    with FlopCounterMode(display=False) as counter:
+        compute(batch).sum().backward()
+    return counter.get_total_flops()
+
+
+def measure(peers: Sequence[Peer], options: argparse.Namespace, clock: Clock) -> list[Row]:
+    device, batch = options.device, options.batch_size
+    data = steps(400, 200).to(device)
+    sample = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO).sample
+    training = clock.times(*(training_step(peer, sample, device) for peer in peers))
+    rows = [
+        {
+            "policy": peer.name,
+            "parameters": peer.parameters,
+            "samples_per_second": batch / statistics.median(seconds),
+            "gflop_per_sample": flop_of(peer, sample()) / batch / 1e9,
+        }
+        for peer, seconds in zip(peers, training, strict=True)
+    ]
+    for peer in peers:
+        peer.module.eval()
+    with torch.no_grad():
+        for nfe in NFES:
+            decisions = [synchronised(partial(peer.decide, nfe), device) for peer in peers]
+            for row, seconds in zip(rows, clock.times(*decisions, calls=5), strict=True):
+                row[f"latency_nfe_{nfe}"] = 1000 * statistics.median(seconds)
+        for row, peer in zip(rows, peers, strict=True):
+            row["own_steps"] = peer.own_steps
+            (seconds,) = clock.times(synchronised(partial(peer.decide, peer.own_steps), device))
+            row["latency_own"] = 1000 * statistics.median(seconds)
+    return rows
+
+
+def report(rows: Sequence[Row]) -> str:
+    lines = {
+        row["policy"]: {
+            "parameters": f"{row['parameters'] / 1e6:.1f} M",
+            "training, samples/s": f"{row['samples_per_second']:.0f}",
+            "GFLOP/sample": f"{row['gflop_per_sample']:.2f}",
+            **{f"NFE {nfe}, ms": f"{row[f'latency_nfe_{nfe}']:.1f}" for nfe in NFES},
+            "own steps, ms": f"{row['latency_own']:.0f} ({row['own_steps']})",
+        }
+        for row in rows
+    }
+    return pd.DataFrame(lines).T.to_string()
+
+
+def over_lerobot(rows: Sequence[Row]) -> dict[str, float]:
+    """Training samples per second of this library's over those of LeRobot's faster policy."""
+    speed = {row["policy"]: row["samples_per_second"] for row in rows}
+    theirs = [value for name, value in speed.items() if name.startswith("lerobot")]
+    mine = {name: value for name, value in speed.items() if name.startswith("warmprior")}
+    return {name: value / max(theirs) for name, value in mine.items()} if theirs else {}
+
+
+def draw(path: Path, rows: Sequence[Row]) -> None:
+    figure = Figure(figsize=(10, 3.6), layout="constrained")
+    speed, latency = figure.subplots(1, 2)
+    names = [row["policy"].replace(": ", ":\n") for row in rows]
+    palette = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3"]
+    colors = palette[: len(rows)]
+    speed.barh(names, [row["samples_per_second"] for row in rows], color=colors)
+    speed.set(xlabel="training, samples/s")
+    speed.invert_yaxis()
+    for row, color in zip(rows, colors, strict=True):  # of the bars, which name them
+        y = [row[f"latency_nfe_{nfe}"] for nfe in NFES]
+        latency.plot(NFES, y, "o-", color=color)
+    latency.set(xlabel="network evaluations per chunk", ylabel="latency of a chunk, ms")
+    latency.set(yscale="log", xticks=NFES)
+    figure.savefig(path, dpi=150)
+
+
+def run(argv: Sequence[str] | None) -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add = parser.add_argument
+    add("--peers", nargs="+", default=list(PEERS), choices=PEERS, help="default: all")
+    add("--parameters", type=float, default=2e7, help="of each network (%(default)s)")
+    add("--batch-size", type=int, default=256, help="windows (%(default)s)")
+    add("--repeats", type=int, default=5, help="rounds (%(default)s)")
+    add("--device", default="cpu", help="such as cuda (%(default)s)")
+    add("--out", type=Path, default=Path("runs/peers"), help="output folder (%(default)s)")
+    options = parser.parse_args(argv)
+    if options.repeats < 1 or options.batch_size < 1 or not 1e4 <= options.parameters <= 1e9:
+        parser.error("--repeats and --batch-size must be at least 1, --parameters 1e4 to 1e9")
+    check_device(options.device)
+    torch.manual_seed(0)
+    peers = [PEERS[name][0](options.parameters, options.device) for name in found(options.peers)]
+    if not peers:
+        raise ValueError("none of these peers is installed: pip install 'warmprior[vla]'")
+    options.out.mkdir(parents=True, exist_ok=True)
+    with tqdm(desc="rounds", dynamic_ncols=True) as bar:
+        rows = measure(peers, options, Clock(options.repeats, bar))
+    meta = facts_of_machine(
+        device=options.device, torch_threads=torch.get_num_threads(), batch_size=options.batch_size
+    )
+    text = json.dumps({"meta": meta, "rows": rows}, indent=2)
+    (options.out / "peers.json").write_text(text + "\n")
+    (options.out / "table.txt").write_text(report(rows) + "\n")
+    draw(options.out / "peers.png", rows)
+    print(report(rows))
+    for name, ratio in over_lerobot(rows).items():
+        print(f"training over lerobot's faster policy, {name}: {ratio:.2f}")
+    print(f"written to {options.out}")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    return run_script(lambda: run(argv), "peers.py")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,321 @@
+"""Jobs of a benchmark: functions that fresh processes of this machine (loky), or a Ray cluster, compute.
+
+    with Jobs(run) as jobs:
+        trained = jobs.submit("train", train, policy)
+        jobs.submit("play", play, policy, after=trained, then=print)
+        failures = jobs.wait()
+
+A job is a function of an importable module whose result is small, or a file that it finds again when it is
+called once more. So a worker that dies costs its own job alone, and nothing is stored here.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+from options import Run
+from tqdm import tqdm
+
+from warmprior.io.processes import fresh_processes
+from warmprior.io.script import ERRORS
+from warmprior.io.workers import available_cores
+
+DEATHS = 3
+"""Workers that a job may lose before it counts as failed."""
+
+LINES_EVERY = 30.0
+"""Seconds between two reports on running trainings where there is no terminal."""
+
+
+@dataclass(eq=False)
+class Job:
+    """One call of a function."""
+
+    name: str
+    function: Callable[..., Any]
+    args: tuple[Any, ...]
+    after: Job | None  # it starts once this one is done
+    group: str  # after a failure, the other jobs of its group are left out
+    then: Callable[[Any], object] | None  # called here with the result
+    training: bool  # it is long, and takes a GPU if there is one
+    status: Path | None  # where it reports its progress: {"iteration": ..., "iterations": ...}
+    deaths: int = 0
+    done: bool = False
+
+
+class Engine(Protocol):
+    """Who computes."""
+
+    workers: int
+
+    def takes(self, job: Job) -> bool:
+        """Whether a job would start at once."""
+
+    def submit(self, job: Job) -> Future[tuple[Any, str | None]]:
+        """Start it. Its future raises if the worker dies."""
+
+    def close(self, kill: bool) -> None:
+        """End all workers; if `kill`, whatever they do."""
+
+
+def _call(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, str | None]:
+    """In a worker: the result, or why there is none, as text: some exceptions cannot be pickled."""
+    import torch
+
+    torch.set_num_threads(1)
+    torch.set_float32_matmul_precision("high")
+    try:
+        return function(*args), None
+    except Exception as error:
+        if not isinstance(error, ERRORS):
+            traceback.print_exc()  # nothing that a user can mend
+        text = error.args[0] if isinstance(error, KeyError) and error.args else error
+        return None, str(text) or repr(error)
+
+
+class Local:
+    """Processes of this machine, one thread each; the first ones have a GPU each, where one is asked for."""
+
+    def __init__(self, workers: int | None, device: str) -> None:
+        gpus = _gpus(device)
+        self.workers = workers or available_cores()
+        self._gpus = [gpus[i] if i < len(gpus) else "" for i in range(self.workers)]
+        self._on_gpu = bool(gpus)
+        self._pools: list[Any] = [None] * self.workers
+        self._busy: dict[int, Future[Any]] = {}
+
+    def _slot(self, job: Job) -> int | None:
+        free = [i for i in range(self.workers) if i not in self._busy or self._busy[i].done()]
+        if self._on_gpu and job.training:
+            return next((i for i in free if self._gpus[i]), None)
+        return free[-1] if free else None
+
+    def takes(self, job: Job) -> bool:
+        """Whether a process is free, with a GPU where the job trains on one."""
+        return self._slot(job) is not None
+
+    def submit(self, job: Job) -> Future[Any]:
+        """Start it in a free process, which is started with its first job."""
+        slot = self._slot(job)
+        assert slot is not None, "takes(job) says so"
+        if self._pools[slot] is not None:
+            try:
+                self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
+                return self._busy[slot]
+            except BrokenProcessPool:  # its process died with an earlier job
+                pass
+        env = {"CUDA_VISIBLE_DEVICES": self._gpus[slot]} if self._on_gpu else None
+        self._pools[slot] = fresh_processes(1, env=env)
+        self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
+        return self._busy[slot]
+
+    def close(self, kill: bool) -> None:
+        """End the processes: what they have done is in files, or was given back."""
+        for pool in filter(None, self._pools):
+            pool.shutdown(kill_workers=kill)
+
+
+def _gpus(device: str) -> list[str]:
+    """The GPUs that --device names, as CUDA_VISIBLE_DEVICES takes them."""
+    kind, _, index = device.partition(":")
+    if kind != "cuda":
+        return []
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is None:
+        import torch
+
+        visible = ",".join(map(str, range(torch.cuda.device_count())))
+    names = visible.split(",")
+    return [names[int(index)]] if index else names
+
+
+class Ray:
+    """Tasks of a Ray cluster, which starts those of a lost machine again."""
+
+    def __init__(self, run: Run, folders: list[Path]) -> None:
+        from warmprior.io.ray_cluster import ray_cluster
+
+        self._device = run.device
+        self._connection = ray_cluster(run.ray_address, run.envs, folders)
+        self._ray = self._connection.__enter__()
+        self.workers = run.envs or int(self._ray.cluster_resources().get("CPU", 1))
+        self._task = self._ray.remote(_call)
+        self._running: dict[Future[Any], Any] = {}
+
+    def takes(self, job: Job) -> bool:
+        """Whether fewer jobs run than may."""
+        return sum(not future.done() for future in self._running) < self.workers
+
+    def submit(self, job: Job) -> Future[Any]:
+        """Give it to the cluster."""
+        gpus = float(job.training and self._device.startswith("cuda"))
+        task = self._task.options(num_cpus=1, num_gpus=gpus, max_retries=DEATHS).remote(
+            job.function, job.args
+        )
+        future = task.future()
+        self._running[future] = task
+        return future
+
+    def close(self, kill: bool) -> None:
+        """Cancel what runs, and leave the cluster."""
+        for future, task in self._running.items():
+            if not future.done():
+                self._ray.cancel(task, force=True)
+        self._connection.__exit__(None, None, None)
+
+
+class Jobs:
+    """Jobs of one run.
+
+    The first that is ready starts first, but the last trainings start before everything else: they take
+    longest, and nothing should wait for them in the end.
+    """
+
+    def __init__(self, run: Run, folders: list[Path] | None = None) -> None:
+        on_ray = run.engine == "ray"
+        self.engine: Engine = Ray(run, folders or []) if on_ray else Local(run.envs, run.device)
+        self._waiting: list[Job] = []
+        self._failed: dict[str, str] = {}  # by group, why
+        self._all = 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
+        self.engine.close(kill=kind is not None)
+
+    def submit(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        *args: Any,
+        after: Job | None = None,
+        group: str | None = None,
+        then: Callable[[Any], object] | None = None,
+        training: bool = False,
+        status: Path | None = None,
+    ) -> Job:
+        """Add a job; :meth:`wait` computes it."""
+        job = Job(name, function, args, after, group or name, then, training, status)
+        self._waiting.append(job)
+        self._all += 1
+        return job
+
+    def say(self, line: str) -> None:
+        """Print a line that stays above the bars."""
+        tqdm.write(line)
+        sys.stdout.flush()
+
+    def wait(self) -> dict[str, str]:
+        """Compute all jobs; what failed, by group, and why."""
+        running: dict[Future[Any], Job] = {}
+        with Progress(self.engine.workers, self._all) as progress:
+            while self._waiting or running:
+                while (job := self._next()) is not None:
+                    self._waiting.remove(job)
+                    running[self.engine.submit(job)] = job
+                finished, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
+                for future in finished:
+                    job = running.pop(future)
+                    progress.ended += self._ended(job, future)
+                progress.show(list(running.values()), len(self._waiting) + len(running))
+        return self._failed
+
+    def _next(self) -> Job | None:
+        """The job that starts now, if one can."""
+        ready = [
+            job
+            for job in self._waiting
+            if (job.after is None or job.after.done) and self.engine.takes(job)
+        ]
+        trainings = [job for job in ready if job.training]
+        if trainings and sum(job.training for job in self._waiting) <= self.engine.workers:
+            return trainings[0]
+        return ready[0] if ready else None
+
+    def _ended(self, job: Job, future: Future[Any]) -> int:
+        """Take note of a job whose future is done; how many jobs that settles."""
+        try:
+            result, reason = future.result()
+        except Exception as error:  # the worker died
+            job.deaths += 1
+            if job.deaths < DEATHS and not hasattr(error, "cause"):
+                self._waiting.insert(0, job)
+                return 0
+            result, reason = (
+                None,
+                (
+                    f"its worker died {job.deaths} times ({type(error).__name__}), perhaps for lack of "
+                    "memory: use fewer with --envs"
+                ),
+            )
+        if reason is None:
+            job.done = True
+            if job.then is not None:
+                job.then(result)
+            return 1
+        if job.group not in self._failed:
+            self._failed[job.group] = f"{job.name}: {reason}" if job.name != job.group else reason
+            self.say(f"FAILED {job.group}: {self._failed[job.group]}")
+        before = len(self._waiting)
+        self._waiting = [other for other in self._waiting if other.group != job.group]
+        return 1 + before - len(self._waiting)
+
+
+class Progress:
+    """A bar of all jobs and one per worker on a terminal; elsewhere a line per training, now and then."""
+
+    def __init__(self, workers: int, total: int) -> None:
+        self.ended = 0
+        self._spoke = time.monotonic()
+        # disable=None: no bars without a terminal.
+        options: dict[str, Any] = {"leave": False, "dynamic_ncols": True, "disable": None}
+        self._whole = tqdm(total=total, desc="jobs", **options)
+        self._bars = [
+            tqdm(position=1 + i, bar_format="{desc}", **options) for i in range(min(workers, 8))
+        ]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for bar in (*self._bars, self._whole):
+            bar.close()
+
+    def show(self, running: list[Job], left: int) -> None:
+        """Show how far the running jobs are."""
+        self._whole.total, self._whole.n = self.ended + left, self.ended
+        self._whole.refresh()
+        if not self._whole.disable:
+            for bar, job in zip_longest(self._bars, running[: len(self._bars)]):
+                done = job and iterations_of(job)
+                bar.n, bar.total = done or (0, 1)
+                bar.bar_format = (
+                    "{desc}: {percentage:3.0f}%|{bar}| {n}/{total}" if done else "{desc}"
+                )
+                bar.set_description_str(job.name if job else "")
+        elif time.monotonic() - self._spoke > LINES_EVERY:
+            self._spoke = time.monotonic()
+            for job in running:
+                if done := iterations_of(job):
+                    print(f"{job.name}: {done[0]:,} of {done[1]:,} iterations", flush=True)
+
+
+def iterations_of(job: Job) -> tuple[int, int] | None:
+    """How many iterations of a training are done, of how many."""
+    try:
+        status = json.loads(job.status.read_text()) if job.status else {}
+        return status["iteration"], status["iterations"]
+    except (OSError, ValueError, KeyError):  # none yet, or another machine is writing it
+        return None

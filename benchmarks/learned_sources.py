@@ -1,0 +1,515 @@
+"""Sources of other papers that learn from the demonstrations before the flow does, and how they learn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torch.optim import AdamW
+from torchrl.data import TensorDictReplayBuffer
+from torchrl.modules import MLP
+
+from warmprior import keys
+from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
+from warmprior.modules.prior import GaussianPrior, PastPrior, Source
+from warmprior.modules.registry import Registered
+from warmprior.modules.start import StartPoint
+from warmprior.training.optim import warmup_cosine
+from warmprior.transforms.window import window_replay_buffer, without_images
+
+__all__ = [
+    "A2APrior",
+    "CVAEPrior",
+    "ForecastPrior",
+    "ForecastStart",
+    "LeapPrior",
+    "Learner",
+    "learn",
+]
+
+SCALE_FLOOR = 0.02
+"""Smallest standard deviation of a learned Gaussian source, calibrated, in normalised action units and
+before ``sigma`` multiplies it."""
+
+CALIBRATION_WINDOWS = 4_096
+
+
+class Learner(nn.Module):
+    r"""A network :math:`f_\phi(o, h)` of observation and last ``H`` actions that learns by a loss of its own.
+
+    It learns on the windows that the flow will be trained on (:func:`learn`), and is fixed from then on. The
+    last actions count once there are ``H`` of them. Subclasses are sources or start points as well; they
+    make their networks in :meth:`build`. Observations are single tensors.
+    """
+
+    sees_history: ClassVar[bool] = True
+    """Whether the network is given the last actions."""
+    sees_observation: ClassVar[bool] = True
+    """Whether the network is given the observation."""
+    chunk_length: int
+    action_dim: int
+    observation_dim: int
+    observation_steps: int
+    hidden_dim: int
+    network: nn.Module
+
+    def _set_widths(self, widths: Sequence[int] | None, hidden_dim: int) -> None:
+        """Make the networks, if the widths of the data are known; :meth:`sized` tells them."""
+        check_whole_numbers(hidden_dim=hidden_dim)
+        self.hidden_dim = hidden_dim
+        if widths is not None:
+            names = ("action_dim", "observation_dim", "observation_steps")
+            given = dict(zip(names, widths, strict=True))
+            check_whole_numbers(**given)
+            self.__dict__.update(given)
+            self.build()
+            self.requires_grad_(False)
+
+    def sized(self, action_dim: int, observation_dim: int, observation_steps: int) -> Self:
+        """The same with fresh networks for data of these widths, ``d_a``, ``d_o`` and ``To``."""
+        assert isinstance(self, Registered)
+        kind: Any = type(self)
+        widths = [action_dim, observation_dim, observation_steps]
+        return kind(**(self._resolved() | {"widths": widths}))
+
+    def build(self) -> None:
+        """Make the networks, once the widths are known."""
+        raise NotImplementedError
+
+    def check_built(self) -> None:
+        """Whether there are networks."""
+        if not hasattr(self, "action_dim"):
+            name = type(self).__name__
+            raise ValueError(
+                f"{name} has no networks yet: take .sized(d_a, d_o, To), and learn(...)"
+            )
+
+    def learning_loss(
+        self, windows: LearningWindows, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """What the networks minimise on windows, a scalar."""
+        raise NotImplementedError
+
+    def calibrate(self, windows: LearningWindows) -> None:
+        """Correct the source by its error on windows that were held out; nothing by default."""
+
+    @property
+    def chunk_dim(self) -> int:
+        """Numbers in a chunk, ``H d_a``."""
+        return self.chunk_length * self.action_dim
+
+    @property
+    def seen_dim(self) -> int:
+        """Numbers that the network is given."""
+        observed = self.observation_steps * self.observation_dim
+        return self.sees_history * (self.chunk_dim + 1) + self.sees_observation * observed
+
+    def mlp(self, inputs: int, outputs: int) -> MLP:
+        """A network of the learner's width."""
+        return MLP(inputs, outputs, num_cells=[self.hidden_dim] * 2, activation_class=nn.GELU)
+
+    def seen(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+        """What the network is given, ``[*B, seen_dim]``."""
+        self.check_built()
+        name = type(self).__name__
+        parts = []
+        if self.sees_observation:
+            if not isinstance(observation, Tensor):
+                found = "none" if observation is None else "nested ones"
+                raise ValueError(
+                    f"{name} takes one tensor [*B, To, d_o] as the observation, and got {found}: concatenate "
+                    "the entries, or use a source that sees none"
+                )
+            parts.append(observation.flatten(-2))
+        if self.sees_history:
+            known = history["steps"] >= self.chunk_length
+            actions = history["actions"][..., -self.chunk_length :, :]
+            parts.append(torch.where(known.unsqueeze(-1), actions, 0.0).flatten(-2))
+            parts.append(known.to(actions.dtype))
+        return torch.cat(parts, -1)
+
+    def outputs(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+        """What the network says, ``[*B, n]``; see :meth:`seen`."""
+        seen = self.seen(history, observation)  # first: it tells if there is no network
+        return self.network(seen)
+
+    def as_chunk(self, out: Tensor) -> Tensor:
+        """Outputs ``[*B, H d_a]`` as ``[*B, H, d_a]``."""
+        return out.unflatten(-1, (self.chunk_length, self.action_dim))
+
+
+class LearnedPrior(PastPrior, Learner, abstract=True):
+    """A learned source around which agents can search: warm where the network is, that is everywhere.
+
+    Args:
+        chunk_length: ``H``.
+
+    Keyword Args:
+        widths: ``d_a``, ``d_o`` and ``To``, which :meth:`sized` fills in.
+        hidden_dim: width of the network's two hidden layers.
+        sigma: see the subclass.
+    """
+
+    def __init__(
+        self,
+        chunk_length: int,
+        *,
+        widths: Sequence[int] | None = None,
+        hidden_dim: int = 256,
+        sigma: float | None = None,
+    ) -> None:
+        nn.Module.__init__(self)
+        PastPrior.__init__(self, chunk_length, sigma=sigma)
+        self._set_widths(widths, hidden_dim)
+
+    def _everywhere(self, loc: Tensor, scale: Tensor) -> Source:
+        return Source(loc, scale, torch.ones_like(loc[..., :1], dtype=torch.bool))
+
+
+class ForecastPrior(LearnedPrior):
+    r"""A learned Gaussian source: mean and scale from observation and last actions, calibrated.
+
+    .. math::
+        a_0 = \mu_\phi(o, h) + s_\phi(o, h) \varepsilon, \qquad
+        \min_\phi E\left[\log s_\phi + \tfrac12 (a_1 - \mu_\phi)^2 / s_\phi^2\right],
+
+    per position and dimension. Afterwards :math:`s_\phi` is multiplied, per position and dimension, by the
+    root mean square of :math:`(a_1 - \mu_\phi) / s_\phi` on episodes that were held out: a source that errs
+    more than it thinks is widened until it errs as it says, and one that errs less is narrowed, down to 0.02.
+    ``sigma`` multiplies the result.
+    """
+
+    name = "forecast"
+    default_sigma = 1.0
+    calibration: Tensor
+    typical_scale: Tensor
+
+    def build(self) -> None:
+        """One network for mean and scale, the calibration, and the typical scale that it finds."""
+        self.network = self.mlp(self.seen_dim, 2 * self.chunk_dim)
+        self.register_buffer("calibration", torch.ones(self.chunk_length, self.action_dim))
+        self.register_buffer("typical_scale", torch.ones(()))
+
+    def _calibrated(self, scale: Tensor) -> Tensor:
+        return (self.calibration * scale).clamp_min(SCALE_FLOOR)
+
+    def _gaussian(
+        self, history: TensorDictBase, observation: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean and scale before the calibration."""
+        out = self.outputs(history, observation)
+        mean, raw = out.unflatten(-1, (2, self.chunk_length, self.action_dim)).unbind(-3)
+        return mean, SCALE_FLOOR + nn.functional.softplus(raw)
+
+    def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
+        """The learned mean and the calibrated scale."""
+        mean, scale = self._gaussian(history, observation)
+        return self._everywhere(mean, self.sigma * self._calibrated(scale))
+
+    def learning_loss(
+        self, windows: LearningWindows, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Negative log-likelihood per coordinate, without its constant."""
+        mean, scale = self._gaussian(windows.history, windows.observation)
+        return windows.mean(scale.log() + 0.5 * ((windows.a1 - mean) / scale).square())
+
+    def calibrate(self, windows: LearningWindows) -> None:
+        """Scale by the root mean square of the standardised error, and note what scale that gives."""
+        mean, scale = self._gaussian(windows.history, windows.observation)
+        counted = windows.counted
+        squared = ((windows.a1 - mean) / scale).square() * counted
+        known = counted.sum(0).clamp_min(1)
+        found = torch.where(counted.any(0), squared.sum(0) / known, 1.0)
+        self.calibration.copy_(found.sqrt())
+        self.typical_scale.copy_(windows.mean(self._calibrated(scale).square()).sqrt())
+
+
+class LeapPrior(ForecastPrior):
+    """A learnable prior: the Gaussian source of :class:`ForecastPrior` from the observation alone."""
+
+    name = "leap"
+    sees_history = False
+
+
+class A2APrior(LearnedPrior):
+    r"""A2A in action space: a deterministic source :math:`a_0 = f_\phi(h)` made of the last actions alone.
+
+    A2A (Jia et al., 2026) encodes a history into the source of a flow between latent codes of chunks, without
+    any noise. Here the code of a chunk is the chunk itself, the history that of WP-Past, and :math:`f_\phi`
+    learns by mean squared error to be near the target before the flow does.
+    """
+
+    name = "a2a"
+    default_sigma = 0.0
+    sees_observation = False
+
+    def build(self) -> None:
+        """The encoder of the history."""
+        self.network = self.mlp(self.seen_dim, self.chunk_dim)
+
+    def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
+        """The encoded history, and ``sigma`` around it, 0 by default."""
+        mean = self.as_chunk(self.outputs(history, observation))
+        return self._everywhere(mean, torch.full_like(mean[..., :1], self.sigma))
+
+    def learning_loss(
+        self, windows: LearningWindows, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Mean squared error."""
+        forecast = self.as_chunk(self.outputs(windows.history, windows.observation))
+        return windows.mean((windows.a1 - forecast).square())
+
+
+@dataclass(frozen=True)
+class _Decoded(Source):
+    """A source that is Gaussian given a latent draw, and none without."""
+
+    prior: Any = None
+    seen: Any = None
+
+    def sample(self, generator: torch.Generator | None = None) -> Tensor:
+        like: dict[str, Any] = {"dtype": self.loc.dtype, "device": self.loc.device}
+        shape = (*self.seen.shape[:-1], self.prior.latent_dim)
+        z = torch.randn(shape, generator=generator, **like)
+        decoded = replace(self, loc=self.prior.decode(self.seen, z), scale=self.prior.sigma)
+        return Source.sample(decoded, generator)
+
+
+class CVAEPrior(LearnedPrior):
+    r"""BRIDGER's learned source: the decoder of a conditional variational autoencoder.
+
+    .. math::
+        a_0 = g_\phi(o, z) + \sigma \varepsilon, \quad z \sim N(0, I), \qquad
+        \min_\phi E\left[\frac{1}{D} \|a_1 - g_\phi(o, z)\|^2
+        + \beta \frac{d_z}{D} \, KL(q_\phi(z | o, a_1) \| N(0, I))\right]
+
+    with :math:`D = P d_a` coordinates of a chunk and :math:`d_z` of ``z``; the first term is the mean over
+    the coordinates inside the episode (Chen et al., 2024). The flow from it is that of every other prior;
+    BRIDGER's own path adds noise between the ends and is sampled as a stochastic differential equation. The
+    source is no Gaussian and has no mean: agents search around zero.
+
+    Keyword Args:
+        latent_dim: width of ``z``.
+        beta: weight of the divergence.
+        sigma: noise of the source around the decoder's output.
+    """
+
+    name = "cvae"
+    default_sigma = 0.1
+    sees_history = False
+    latent_dim: int
+    beta: float
+
+    def __init__(
+        self,
+        chunk_length: int,
+        *,
+        latent_dim: int = 8,
+        beta: float = 0.01,
+        widths: Sequence[int] | None = None,
+        hidden_dim: int = 256,
+        sigma: float | None = None,
+    ) -> None:
+        check_whole_numbers(latent_dim=latent_dim)
+        check_finite_numbers(beta=beta)
+        if beta <= 0:
+            raise ValueError(f"beta must be a finite number > 0, got {beta}")
+        self.__dict__.update(latent_dim=latent_dim, beta=beta)
+        super().__init__(chunk_length, widths=widths, hidden_dim=hidden_dim, sigma=sigma)
+
+    def build(self) -> None:
+        """Encoder and decoder."""
+        self.encoder = self.mlp(self.seen_dim + self.chunk_dim, 2 * self.latent_dim)
+        self.decoder = self.mlp(self.seen_dim + self.latent_dim, self.chunk_dim)
+
+    def decode(self, seen: Tensor, z: Tensor) -> Tensor:
+        """The chunk of a latent."""
+        return self.as_chunk(self.decoder(torch.cat([seen, z], -1)))
+
+    mean = GaussianPrior.mean  # none: cold everywhere
+
+    def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
+        """One that decodes a latent of its own for every draw."""
+        loc, scale, warm = super().distribution(history, observation)
+        return _Decoded(loc, scale, warm, prior=self, seen=self.seen(history, observation))
+
+    def learning_loss(
+        self, windows: LearningWindows, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Mean squared error of the reconstruction, and divergence of the code."""
+        seen = self.seen(windows.history, windows.observation)
+        found = self.encoder(torch.cat([seen, (windows.a1 * windows.counted).flatten(-2)], -1))
+        mean, log_variance = found.chunk(2, -1)
+        eps = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
+        z = mean + (0.5 * log_variance).exp() * eps
+        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
+        error = windows.mean((windows.a1 - self.decode(seen, z)).square())
+        return error + self.beta * divergence / self.chunk_dim * self.latent_dim
+
+
+class ForecastStart(StartPoint, Learner):
+    r"""STEP: a forecast enters the flow of a standard normal source at an intermediate time.
+
+    The flow is trained as ever, from N(0, I). At decisions a forecaster :math:`f_\phi(o, h)`, trained by mean
+    squared error, gives
+
+    .. math::
+        a_{t_s} = (1 - t_s) \varepsilon + t_s f_\phi(o, h),
+
+    from which the flow is integrated to ``t = 1`` (Li et al., 2026). Where the forecast stays where the last
+    chunk was (root mean square distance per coordinate below ``stall``), the robot may be stuck, and the
+    noise is multiplied by ``1 + stall_noise`` (velocity-aware noise).
+
+    Args:
+        chunk_length: ``H``.
+
+    Keyword Args:
+        start_time: :math:`t_s`.
+        stall: see above, in normalised action units.
+        stall_noise: see above.
+        widths: see :class:`LearnedPrior`.
+        hidden_dim: see :class:`LearnedPrior`.
+    """
+
+    name = "step"
+
+    def __init__(
+        self,
+        chunk_length: int,
+        *,
+        start_time: float = 0.5,
+        stall: float = 0.02,
+        stall_noise: float = 0.1,
+        widths: Sequence[int] | None = None,
+        hidden_dim: int = 256,
+    ) -> None:
+        check_finite_numbers(start_time=start_time, stall=stall, stall_noise=stall_noise)
+        if not 0.0 < start_time < 1.0 or stall < 0:
+            raise ValueError(
+                f"need 0 < start_time < 1 and stall >= 0, got {start_time} and {stall}"
+            )
+        nn.Module.__init__(self)
+        self.chunk_length = chunk_length
+        self.time, self.noise_share = start_time, 1.0 - start_time
+        self.stall, self.stall_noise = stall, stall_noise
+        self._set_widths(widths, hidden_dim)
+
+    def build(self) -> None:
+        """The forecaster."""
+        self.network = self.mlp(self.seen_dim, self.chunk_dim)
+
+    def _forecast(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+        return self.as_chunk(self.outputs(history, observation))
+
+    def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+        """Share of the forecast."""
+        return self.time * self._forecast(history, observation)
+
+    def forward(self, noise: Tensor, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+        """Noise and forecast, mixed as on the path at ``start_time``."""
+        forecast = self._forecast(history, observation)
+        last = history["actions"][..., -self.chunk_length :, :]
+        moved = (forecast - last).square().mean((-1, -2), keepdim=True).sqrt()
+        known = (history["steps"] >= self.chunk_length).unsqueeze(-1)
+        noise = torch.where(known & (moved < self.stall), (1 + self.stall_noise) * noise, noise)
+        return (1 - self.time) * noise + self.time * forecast
+
+    def learning_loss(
+        self, windows: LearningWindows, generator: torch.Generator | None = None
+    ) -> Tensor:
+        """Mean squared error."""
+        forecast = self._forecast(windows.history, windows.observation)
+        return windows.mean((windows.a1 - forecast).square())
+
+
+@dataclass(frozen=True)
+class LearningWindows:
+    """Windows of demonstrations, as a :class:`Learner` is given them.
+
+    Attributes:
+        a1: targets, ``[B, P, d_a]``.
+        counted: positions inside the episode, bool ``[B, P, 1]``.
+        history: before them, ``[B]``, see :mod:`warmprior.history`.
+        observation: ``[B, To, d_o]``.
+    """
+
+    a1: Tensor
+    counted: Tensor
+    history: TensorDictBase
+    observation: Tensor
+
+    @classmethod
+    def of(cls, batch: TensorDictBase) -> LearningWindows:
+        """Those of a batch of :func:`~warmprior.window_replay_buffer`."""
+        counted = ~batch[keys.IS_PAD].unsqueeze(-1)
+        return cls(batch[keys.CHUNK], counted, batch[keys.HISTORY], batch[keys.OBSERVATION])
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Mean over the coordinates inside the episode; 0 if no position is inside."""
+        counted = self.counted.expand_as(values)
+        return (values * counted).sum() / counted.sum().clamp_min(1)
+
+
+def learn(
+    learner: Learner,
+    data: TensorDictBase,
+    *,
+    iterations: int,
+    batch_size: int = 256,
+    learning_rate: float = 1e-3,
+    weight_decay: float = 1e-2,
+    observation_steps: int = 2,
+    withhold: float = 0.0,
+    held_out: float = 0.1,
+    seed: int = 0,
+) -> None:
+    """Train the networks of a learner, in place, and calibrate it on episodes that it does not learn from."""
+    if iterations < 1 or not 0.0 < held_out <= 0.5:
+        raise ValueError(
+            f"need iterations >= 1 and 0 < held_out <= 0.5, got {iterations} and {held_out}"
+        )
+    learner.check_built()
+    data = without_images(data)  # no learner sees them
+    episodes = data[keys.EPISODE].flatten()
+    number = episodes.unique(return_inverse=True)[1]
+    every = max(2, round(1 / held_out))
+    apart = number % every == every - 1 if int(number.max()) + 1 >= every else number == 1
+    device = data.device or torch.device("cpu")
+    generator = torch.Generator(device).manual_seed(seed)
+
+    def windows(part: TensorDictBase, size: int) -> TensorDictReplayBuffer:
+        return window_replay_buffer(
+            part,
+            GaussianPrior(learner.chunk_length),
+            batch_size=size,
+            observation_steps=observation_steps,
+            withhold=withhold,
+            generator=generator,
+        )
+
+    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+        torch.manual_seed(seed)
+        learner.build()
+        learner.to(device)
+    buffer = windows(data[~apart], batch_size)
+    learner.requires_grad_(True).train()
+    optimizer = AdamW(learner.parameters(), lr=learning_rate, weight_decay=weight_decay, fused=True)
+    schedule = warmup_cosine(optimizer, iterations, 0.1)
+    for _ in range(iterations):
+        loss = learner.learning_loss(LearningWindows.of(buffer.sample()), generator)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    learner.requires_grad_(False).eval()
+    if not all(bool(torch.isfinite(p).all()) for p in learner.parameters()):
+        raise FloatingPointError(
+            f"the networks of {type(learner).__name__} became NaN or infinite: lower the learning rate"
+        )
+    unseen = data[apart] if bool(apart.any()) else data
+    with torch.no_grad():
+        learner.calibrate(LearningWindows.of(windows(unseen, CALIBRATION_WINDOWS).sample()))

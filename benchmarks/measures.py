@@ -1,0 +1,239 @@
+"""What is measured of policies beside their success: leak, memory, and the shape of their flow."""
+
+from __future__ import annotations
+
+import copy
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from methods import Method
+from options import HeldOut
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from tqdm import tqdm
+
+from warmprior import Normalizer, Prior, WarmPriorActor
+from warmprior.data import generate_demonstrations
+from warmprior.diagnostics import (
+    SharedObservations,
+    bootstrap_ratio,
+    branching_bound,
+    curvature,
+    encoded_windows,
+    mean_error,
+    memory_gain,
+    source_coverage,
+    source_leak,
+)
+from warmprior.diagnostics.flow import allowed_nfes, depends_on_history, sees_history
+from warmprior.training.task import read_like
+
+MEASURED_WINDOWS = 512
+"""Observations of the training data on which every policy is measured."""
+
+HELD_OUT_SEED = 50
+"""Of generated demonstrations that no training uses; training data have seed 0."""
+
+RATIOS = {
+    "ratio": ("kappa", "whole prediction"),
+    "ratio_executed": ("kappa_executed", "executed H"),
+    "ratio_relative": ("relative_executed", "executed H, per squared mean velocity"),
+    "ratio_one_step": ("one_step_error_executed", "error of one Euler step, executed H"),
+}
+"""Ratios to the baseline: the entry of `curvature` that each compares, and what it is in words."""
+
+
+def measured(
+    policy: WarmPriorActor,
+    data: TensorDictBase,
+    nfes: Sequence[int],
+    *,
+    chunk_length: int,
+    observation_steps: int,
+    coupled: bool,
+) -> dict[int, dict[str, float | None]]:
+    """What is measured of a policy on its training data, by NFE: the same observations and draws for all."""
+    shared = SharedObservations(data.to("cpu"), chunk_length, observation_steps=observation_steps)
+    drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
+    shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
+    windows = shared.windows(policy.prior, see_history=sees_history(policy))
+    seen = encoded_windows(policy, windows)
+    leaks: Mapping[int, Any] = {}
+    if len(shared.episodes.unique()) > 1:  # two episodes with steps to compare
+        leaks = source_leak(policy, seen, nfes=nfes, episodes=shared.episodes)
+    generator = torch.Generator().manual_seed(0)
+    met = shared.met(policy, generator=generator)
+    allowed = allowed_nfes(policy, nfes)
+    means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
+    gains = memory_gain(policy, windows if sees_history(policy) else seen, nfes=nfes)
+    flow = flow_measures(policy, met, coupled=coupled, generator=generator)
+    return {
+        nfe: {
+            "mean_error": means[nfe].target,
+            "mean_revision_data": means[nfe].revision,
+            "source_leak": leaks[nfe].leak if nfe in leaks else None,
+            "inner_step_ratio": leaks[nfe].inner_step_ratio if nfe in leaks else None,
+            "memory_gain": gains[nfe],
+            **flow,
+        }
+        for nfe in allowed
+    }
+
+
+def flow_measures(
+    policy: WarmPriorActor, batch: TensorDictBase, *, coupled: bool, generator: torch.Generator
+) -> dict[str, float]:
+    """How far the source is from its targets, and how straight the flow between them, over the executed H."""
+    found = dict.fromkeys(("kappa", "relative_curvature"), math.nan)
+    if policy.ode.max_nfe is None:
+        with warnings.catch_warnings():  # the NaN says that something does not move
+            warnings.simplefilter("ignore")
+            values = curvature(policy, batch, 100, generator=generator)
+        for name, key in (("kappa", "kappa_executed"), ("relative_curvature", "relative_executed")):
+            found[name] = float(values[key].nanmean())
+    bound = bounds(policy.prior, batch, coupled)[1]
+    return found | {"bound": float(bound), "coverage": source_coverage(policy, batch)}
+
+
+def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
+    """Bound of the branching cost, whole and executed; NaN where it does not apply."""
+    if not coupled:
+        try:
+            bound = branching_bound(batch, prior)
+            return torch.stack([bound[key].nanmean().cpu() for key in ("total", "total_executed")])
+        except ValueError:  # a source that is not Gaussian
+            pass
+    return torch.full((2,), math.nan)
+
+
+def held_out(
+    options: HeldOut,
+    name: str,
+    style: str,
+    facts: Mapping[str, Any],
+    normalizer: Normalizer,
+    *,
+    chunk_length: int,
+    observation_steps: int,
+    device: str = "cpu",
+) -> tuple[SharedObservations, str]:
+    """Observations that no policy of a task was trained on, and what they are in words."""
+    place: Path | str
+    if options.validation is not None:
+        place, words = options.validation, ""
+    elif facts.get("source") != "scripted":
+        raise ValueError(
+            f"these policies are trained on demonstrations of {facts.get('file', name)}: add --validation "
+            "FILE with others (or with the same file, to measure on the training data)"
+        )
+    else:
+        # As many as the training demonstrations suggest, with room to spare.
+        usable = 0.8 * (facts["steps"] / facts["demonstrations"] - chunk_length)
+        count = max(20, int(-(-options.observations // max(1.0, min(50.0, usable)))))
+        place = generate_demonstrations(name, style, count, HELD_OUT_SEED)
+        words = f"{count} newly generated demonstrations"
+    data, called = read_like(place, name, facts)
+    # A copy: the data are normalised on the CPU, the policy may live elsewhere.
+    data = copy.deepcopy(normalizer).to("cpu").normalize(data)
+    shared = SharedObservations(
+        data.to(device),
+        chunk_length,
+        observation_steps=observation_steps,
+        count=options.observations,
+        generator=torch.Generator().manual_seed(0),
+    )
+    return shared, words or called
+
+
+def straightness(
+    policies: Mapping[Method, Mapping[int, WarmPriorActor]],
+    observations: SharedObservations,
+    *,
+    n_steps: int = 100,
+    draws: int = 1,
+    seed: int = 0,
+) -> list[dict[str, Any]]:
+    """Curvatures relative to the first policy's, with bootstrap intervals over episodes (Table 2).
+
+    Every policy is measured at the history of its training and, if it depends on that, at the one that
+    deployment meets, made from its own prediction one decision earlier. A row per policy, training seed and
+    mean, and one with `seed` None for the average over several seeds.
+    """
+    policies = {method: actors for method, actors in policies.items() if method.is_flow}
+    if not policies:
+        raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
+    seeds = sorted(next(iter(policies.values())))
+    measured: dict[tuple[Method, str], list[TensorDict]] = {}
+    bound: dict[tuple[Method, str], list[Tensor]] = {}
+    jobs = [(method, actors[s]) for method, actors in policies.items() for s in seeds]
+    for method, actor in tqdm(jobs, desc="curvature", disable=None):
+        device = next(actor.parameters()).device
+        # Of the earlier prediction: at deployment its noise and that of the next are independent.
+        earlier = torch.Generator(device).manual_seed(seed + 1)
+        windows = observations.windows(actor.prior, see_history=sees_history(actor))
+        batches = {"training": encoded_windows(actor, windows)}
+        if depends_on_history(actor, batches["training"]):
+            batches["deployed"] = observations.deployed(actor, generator=earlier)
+        for mean, batch in batches.items():
+            # The same source noise for every policy and mean.
+            generator = torch.Generator(device).manual_seed(seed)
+            try:
+                values = curvature(actor, batch, n_steps, draws=draws, generator=generator).cpu()
+            except FloatingPointError as error:
+                raise FloatingPointError(f"{method}, {mean} mean: {error}") from error
+            coupled = method.parts.coupling is not None
+            measured.setdefault((method, mean), []).append(values)
+            bound.setdefault((method, mean), []).append(bounds(actor.prior, batch, coupled))
+    first = measured[next(iter(policies)), "training"]
+    rows = []
+    for (method, mean), per_seed in measured.items():
+        parts: list[tuple[int | None, TensorDict, TensorDict, Tensor]] = list(
+            zip(seeds, per_seed, first, bound[method, mean], strict=True)
+        )
+        if len(seeds) > 1:
+            whole = torch.stack(bound[method, mean]).mean(0)
+            parts.append((None, average(per_seed), average(first), whole))
+        for s, values, baseline, limits in parts:
+            rows.append(
+                {
+                    "policy": str(method),
+                    "prior": method.name,
+                    "options": method.options,
+                    "sigma": method.sigma,
+                    "chunk": method.chunk_length,
+                    "mean": mean,
+                    "seed": s,
+                    "observations": len(observations),
+                    **{key: float(value.nanmean()) for key, value in values.items()},
+                    **dict(zip(("bound", "bound_executed"), limits.tolist(), strict=True)),
+                    **ratios(values, baseline, observations.episodes, seed),
+                }
+            )
+    return rows
+
+
+def average(per_seed: Sequence[TensorDict]) -> TensorDict:
+    """Over seeds; NaN where any predicts no motion: the others alone would be no average over the seeds."""
+    mean = {key: torch.stack([v[key] for v in per_seed]).mean(0) for key, _ in per_seed[0].items()}
+    return TensorDict(mean, batch_size=per_seed[0].shape)
+
+
+def ratios(
+    values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int
+) -> dict[str, float]:
+    """The ratios to the baseline, with their 95% intervals."""
+    found: dict[str, float] = {}
+    # A field that predicts no motion has no error of one step either, and no merit in that.
+    still = values["kappa_executed"].isnan() | baseline["kappa_executed"].isnan()
+    for name, (key, _) in RATIOS.items():
+        generator = torch.Generator().manual_seed(seed)
+        counted = values[key]
+        if name == "ratio_one_step":
+            counted = counted.masked_fill(still, math.nan)
+        ends = bootstrap_ratio(counted, baseline[key], episodes, generator=generator)
+        found |= zip((name, f"{name}_low", f"{name}_high"), ends, strict=True)
+    return found

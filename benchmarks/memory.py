@@ -1,0 +1,61 @@
+"""Does memory help? Memory gain against success over the Gaussian source, from finished runs.
+
+python benchmarks/memory.py runs/square-ph-cpu runs/square-mh-cpu --out memory.png
+
+It trains and plays nothing: it reads `results.jsonl` of runs of robomimic.py (docs/benchmarks.md).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import pandas as pd
+from plots import colors_of, legend_below, new_figure, save
+from report import markdown, read_rows, summary
+
+from warmprior.io.script import run_script
+
+
+def run(argv: list[str] | None) -> None:
+    """Read the runs, print a table and draw a point per task, method and NFE."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("runs", nargs="+", type=Path, help="folders of finished runs")
+    parser.add_argument(
+        "--out", type=Path, default=Path("memory.png"), help="picture (%(default)s)"
+    )
+    args = parser.parse_args(argv)
+
+    # A record per task, method and NFE, with everything that is known of it as a column.
+    found = pd.concat([summary(read_rows(run / "results.jsonl"), top_k=1) for run in args.runs])
+    found = found[found.memory_gain.notna() & found.gain.notna()]
+    if found.empty:
+        raise ValueError("these runs have no method beside their first one that was measured")
+
+    figure, (axis,) = new_figure(6.0, 4.0)
+    colors = colors_of(found)
+    for method, group in found.groupby("method", sort=False):
+        axis.scatter(group.memory_gain, 100 * group.gain, 18, color=colors[method], label=method)
+    axis.axhline(0, color="0.6", lw=0.8)
+    axis.set_xlabel("memory gain (0: ignores what it did, 1: repeats it)")
+    axis.set_ylabel("success over the first method (points)")
+    legend_below(figure)
+    save(figure, args.out, f"{len(found)} cells of {len(args.runs)} runs")
+
+    lines = found.assign(
+        cell=found.problem + ", NFE " + found.nfe.astype(str) + ", " + found.method
+    )
+    table = lines.set_index("cell")[["memory_gain", "gain"]].map("{:.3f}".format)
+    print(markdown(table, "cell"), f"\nPicture: {args.out}", sep="")
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the study."""
+    return run_script(lambda: run(argv), "memory.py")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,492 @@
+"""The options that all benchmarks share: a dataclass per concern, and how a command line becomes one.
+
+Every option is declared here once, or in the library's `DataOptions`, `NetworkOptions` and `TrainingConfig`.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from glob import escape
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_type_hints
+
+import torch
+import tyro
+from methods import Method
+
+from warmprior.data.opening import check_place, name_of_place, resolved_place
+from warmprior.io.distributed import check_batch, check_device, from_leader, launched, rank
+from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
+from warmprior.io.machine import facts_of_machine
+from warmprior.modules import imagenet_weights
+from warmprior.modules.grid import check_grid
+from warmprior.training import DataOptions, NetworkOptions, TrainingConfig
+from warmprior.training.options import GENERATED, PRETRAINED, SMALL, check_counts
+
+Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
+
+
+@dataclass(frozen=True)
+class Sources:
+    """The methods to compare.
+
+    Attributes:
+        prior: by name (gaussian, past, preview, forecast, history, regression, ot, reflow, step, cvae, a2a,
+            leap) or, your own, as package.module:Class, which Python has to find (PYTHONPATH); options
+            follow as in preview,correlation=0.5. Gains are over the first.
+        chunk: chunk lengths H.
+        sigma: residual noise of the warm priors, one policy each (default: past 0.5, preview 1.0).
+    """
+
+    prior: tuple[str, ...] = ("gaussian", "past", "preview")
+    chunk: tuple[int, ...] = (8,)
+    sigma: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        check_counts(self, "chunk")
+        for name in ("prior", "chunk"):
+            if not getattr(self, name):
+                raise ValueError(f"--{name} needs at least one value")
+
+    def methods(self) -> list[Method]:
+        """All of them, chunk length by chunk length, each once."""
+        found = [
+            Method(text, chunk, sigma)
+            for chunk in sorted(set(self.chunk))
+            for text in self.prior
+            for sigma in self.sigma or (None,)
+        ]
+        return list(dict.fromkeys(found))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How policies are played.
+
+    Attributes:
+        seeds: number of training seeds, from --seed on.
+        episodes: evaluation episodes per cell.
+        nfe: network evaluations per chunk.
+        top_k: best checkpoints averaged per seed.
+        play_on: go on after success, up to the time limit; solved is solved at any step.
+        grid: of the integration: uniform, or dense-jump (one last step from half way; dense-jump:0.7 from
+            there).
+    """
+
+    seeds: int = 1
+    episodes: int = 25
+    nfe: tuple[int, ...] = (9, 3, 1)
+    top_k: int = 1
+    play_on: bool = False
+    grid: str = "uniform"
+
+    def __post_init__(self) -> None:
+        check_counts(self, "seeds", "episodes", "nfe", "top_k")
+        if not self.nfe:
+            raise ValueError("--nfe needs at least one number of network evaluations")
+        check_grid(self.grid)
+
+    @property
+    def environment(self) -> dict[str, Any]:
+        """Options of the environment."""
+        return {"terminate_on_success": False} if self.play_on else {}
+
+
+@dataclass(frozen=True)
+class Run:
+    """Where and how to compute.
+
+    Attributes:
+        preset: the budget that the other options start from.
+        out: output folder (default: a numbered one under runs/).
+        resume: continue in --out, or in the latest default folder, with the options stored there.
+        envs: worker processes that train and play, with the same results (default: one per core).
+        device: of networks and data, such as cuda; one per process under torchrun.
+        compile: torch.compile the network in training.
+        logger: TorchRL logger of the training curves.
+        engine: who computes, with the same results: processes of this machine, or Ray, on one or many.
+        ray_address: HOST:PORT of a Ray cluster's head (default: $RAY_ADDRESS, or this machine alone).
+    """
+
+    preset: str = "quick"
+    out: Path | None = None
+    resume: bool = False
+    envs: int | None = None
+    device: str = "cpu"
+    compile: bool = False
+    logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"
+    engine: Literal["local", "ray"] = "local"
+    ray_address: str | None = None
+
+    def __post_init__(self) -> None:
+        check_counts(self, "envs")
+        check_device(self.device)
+        if self.ray_address is not None and self.engine != "ray":
+            raise ValueError("--ray-address belongs to --engine ray")
+        if self.engine == "ray" and launched():
+            raise ValueError("--engine ray distributes the work itself: start it without torchrun")
+        if self.engine == "ray" and torch.device(self.device).index is not None:
+            raise ValueError(
+                f"--device {self.device}: with --engine ray, Ray chooses the GPU: use cuda"
+            )
+
+    @property
+    def folder(self) -> Path:
+        """The output folder, once :func:`parse` has chosen it."""
+        assert self.out is not None
+        return self.out
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Observations to measure on, which no policy was trained on.
+
+    Attributes:
+        validation: held-out demonstrations, as --dataset names them (default: newly generated ones).
+        observations: how many; the paper's curvature has 2000.
+        steps: Euler steps of a curvature.
+        draws: source samples per observation.
+    """
+
+    validation: Path | None = None
+    observations: int = 500
+    steps: int = 100
+    draws: int = 1
+
+    def __post_init__(self) -> None:
+        check_counts(self, "observations", "draws", "steps")
+        if self.steps < 2:
+            raise ValueError(f"--steps must be at least 2, got {self.steps}")
+        if self.validation is not None:
+            check_place(self.validation, "--validation")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Everything that determines a comparison of sources."""
+
+    data: Annotated[DataOptions, Flat] = field(default_factory=DataOptions)
+    network: Annotated[NetworkOptions, Flat] = field(default_factory=NetworkOptions)
+    training: Annotated[TrainingConfig, Flat] = field(default_factory=TrainingConfig)
+    sources: Annotated[Sources, Flat] = field(default_factory=Sources)
+    evaluation: Annotated[Evaluation, Flat] = field(default_factory=Evaluation)
+    run: Annotated[Run, Flat] = field(default_factory=Run)
+
+    @property
+    def name(self) -> str:
+        """Of the tasks, in names of folders."""
+        file = self.data.dataset
+        tasks = self.data.task or ("square" if file is None else name_of_place(file),)
+        space = [] if self.data.actions == "delta" else [self.data.actions]
+        seen = [] if self.data.obs == "state" else [self.data.obs]
+        own = [task.replace(":", "-") for task in tasks]
+        return "-".join([*own, *self.data.data, *space, *seen])
+
+    @property
+    def seeds(self) -> range:
+        """The training seeds."""
+        return range(self.training.seed, self.training.seed + self.evaluation.seeds)
+
+    def trainings(self) -> list[TrainingConfig]:
+        """The recipes to compare, without seeds."""
+        return [self.training]
+
+    def check(self) -> None:
+        """Refuse what cannot work, before any work."""
+        self.data.check()
+        self.network.check(self.data)
+        check_batch(self.training.batch_size)
+        if self.training.weighting == "standardised" and not self.network.precondition:
+            raise ValueError("--no-precondition needs --weighting velocity")
+        for method in self.sources.methods():
+            method.nfes(self.evaluation.nfe)
+            if self.data.obs == "image" and method.needs_vector:
+                raise ValueError(
+                    f"{method.name} reads observations that are one vector: leave it out with --obs image"
+                )
+            try:
+                method.recipe(self.training)
+            except ValueError as error:
+                raise ValueError(f"leave out {method.name}, which is no flow: {error}") from error
+            if method.pairs_in_batch and self.training.batch_size < 2:
+                raise ValueError(
+                    f"{method.name} pairs within a batch: --batch-size must be at least 2"
+                )
+
+
+@dataclass(frozen=True)
+class PolicyOptions:
+    """Which policies to take.
+
+    Attributes:
+        run: a finished run of robomimic.py, whose policies to take instead of training them.
+    """
+
+    run: Path | None = None
+
+
+@dataclass(frozen=True)
+class MeasuredOptions(Options):
+    """A comparison with measures on held-out observations, of one task and chunk length."""
+
+    held_out: Annotated[HeldOut, Flat] = field(default_factory=HeldOut)
+
+    def check(self) -> None:
+        """Refuse what cannot work, before any work."""
+        super().check()
+        check_single(self, "task", "data", "chunk")
+
+
+def check_single(options: Options, *names: str) -> None:
+    """Refuse several of what a study has one of, such as `task` or `chunk`."""
+    parts = (options.data, options.sources, options.evaluation)
+    for name in names:
+        values = next(getattr(part, name) for part in parts if hasattr(part, name))
+        if len(values) > 1:
+            raise ValueError(f"this study has one --{name}, got {' '.join(map(str, values))}")
+
+
+PRESETS: dict[str, Options] = {
+    # One seed, small network: a first table within 15 minutes on two cores.
+    "quick": Options(
+        data=DataOptions(demonstrations=(GENERATED,)),
+        network=NetworkOptions(hidden_dim=384),
+        training=SMALL,
+    ),
+    # The same policies with three seeds and twice the episodes: a table with seeds.
+    "cpu": Options(
+        data=DataOptions(demonstrations=(150, 300)),
+        network=NetworkOptions(hidden_dim=384),
+        training=SMALL,
+        evaluation=Evaluation(seeds=3, episodes=50),
+    ),
+    # The paper's: 20M parameters, 200k iterations.
+    "paper": Options(
+        data=DataOptions(demonstrations=(200, 300)),
+        network=NetworkOptions(network="chi_transformer", precondition=False),
+        evaluation=Evaluation(seeds=3, episodes=200, top_k=3),
+    ),
+}
+
+# What a preset does differently where policies see images. Small images and networks, and a task that is
+# solved from them: 15 minutes on two cores.
+SMALL_IMAGES: dict[str, dict[str, Any]] = {
+    "data": {"image_size": 48, "fast_rendering": True},
+    "network": {"hidden_dim": 256, "encoder": "small", "crop_size": 42},
+    "training": {"iterations": 3_000, "batch_size": 64},
+}
+IMAGES: dict[str, dict[str, dict[str, Any]]] = {
+    "quick": {**SMALL_IMAGES, "evaluation": {"nfe": (3, 1)}},
+    "cpu": SMALL_IMAGES,
+    "paper": {"training": {"batch_size": 256}},
+}
+
+
+def adapted[O: Options](preset: O, asked: Options) -> O:
+    """A preset for what policies are to see.
+
+    Where ImageNet's weights cannot be had, an encoder that would start from them starts from random ones.
+    """
+    if "image" not in (asked.data.obs, preset.data.obs):
+        return preset
+    if preset.data.obs == "state":
+        changed = {part: dict(values) for part, values in IMAGES[asked.run.preset].items()}
+        changed["data"] = {**changed.get("data", {}), "obs": "image"}
+        if asked.run.preset == "quick" and not preset.data.task:
+            changed["data"] |= {"task": ("lift",), "demonstrations": (100,)}
+        preset = with_parts(preset, **changed)
+    if preset.network.encoder == asked.network.encoder == PRETRAINED:
+        try:
+            imagenet_weights()
+        except (OSError, ImportError) as error:
+            print(f"{error}. The encoder starts from random weights.", flush=True)
+            return with_parts(preset, network={"encoder": "resnet18"})
+    return preset
+
+
+def with_parts[O](options: O, **parts: Mapping[str, Any]) -> O:
+    """Options with some leaves replaced, by part."""
+    made: Any = {part: replace(getattr(options, part), **values) for part, values in parts.items()}
+    return replace(options, **made)  # type: ignore[type-var]
+
+
+def study[O: Options](kind: type[O], preset: Options, **parts: Any) -> O:
+    """A preset of a study: that of the comparison, with further parts or others."""
+    mine: Any = {f.name: getattr(preset, f.name) for f in fields(Options)}
+    return kind(**mine | parts)
+
+
+def parse[O: Options](
+    presets: Mapping[str, O],
+    argv: Sequence[str] | None,
+    study: str,
+    description: str | None,
+    adapt: Callable[[O, O], O] = adapted,
+) -> O:
+    """The options of a command line, checked, with their output folder.
+
+    They start from those of --preset, or with --resume from those stored in the folder, which the command
+    line may then only repeat.
+    """
+    argv = sys.argv[1:] if argv is None else list(map(str, argv))
+    asked = read(next(iter(presets.values())), argv, description)
+    if asked.run.preset not in presets:
+        raise ValueError(f"--preset must be one of {', '.join(presets)}, got {asked.run.preset!r}")
+    base = adapt(presets[asked.run.preset], asked)
+    if not asked.data.generated:  # the demonstrations of presets are numbers to generate
+        base = with_parts(base, data={"demonstrations": ()})
+    options = read(base, argv, description)
+    out = from_leader(lambda: output_folder(options, study))
+    if options.run.resume:
+        stored = stored_options(type(base), out, study)
+        options = read(stored, argv, description)
+        changed = sorted(set(differences(recorded(stored), recorded(options))))
+        if changed:
+            raise ValueError(
+                f"{out} was started with other values of {', '.join(changed)}: leave these out, or choose "
+                "another --out"
+            )
+        # What a file says is not imported: only what was typed, or what the script itself takes.
+        known = (*argv, *base.sources.prior, *base.data.task)
+        for name in (*stored.sources.prior, *stored.data.task):
+            if ":" in name and name not in known:
+                raise ValueError(
+                    f"{out} uses {name}: name it again, with --prior or --task as before"
+                )
+    name = options.run.logger
+    if name in ("tensorboard", "wandb") and find_spec(name) is None:
+        raise ImportError(f"--logger {name} needs the package {name}: pip install it")
+    if options.run.engine == "ray":
+        from warmprior.io.ray_cluster import check_ray
+
+        check_ray(options.run.ray_address)
+    options.check()
+    place = options.data.dataset
+    if place is not None:  # workers on other machines have other working directories
+        options = with_parts(options, data={"dataset": Path(resolved_place(place))})
+    return with_parts(options, run={"out": out})
+
+
+def read[O: Options](default: O, argv: Sequence[str], description: str | None) -> O:
+    """A command line, on top of defaults."""
+    written = io.StringIO()
+    try:
+        with redirect_stderr(written):
+            kind: Any = type(default)
+            return tyro.cli(kind, default=default, args=argv, description=description)
+    except SystemExit as stop:
+        # What a dataclass refuses is reported like all that we refuse; what no option is, by tyro.
+        refused: Any = stop.__context__
+        if isinstance(getattr(refused, "arg", None), str):
+            raise ValueError(str(refused.message)) from None
+        sys.stderr.write(written.getvalue())
+        raise
+
+
+def output_folder(options: Options, study: str) -> Path:
+    """The folder to write to; never one that holds a run, unless it is to be continued."""
+    out, resume = options.run.out, options.run.resume
+    if out is None:
+        prefix = [] if study == "robomimic" else [study]
+        name = "-".join([*prefix, options.name, options.run.preset])
+        taken = sorted(
+            int(folder.name[len(name) + 1 :] or 1)
+            for folder in Path("runs").glob(f"{escape(name)}*")
+            if folder.name == name or folder.name[len(name) + 1 :].isdigit()
+        )
+        number = (taken or [0])[-1] + (0 if resume and taken else 1)
+        out = Path("runs") / (name if number == 1 else f"{name}-{number}")
+    if (out / "options.json").exists() and not resume:
+        raise ValueError(f"{out} holds a run: add --resume to continue it, or choose another --out")
+    return out
+
+
+OF_A_START = ("out", "resume", "envs", "logger", "engine", "ray_address")
+"""Options of a run that may differ each time it is started: they change no result."""
+
+
+def recorded(options: Any) -> dict[str, Any]:
+    """Options as JSON holds them, without those of a start."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(v) for key, v in value.items()}
+        if isinstance(value, (tuple, list)):
+            return [plain(v) for v in value]
+        # The same file from another working directory.
+        return resolved_place(value) if isinstance(value, Path) else value
+
+    tree = plain(asdict(options))
+    if "run" in tree:
+        tree["run"] = {k: v for k, v in tree["run"].items() if k not in OF_A_START}
+        del tree["data"]["force_download"]
+    return tree
+
+
+def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> Iterator[str]:
+    """The options in which two records differ."""
+    for name in mine.keys() | theirs.keys():
+        one, two = mine.get(name), theirs.get(name)
+        if isinstance(one, dict) and isinstance(two, dict):
+            yield from differences(one, two)
+        elif one != two:
+            yield "--" + name.replace("_", "-")
+
+
+def stored_options[O: Options](kind: type[O], out: Path, study: str) -> O:
+    """The options of the run in a folder."""
+    path = out / "options.json"
+    if not path.is_file():
+        raise ValueError(f"--resume: there is no run in {out}; name its folder with --out")
+    stored = read_json(path)
+    theirs = stored.get("study") if isinstance(stored, dict) else None
+    if theirs != study:
+        raise ValueError(
+            f"{out} holds a run of {theirs}: continue it with that script, or choose another --out"
+        )
+    try:
+        return from_record(kind, stored["options"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged, or of another version: {error}") from error
+
+
+def from_record[T](kind: type[T], tree: Mapping[str, Any]) -> T:
+    """The inverse of :func:`recorded`."""
+    hints, values = get_type_hints(kind), {}
+    for name, value in tree.items():
+        if is_dataclass(hints[name]):
+            value = from_record(hints[name], value)  # type: ignore[arg-type]
+        elif isinstance(value, list):
+            value = tuple(value)
+        elif isinstance(value, str) and Path in get_args(hints[name]):
+            value = Path(value)
+        values[name] = value
+    return kind(**values)
+
+
+@contextmanager
+def started(options: Options, study: str) -> Iterator[Path]:
+    """The output folder, with the options in it, and without another process."""
+    out = options.run.folder
+    if rank():  # the first process is in it, for all
+        yield out
+        return
+    check_writable(out)
+    with exclusive(out):
+        facts = facts_of_machine(workers=options.run.envs, device=options.run.device)
+        record = {"study": study, **facts, "options": recorded(options)}
+        text = json.dumps(record, indent=1) + "\n"
+        write_atomic(out / "options.json", lambda path: path.write_text(text))
+        print(f"Output folder: {out}", flush=True)
+        try:
+            yield out
+        except Exception:
+            if not (out / "tasks.json").exists():  # nothing was begun, and nothing is in the way
+                (out / "options.json").unlink()
+            raise

@@ -1,0 +1,194 @@
+"""What is measured of policies: straightness on fields whose ratios are known, and memory."""
+
+from __future__ import annotations
+
+import math
+import sys
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+pytest.importorskip("tyro")
+
+import measures
+from measures import measured
+from methods import Method
+
+from tests.benchmarks.drift import ACTION_DIM, OBSERVATION_DIM, task
+from tests.diagnostics.fields import Field, policy, seeing_network
+from tests.diagnostics.test_shared_observations import H, steps
+from warmprior import (
+    GaussianPrior,
+    HistoryObservation,
+    PastPrior,
+    PreviewPrior,
+    WarmPriorActor,
+    keys,
+)
+from warmprior.diagnostics import SharedObservations, memory_gain
+
+
+def straightness(policies, *args, **options):
+    """Rows of the policies of seeds 0, 1, ..., by prior, seed and mean."""
+    given = {Method(n, H): dict(enumerate(group)) for n, group in policies.items()}
+    rows = measures.straightness(given, *args, **options)
+    return {(row["prior"], row["seed"], row["mean"]): row for row in rows}
+
+
+def turning(speed):
+    """v = speed * cos(pi t / 2) on every coordinate: kappa is proportional to speed squared."""
+    return lambda t, a, o: speed * torch.cos(torch.pi / 2 * t) + torch.zeros_like(a)
+
+
+def shared(count=20):
+    data = steps([9] * 8)
+    data["action"] = data["action"] / len(data)
+    return SharedObservations(data, H, count=count, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture
+def small_loss(monkeypatch):
+    # The fields here are no fits of the data; that check has its own tests.
+    module = sys.modules["warmprior.diagnostics.curvature"]  # its function has the same name
+    monkeypatch.setattr(module, "NO_MOTION", math.inf)
+
+
+@pytest.mark.filterwarnings("ignore:.*has not learnt to move")
+def test_a_field_worse_than_none_has_no_ratio():
+    rows = straightness({"gaussian": [policy(turning(9.0))]}, shared(), n_steps=10)
+    assert math.isnan(rows["gaussian", 0, "training"]["ratio"])
+
+
+def test_ratios_follow_from_the_fields(small_loss):
+    policies = {
+        "regression": [policy(turning(5.0))] * 2,  # no flow: the next one is the baseline
+        "gaussian": [policy(turning(2.0)), policy(turning(2.0))],
+        "past": [policy(turning(1.0), PastPrior(H)), policy(turning(2.0), PastPrior(H))],
+        "preview": [policy(turning(1.0), PreviewPrior(H))] * 2,
+    }
+    rows = straightness(policies, shared())
+    assert {name for name, *_ in rows} == {"gaussian", "past", "preview"}
+    assert {mean for name, _, mean in rows if name == "gaussian"} == {"training"}
+    assert rows["gaussian", 0, "training"]["ratio"] == 1.0
+    assert rows["past", 0, "training"]["ratio"] == pytest.approx(1 / 4, rel=1e-4)
+    assert rows["past", 1, "deployed"]["ratio"] == pytest.approx(1.0, rel=1e-4)
+    assert rows["past", None, "training"]["ratio"] == pytest.approx(5 / 8, rel=1e-4)
+    # A prediction of 2H counts up to twice when it counts whole; the executed half does not.
+    inside = [
+        int((~shared().windows(p)["action_is_pad"]).sum())
+        for p in (PreviewPrior(H), GaussianPrior(H))
+    ]
+    assert 1.3 < inside[0] / inside[1] < 2.0
+    both = rows["preview", None, "training"]
+    assert both["ratio"] == pytest.approx(inside[0] / inside[1] / 4, rel=1e-4)
+    assert both["ratio_executed"] == pytest.approx(1 / 4, rel=1e-4)
+    # All paths bend alike: relative to its speed every field is as curved as the baseline.
+    assert all(r["ratio_relative"] == pytest.approx(1.0, rel=1e-4) for r in rows.values())
+    assert all(r["ratio_low"] <= r["ratio"] + 1e-9 <= r["ratio_high"] + 2e-9 for r in rows.values())
+    assert rows["gaussian", 0, "training"]["bound"] > rows["past", 0, "training"]["bound"]
+
+
+def test_the_ratio_of_linear_fields_has_the_closed_form(small_loss):
+    """v = -rate * a: v_k = -rate * (1 - rate/N)^k a0 at step k, from the same sources a0."""
+    fields = {"gaussian": [policy(lambda t, a, o: -a)], "history": [policy(lambda t, a, o: -2 * a)]}
+    rows = straightness(fields, shared(), draws=2, seed=3)
+    ks = torch.arange(100, dtype=torch.float64)
+    kappas = [(rate * (1 - rate / 100) ** ks).var(correction=0) for rate in (1.0, 2.0)]
+    expected = pytest.approx(float(kappas[1] / kappas[0]), rel=1e-3)
+    assert rows["history", 0, "training"]["ratio"] == expected
+    # One seed, one result.
+    assert straightness(fields, shared(), draws=2, seed=3) == rows
+    other = straightness(fields, shared(), draws=2, seed=4)
+    place = "gaussian", 0, "training"
+    assert other[place]["kappa"] != rows[place]["kappa"]
+
+
+def test_an_average_over_seeds_leaves_none_out(small_loss):
+    policies = {
+        "gaussian": [policy(turning(2.0)), policy(turning(2.0))],
+        "past": [policy(turning(0.0), PastPrior(H)), policy(turning(1.0), PastPrior(H))],
+    }
+    with pytest.warns(UserWarning, match="do not move"):
+        rows = straightness(policies, shared())
+    assert rows["past", 1, "training"]["ratio_executed"] == pytest.approx(1 / 4, rel=1e-4)
+    for seed in (0, None):
+        row = rows["past", seed, "training"]
+        # Nor is an exact Euler step from nowhere to nowhere a merit.
+        assert math.isnan(row["ratio_executed"]) and math.isnan(row["ratio_one_step"])
+    with pytest.warns(UserWarning, match="do not move"):  # the baseline, now
+        rows = straightness(dict(reversed(policies.items())), shared())
+    assert math.isnan(rows["gaussian", 0, "training"]["ratio_one_step"])
+
+
+def test_the_noise_of_the_earlier_prediction_is_not_that_of_the_path(small_loss):
+    """A field of 0 predicts mean + noise; from the mean it makes, the next source starts."""
+    starts = []
+
+    def field(t, a, o):
+        if bool((t == 0).all()):
+            starts.append(a.clone())
+        return torch.ones_like(a)
+
+    observations = shared(count=None)
+    demonstrated = PastPrior(H).distribution(observations.windows(PastPrior(H))["history"]).loc
+    straightness({"past": [policy(field, PastPrior(H, sigma=1.0))]}, observations, n_steps=2)
+    # At time 0: the earlier prediction, then path and one step at either mean.
+    earlier, at_training, at_deployed = starts[0], starts[1], starts[3]
+    noise = at_training - demonstrated
+    assert torch.equal(starts[1], starts[2]) and torch.equal(starts[3], starts[4])
+    mean = earlier + 1.0  # what the field makes of it
+    torch.testing.assert_close(at_deployed - mean, noise, atol=1e-5, rtol=0)
+    before = observations.windows(PastPrior(H), offset=H)["history"]
+    previous = earlier - PastPrior(H).distribution(before).loc
+    both = torch.stack([noise.flatten(), previous.flatten()])
+    assert abs(float(torch.corrcoef(both)[0, 1])) < 0.25
+
+
+def test_the_bound_is_that_of_the_mean_it_stands_beside(small_loss):
+    far = {"past": [policy(lambda t, a, o: torch.full_like(a, 100.0), PastPrior(H))]}
+    rows = straightness(far, shared(), n_steps=4)
+    assert rows["past", 0, "deployed"]["bound"] > 1_000 > rows["past", 0, "training"]["bound"]
+    # It is no bound of pairs that a coupling has made.
+    rows = straightness({"ot": [policy(turning(1.0))]}, shared(), n_steps=4)
+    assert math.isnan(rows["ot", 0, "training"]["bound"])
+
+
+def test_what_cannot_be_compared_is_named():
+    policies = {"past": [policy(lambda t, a, o: a * math.inf, PastPrior(H))]}
+    with pytest.raises(FloatingPointError, match=r"past, sigma 0\.5, H 3, training mean: 20 of 20"):
+        straightness(policies, shared(), n_steps=4)
+    with pytest.raises(ValueError, match="none of these policies has a flow"):
+        straightness({"regression": [policy(turning(1.0))]}, shared())
+
+
+def test_the_memory_gain_of_a_network_that_sees_the_history_is_that_of_what_it_sees():
+    length = 4
+    seen = slice(OBSERVATION_DIM, OBSERVATION_DIM + length * ACTION_DIM)
+    follows = Field(lambda t, a, o: 0.4 * o[:, -1, seen].unflatten(-1, (length, ACTION_DIM)) - a)
+    actor = WarmPriorActor(follows, GaussianPrior(length), observation_key=keys.CONDITIONED)
+    options = {"chunk_length": length, "observation_steps": 2, "coupled": False}
+    found = measured(actor, task().data, (1,), **options)
+    assert found[1]["memory_gain"] == pytest.approx(0.4, rel=1e-4)
+
+
+def test_images_that_stand_beside_the_history_are_encoded_with_it():
+    prior, n = GaussianPrior(H), 20
+    width = OBSERVATION_DIM + HistoryObservation.width(H, ACTION_DIM)
+    network = seeing_network(ACTION_DIM, width, H)
+    data = TensorDict(
+        {
+            "observation": {
+                "state": torch.randn(n, OBSERVATION_DIM),
+                "cam_image": torch.randint(0, 255, (n, 3, 16, 16), dtype=torch.uint8),
+            },
+            "action": torch.randn(n, ACTION_DIM),
+            "episode": torch.arange(n) // 10,
+        },
+        [n],
+    )
+    actor = WarmPriorActor(network, prior, observation_key=keys.CONDITIONED)
+    options = {"chunk_length": H, "observation_steps": 2, "coupled": False}
+    found = measured(actor, data, (1,), **options)[1]["memory_gain"]
+    windows = SharedObservations(data, H, observation_steps=2).windows(prior, see_history=True)
+    assert found == pytest.approx(memory_gain(actor, windows)[1]) and found != 0

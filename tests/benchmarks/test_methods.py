@@ -1,0 +1,118 @@
+"""Methods by name: equal where they do the same, refused where an option means nothing."""
+
+from __future__ import annotations
+
+import pickle
+
+import pytest
+import torch
+from methods import METHODS, Method
+
+from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from warmprior.history import cold_history
+from warmprior.modules.prior import Prior
+from warmprior.objectives import OTCoupling, ReflowCoupling
+from warmprior.training import TrainingConfig
+
+H = 3
+
+
+class Bare(Prior):
+    """No source: it has neither a mean nor a distribution."""
+
+
+@pytest.mark.parametrize(
+    ("one", "two"),
+    [
+        (("past", H), ("past,correlation=0.0,sigma=0.5", H)),
+        (("past,sigma=0.3", H), ("past", H, 0.3)),
+        (("gaussian", H), ("gaussian", H, 0.3)),  # --sigma belongs to those that take it
+        (("step,stall=1,start_time=0.7", H), ("step,start_time=0.7,stall=1", H)),
+    ],
+)
+def test_methods_are_equal_if_they_do_the_same(one, two):
+    first, second = Method(*one), Method(*two)
+    assert first == second and hash(first) == hash(second) and first.config() == second.config()
+
+
+@pytest.mark.parametrize(
+    "other", [("past", H + 1), ("past", H, 0.3), ("past,correlation=0.5", H), ("preview", H)]
+)
+def test_methods_differ_in_each_of_their_options(other):
+    assert (
+        Method(*other) != Method("past", H)
+        and Method(*other).config() != Method("past", H).config()
+    )
+
+
+@pytest.mark.parametrize("text", [*METHODS, "tests.benchmarks.user_priors:HeldAction"])
+def test_every_method_arrives_in_a_fresh_process(text):
+    method = Method(text, H)
+    again = pickle.loads(pickle.dumps(method))
+    assert again == method and again.sigma == method.sigma and str(again) == str(method)
+    assert method.prediction_length == (2 * H if method.name == "preview" else H)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("nobodys", H), "unknown prior 'nobodys'.*methods: gaussian, past"),
+        (("no.such:Prior", H), "no prior at no.such:Prior"),
+        (("past,age=3", H), r"age is unknown to it.*its options are sigma, correlation"),
+        (("gaussian,sigma=0.3", H), "sigma is unknown to it, or without effect"),
+        (("past,sigma=0.3", H, 0.5), "both set sigma"),
+        (("past,sigma=-1", H), "sigma"),
+        (("past", 0), "chunk_length"),
+        (("ot,observation_weight=-1", H), "observation_weight"),
+        ((f"{__name__}:Bare", H), "Bare"),
+        (("methods:PointPrior", H), "is a part of methods, and none itself"),
+        (("warmprior:PastPrior", H), "is a part of methods, and none itself"),
+    ],
+)
+def test_what_cannot_be_is_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        Method(*arguments)
+
+
+def test_a_regression_draws_nothing_and_is_trained_at_the_start_alone():
+    method = Method("regression", H)
+    source = method.prior().distribution(cold_history([2], H, H, 1))
+    assert (source.sample() == 0).all() and not source.warm.any()
+    assert method.recipe(TrainingConfig()).times == "start" and not method.is_flow
+    assert method.nfes((9, 1)) == [1] and Method("past", H).nfes((1, 9, 1)) == [9, 1]
+    with pytest.raises(ValueError, match="for --nfe 1 alone"):
+        method.nfes((9, 3))
+    with pytest.raises(ValueError, match=r"l1|self|objective"):
+        method.recipe(TrainingConfig(self_distillation=1.0))
+
+
+def test_history_is_withheld_from_those_alone_that_remember():
+    training = TrainingConfig(cold_probability=0.5)
+    remember = {name for name in METHODS if Method(name, H).recipe(training).cold_probability}
+    assert remember == {"past", "preview", "forecast", "history", "step", "a2a"}
+    assert {name for name in METHODS if Method(name, H).needs_vector} == {
+        "forecast",
+        "ot",
+        "step",
+        "cvae",
+        "leap",
+    }
+    assert not Method("ot,observation_weight=0", H).needs_vector
+
+
+def test_couplings_are_those_of_the_table():
+    assert type(Method("ot", H).coupling()) is OTCoupling and Method("past", H).coupling() is None
+    method = Method("reflow,teacher_nfe=2", H)
+    teacher = WarmPriorActor(VelocityMLP(1, 1, H, 1, hidden_dim=8), method.prior())
+    coupling = method.coupling(teacher)
+    assert isinstance(coupling, ReflowCoupling) and method.teacher == Method("gaussian", H)
+    a0, seen = torch.randn(4, H, 1), torch.randn(4, 1, 1)
+    expected = ReflowCoupling(teacher, 2)(a0, a0, seen)[1]
+    assert torch.equal(coupling(a0, a0, seen)[1], expected)
+
+
+def test_sources_that_learn_are_given_the_widths_of_the_data():
+    prior = Method("forecast,hidden_dim=16", H).prior((2, 5, 1))
+    assert (prior.action_dim, prior.observation_dim, prior.hidden_dim) == (2, 5, 16)
+    assert Method("step", H).start((2, 5, 1)).observation_steps == 1
+    assert type(Method("past", H).prior((2, 5, 1))) is PastPrior

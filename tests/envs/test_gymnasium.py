@@ -1,0 +1,100 @@
+"""Gymnasium environments: their episodes and infos, against the bare environments."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+pytest.importorskip("gymnasium")
+
+import gymnasium
+import numpy as np
+
+from warmprior.envs.gymnasium import gym_env
+
+
+class Dial(gymnasium.Env):
+    """A dial that starts where its seed says; it counts its resets, and says in ``info`` what it knows."""
+
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, nested=False):
+        self.nested, self.resets = nested, []
+        dial = gymnasium.spaces.Box(-9.0, 9.0, (2,), np.float64)
+        turns = gymnasium.spaces.Box(-9.0, 9.0, (1,), np.float64)
+        both = gymnasium.spaces.Dict({"dial": dial, "turns": turns})
+        self.observation_space = both if nested else dial
+
+    def _seen(self):
+        dial = np.array([self.at, -self.at])
+        return {"dial": dial, "turns": np.array([float(self.turns)])} if self.nested else dial
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.resets.append(seed)
+        self.at, self.turns = self.np_random.uniform(-1, 1), 0
+        return self._seen(), {"solved": self.at > 0.5}
+
+    def step(self, action):
+        self.at, self.turns = self.at + float(action[0]), self.turns + 1
+        info = {"solved": self.at > 0.5, "height": 2 * self.at}
+        return self._seen(), 1.0, self.turns == 5, False, info if self.turns % 2 else {}
+
+
+def actions(n=5):
+    return torch.rand(n, 1, generator=torch.Generator().manual_seed(1)) * 2 - 1
+
+
+def played(env, seed):
+    """Observations, solved and height at the reset and after every step."""
+    env.set_seed(seed)
+    data = env.reset()
+    found = [data]
+    for action in actions():
+        data = env.step(data.set("action", action))["next"]
+        found.append(data)
+    return [
+        [d[key].squeeze().tolist() for d in found] for key in ("observation", "solved", "height")
+    ]
+
+
+@pytest.mark.parametrize("seed", [0, 7])
+def test_episodes_are_those_of_the_bare_environment(seed):
+    bare, env = Dial(), gym_env(Dial(), success="solved", measures=["height"])
+    seen, info = bare.reset(seed=seed)
+    expected = [(seen, info.get("solved", False), info.get("height", 0.0))]
+    for action in actions():
+        seen, _, _, _, info = bare.step(action.numpy())
+        # What a step leaves out is 0: of no step is said what was said of another.
+        expected.append((seen, info.get("solved", False), info.get("height", 0.0)))
+    observations, solved, heights = played(env, seed)
+    assert observations == [pytest.approx(seen) for seen, *_ in expected]
+    assert solved == [bool(flag) for _, flag, _ in expected]
+    assert heights == pytest.approx([height for *_, height in expected])
+    # The flag of a reset is there as well; both kinds occur.
+    assert any(solved) and not all(solved)
+
+
+def test_every_seed_is_one_reset_and_later_episodes_are_others():
+    base = Dial()
+    env = gym_env(base, success="solved", measures=["height"])
+    before = len(base.resets)
+    first = played(env, 3)
+    assert base.resets[before:] == [3]
+    again = env.reset()["observation"]
+    assert base.resets[before:] == [3, None] and again.tolist() != first[0][0]
+    assert played(env, 3) == first  # whatever was played before
+
+
+def test_dictionaries_are_concatenated_in_the_order_that_is_asked_for():
+    for keys, width in (((), 3), (("turns", "dial"), 3), (("dial",), 2)):
+        env = gym_env(Dial(nested=True), observation_keys=keys)
+        env.set_seed(0)
+        data = env.step(env.reset().set("action", torch.zeros(1)))["next"]
+        seen = data["observation"]
+        assert seen.shape == (width,) and seen.dtype == torch.float32
+        assert env.observation_spec["observation"].shape == (width,)
+        turns = {(): 2, ("turns", "dial"): 0}.get(keys)
+        assert turns is None or seen[turns] == 1.0
+    with pytest.raises(KeyError, match=r"no observations \['hand'\]: it has \['dial', 'turns'\]"):
+        gym_env(Dial(nested=True), observation_keys=["hand"])

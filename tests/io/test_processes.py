@@ -1,0 +1,170 @@
+"""Fresh processes: errors arrive, nothing hangs, and nobody outlives whoever started them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from operator import add
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("loky")
+
+from tests.processes import ended
+from warmprior.io.processes import fresh_processes, working
+from warmprior.io.workers import WorkerError
+
+ROOT = Path(__file__).parents[2]
+
+
+def facts(state):
+    return os.getpid(), os.environ["OMP_NUM_THREADS"], state
+
+
+def remember(number, state):
+    state.append(number)
+    return os.getpid(), list(state)
+
+
+def sleep(path, state):
+    path.with_name(str(os.getpid())).touch()
+    time.sleep(600)
+
+
+def fail(state):
+    raise FloatingPointError("the loss became nan")
+
+
+def kill_oneself(state):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def wait_for(happened, seconds=60):
+    end = time.monotonic() + seconds
+    while not happened():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def sleepers(folder, count):
+    """The processes that sleep there, once they do."""
+    wait_for(lambda: len(list(folder.iterdir())) == count)
+    return [int(path.name) for path in folder.iterdir()]
+
+
+def test_every_process_has_one_thread_and_a_state_of_its_own():
+    state = []
+    with working(2, state) as call:
+        found = [call(partial(remember, i)).result() for i in range(6)]
+        pid, threads, _ = call(facts).result()
+    assert state == [] and threads == "1" and os.getpid() != pid
+    for process in {pid for pid, _ in found}:
+        seen = [numbers for pid, numbers in found if pid == process]
+        assert all(numbers == seen[-1][: len(numbers)] for numbers in seen)
+    assert sorted(numbers[-1] for _, numbers in found) == list(range(6))
+    wait_for(lambda: ended(pid))
+
+
+def test_a_process_has_the_environment_that_it_is_given():
+    with fresh_processes(1, env={"CUDA_VISIBLE_DEVICES": "7"}) as executor:
+        assert executor.submit(os.getenv, "CUDA_VISIBLE_DEVICES").result() == "7"
+        assert executor.submit(signal.getsignal, signal.SIGINT).result() == signal.SIG_IGN
+
+
+@pytest.mark.parametrize(
+    ("job", "error", "said"),
+    [
+        (fail, FloatingPointError, "the loss became nan"),
+        (kill_oneself, WorkerError, "one of 2 workers died.*memory.*--envs"),
+    ],
+)
+def test_an_error_and_a_dead_process_end_all_others(tmp_path, job, error, said):
+    with pytest.raises(error, match=said) as raised, working(2, None) as call:
+        call(partial(sleep, tmp_path / "x"))
+        pids = sleepers(tmp_path, 1)
+        call(job).result()
+    assert job is fail or isinstance(raised.value.__cause__, BrokenProcessPool)
+    wait_for(lambda: all(map(ended, pids)), 20)
+
+
+def test_an_error_of_ones_own_ends_the_processes(tmp_path):
+    with pytest.raises(KeyboardInterrupt), working(2, None) as call:
+        for _ in range(2):
+            call(partial(sleep, tmp_path / "x"))
+        pids = sleepers(tmp_path, 2)
+        raise KeyboardInterrupt
+    wait_for(lambda: all(map(ended, pids)), 20)
+
+
+def test_results_are_those_of_the_jobs():
+    with working(2, 10) as call:
+        futures = [call(partial(add, i)) for i in range(20)]
+        assert [future.result() for future in futures] == list(range(10, 30))
+
+
+HELD = """
+import sys
+from functools import partial
+from pathlib import Path
+from tests.io.test_processes import sleep
+from warmprior.io.processes import working
+if __name__ == "__main__":
+    with working(2, None) as call:
+        futures = [call(partial(sleep, Path(sys.argv[1]) / "x")) for _ in range(2)]
+        futures[0].result()
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_processes_end_with_whoever_started_them(tmp_path, how):
+    """However that ends; a terminal sends SIGINT to all of them."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HELD, str(tmp_path)],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    pids = sleepers(tmp_path, 2)
+    time.sleep(1.0)
+    assert not any(map(ended, pids))
+    os.killpg(process.pid, how) if how == signal.SIGINT else process.kill()
+    _, errors = process.communicate(timeout=60)
+    wait_for(lambda: all(map(ended, pids)), 20)
+    if how == signal.SIGINT:
+        assert errors.count("KeyboardInterrupt") == 1
+
+
+FAKED = """
+import multiprocessing
+import torch
+from torch._subclasses.fake_tensor import FakeTensorMode
+from warmprior.io.workers import count_devices, start_method
+
+def gradient(pipe, factor):
+    weight = torch.ones((), requires_grad=True)
+    (factor * weight).backward()
+    pipe.send(weight.grad.item())
+
+count_devices()  # as a training does that compiles
+with FakeTensorMode():
+    torch.ones(2)
+ours, theirs = multiprocessing.Pipe()
+gradient(theirs, 1.0)
+process = multiprocessing.get_context(start_method()).Process(target=gradient, args=(theirs, 3.0))
+process.start()
+print(ours.recv(), ours.recv() if ours.poll(60) else None)
+"""
+
+
+def test_forked_workers_compute_gradients_after_something_was_compiled():
+    # In a process of its own: autograd counts devices once.
+    done = subprocess.run([sys.executable, "-c", FAKED], capture_output=True, text=True)
+    assert done.stdout == "1.0 3.0\n", done.stderr

@@ -1,0 +1,33 @@
+"""Scripts: Ctrl-C is one line, and errors of ours are not hidden."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from warmprior.io.script import run_script
+
+
+def test_ctrl_c_is_one_line_whatever_becomes_of_it(capsys):
+    def script():
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(1)
+        except KeyboardInterrupt as error:  # as libraries do that say where it happened
+            raise RuntimeError("in the forward pass") from error
+
+    before = signal.getsignal(signal.SIGINT)
+    assert run_script(script, "a.py") == 130
+    assert capsys.readouterr().err == "\na.py: interrupted; --resume continues\n"
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_errors_of_ours_are_not_hidden():
+    def script():
+        raise TypeError("a defect")
+
+    with pytest.raises(TypeError, match="a defect"):
+        run_script(script, "a.py")

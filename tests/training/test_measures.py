@@ -1,0 +1,145 @@
+"""Success under any key, and measures of episodes, against loops written out by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+
+from tests.toy_env import ACTION_DIM, ChunkPolicy
+from warmprior import PastPrior, policy_transforms
+from warmprior.training import evaluate, play_episode
+from warmprior.transforms import ChunkStep
+
+H = 4
+HOW = {"high": "max", "effort": "sum", "left": "last"}
+
+
+def values(seed, t):
+    """What the environment says after step ``t`` of the episode of a seed; it ends after some steps."""
+    g = torch.Generator().manual_seed(100 * seed + t)
+    high, effort = (
+        2 * torch.rand(2, generator=g) - 3
+    ).tolist()  # below 0: no maximum is that of zeros
+    return {"high": high, "effort": effort, "left": float(t), "won": t == 2 + seed % 3}
+
+
+def length(seed):
+    return 5 + seed % 4  # 5 to 8 steps: 7 or 5 end inside a chunk
+
+
+class Saying(EnvBase):
+    """Says what :func:`values` has, whatever is done; what it says at the reset counts for nothing."""
+
+    def __init__(self):
+        super().__init__(device="cpu", batch_size=[])
+        flag = {"dtype": torch.bool, "shape": (1,)}
+        self.observation_spec = Composite(
+            observation=Unbounded((1,)),
+            won=Categorical(2, **flag),
+            **{name: Unbounded((1,)) for name in HOW},
+        )
+        self.action_spec = Unbounded((ACTION_DIM,))
+        self.reward_spec = Unbounded((1,))
+        names = ("done", "terminated", "truncated")
+        self.done_spec = Composite({name: Categorical(2, **flag) for name in names})
+        self.seed_ = 0
+
+    def _set_seed(self, seed):
+        self.seed_ = seed
+
+    def _says(self, said, done):
+        flags = {name: torch.tensor([done]) for name in ("done", "terminated")}
+        flags |= {"truncated": torch.tensor([False]), "observation": torch.zeros(1)}
+        return TensorDict(flags | {name: torch.tensor([value]) for name, value in said.items()}, [])
+
+    def _reset(self, tensordict=None, **kwargs):
+        self.t = 0
+        return self._says({"high": 1e6, "effort": 1e6, "left": 1e6, "won": True}, False)
+
+    def _step(self, tensordict):
+        self.t += 1
+        said = self._says(values(self.seed_, self.t), self.t == length(self.seed_))
+        return said.set("reward", torch.zeros(1))
+
+
+def by_hand(seed, executed=H):
+    """Success, steps and measures of an episode."""
+    said = [values(seed, t) for t in range(1, length(seed) + 1)]
+    return (
+        any(each["won"] for each in said),
+        len(said),
+        {
+            "high": max(each["high"] for each in said),
+            "effort": sum(each["effort"] for each in said),
+            "left": said[-1]["left"],
+        },
+    )
+
+
+def make_env(**options):
+    transforms = policy_transforms(
+        PastPrior(H), observation_steps=1, success="won", measures=HOW, **options
+    )
+    return TransformedEnv(Saying(), transforms)
+
+
+POLICY = ChunkPolicy(lambda data: torch.zeros(*data.batch_size, H, ACTION_DIM))
+
+
+def assert_by_hand(episode):
+    won, steps, measures = by_hand(episode.seed)
+    assert (episode.success, episode.steps) == (won, steps)
+    assert episode.measures == pytest.approx(measures, rel=1e-5)
+
+
+@pytest.mark.parametrize("execute", [1, 3, 4])
+def test_an_episode_combines_what_every_step_says(execute):
+    env = make_env(execute=execute)
+    for seed in range(4):
+        assert_by_hand(play_episode(POLICY, env, seed, success="won", measures=HOW))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_batched_episodes_are_those_played_alone(n):
+    """Rows end inside chunks while others go on, and rest at the end."""
+    inside = SerialEnv(n, make_env)
+    outside = TransformedEnv(
+        SerialEnv(n, Saying),
+        policy_transforms(PastPrior(H), observation_steps=1, success="won", measures=HOW),
+    )
+    options = {"episodes": 7, "first_seed": 20, "success": "won", "measures": HOW}
+    for env in (inside, outside):
+        episodes = evaluate(POLICY, env, **options)
+        assert [episode.seed for episode in episodes] == list(range(20, 27))
+        for episode in episodes:
+            assert_by_hand(episode)
+    for one, other in zip(episodes, evaluate(POLICY, make_env(), **options), strict=True):
+        assert (one.success, one.steps) == (other.success, other.steps)
+        assert one.measures == pytest.approx(other.measures)
+
+
+def test_a_chunk_combines_what_its_own_steps_say():
+    env = TransformedEnv(
+        Saying(), ChunkStep(H, event_keys=("won",), measures={**HOW, "left": "last"})
+    )
+    env.set_seed(2)  # seven steps: chunks of four and three
+    data = env.rollout(9, ChunkPolicy(lambda data: torch.zeros(H, ACTION_DIM)))["next"]
+    chunks = [[values(2, t) for t in part] for part in (range(1, 5), range(5, 8))]
+    assert data["executed_steps"].flatten().tolist() == [4, 3]
+    for name, combine in (("high", max), ("effort", sum), ("left", lambda vs: list(vs)[-1])):
+        expected = [combine(each[name] for each in chunk) for chunk in chunks]
+        assert data[name].flatten().tolist() == pytest.approx(expected, rel=1e-5)
+    won = [any(each["won"] for each in chunk) for chunk in chunks]
+    assert data["won"].flatten().tolist() == won == [True, False]
+
+
+def test_keys_that_are_not_there_are_named():
+    env = make_env()
+    for options in ({"success": "solved"}, {"success": "won", "measures": {"height": "max"}}):
+        with pytest.raises(
+            KeyError, match=r"does not write .*(solved|height).*success= or measures="
+        ):
+            play_episode(POLICY, env, 0, **options)

@@ -1,0 +1,230 @@
+"""Tasks: of a user's own, of files in both spaces of actions, and those that options name."""
+
+from __future__ import annotations
+
+import math
+import sys
+from types import ModuleType
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from tests.data.synthetic import env_args_15, write_robomimic_file
+from tests.toy_env import CountingEnv
+from warmprior import GaussianPrior, ODEActor, PoseTrend
+from warmprior.training import (
+    DataOptions,
+    NetworkOptions,
+    Task,
+    TrainingConfig,
+    load_task,
+    new_policy,
+    robosuite_task,
+)
+from warmprior.training import task as module
+from warmprior.training.task import read_like
+from warmprior.transforms import AbsoluteActions
+
+
+def steps(n=40, **changed):
+    g = torch.Generator().manual_seed(0)
+    data = {
+        "observation": 5 + torch.randn(n, 3, generator=g),
+        "action": 100 * torch.rand(n, 2, generator=g),
+        "episode": torch.arange(n) // 10,
+        "reward": torch.zeros(n),
+    }
+    return TensorDict({k: v for k, v in (data | changed).items() if v is not None}, [n])
+
+
+def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
+    raw = steps()
+    task = Task.of("own", raw, CountingEnv, measures={"reward": "sum"})
+    for key in ("observation", "action"):  # every dimension spans [-1, 1]
+        low, high = raw[key].amin(0), raw[key].amax(0)
+        expected = 2 * (raw[key] - low) / (high - low) - 1
+        torch.testing.assert_close(task.data[key], expected, atol=1e-5, rtol=0)
+    assert set(task.data.keys()) == {"observation", "action", "episode"}
+    assert torch.allclose(task.normalizer.denormalize(task.data)["action"], raw["action"])
+    assert task.facts == {"demonstrations": 4, "steps": 40} and task.clip == 1.0
+    assert (task.title, task.longest, task.images) == ("own human", 10, {})
+    assert raw["action"].max() > 50  # the data themselves stay as they were
+    # What policies are trained on is what identifies it.
+    again, other = (
+        Task.of("own", steps(action=a), CountingEnv) for a in (raw["action"], raw["action"] ** 2)
+    )
+    assert task.identity == again.identity != other.identity
+
+
+@pytest.mark.parametrize(
+    ("name", "changed", "error", "said"),
+    [
+        ("own", {"episode": None}, KeyError, r"demonstrations of own lack \['episode'\]"),
+        ("own", {"action": torch.zeros(40)}, ValueError, r"'action' of own has shape \(40,\)"),
+        ("own", {"observation": torch.full((40, 3), math.nan)}, ValueError, "NaN|finite"),
+        ("../own", {}, ValueError, "become names of files: '../own' cannot"),
+    ],
+)
+def test_data_that_cannot_be_are_named(name, changed, error, said):
+    with pytest.raises(error, match=said):
+        Task.of(name, steps(**changed), CountingEnv)
+
+
+def test_a_function_of_ones_own_is_found_by_its_place(monkeypatch):
+    place = ModuleType("a_users_module")
+    place.task = lambda options: Task.of("own", steps()[: options.count("ph")], CountingEnv)
+    place.number = lambda options: 3
+    monkeypatch.setitem(sys.modules, "a_users_module", place)
+    options = DataOptions(demonstrations=(20,))
+    assert load_task(options, "a_users_module:task").facts["steps"] == 20
+    for name, said in (
+        ("a_users_module:number", "returns int, not a Task"),
+        ("a_users_module:nothing", "a_users_module:nothing: module .* has no attribute"),
+        ("no_such_module:task", "No module named 'no_such_module'"),
+        ("nothing", "unknown task 'nothing'"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            load_task(options, name)
+
+
+# Of files in robosuite
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    pytest.importorskip("robosuite")
+    path = tmp_path_factory.mktemp("data") / "lift.hdf5"
+    write_robomimic_file(path, lengths=(30, 20), task="lift")
+    return path
+
+
+def in_both_spaces(path):
+    return [robosuite_task(path, options=DataOptions(actions=a)) for a in ("delta", "absolute")]
+
+
+def test_absolute_actions_have_the_units_of_deltas(path):
+    delta, absolute = in_both_spaces(path)
+    assert "actions" not in delta.facts and delta.title == "lift ph (file data)"
+    assert absolute.identity != delta.identity and absolute.data["action"].shape == (50, 10)
+    assert absolute.title == "lift ph (file data), absolute actions"
+    assert isinstance(absolute.adapters["actions"], AbsoluteActions) and not delta.adapters
+    # What is executed spans what was recorded.
+    units = [0.05] * 3 + [0.5] * 6
+    assert absolute.normalizer.scale("action")[:9].tolist() == pytest.approx(units)
+    assert absolute.data["action"][:, 9].abs().max() <= 1
+    options = NetworkOptions(hidden_dim=16)
+    made = [new_policy(t, GaussianPrior(8), options, TrainingConfig()) for t in (delta, absolute)]
+    trends = [actor.network.trend for actor in made]
+    assert trends[0] is None and isinstance(trends[1], PoseTrend)
+
+
+class Towards(torch.nn.Module):
+    """The flow from 0 to a chunk."""
+
+    def __init__(self, chunk):
+        super().__init__()
+        self.chunk = chunk
+
+    def forward(self, t, a, observation):
+        return self.chunk.expand_as(a)
+
+
+def test_what_leaves_the_span_of_the_demonstrations_is_remembered_at_its_bound(path):
+    """Of every dimension: poses range over many control steps, the gripper over one unit."""
+    delta, task = in_both_spaces(path)
+    span = task.data["action"].abs().amax(0)
+    assert delta.clip == 1.0 and span[9] < span.max() / 2
+    actor = new_policy(task, GaussianPrior(8), NetworkOptions(hidden_dim=16), TrainingConfig())
+    demonstrated, beyond = task.data["action"][:8], 1e3 * task.data["action"][8:16].sign()
+    for wanted, expected in ((demonstrated, demonstrated), (beyond, beyond.clamp(-span, span))):
+        mean = {("prior", "noise"): torch.zeros(1, 8, 10), "observation": torch.zeros(1, 2, 19)}
+        ode = ODEActor(Towards(wanted), nfe=1, clip=actor.ode.clip)
+        assert torch.equal(ode(TensorDict(mean, [1]))["vla_action", "chunk"][0], expected)
+
+
+def test_files_without_poses_are_named(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    from warmprior.data import DatasetError
+
+    path = tmp_path / "lift.hdf5"
+    write_robomimic_file(path, lengths=(30,), task="lift", env_args=env_args_15("lift"))
+    with h5py.File(path, "a") as file:
+        del file["data/demo_0/obs/robot0_eef_quat"]
+    with pytest.raises(DatasetError, match=r"lift\.hdf5.*no 'obs/robot0_eef_quat'"):
+        robosuite_task(path, options=DataOptions(actions="absolute"))
+
+
+def test_part_of_a_file_is_its_first_demonstrations(path):
+    from warmprior.data import DatasetError
+
+    whole, part, all_ = (
+        robosuite_task(path, options=DataOptions(demonstrations=n)) for n in ((), (1,), (2,))
+    )
+    assert all_.identity == whole.identity != part.identity  # other policies, of the same file
+    assert part.facts["sha256"] == whole.facts["sha256"]
+    assert part.facts["demonstrations"] == 1 and part.facts["steps"] == len(part.data) == 30
+    mine, theirs = (t.normalizer.denormalize(t.data)["action"] for t in (part, whole))
+    assert torch.allclose(mine, theirs[:30], atol=1e-6)
+    with pytest.raises(DatasetError, match="there are 2 demonstrations, fewer than the 3"):
+        robosuite_task(path, options=DataOptions(demonstrations=(3,)))
+
+
+def test_further_demonstrations_are_read_as_a_policy_sees_them(path, tmp_path):
+    other = tmp_path / "other.hdf5"
+    write_robomimic_file(other, lengths=(25, 9), task="lift", seed=1)
+    for task in in_both_spaces(path):
+        data, called = read_like(other, task.name, task.facts)
+        assert data["action"].shape == (34, task.data["action"].shape[1])
+        assert called == "other.hdf5"
+        raw = task.normalizer.denormalize(task.data)
+        same, called = read_like(path, task.name, task.facts)
+        assert torch.allclose(same["action"], raw["action"], atol=1e-5)
+        assert called == "the TRAINING demonstrations (not held out)"
+
+
+def test_another_task_is_refused_before_anything_is_rendered(path, monkeypatch):
+    from warmprior.data import render
+
+    monkeypatch.setattr(render, "render_demonstrations", lambda *_, **__: pytest.fail("rendered"))
+    asked = DataOptions(task=("stack",), dataset=path, obs="image")
+    with pytest.raises(ValueError, match="holds demonstrations of lift, not of stack"):
+        load_task(asked, "stack")
+    facts = {"source": "file", "demonstrations": 2, "sha256": ""}
+    facts["images"] = {"cameras": ["agentview"], "size": 16, "fast_rendering": True}
+    with pytest.raises(ValueError, match=r"of lift, but these .* are for stack"):
+        read_like(path, "stack", facts)
+
+
+def test_of_images_only_that_part_is_rendered(path, monkeypatch):
+    asked = []
+
+    def rendered(*args, **options):
+        asked.append((*args, options))
+        raise LookupError("enough")
+
+    monkeypatch.setattr("warmprior.data.render.render_demonstrations", rendered)
+    options = DataOptions(demonstrations=(1,), obs="image", image_size=16, fast_rendering=True)
+    with pytest.raises(LookupError, match="enough"):
+        robosuite_task(path, options=options)
+    cameras = ("agentview", "robot0_eye_in_hand")
+    assert asked == [(path, cameras, 16, {"demos": 1, "fast": True})]
+
+
+def test_a_lerobot_dataset_is_the_task_of_its_file(path, tmp_path):
+    pytest.importorskip("lerobot")
+    from warmprior.data import convert_robomimic
+
+    folder = convert_robomimic(path, tmp_path / "lift", progress=False)
+    file, theirs = (
+        robosuite_task(p, options=DataOptions(("lift",))) for p in (path, f"lerobot:{folder}")
+    )
+    assert (file.data == theirs.data).all() and file.name == theirs.name == "lift"
+    assert file.environment == theirs.environment and file.identity != theirs.identity
+    (folder / "meta" / "warmprior.json").unlink()  # as from another converter
+    for actions, width in (("delta", 7), ("absolute", 10)):
+        options = DataOptions(("lift",), actions=actions)
+        named = robosuite_task(f"lerobot:{folder}", options=options)
+        assert named.data["action"].shape[-1] == width
+        assert named.environment["robosuite"]["env_args"]["env_name"] == "Lift"
+    assert module._open(f"lerobot:{folder}", "lift").name == "lerobot:lift"

@@ -1,0 +1,94 @@
+"""From a task and a source to a trained policy: it continues, and depends on what it is given alone."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from warmprior import GaussianPrior, PastPrior
+from warmprior.modules import PreconditionedNetwork
+from warmprior.training import (
+    BehaviourCloning,
+    NetworkOptions,
+    TrainingConfig,
+    load_policy,
+    navigation_task,
+    new_policy,
+    train_policy,
+)
+from warmprior.training.behaviour_cloning import policy_path
+
+NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
+CONFIG = TrainingConfig(iterations=8, batch_size=16, checkpoints=2, save_every=2)
+
+
+def train(folder, prior=None, training=CONFIG, **options):
+    return train_policy(
+        navigation_task(),
+        prior or PastPrior(4),
+        folder,
+        network=NETWORK,
+        training=training,
+        description=None,
+        **options,
+    )
+
+
+def equal(one, two):
+    pairs = zip(one.parameters(), two.parameters(), strict=True)
+    return all(torch.equal(a, b) for a, b in pairs)
+
+
+def test_an_interrupted_training_continues_to_the_same_policy(tmp_path):
+    whole = train(tmp_path / "whole")
+
+    def interrupt(iteration):
+        if iteration == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "cut", progress=interrupt)
+    seen = []
+    again = train(tmp_path / "cut", progress=seen.append)
+    assert seen == [4, 5, 6, 7, 8]  # from the last state on
+    assert equal(again, whole)
+    for checkpoint in (4, 8):
+        paths = [policy_path(tmp_path / name, checkpoint) for name in ("whole", "cut")]
+        assert equal(*map(load_policy, paths))
+
+
+def test_a_finished_training_is_found(tmp_path, monkeypatch):
+    first = train(tmp_path)
+    monkeypatch.setattr(BehaviourCloning, "step", lambda self: pytest.fail("trained again"))
+    assert equal(train(tmp_path), first)
+    for other in ({"prior": GaussianPrior(4)}, {"training": TrainingConfig(iterations=9)}):
+        with pytest.raises(ValueError, match=str(tmp_path)):
+            train(tmp_path, **other)
+
+
+def test_what_is_done_before_makes_no_difference(tmp_path):
+    policies = []
+    for name in ("one", "two"):
+        torch.manual_seed(len(policies))
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1 + len(policies))
+        policies.append(train(tmp_path / name))
+        assert torch.get_num_threads() == 1 + len(policies) - 1
+        torch.set_num_threads(threads)
+    assert equal(*policies) and next(policies[0].parameters()).device.type == "cpu"
+    assert not equal(policies[0], train(tmp_path / "other", training=TrainingConfig(
+        iterations=8, batch_size=16, checkpoints=1, seed=1
+    )))  # fmt: skip
+
+
+def test_a_fresh_policy_has_the_parts_that_were_asked_for():
+    task = navigation_task()
+    plain = NetworkOptions(hidden_dim=8, observation_steps=1, precondition=False)
+    first, again, other = (
+        new_policy(task, PastPrior(4), plain, TrainingConfig(seed=seed)) for seed in (3, 3, 4)
+    )
+    assert equal(first, again) and not equal(first, other)
+    made = new_policy(task, PastPrior(4), NETWORK, CONFIG, max_nfe=1, see_history=True)
+    assert isinstance(made.network, PreconditionedNetwork) and made.ode.max_nfe == 1
+    width = task.vector.shape[-1]
+    assert made.network.observation_dim > first.network.observation_dim == width

@@ -1,0 +1,112 @@
+"""Fresh processes that compute, and end with whoever started them."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from typing import Any
+
+from warmprior.io.extras import require
+from warmprior.io.workers import worker_died
+
+__all__ = ["fresh_processes", "working"]
+
+_states: dict[str, Any] = {}
+"""Of this process: what jobs of :func:`working` work on."""
+
+
+def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
+    """A loky executor whose processes compute with one thread each.
+
+    They are no forks: nothing of this process, such as its threads, simulators and gradients, is in them.
+    Ctrl-C is left to this process, and they end when it ends, however that happens.
+
+    Args:
+        count: of the processes.
+        env: environment variables of the processes.
+
+    See Also:
+        :func:`~warmprior.io.processes.working`: jobs on a state that the processes keep.
+
+    Examples:
+        >>> with fresh_processes(1) as executor:
+        ...     executor.submit(pow, 2, 3).result()
+        8
+    """
+
+    def begin(parent: int) -> None:
+        # Sent by value, for it is defined here: it runs before this library is imported, which takes seconds.
+        import os
+        import signal
+        import sys
+        import threading
+        import time
+
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # What a process keeps on purpose, such as demonstrations, is no leak to start it anew for.
+        loky: Any = sys.modules["loky.process_executor"]
+        loky._MAX_MEMORY_LEAK_SIZE = sys.maxsize
+
+        def watch() -> None:
+            while os.getppid() == parent:
+                time.sleep(0.2)
+            os._exit(1)  # nobody is left to be told, and a job may be in the middle of a step
+
+        threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
+
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return require("loky", "sim").ProcessPoolExecutor(
+        max_workers=count,
+        env={**threads, **(env or {})},
+        initializer=begin,
+        initargs=(os.getpid(),),
+    )
+
+
+@contextmanager
+def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]], Future[Any]]]:
+    """Processes that each hold a copy of a state, and call jobs with it.
+
+    Leaving the context with an error, such as Ctrl-C, ends all of them at once, whatever they do.
+
+    Args:
+        count: of the processes.
+        state: picklable; what a job changes in it stays in its process.
+
+    Yields:
+        A function of a job, which gives the future of ``job(state)``.
+
+    Raises:
+        WorkerError: if a process dies.
+
+    See Also:
+        :func:`~warmprior.io.processes.fresh_processes`: what they are.
+
+    Examples:
+        >>> from functools import partial
+        >>> from operator import add
+        >>> with working(1, 40) as call:
+        ...     call(partial(add, 2)).result()
+        42
+    """
+    executor, name, pickled = fresh_processes(count), uuid.uuid4().hex, pickle.dumps(state)
+    try:
+        yield lambda job: executor.submit(_on_state, name, pickled, job)
+    except BaseException as error:
+        executor.shutdown(kill_workers=True)
+        if isinstance(error, BrokenProcessPool):
+            worker = f"one of {count} workers"
+            raise worker_died(worker, "see above for its own error") from error
+        raise
+    executor.shutdown()
+
+
+def _on_state(name: str, pickled: bytes, job: Callable[[Any], Any]) -> Any:
+    if name not in _states:
+        _states[name] = pickle.loads(pickled)
+    return job(_states[name])

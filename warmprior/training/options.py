@@ -1,0 +1,288 @@
+"""What a training needs to know of data and network, as a command line asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from warmprior.data.opening import check_place
+from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
+from warmprior.envs.rendering import require_rendering
+from warmprior.envs.tasks import get_task
+from warmprior.io.extras import require
+from warmprior.modules import (
+    ChiTransformer,
+    ImageEncoder,
+    VelocityMLP,
+    VelocityNetwork,
+    VisionNetwork,
+    imagenet_weights,
+    load_imagenet,
+)
+from warmprior.modules.checks import check_whole_numbers
+from warmprior.training.training_config import TrainingConfig
+
+__all__ = ["GENERATED", "PRETRAINED", "SMALL", "DataOptions", "NetworkOptions", "check_counts"]
+
+GENERATED = 150
+"""Scripted demonstrations, where no other number is asked for."""
+
+PRETRAINED = "resnet18-imagenet"
+
+SMALL = TrainingConfig(
+    iterations=10_000,
+    batch_size=128,
+    learning_rate=1e-3,
+    warmup_ratio=0.1,
+    checkpoints=1,
+    weighting="standardised",
+)
+"""The recipe for a small preconditioned network on a CPU.
+
+It was chosen from success against iterations on square. Half the batch at twice the iterations is as good.
+"""
+
+_NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
+    "mlp": (VelocityMLP, "hidden_dim"),
+    "chi_transformer": (ChiTransformer, "embedding_dim"),
+}
+
+
+def is_simulated(task: str) -> bool:
+    """Whether a task is one of robosuite: not the toy, and not one of a user's own."""
+    return task != "navigation" and ":" not in task
+
+
+def check_counts(options: Any, *names: str) -> None:
+    """Refuse options that are no whole numbers of at least 1; ``None`` is fine.
+
+    Args:
+        options: the dataclass that holds them.
+        names: of its fields.
+
+    Raises:
+        ValueError: naming the option.
+    """
+    for name in names:
+        value = getattr(options, name)
+        for count in value if isinstance(value, tuple) else (value,):
+            if count is not None:
+                check_whole_numbers(**{f"--{name.replace('_', '-')}": count})
+
+
+@dataclass(frozen=True)
+class DataOptions:
+    """What policies are trained on.
+
+    Attributes:
+        task: manipulation tasks (default: square, or the dataset's); or one of your own, as
+            package.module:function, which is given these options and returns a Task.
+        data: ph (one operator) or mh (six operators); of MimicGen's files source (human) or core (made of
+            the source).
+        dataset: a robomimic HDF5 file, or a LeRobotDataset: lerobot:FOLDER, or lerobot:USER/NAME of the hub.
+            Instead of generated data.
+        download: fetch the official files from the hub instead.
+        force_download: fetch them again, in place of a broken local copy.
+        demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
+            numbers for ph and mh.
+        actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
+        obs: what policies see: the state of robot and objects, or that of the robot and images.
+        cameras: of the images; by default the task's two, or four with two arms.
+        image_size: side of the images in pixels.
+        fast_rendering: render without reflections, shadows and smooth edges, three to five times faster.
+
+    See Also:
+        :func:`~warmprior.training.find_tasks`: reads what they name.
+
+    Examples:
+        >>> options = DataOptions(data=("ph", "mh"), demonstrations=(20, 60))
+        >>> options.count("ph"), options.count("mh"), options.generated
+        (20, 60, True)
+        >>> DataOptions(task=("tool_hang",)).check()
+        Traceback (most recent call last):
+            ...
+        ValueError: there is no scripted expert for tool_hang: add --download for the official data, or ...
+    """
+
+    task: tuple[str, ...] = ()
+    data: tuple[Literal["ph", "mh", "source", "core"], ...] = ("ph",)
+    dataset: Path | None = None
+    download: bool = False
+    force_download: bool = False
+    demonstrations: tuple[int, ...] = ()
+    actions: Literal["delta", "absolute"] = "delta"
+    obs: Literal["state", "image"] = "state"
+    cameras: tuple[str, ...] = ()
+    image_size: int = 84
+    fast_rendering: bool = False
+
+    def __post_init__(self) -> None:
+        check_counts(self, "demonstrations", "image_size")
+        if len(self.demonstrations) > 2:
+            raise ValueError(
+                f"--demonstrations takes one number, or one for ph and one for mh, got {self.demonstrations}"
+            )
+
+    def check(self) -> None:
+        """Refuse options that cannot work, before anything is generated or downloaded.
+
+        Raises:
+            ValueError: naming the options.
+            FileNotFoundError: if the file does not exist.
+            ImportError: if MimicGen's data are to be fetched without its package, which plays its tasks.
+        """
+        if self.force_download and not self.download:
+            raise ValueError("--force-download belongs to --download")
+        if self.obs == "image":
+            try:
+                require_rendering()
+            except RuntimeError as error:
+                raise ValueError(f"--obs image needs the simulator's images: {error}") from error
+            if self.actions == "absolute":
+                raise ValueError("--obs image goes with --actions delta, as in the paper")
+            if len(set(self.cameras)) < len(self.cameras):
+                raise ValueError(f"--cameras names one twice: {' '.join(self.cameras)}")
+        elif self.cameras or self.fast_rendering:
+            raise ValueError("--cameras and --fast-rendering belong to --obs image")
+        if self.dataset is not None:
+            if self.download:
+                raise ValueError("--dataset reads a file: leave out --download")
+            if len(self.task) > 1 or len(self.data) > 1:
+                raise ValueError(
+                    "--dataset is of one task and style: name at most one --task and --data"
+                )
+            check_place(self.dataset, "--dataset")
+        for task in filter(is_simulated, self.task):
+            if self.generated and not get_task(task).scripted:
+                raise ValueError(
+                    f"there is no scripted expert for {task}: add --download for the official data, or "
+                    "--dataset FILE"
+                )
+            if self.download and is_mimicgen(get_task(task).env_name):
+                find_mimicgen()
+        for style in self.data if self.generated else ():
+            if style not in ("ph", "mh"):
+                raise ValueError(
+                    f"--data {style} is that of MimicGen's files: add --download, or --dataset FILE"
+                )
+
+    @property
+    def generated(self) -> bool:
+        """Whether scripted experts make the data."""
+        return self.dataset is None and not self.download
+
+    def first(self, style: str) -> int | None:
+        """Demonstrations to take of a file of a style; ``None`` for all of it."""
+        return self.demonstrations[-1 if style == "mh" else 0] if self.demonstrations else None
+
+    def count(self, style: str) -> int:
+        """Scripted demonstrations of a style."""
+        return self.first(style) or GENERATED
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """The velocity network.
+
+    Attributes:
+        network: its kind.
+        hidden_dim: its width; the class's own by default.
+        precondition: by the second moments of source and data, see PreconditionedNetwork.
+        observation_steps: To, observations per decision.
+        encoder: of images, a network per camera: ResNet-18 from ImageNet's weights, which torchvision
+            downloads once, from random ones, or a small network.
+        crop_size: side of the random window of an image that is seen in training, the central one else.
+        share_encoder: one encoder for all cameras.
+
+    See Also:
+        - :class:`~warmprior.PreconditionedNetwork`: what ``precondition`` does.
+        - :class:`~warmprior.ChiTransformer`: the paper's network.
+
+    Examples:
+        >>> import torch
+        >>> options = NetworkOptions(network="chi_transformer", hidden_dim=48)
+        >>> network = options.make(action_dim=7, observation_dim=23, prediction_length=8)
+        >>> seen, noisy = torch.zeros(1, options.observation_steps, 23), torch.zeros(1, 8, 7)
+        >>> type(network).__name__, network(torch.zeros(1), noisy, seen).shape
+        ('ChiTransformer', torch.Size([1, 8, 7]))
+    """
+
+    network: Literal["mlp", "chi_transformer"] = "mlp"
+    hidden_dim: int | None = None
+    precondition: bool = True
+    observation_steps: int = 2
+    encoder: Literal["resnet18-imagenet", "resnet18", "small"] = "resnet18-imagenet"
+    crop_size: int = 76
+    share_encoder: bool = False
+
+    def __post_init__(self) -> None:
+        check_counts(self, "hidden_dim", "observation_steps", "crop_size")
+
+    def check(self, data: DataOptions) -> None:
+        """Refuse options of images that cannot work, or have no effect.
+
+        Args:
+            data: what the network is trained on.
+
+        Raises:
+            ValueError: naming the option.
+            OSError: if ImageNet's weights are asked for and cannot be had.
+        """
+        if data.obs == "state":
+            usual = self.without_images() == self or self.encoder == "resnet18"
+            if not usual or data.image_size != DataOptions().image_size:
+                raise ValueError(
+                    "--image-size, --crop-size, --share-encoder and --encoder belong to --obs image"
+                )
+            return
+        if not 8 <= self.crop_size <= data.image_size:
+            raise ValueError(
+                f"--crop-size {self.crop_size} must be at least 8 and at most --image-size {data.image_size}"
+            )
+        if self.encoder == PRETRAINED:
+            imagenet_weights()
+        elif self.encoder != "small":
+            require("torchvision", "vision")
+
+    def without_images(self) -> NetworkOptions:
+        """With the defaults for what has no effect where no images are seen."""
+        usual = NetworkOptions()
+        names = ("encoder", "crop_size", "share_encoder")
+        return replace(self, **{name: getattr(usual, name) for name in names})
+
+    def make(
+        self,
+        action_dim: int,
+        observation_dim: int,
+        prediction_length: int,
+        images: Mapping[str, int] | None = None,
+    ) -> VelocityNetwork:
+        """A network with fresh weights.
+
+        Args:
+            action_dim: ``d_a``.
+            observation_dim: ``d_o``, that of the vector beside the images if there are some.
+            prediction_length: ``P``.
+            images: their names and sides in pixels.
+        """
+        kind, width = _NETWORKS[self.network]
+        options = {} if self.hidden_dim is None else {width: self.hidden_dim}
+        encoder = None
+        if images:
+            encoder = ImageEncoder(
+                list(images),
+                observation_dim,
+                image_size=next(iter(images.values())),
+                crop_size=self.crop_size,
+                backbone="small" if self.encoder == "small" else "resnet18",
+                share=self.share_encoder,
+            )
+            if self.encoder == PRETRAINED:
+                load_imagenet(encoder)
+            observation_dim = encoder.observation_dim
+        network = kind(
+            action_dim, observation_dim, prediction_length, self.observation_steps, **options
+        )
+        return network if encoder is None else VisionNetwork(encoder, network)

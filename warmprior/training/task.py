@@ -1,0 +1,517 @@
+"""What policies are trained for: demonstrations, their units, and the environment that plays episodes."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.transforms import Transform
+
+from warmprior.data import download_mimicgen, download_robomimic, generate_demonstrations
+from warmprior.data.index import DatasetIndex
+from warmprior.data.opening import Demonstrations, open_demonstrations
+from warmprior.data.render import renderer_versions
+from warmprior.data.replay import DemonstrationReplay
+from warmprior.envs.description import environment_description, robosuite_parts
+from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
+from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
+from warmprior.envs.simulator import task_env_args
+from warmprior.envs.tasks import TASKS, get_task
+from warmprior.io.files import digest_of
+from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
+from warmprior.modules.normalize import Normalizer
+from warmprior.modules.trend import RestingAction
+from warmprior.training.behaviour_cloning import data_digest
+from warmprior.training.options import DataOptions, is_simulated
+from warmprior.transforms.absolute_actions import AbsoluteActions
+
+__all__ = [
+    "Task",
+    "find_tasks",
+    "load_task",
+    "navigation_task",
+    "read_like",
+    "robosuite_task",
+    "task_places",
+]
+
+
+@dataclass(frozen=True)
+class Task:
+    """Demonstrations and an environment: what every policy of a comparison is trained for.
+
+    Of your own: :meth:`of` takes raw demonstrations and a function that builds the environment.
+
+    Attributes:
+        name: short name, such as ``"square"``.
+        style: of the demonstrations, such as ``"ph"``.
+        data: contiguous steps in normalised units, see :class:`~warmprior.ActionWindow`.
+        make_env: builds the environment, called without arguments to play episodes: a TorchRL environment
+            without batch dimensions, in raw units, with ``"observation"`` ``[d_o]`` and ``"action"``
+            ``[d_a]``, that starts the same episode after every ``set_seed(seed)``.
+        normalizer: between raw and normalised units; ``None`` if they are the same.
+        success: the environment's key for whether the task is solved, bool ``[1]``.
+        measures: further keys that episodes report, each with how its values are combined: ``"max"``,
+            ``"sum"`` or ``"last"``.
+        film_rate: control steps per second of films, where the environment has a method ``render`` that gives
+            a picture, uint8 ``[h, w, 3]``; ``None`` for no films, but robosuite's.
+        facts: what results say about the data, as JSON.
+        adapters: transforms next to the environment, as arguments of
+            :func:`~warmprior.policy_transforms`.
+        rest: for absolute actions, see :class:`~warmprior.PoseTrend`.
+        clip: bound of the normalised actions that are executed, or one per dimension; ``None`` for none.
+        environment: what a saved policy keeps of the environment, see
+            :func:`~warmprior.envs.environment_of`.
+        digest: of the data; computed from them by default.
+
+    Raises:
+        ValueError: if ``name`` or ``style`` cannot be part of the name of a file.
+
+    See Also:
+        - :func:`~warmprior.training.robosuite_task`: of demonstrations in robosuite.
+        - :func:`~warmprior.training.navigation_task`: the toy.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.envs import GymEnv
+        >>> steps = {"observation": torch.rand(60, 3), "action": torch.rand(60, 1),
+        ...          "episode": torch.arange(60) // 20}
+        >>> task = Task.of("pendulum", TensorDict(steps, [60]), lambda: GymEnv("Pendulum-v1"))
+        >>> task.title, round(task.data["action"].amax().item(), 3), task.facts["demonstrations"]
+        ('pendulum human', 1.0, 3)
+    """
+
+    name: str
+    style: str
+    data: TensorDictBase
+    make_env: Callable[..., EnvBase]
+    normalizer: Normalizer | None = None
+    success: NestedKey = SUCCESS
+    measures: Mapping[str, Literal["max", "sum", "last"]] = field(default_factory=dict)
+    film_rate: int | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+    adapters: Mapping[str, Transform] = field(default_factory=dict)
+    rest: RestingAction | None = None
+    clip: float | Sequence[float] | None = None
+    environment: Mapping[str, Any] | None = None
+    digest: str | None = None
+
+    def __post_init__(self) -> None:
+        for part in (self.name, self.style):
+            if Path(part).name != part:
+                raise ValueError(f"name and style become names of files: {part!r} cannot")
+
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        data: TensorDictBase,
+        make_env: Callable[..., EnvBase],
+        *,
+        style: str = "human",
+        success: NestedKey = SUCCESS,
+        measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
+        film_rate: int | None = None,
+    ) -> Self:
+        """A task of your own, from raw demonstrations; the normaliser is fitted to them.
+
+        Args:
+            name: see above.
+            data: contiguous steps ``[N]`` in raw units: ``"observation"`` ``[N, d_o]``, ``"action"``
+                ``[N, d_a]`` and ``"episode"``, an integer ``[N]``.
+            make_env: see above.
+
+        Keyword Args:
+            style: see above.
+            success: see above.
+            measures: see above.
+            film_rate: see above.
+
+        Raises:
+            KeyError: naming what the data lack.
+            ValueError: if an entry has another shape, or is not finite.
+        """
+        missing = [key for key in (OBSERVATION, ACTION, EPISODE) if key not in list(data.keys())]
+        if missing:
+            raise KeyError(
+                f"the demonstrations of {name} lack {missing}: they have {list(data.keys())}"
+            )
+        for key in (OBSERVATION, ACTION):
+            if data[key].ndim != 2:
+                raise ValueError(
+                    f"{key!r} of {name} has shape {tuple(data[key].shape)}, not [N, d]"
+                )
+        normalizer = Normalizer.fit(data)
+        return cls(
+            name,
+            style,
+            normalizer.normalize(data.select(OBSERVATION, ACTION, EPISODE)),
+            make_env,
+            normalizer,
+            success=success,
+            measures=measures or {},
+            film_rate=film_rate,
+            facts={"demonstrations": len(data[EPISODE].unique()), "steps": len(data)},
+            clip=1.0,
+        )
+
+    @cached_property
+    def identity(self) -> str:
+        """Of the data: part of the identity of every policy that is trained on them."""
+        return self.digest or data_digest(self.data.select(OBSERVATION, ACTION, EPISODE))
+
+    @property
+    def title(self) -> str:
+        """Task, style and what is unusual, for figures."""
+        source = self.facts.get("source")
+        words = {"actions": "actions", "obs": "observations"}
+        parts = [f"{self.name} {self.style}" + (f" ({source} data)" if source else "")]
+        parts += [f"{value} {words[key]}" for key, value in self.space.items()]
+        if (self.facts.get("images") or {}).get("fast_rendering"):
+            parts.append("rendered fast")
+        return ", ".join(parts)
+
+    @property
+    def vector(self) -> Tensor:
+        """The observation, or its vector if it has images, ``[N, d]``."""
+        observation = self.data[OBSERVATION]
+        return observation[STATE] if isinstance(observation, TensorDictBase) else observation
+
+    @property
+    def images(self) -> dict[str, int]:
+        """Names of the observation's images, and their sides in pixels."""
+        observation = self.data[OBSERVATION]
+        if not isinstance(observation, TensorDictBase):
+            return {}
+        return {name: int(value.shape[-1]) for name, value in observation.items() if name != STATE}
+
+    @property
+    def space(self) -> dict[str, str]:
+        """The spaces of actions and observations, where they are not the recorded one and the state."""
+        return {key: self.facts[key] for key in ("actions", "obs") if key in self.facts}
+
+    @property
+    def longest(self) -> int:
+        """Steps of the longest demonstration."""
+        return int(self.data[EPISODE].flatten().bincount().max())
+
+
+def robosuite_task(
+    path: Path | str,
+    style: str = "ph",
+    *,
+    source: str = "file",
+    observation_steps: int = 2,
+    options: DataOptions | None = None,
+) -> Task:
+    """The task of demonstrations in robosuite, played in the simulator that recorded them.
+
+    Args:
+        path: of a robomimic HDF5 file; or ``lerobot:`` and the folder or repository of a LeRobotDataset,
+            whose environment is that of ``options.task`` where it does not describe its own.
+        style: of the demonstrations, such as ``"ph"``; decides the time limit of tasks of ours.
+
+    Keyword Args:
+        source: where the file comes from: ``"scripted"``, ``"official"`` or ``"file"``.
+        observation_steps: ``To`` of the policies.
+        options: the policies' actions and observations, and how many demonstrations to take; those of the
+            file by default.
+
+    Raises:
+        DatasetError: if the file cannot be read or has fewer demonstrations, or images are to be rendered
+            and it has no states.
+        ValueError: if it has no pose deltas to make absolute poses of, there is no such camera, its
+            environment is unknown, or a file is of another task than the one that is named.
+        ImportError: if its simulator is MimicGen's, and its package is missing.
+
+    See Also:
+        - :func:`~warmprior.training.find_tasks`: all that the options name.
+        - :class:`~warmprior.envs.RobosuiteEnv`: its environment.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> import h5py
+        >>> import torch
+        >>> lift = TASKS["lift"]
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "lift.hdf5"
+        ...     with h5py.File(path, "w") as file:
+        ...         widths = {f"obs/{key}": width for key, width in lift.low_dim_widths.items()}
+        ...         for name, width in {"actions": lift.action_dim, "rewards": 1, **widths}.items():
+        ...             file[f"data/demo_0/{name}"] = torch.arange(9.0)[:, None].expand(9, width).numpy()
+        ...         file["data"].attrs["env_args"] = '{"env_name": "Lift", "env_kwargs": {}}'
+        ...     task = robosuite_task(path)
+        >>> task.title, task.vector.shape, task.vector.amin().item(), task.vector.amax().item()
+        ('lift ph (file data)', torch.Size([9, 19]), -1.0, 1.0)
+    """
+    options = DataOptions() if options is None else options
+    # A generated file has as many as were asked for.
+    demos = None if source == "scripted" else options.first(style)
+    found = _open(path, next(iter(options.task), None))
+    index = found.index()
+    if demos == len(index.demos):
+        demos = None  # all of them
+    if not index.env_args:
+        raise ValueError(
+            f"{path} does not say which environment it was recorded in: name a robosuite task with --task, "
+            "or describe a task of your own (docs/benchmarks.md)"
+        )
+    # Not after hours of rendering, or of training.
+    if source == "file" and options.task not in ((), (_name_of(index),)):
+        raise ValueError(
+            f"{path} holds demonstrations of {_name_of(index)}, not of {options.task[0]}: leave --task out "
+            "or correct it"
+        )
+    if is_mimicgen(index.env_args["env_name"]):
+        find_mimicgen()
+    dataset, images = _read(found, options, demos)
+    description = environment_description(
+        dataset.recorded_env_args, style, observation_steps, options.actions, images
+    )
+    make_env, adapters = robosuite_parts(description)
+    # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and
+    # positions, which range far, do not weigh little beside the gripper in the loss.
+    absolute = adapters.get("actions")
+    units = {ACTION: absolute.one_step} if isinstance(absolute, AbsoluteActions) else None
+    vector = OBSERVATION if images is None else (OBSERVATION, STATE)
+    normalizer = Normalizer.fit(dataset.data, (vector, ACTION), units=units)
+    data = normalizer.normalize(dataset.data.exclude("next"))
+    sha256 = found.digest(_names(images), demos)
+    # Nothing is said of what is usual.
+    space: dict[str, Any] = {} if options.actions == "delta" else {"actions": options.actions}
+    space |= {} if images is None else {"obs": "image", "images": images}
+    return Task(
+        _name_of(dataset),
+        style,
+        data,
+        make_env,
+        normalizer,
+        facts={
+            "source": source,
+            "file": found.name,
+            "sha256": sha256,
+            "demonstrations": dataset.num_episodes,
+            "steps": len(dataset.data),
+            **space,
+        },
+        adapters=adapters,
+        rest=None if absolute is None else RestingAction(dataset.pose_columns, normalizer),
+        # What leaves the span of the normalised demonstrations is executed, and remembered, at the bound.
+        clip=1.0 if absolute is None else data[ACTION].abs().amax(0).tolist(),
+        environment=description,
+        # Images are drawn by what is installed.
+        digest=digest_of(sha256, demos, space, images and renderer_versions()),
+    )
+
+
+def _open(place: Path | str, task: str | None) -> Demonstrations:
+    """The demonstrations at a place; the task's environment is theirs where they do not say."""
+    return open_demonstrations(place, task_env_args(task) if task in TASKS else None)
+
+
+def _names(images: Mapping[str, Any] | None) -> list[str]:
+    """The images' names."""
+    return [] if images is None else [f"{camera}_image" for camera in images["cameras"]]
+
+
+def _read(
+    found: Demonstrations, options: DataOptions, demos: int | None = None
+) -> tuple[DemonstrationReplay, dict[str, Any] | None]:
+    """The demonstrations as policies are to see them, and what images are among it, if any."""
+    if options.obs == "state":
+        absolute = options.actions == "absolute"
+        return found.replay(absolute_actions=absolute, demos=demos), None
+    index = found.index(demos=demos)
+    cameras = options.cameras or (index.task.cameras if index.task else index.cameras)
+    if not cameras:
+        raise ValueError(f"{found.name} has no images, and its task is unknown: name --cameras")
+    names, fast = _names({"cameras": cameras}), options.fast_rendering
+    if set(cameras) <= set(index.cameras):
+        size = found.index(image_keys=names, demos=demos).image_size
+        if size != options.image_size:
+            raise ValueError(
+                f"{index.path} has images of {size} pixels: add --image-size {size} (and a --crop-size "
+                "below), or render it anew"
+            )
+    found = found.with_images(cameras, options.image_size, demos=demos, fast=fast)
+    # What robomimic's image policies see besides: the robot, and not where the objects are.
+    vector = [key for key in index.observation_keys if key != "object"]
+    dataset = found.replay(observation_keys=vector, image_keys=names, storage="memmap", demos=demos)
+    return dataset, {
+        "cameras": list(cameras),
+        "size": dataset.image_size,
+        "fast_rendering": fast,
+        "low_dim_keys": vector,
+    }
+
+
+def _name_of(dataset: DemonstrationReplay | DatasetIndex) -> str:
+    """Short name of a dataset's task, or the environment's where it is none of ours."""
+    task = dataset.task
+    return str(dataset.env_args["env_name"]).lower() if task is None else task.name
+
+
+def read_like(place: Path | str, name: str, facts: Mapping[str, Any]) -> tuple[TensorDictBase, str]:
+    """Further demonstrations of a task in robosuite, in raw units, as its policies see them.
+
+    Args:
+        place: see :func:`robosuite_task`.
+        name: of the task.
+        facts: of the task.
+
+    Returns:
+        The steps, and what the place is called in results.
+
+    Raises:
+        ValueError: if they are of another task.
+    """
+    found = _open(place, name)
+    if (theirs := _name_of(found.index())) != name:  # before images are rendered
+        raise ValueError(
+            f"{place} holds demonstrations of {theirs}, but these policies are for {name}"
+        )
+    images = facts.get("images")
+    demos = min(facts["demonstrations"], len(found.index().demos))
+    called = found.name
+    if found.digest(_names(images), demos) == facts["sha256"]:
+        called = "the TRAINING demonstrations (not held out)"
+    seen: dict[str, Any] = {}
+    if images is not None:
+        seen = {
+            "obs": "image",
+            "cameras": tuple(images["cameras"]),
+            "image_size": images["size"],
+            "fast_rendering": images["fast_rendering"],
+        }
+    dataset, _ = _read(found, DataOptions(actions=facts.get("actions", "delta"), **seen))
+    return dataset.data.exclude("next"), called
+
+
+def navigation_task() -> Task:
+    """The one-dimensional navigation toy (Fig. 5).
+
+    See Also:
+        - :class:`~warmprior.envs.NavigationEnv`: its environment.
+        - :func:`~warmprior.envs.navigation_demonstrations`: its data.
+
+    Examples:
+        >>> task = navigation_task()
+        >>> task.title, task.make_env(batch_size=[8]).batch_size
+        ('navigation toy', torch.Size([8]))
+    """
+    return Task("navigation", "toy", navigation_demonstrations(), NavigationEnv)
+
+
+def load_task(
+    options: DataOptions, name: str | None, style: str = "ph", observation_steps: int = 2
+) -> Task:
+    """Read, download or generate the demonstrations of one task.
+
+    Args:
+        options: where they come from, and what policies are to see of them.
+        name: of a robosuite task, ``"navigation"`` for the toy, or ``"package.module:function"`` of your own,
+            which is called with the options; ``None`` for that of ``options.dataset``.
+        style: of the demonstrations.
+        observation_steps: ``To`` of the policies.
+
+    Raises:
+        ValueError: if there is no such task, or a file is of another one.
+
+    See Also:
+        :func:`~warmprior.training.find_tasks`: all that options name.
+
+    Examples:
+        >>> load_task(DataOptions(), "navigation").title
+        'navigation toy'
+        >>> load_task(DataOptions(), "nowhere:pendulum")
+        Traceback (most recent call last):
+            ...
+        ValueError: --task nowhere:pendulum: No module named 'nowhere'
+    """
+    if name == "navigation":
+        return navigation_task()
+    if name is not None and ":" in name:
+        module, _, function = name.partition(":")
+        try:
+            make = getattr(importlib.import_module(module), function)
+        except (ImportError, AttributeError) as error:
+            raise ValueError(f"--task {name}: {error}") from error
+        task = make(options)
+        if not isinstance(task, Task):
+            raise ValueError(f"--task {name} returns {type(task).__name__}, not a Task")
+        return task
+    source: str
+    path: Path | str
+    if options.dataset is not None:
+        path, source = options.dataset, "file"
+    elif options.download:
+        theirs = is_mimicgen(get_task(str(name)).env_name)
+        download = download_mimicgen if theirs else download_robomimic
+        path, source = download(str(name), style, force=options.force_download), "official"
+    else:
+        path, source = generate_demonstrations(str(name), style, options.count(style)), "scripted"
+    return robosuite_task(
+        path, style, source=source, observation_steps=observation_steps, options=options
+    )
+
+
+def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
+    """The tasks that options name, checked: for each what :func:`load_task` takes, a name and a style.
+
+    Args:
+        options: which.
+
+    Raises:
+        ValueError: if the options do not go together.
+
+    Examples:
+        >>> task_places(DataOptions(task=("lift", "can"), download=True))
+        [('lift', 'ph'), ('can', 'ph')]
+        >>> task_places(DataOptions(data=("core",)))
+        Traceback (most recent call last):
+            ...
+        ValueError: --data core is that of MimicGen's files: add --download, or --dataset FILE
+    """
+    options.check()
+    names: Sequence[str | None] = options.task or (None if options.dataset else "square",)
+    if options.generated and any(name in TASKS for name in names):
+        counts = ", ".join(f"{options.count(style)} {style}" for style in options.data)
+        print(
+            f"Data: {counts} scripted demonstrations per task. They stand in for the official human data "
+            "(--download); success rates on them are not comparable with the paper's.",
+            flush=True,
+        )
+    found: dict[tuple[str | None, str], None] = {}
+    for name in names:
+        one_style = name is not None and not is_simulated(name)
+        found |= dict.fromkeys((name, style) for style in options.data[: 1 if one_style else None])
+    return list(found)
+
+
+def find_tasks(options: DataOptions, observation_steps: int = 2) -> list[Task]:
+    """Read, download or generate the demonstrations of all tasks that options name.
+
+    Args:
+        options: which.
+        observation_steps: ``To`` of the policies.
+
+    Raises:
+        ValueError: see :func:`task_places` and :func:`load_task`.
+
+    See Also:
+        :func:`~warmprior.training.load_task`: one of them.
+
+    Examples:
+        >>> [task.title for task in find_tasks(DataOptions(task=("navigation",)))]
+        ['navigation toy']
+    """
+    return [load_task(options, *place, observation_steps) for place in task_places(options)]

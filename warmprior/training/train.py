@@ -1,0 +1,181 @@
+"""From a task and a source to a trained policy."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from contextlib import closing, nullcontext
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.record.loggers.common import Logger
+
+from warmprior import keys
+from warmprior.io.distributed import from_leader
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.prior import Prior
+from warmprior.modules.start import StartPoint
+from warmprior.objectives.couplings import Coupling
+from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
+from warmprior.training.options import NetworkOptions
+from warmprior.training.placement import placed
+from warmprior.training.saved import load_policy
+from warmprior.training.task import Task
+from warmprior.training.threads import torch_threads
+from warmprior.training.training_config import TrainingConfig
+from warmprior.transforms.history_observation import HistoryObservation
+
+__all__ = ["new_policy", "train_policy"]
+
+
+def new_policy(
+    task: Task,
+    prior: Prior,
+    network: NetworkOptions,
+    training: TrainingConfig,
+    *,
+    start: StartPoint | None = None,
+    coupling: Coupling | None = None,
+    see_history: bool = False,
+    max_nfe: int | None = None,
+) -> WarmPriorActor:
+    """A policy with fresh weights, which depend on the seed of its training alone.
+
+    Args:
+        task: what it is for.
+        prior: the source distribution.
+        network: the velocity network.
+        training: the recipe that it will be trained by.
+
+    Keyword Args:
+        start: where samplers start; at the source by default.
+        coupling: how the training pairs sources and targets; as they come by default.
+        see_history: whether the network sees the last actions.
+        max_nfe: most network evaluations per chunk, for a field that is trained at ``t = 0`` alone.
+
+    See Also:
+        :func:`~warmprior.training.train_policy`: trains one.
+
+    Examples:
+        >>> from warmprior import PastPrior
+        >>> from warmprior.training import navigation_task
+        >>> options = NetworkOptions(hidden_dim=8, observation_steps=1)
+        >>> actor = new_policy(navigation_task(), PastPrior(4), options, TrainingConfig(seed=3))
+        >>> type(actor.network).__name__
+        'PreconditionedNetwork'
+    """
+    action_dim, observation_dim = task.data[keys.ACTION].shape[-1], task.vector.shape[-1]
+    if see_history:
+        observation_dim += HistoryObservation.width(prior.chunk_length, action_dim)
+    torch.manual_seed(training.seed)
+    velocity = network.make(action_dim, observation_dim, prior.prediction_length, task.images)
+    if network.precondition:
+        velocity = precondition(
+            velocity,
+            task.data,
+            prior,
+            observation_steps=network.observation_steps,
+            coupling=coupling,
+            withhold=training.cold_probability,
+            rest=copy.deepcopy(task.rest),
+        )
+    return WarmPriorActor(
+        velocity,
+        prior,
+        start=start,
+        max_nfe=max_nfe,
+        observation_key=keys.CONDITIONED if see_history else keys.OBSERVATION,
+        # A copy: the policy moves to the device, the environments' normaliser stays on the CPU.
+        normalizer=copy.deepcopy(task.normalizer),
+        clip=task.clip,
+        environment=task.environment,
+    )
+
+
+def train_policy(
+    task: Task,
+    prior: Prior,
+    directory: str | Path,
+    *,
+    network: NetworkOptions | None = None,
+    training: TrainingConfig | None = None,
+    start: StartPoint | None = None,
+    coupling: Coupling | None = None,
+    see_history: bool = False,
+    max_nfe: int | None = None,
+    device: str = "cpu",
+    compile: bool = False,
+    logger: Logger | None = None,
+    description: str | None = "train",
+    progress: Callable[[int], object] | None = None,
+) -> WarmPriorActor:
+    """Train a policy by behaviour cloning; an interrupted training continues from its last state.
+
+    On a CPU it is trained by one thread: another number would give other weights.
+
+    Args:
+        task: what it is for.
+        prior: the source distribution.
+        directory: of the training, see :class:`BehaviourCloning`.
+
+    Keyword Args:
+        network: the velocity network; the default of :class:`NetworkOptions` by default.
+        training: the recipe; the paper's by default.
+        start: see :func:`new_policy`.
+        coupling: likewise.
+        see_history: likewise.
+        max_nfe: likewise.
+        device: of the network and, where they fit, the demonstrations.
+        compile: compile the network with :func:`torch.compile`.
+        logger: a TorchRL logger, closed at the end.
+        description: of the progress bar; no bar if ``None``.
+        progress: called with the number of iterations, at the start and after each.
+
+    Returns:
+        The last policy of averaged weights, on the CPU.
+
+    Raises:
+        FloatingPointError: if the loss becomes NaN or infinite.
+        ValueError: if the folder holds another training.
+
+    See Also:
+        - :class:`~warmprior.training.BehaviourCloning`: the training loop.
+        - :func:`~warmprior.training.load_policy`: loads what it keeps.
+
+    Examples:
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior import PastPrior
+        >>> from warmprior.training import navigation_task
+        >>> options = NetworkOptions(hidden_dim=8, observation_steps=1)
+        >>> recipe = TrainingConfig(iterations=2, batch_size=8, checkpoints=1)
+        >>> with TemporaryDirectory() as folder:
+        ...     actor = train_policy(
+        ...         navigation_task(), PastPrior(4), folder, network=options, training=recipe)
+        ...     sorted(path.name for path in Path(folder).iterdir())
+        ['policy_000002', 'state.safetensors']
+    """
+    network, training = network or NetworkOptions(), training or TrainingConfig()
+    parts: dict[str, Any] = {"start": start, "coupling": coupling}
+    on_cpu = torch.device(device).type == "cpu"
+    with (
+        torch_threads(1 if on_cpu else None),
+        # A process may end without the exit handlers that some loggers write in.
+        nullcontext() if logger is None else closing(logger),  # type: ignore[type-var]
+    ):
+        actor = new_policy(
+            task, prior, network, training, see_history=see_history, max_nfe=max_nfe, **parts
+        )
+        cloning = BehaviourCloning(
+            actor.to(device),
+            placed(task.data, device),
+            training,
+            directory,
+            observation_steps=network.observation_steps,
+            coupling=coupling,
+            logger=logger,
+            compile=compile,
+        )
+        cloning.run(description, progress)
+    from_leader(lambda: None)  # other processes wait until the first has written it
+    return load_policy(cloning.policy_path())
