@@ -154,6 +154,8 @@ def policies_of(
         tasks = {place: cached_task(options.data, *place, steps) for place in places}
     found = []
     for place, task in tasks.items():
+        if place[0] is not None and ":" in place[0]:
+            check_environment(task)
         for training in options.trainings():
             for method in methods:
                 if method.chunk_length > task.longest:
@@ -178,6 +180,25 @@ def policies_of(
                     )
                     found.append(policy_of(task, like, method))
     return list({policy.folder: policy for policy in found}.values())
+
+
+def check_environment(task: Task) -> None:
+    """Compare the environment of a task of one's own with its demonstrations, before any training."""
+    env = task.make_env()
+    known = list(env.observation_spec.keys(True, True))
+    for key in (task.success, *task.measures):
+        if key not in known and key not in env.reward_keys:
+            raise KeyError(
+                f"the environment of {task.name} does not write {key!r}: it writes {known}"
+            )
+    for key, spec in (("observation", env.observation_spec), ("action", env.full_action_spec)):
+        theirs = tuple(spec[key].shape) if key in spec.keys(True, True) else None
+        if theirs != (task.data[key].shape[-1],):
+            raise ValueError(
+                f"{key!r} of the environment of {task.name} has shape {theirs}, and that of its "
+                f"demonstrations {(task.data[key].shape[-1],)}"
+            )
+    env.close()
 
 
 def policy_of(task: Task, like: Policy, method: Method) -> Policy:
@@ -326,15 +347,15 @@ def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
 def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
     """Observations that no policy was trained on, where there are some, and what they are in words."""
     task, chunk_length = policy.task(), policy.method.chunk_length
-    steps = policy.network.observation_steps
+    steps, count = policy.network.observation_steps, options.held_out.observations
     if task.normalizer is None or "file" not in task.facts:  # of a task of one's own
-        shared = SharedObservations(
-            task.data.to(policy.device),
-            chunk_length,
-            observation_steps=steps,
-            count=options.held_out.observations,
-            generator=torch.Generator().manual_seed(0),
-        )
+        if options.held_out.validation is not None:
+            raise ValueError(f"--validation belongs to robosuite's tasks, and {task.name} is none")
+        data = task.data.to(policy.device)
+        shared = SharedObservations(data, chunk_length, observation_steps=steps)
+        if len(shared) > count:
+            generator = torch.Generator().manual_seed(0)
+            shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
         return shared, "the TRAINING demonstrations (not held out)"
     return held_out(
         options.held_out,

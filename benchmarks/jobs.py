@@ -266,7 +266,8 @@ class Jobs:
                 job.then(result)
             return 1
         if job.group not in self._failed:
-            self._failed[job.group] = f"{job.name}: {reason}" if job.name != job.group else reason
+            what = job.name.replace(job.group, "").replace(" ,", ",").strip()
+            self._failed[job.group] = f"{what}: {reason}" if what else str(reason)
             self.say(f"FAILED {job.group}: {self._failed[job.group]}")
         before = len(self._waiting)
         self._waiting = [other for other in self._waiting if other.group != job.group]

@@ -123,6 +123,8 @@ def held_out(
 ) -> tuple[SharedObservations, str]:
     """Observations that no policy of a task was trained on, and what they are in words."""
     place: Path | str
+    if "file" not in facts:
+        raise ValueError(f"{name} is a task of one's own: name it with --task in place of --run")
     if options.validation is not None:
         place, words = options.validation, ""
     elif facts.get("source") != "scripted":

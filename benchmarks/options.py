@@ -27,7 +27,7 @@ from warmprior.io.machine import facts_of_machine
 from warmprior.modules import imagenet_weights
 from warmprior.modules.grid import check_grid
 from warmprior.training import DataOptions, NetworkOptions, TrainingConfig
-from warmprior.training.options import GENERATED, PRETRAINED, SMALL, check_counts
+from warmprior.training.options import GENERATED, PRETRAINED, SMALL, check_counts, is_simulated
 
 Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
 
@@ -202,6 +202,8 @@ class Options:
         self.data.check()
         self.network.check(self.data)
         check_batch(self.training.batch_size)
+        if self.evaluation.play_on and not all(map(is_simulated, self.data.task)):
+            raise ValueError("--play-on belongs to robosuite's tasks: leave it out")
         if self.training.weighting == "standardised" and not self.network.precondition:
             raise ValueError("--no-precondition needs --weighting velocity")
         for method in self.sources.methods():

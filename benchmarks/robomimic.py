@@ -50,8 +50,10 @@ def run(
         source = policies[0].task().facts.get("source")
         notes = beside(options, presets["paper"]) + smaller(options, presets["paper"])
         full = success_report(results, notes, source)
-        draw(options, policies, rows)
-        write_report(out, terminal_table(results), full, results, failures)
+        try:
+            write_report(out, terminal_table(results), full, results, failures)
+        finally:
+            draw(options, policies, rows)  # pictures are the lesser loss
 
 
 def compare(

@@ -98,7 +98,8 @@ def _played(
         require_rendering()
         env = environment_of(actor, **options)
         simulator, loop = env.base_env, env.base_env.loop
-        look, frame = loop.state, lambda state, size: simulator.render_frame(size=size, state=state)
+        look = loop.state
+        frame = lambda state, size: simulator.render_frame(size=size, state=state)  # noqa: E731
         renderer, nq = EnvRenderers(loop.env, fast=True), loop.env.sim.model.nq
 
         def drawn(state: np.ndarray, size: int) -> np.ndarray:
@@ -106,7 +107,19 @@ def _played(
 
         quick = drawn
     else:
-        look = env.base_env.render
+
+        def look() -> np.ndarray:
+            try:
+                picture = env.base_env.render()
+            except NotImplementedError:
+                picture = None
+            if picture is None:
+                raise ValueError(
+                    "the environment draws no pictures: make it with render_mode='rgb_array', or ask for "
+                    "no films (film_rate=None)"
+                )
+            return picture
+
     # First, and so one of the transforms that run at every control step inside of a chunk.
     recorder = _Recorder(look)
     env.transform.insert(0, recorder)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -150,6 +151,12 @@ class Task:
                 raise ValueError(
                     f"{key!r} of {name} has shape {tuple(data[key].shape)}, not [N, d]"
                 )
+        episode = data[EPISODE]
+        if episode.ndim != 1 or episode.is_floating_point() or bool((episode < 0).any()):
+            raise ValueError(
+                f"{EPISODE!r} of {name} must count the demonstrations, integers [N] from 0 on, got "
+                f"{episode.dtype} {tuple(episode.shape)}"
+            )
         normalizer = Normalizer.fit(data)
         return cls(
             name,
@@ -419,7 +426,7 @@ def load_task(
     Args:
         options: where they come from, and what policies are to see of them.
         name: of a robosuite task, ``"navigation"`` for the toy, or ``"package.module:function"`` of your own,
-            which is called with the options; ``None`` for that of ``options.dataset``.
+            which may take the options; ``None`` for that of ``options.dataset``.
         style: of the demonstrations.
         observation_steps: ``To`` of the policies.
 
@@ -445,7 +452,7 @@ def load_task(
             make = getattr(importlib.import_module(module), function)
         except (ImportError, AttributeError) as error:
             raise ValueError(f"--task {name}: {error}") from error
-        task = make(options)
+        task = make(options) if inspect.signature(make).parameters else make()
         if not isinstance(task, Task):
             raise ValueError(f"--task {name} returns {type(task).__name__}, not a Task")
         return task
