@@ -505,7 +505,8 @@ def row(
         "boundary_jump": None if smooth is None else smooth.boundary_jump,
         "inner_jump": None if smooth is None else smooth.inner_jump,
         "mean_revision": mean_revision(decisions),
-        **{name: sum(values) / len(values) for name, values in own.items()},
+        # A measure of an episode may be called what a column is called.
+        **{f"episode_{name}": sum(values) / len(values) for name, values in own.items()},
         **measures,
         "training_seconds": policy.seconds,
         "outcomes": "".join("01"[solved] for solved in solved),

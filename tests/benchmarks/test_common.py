@@ -114,7 +114,7 @@ def test_a_row_is_what_episodes_played_by_hand_give(finished, cell, row):
     if cell == Cell(20, 3):
         (mine,) = (r for r in stored(finished) if policy.facts.items() | row.items() <= r.items())
         assert all(mine[name] == found[name] for name in found)
-        assert 0 < mine["success_rate"] < 1 and "side" in mine
+        assert 0 < mine["success_rate"] < 1 and "episode_side" in mine
 
 
 def test_a_run_continues_with_what_is_missing(finished, tmp_path, capsys):
@@ -220,7 +220,9 @@ def test_policies_are_played_and_measured_on_the_grid(finished, tmp_path):
     assert written(finished.parent) == before
     mine = [row for row in stored(finished) if row["prior"] == "past"]
     for row, other in zip(mine, stored(out), strict=True):
-        same = [row[n] == other[n] for n in ("boundary_jump", "inner_jump", "outcomes", "side")]
+        same = [
+            row[n] == other[n] for n in ("boundary_jump", "inner_jump", "outcomes", "episode_side")
+        ]
         assert all(same) if row["nfe"] == 1 else not all(same)
     assert "--grid dense-jump:0.9" in (out / "report.md").read_text()
 

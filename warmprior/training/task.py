@@ -74,7 +74,8 @@ class Task:
         digest: of the data; computed from them by default.
 
     Raises:
-        ValueError: if ``name`` or ``style`` cannot be part of the name of a file.
+        ValueError: if ``name`` or ``style`` cannot be part of the name of a file, or for a measure that is
+            combined in another way.
 
     See Also:
         - :func:`~warmprior.training.robosuite_task`: of demonstrations in robosuite.
@@ -110,6 +111,11 @@ class Task:
         for part in (self.name, self.style):
             if Path(part).name != part:
                 raise ValueError(f"name and style become names of files: {part!r} cannot")
+        for key, how in self.measures.items():
+            if how not in ("max", "sum", "last"):
+                raise ValueError(
+                    f"measures of {self.name}: {key!r} is combined by 'max', 'sum' or 'last', not {how!r}"
+                )
 
     @classmethod
     def of(
