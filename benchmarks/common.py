@@ -152,6 +152,11 @@ def policies_of(
         places = [*([] if only else task_places(options.data)), *more]
         steps = options.network.observation_steps
         tasks = {place: cached_task(options.data, *place, steps) for place in places}
+        names = [(task.name, task.style) for task in tasks.values()]
+        if twice := [" ".join(name) for name in set(names) if names.count(name) > 1]:
+            raise ValueError(
+                f"--task: two tasks are called {twice[0]}; give one of them another name or style"
+            )
     found = []
     for place, task in tasks.items():
         if place[0] is not None and ":" in place[0]:

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,6 +20,7 @@ from learned_sources import A2APrior, CVAEPrior, ForecastPrior, ForecastStart, L
 from torch import Tensor
 
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, WarmPriorActor
+from warmprior.io.files import digest_of
 from warmprior.modules.prior import Source
 from warmprior.modules.registry import find, options_of
 from warmprior.objectives import Coupling, OTCoupling, ReflowCoupling
@@ -190,7 +192,12 @@ class Method:
 
     def config(self) -> dict[str, Any]:
         """Everything that makes it differ from others, as JSON."""
-        return {"name": self.name, "chunk_length": self.chunk_length, "arguments": self.arguments}
+        config = {"name": self.name, "chunk_length": self.chunk_length, "arguments": self.arguments}
+        if self.text.partition(",")[0] not in METHODS:
+            # Whoever edits a prior of their own wants it trained anew.
+            file = inspect.getfile(self.parts.prior)
+            config["code"] = digest_of(Path(file).read_text(encoding="utf-8"))
+        return config
 
     @property
     def name(self) -> str:

@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -180,7 +180,15 @@ class Task:
     @cached_property
     def identity(self) -> str:
         """Of the data: part of the identity of every policy that is trained on them."""
-        return self.digest or data_digest(self.data.select(OBSERVATION, ACTION, EPISODE))
+        if self.digest:
+            return self.digest
+        data = data_digest(self.data.select(OBSERVATION, ACTION, EPISODE))
+        # Data in other units may be equal once they are normalised.
+        return data if self.normalizer is None else digest_of(data, data_digest(self._units()))
+
+    def _units(self) -> TensorDictBase:
+        state = self.normalizer.state_dict() if self.normalizer else {}
+        return TensorDict({k: v.reshape(1, -1) for k, v in state.items()}, [1])
 
     @property
     def title(self) -> str:

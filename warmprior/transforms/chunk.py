@@ -137,6 +137,11 @@ class ChunkStep(Transform):
                     "ChunkStep needs one reward and a root 'done', the environment has "
                     f"rewards {rewards} and done keys {dones}"
                 )
+            if rewards[0] in self.measures:
+                raise ValueError(
+                    f"measures of ChunkStep cannot be the reward {rewards[0]!r}, which after a chunk is its "
+                    "return: have the environment write it under another key as well"
+                )
             read = (*dones, rewards[0], *self.event_keys, *self.measures)
             late = LateTransforms.of(inner, self.action_key, read)
             self._inner = (parent, inner, late, rewards[0])
