@@ -77,11 +77,11 @@ def _call(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, str
     torch.set_float32_matmul_precision("high")
     try:
         return function(*args), None
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # code of a user's may call sys.exit
         if not isinstance(error, ERRORS):
             traceback.print_exc()  # nothing that a user can mend
         text = error.args[0] if isinstance(error, KeyError) and error.args else error
-        return None, str(text) or repr(error)
+        return None, repr(error) if isinstance(error, SystemExit) else str(text) or repr(error)
 
 
 class Local:

@@ -39,6 +39,8 @@ def train(folder, number):
             raise ValueError("the loss is NaN")
         if number == 2:
             raise AwkwardError(1, 2)
+        if number == 6:
+            sys.exit(3)
         if number == 3:
             os._exit(9)  # dies every time
         dies = Path(folder) / f"dies{number}"
@@ -85,12 +87,13 @@ def test_failures_cost_themselves_alone(engine, tmp_path, monkeypatch, capsys):
     )  # whatever Ray makes of it, it is as before afterwards
     monkeypatch.setattr(jobs, "DEATHS", 2)
     (tmp_path / "dies4").touch()  # its first worker is killed while it trains
-    found, failures = compute(Run(envs=2, engine=engine), tmp_path, range(5))
+    found, failures = compute(Run(envs=2, engine=engine), tmp_path, (0, 1, 2, 3, 4, 6))
     assert found == {(n, e): n * n + e for n in (0, 4) for e in range(2)}
-    assert sorted(failures) == ["policy 1", "policy 2", "policy 3"]
+    assert sorted(failures) == ["policy 1", "policy 2", "policy 3", "policy 6"]
     assert "the loss is NaN" in failures["policy 1"] and "1 and 2" in failures["policy 2"]
     assert "died" in failures["policy 3"] and "train 3" in failures["policy 3"]
-    assert capsys.readouterr().out.count("FAILED") == 3
+    assert "SystemExit(3)" in failures["policy 6"]
+    assert capsys.readouterr().out.count("FAILED") == 4
 
 
 class Slots:

@@ -45,6 +45,16 @@ def test_methods_differ_in_each_of_their_options(other):
     )
 
 
+def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    file = tmp_path / "edited_prior.py"
+    code = "from warmprior import PastPrior\nclass Mine(PastPrior):\n    name = 'mine'\n"
+    file.write_text(code)
+    one, same = (Method("edited_prior:Mine", H).config() for _ in range(2))
+    file.write_text(code + "    default_sigma = 0.05\n")
+    assert one == same != Method("edited_prior:Mine", H).config()
+
+
 @pytest.mark.parametrize("text", [*METHODS, "tests.benchmarks.user_priors:HeldAction"])
 def test_every_method_arrives_in_a_fresh_process(text):
     method = Method(text, H)

@@ -55,6 +55,17 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
         Task.of("own", steps(action=a), CountingEnv) for a in (raw["action"], raw["action"] ** 2)
     )
     assert task.identity == again.identity != other.identity
+    # In other units they are equal once normalised, and yet others.
+    scaled = Task.of("own", steps(action=2 * raw["action"]), CountingEnv)
+    torch.testing.assert_close(scaled.data["action"], task.data["action"])
+    assert scaled.identity != task.identity
+
+
+def test_measures_are_combined_in_one_of_three_ways():
+    with pytest.raises(
+        ValueError, match="'effort' is combined by 'max', 'sum' or 'last', not 'mean'"
+    ):
+        Task.of("own", steps(), CountingEnv, measures={"effort": "mean"})
 
 
 @pytest.mark.parametrize(

@@ -206,6 +206,12 @@ def test_two_rewards_are_refused():
         env.step(ones(2)(env.reset()))
 
 
+def test_the_reward_is_no_measure():
+    env = TransformedEnv(CountingEnv(4), ChunkStep(2, measures={"reward": "max"}))
+    with pytest.raises(ValueError, match="cannot be the reward 'reward'"):
+        env.step(ones(2)(env.reset()))
+
+
 def test_outside_environments_nothing_happens():
     data = TensorDict({"a": torch.zeros(3)}, [3])
     assert ChunkStep(3)(data) is data
