@@ -72,13 +72,13 @@ def compare(
         delays = row.get("delay") or 0, row.get("guidance") or ""
         return places[row["policy"]], row["checkpoint"], -row["nfe"], *delays
 
-    describe(options, policies)
     rows = Rows(options.run.folder / "results.jsonl", order)
     if others := {row["policy"] for row in rows.rows} - places.keys():
         raise ValueError(
             f"{rows.path} has rows of {min(others)}: it was begun with other versions or data. Finish it "
             "with those, or choose another --out"
         )
+    describe(options, policies)
     failures = train_together(policies)
     folders = [options.run.folder, *{policy.directory for policy in policies}]
     with Jobs(options.run, folders) as jobs:
