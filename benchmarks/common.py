@@ -131,7 +131,7 @@ class Policy:
     def seconds(self) -> float | None:
         """Processor time of its training, with its teacher's; None if it is not trained."""
         teacher = self.teacher()
-        own = read_json(self.status)["seconds"] if self.status.exists() else None
+        own = clock(self.status) if self.status.exists() else None
         others = 0.0 if teacher is None else teacher.seconds
         return None if own is None or others is None else own + others
 
@@ -192,9 +192,9 @@ def check_environment(task: Task) -> None:
     env = task.make_env()
     known = list(env.observation_spec.keys(True, True))
     for key in (task.success, *task.measures):
-        if key not in known and key not in env.reward_keys:
+        if key not in known:
             raise KeyError(
-                f"the environment of {task.name} does not write {key!r}: it writes {known}"
+                f"the environment of {task.name} does not write {key!r} beside its reward: it writes {known}"
             )
     for key, spec in (("observation", env.observation_spec), ("action", env.full_action_spec)):
         theirs = tuple(spec[key].shape) if key in spec.keys(True, True) else None
@@ -272,6 +272,7 @@ def train(policy: Policy) -> None:
             logger = get_logger(
                 policy.logger, logger_name=str(policy.logs), experiment_name=policy.folder.name
             )
+        # Every step draws a_0 from `prior`; the loss is `warmprior.FlowMatchingLoss.forward`.
         train_policy(
             task,
             prior,
@@ -293,12 +294,22 @@ def train(policy: Policy) -> None:
         torch.cuda.empty_cache()  # for the next training, which may be another worker's
 
 
+def clock(status: Path) -> float:
+    """The processor time in a status file."""
+    try:
+        return float(read_json(status)["seconds"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{status} does not say how long the training has taken: remove it, and the count begins anew"
+        ) from error
+
+
 class Status:
     """Writes how far a training is, once a second, and the processor time, of earlier starts as well."""
 
     def __init__(self, path: Path, iterations: int) -> None:
         self.path, self.iteration, self.iterations = path, 0, iterations
-        before = read_json(path)["seconds"] if path.exists() else 0.0
+        before = clock(path) if path.exists() else 0.0
         self._began, self._wrote = time.process_time() - before, time.monotonic()
 
     def __call__(self, iteration: int) -> None:

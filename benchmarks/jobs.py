@@ -141,7 +141,7 @@ def _gpus(device: str) -> list[str]:
 
 
 class Ray:
-    """Tasks of a Ray cluster, which starts those of a lost machine again."""
+    """Tasks of a Ray cluster."""
 
     def __init__(self, run: Run, folders: list[Path]) -> None:
         from warmprior.io.ray_cluster import ray_cluster
@@ -160,9 +160,9 @@ class Ray:
     def submit(self, job: Job) -> Future[Any]:
         """Give it to the cluster."""
         gpus = float(job.training and self._device.startswith("cuda"))
-        task = self._task.options(num_cpus=1, num_gpus=gpus, max_retries=DEATHS).remote(
-            job.function, job.args
-        )
+        # Lost ones are started again by `Jobs`, here as on one machine.
+        options = {"num_cpus": 1, "num_gpus": gpus, "max_retries": 0}
+        task = self._task.options(**options).remote(job.function, job.args)
         future = task.future()
         self._running[future] = task
         return future

@@ -24,9 +24,7 @@ def run(argv: list[str] | None) -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("runs", nargs="+", type=Path, help="folders of finished runs")
-    parser.add_argument(
-        "--out", type=Path, default=Path("memory.png"), help="picture (%(default)s)"
-    )
+    parser.add_argument("--out", type=Path, default=Path("memory.png"), help="the picture")
     args = parser.parse_args(argv)
 
     # A record per task, method and NFE, with everything that is known of it as a column.

@@ -1,6 +1,14 @@
 """What the benchmarks compare: sources, and what other papers combine with a source, by name.
 
 `past,correlation=0.5`, `ot`, `regression`, ...: the table below composes them of the library's parts.
+A source of your own is a class with one method, `--prior gaussian my_module:Damped` with `my_module.py`:
+
+    class Damped(warmprior.PastPrior):
+        name = "damped"
+
+        def mean(self, history):
+            loc, warm = super().mean(history)
+            return 0.9 * loc, warm
 """
 
 from __future__ import annotations

@@ -172,7 +172,7 @@ def torchrl(parameters: float, device: str) -> Peer:
 
 
 def features(objects: bool) -> dict[str, Any]:
-    """What LeRobot's configurations are told of the windows."""
+    """What LeRobot's configurations know of the windows."""
     from lerobot.configs.types import FeatureType, PolicyFeature
 
     state = VECTOR if objects else D_O
@@ -248,10 +248,10 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
     }
 
     def lerobots(batch: Batch) -> dict[str, torch.Tensor]:
-        told = {k: v.expand(len(batch), 1) for k, v in token.items()}
+        language = {k: v.expand(len(batch), 1) for k, v in token.items()}
         state, action = batch["observation"], batch["vla_action", "chunk"]
         pad = batch["action_is_pad"]
-        return told | {"observation.state": state, "action": action, "action_is_pad": pad}
+        return language | {"observation.state": state, "action": action, "action_is_pad": pad}
 
     now = {"observation.state": torch.randn(1, D_O, device=device), **token}
 
@@ -274,7 +274,7 @@ PEERS: dict[str, tuple[Callable[[float, str], Peer], tuple[str, ...]]] = {
 
 
 def found(names: Sequence[str]) -> Iterator[str]:
-    """Those of the peers whose packages are installed; the others are told."""
+    """Those of the peers whose packages are installed; the others are named."""
     for name in names:
         missing = [package for package in PEERS[name][1] if not find_spec(package)]
         if missing:

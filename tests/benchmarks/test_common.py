@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -131,6 +132,19 @@ def test_a_measure_may_be_called_what_a_column_is_called():
     (row,) = [common.row(policy, Cell(20, 3), found, {"kappa": 0.5})]
     assert (row["success_rate"], row["episode_success_rate"]) == (0.5, 7.0)
     assert (row["kappa"], row["episode_kappa"]) == (0.5, 3.0)
+
+
+def test_the_reward_is_no_measure_of_a_task():
+    with pytest.raises(KeyError, match="of drift does not write 'reward' beside its reward"):
+        common.check_environment(replace(drift.task(), measures={"reward": "max"}))
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "x", '{"seconds": null}'])
+def test_a_damaged_clock_is_named(text, tmp_path):
+    path = tmp_path / "status.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"status.json does not say .*: remove it"):
+        common.clock(path)
 
 
 def test_two_tasks_of_one_name_are_refused():

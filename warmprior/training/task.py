@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -182,13 +182,10 @@ class Task:
         """Of the data: part of the identity of every policy that is trained on them."""
         if self.digest:
             return self.digest
-        data = data_digest(self.data.select(OBSERVATION, ACTION, EPISODE))
         # Data in other units may be equal once they are normalised.
-        return data if self.normalizer is None else digest_of(data, data_digest(self._units()))
-
-    def _units(self) -> TensorDictBase:
-        state = self.normalizer.state_dict() if self.normalizer else {}
-        return TensorDict({k: v.reshape(1, -1) for k, v in state.items()}, [1])
+        units = self.normalizer.state_dict() if self.normalizer else {}
+        data = data_digest(self.data.select(OBSERVATION, ACTION, EPISODE))
+        return digest_of(data, {key: value.tolist() for key, value in units.items()})
 
     @property
     def title(self) -> str:
