@@ -287,7 +287,8 @@ def _placed(summary: DataFrame) -> DataFrame:
     delay = ", delay " + summary["delay"].astype(str) if "delay" in summary else ""
     summary = summary.assign(place=summary["problem"] + delay)
     best = summary.groupby(["place", "nfe"])["success"].transform("max")
-    return summary.assign(best=summary["success"] > best - 1e-9)
+    # Where nothing is solved, nobody is the best.
+    return summary.assign(best=(summary["success"] > best - 1e-9) & (best > 0))
 
 
 def _experiment(summary: DataFrame) -> str:

@@ -6,7 +6,6 @@ import copy
 from collections.abc import Callable
 from contextlib import closing, nullcontext
 from pathlib import Path
-from typing import Any
 
 import torch
 from torchrl.record.loggers.common import Logger
@@ -156,7 +155,6 @@ def train_policy(
         ['policy_000002', 'state.safetensors']
     """
     network, training = network or NetworkOptions(), training or TrainingConfig()
-    parts: dict[str, Any] = {"start": start, "coupling": coupling}
     on_cpu = torch.device(device).type == "cpu"
     with (
         torch_threads(1 if on_cpu else None),
@@ -164,7 +162,14 @@ def train_policy(
         nullcontext() if logger is None else closing(logger),  # type: ignore[type-var]
     ):
         actor = new_policy(
-            task, prior, network, training, see_history=see_history, max_nfe=max_nfe, **parts
+            task,
+            prior,
+            network,
+            training,
+            start=start,
+            coupling=coupling,
+            see_history=see_history,
+            max_nfe=max_nfe,
         )
         cloning = BehaviourCloning(
             actor.to(device),
