@@ -83,7 +83,8 @@ class ActionHistory(Transform):
             raise KeyError(
                 f"ActionHistory found no {self.executed_key!r} after the step: append it after ChunkStep"
             )
-        _write(next_tensordict, advance(history, tensordict.get(self.chunk_key), executed))
+        moved = advance(history, tensordict.get(self.chunk_key), executed)
+        next_tensordict.set(keys.HISTORY, moved)
         # The others' chunks were not executed.
         return keep_resting(tensordict, next_tensordict, HISTORY_KEYS)
 
@@ -92,7 +93,7 @@ class ActionHistory(Transform):
     ) -> TensorDictBase:
         # Everywhere: TorchRL merges these rows into the sub-environments that were reset only.
         chunk = self._chunk or self._check_chunk()
-        return _write(tensordict_reset, self._cold(chunk, tensordict_reset))
+        return tensordict_reset.set(keys.HISTORY, self._cold(chunk, tensordict_reset))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Does nothing: in data the history is already there."""
@@ -119,12 +120,6 @@ class ActionHistory(Transform):
         # Kept because resets are frequent and TorchRL rebuilds specs on every access.
         self._chunk = actions[self.chunk_key]
         return self._chunk
-
-
-def _write(tensordict: TensorDictBase, history: TensorDictBase) -> TensorDictBase:
-    for name in ENTRIES:
-        tensordict.set((keys.HISTORY, name), history[name])
-    return tensordict
 
 
 class WithheldHistory(Transform):
