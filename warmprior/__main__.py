@@ -113,7 +113,7 @@ def push(args: argparse.Namespace) -> None:
     if not Path(args.folder).is_dir():
         raise FileNotFoundError(f"no policy at {args.folder}: there is no such folder")
     actor = _policy(args)
-    results = None if args.run_folder is None else policy_results(args.run_folder, args.folder)
+    results = policy_results(args.run_folder, args.folder) if args.run_folder else []
     card = model_card(actor, results, repository=args.repository, licence=args.licence)
     if args.dry_run:
         print(card)

@@ -6,20 +6,16 @@ import json
 
 import pytest
 import torch
-import torch.distributed as dist
 
 from tests.together import together
-from warmprior.io import distributed
 from warmprior.io.distributed import (
     check_device,
     launched,
     leader_first,
-    process_group,
     rank,
     world_size,
 )
 from warmprior.io.script import run_script
-from warmprior.io.workers import WorkerError
 
 
 @pytest.fixture
@@ -60,7 +56,7 @@ def test_other_scripts_are_not_run_twice(under_torchrun, capsys):
 @pytest.mark.parametrize(
     ("device", "said"),
     [
-        ("cuda:7", "--device cuda:7 does not work here: there is cuda:0, cuda:1"),
+        ("cuda:7", "--device cuda:7 does not work here"),
         ("meta", "--device meta does not work here"),
         ("nothing", "--device nothing does not work here"),
     ],
@@ -78,27 +74,9 @@ def test_several_processes_share_no_gpu(under_torchrun, two_gpus):
     check_device("cpu")
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        RuntimeError("[../third_party/gloo/transport/tcp/pair.cc:534] Connection closed by peer"),
-        dist.DistNetworkError("the server is gone"),
-    ],
-)
-def test_errors_of_a_group_are_told_as_what_they_are(error):
-    with pytest.raises(WorkerError, match="start all of them again with --resume"), process_group():
-        raise error
-
-
-def test_other_errors_pass():
-    with pytest.raises(RuntimeError, match="shapes do not fit"), process_group():
-        raise RuntimeError("shapes do not fit")
-    assert distributed.STEP < distributed.PATIENCE
-
-
 def _leaders_fail(folder):
     said = []
-    for error in (FloatingPointError("NaN"), ValueError("damaged"), None, OSError("full")):
+    for error in (FloatingPointError("NaN"), None, OSError("full")):
         try:
             with leader_first():
                 if error is not None and rank() == 0:
@@ -111,5 +89,5 @@ def _leaders_fail(folder):
 def test_what_fails_in_the_first_fails_in_all_and_nobody_waits(tmp_path):
     together(_leaders_fail, tmp_path)
     first, other = (json.loads((tmp_path / str(number)).read_text()) for number in range(2))
-    assert first == [["FloatingPointError", "NaN"], ["ValueError", "damaged"], ["OSError", "full"]]
-    assert other == [*first[:2], ["SystemExit", "2"]]
+    assert first == [["FloatingPointError", "NaN"], ["OSError", "full"]]
+    assert other == [["SystemExit", "2"]] * 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import pytest
@@ -346,7 +345,7 @@ def test_it_is_saved_with_the_policy(tmp_path):
     plain = policy.replace(guidance=None)
     assert plain.ode.guidance is None and policy_config(plain)["actor"]["guidance"] is None
     assert policy.replace(nfe=1).ode.guidance == rtc
-    config = json.loads((tmp_path / "config.json").read_text())
+    config = policy_config(again)
     assert config["actor"]["guidance"]["schedule"] == "ones"
 
 

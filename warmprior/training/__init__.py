@@ -2,7 +2,7 @@
 
 from warmprior.io.workers import WorkerError
 from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
-from warmprior.training.card import PolicyResults, model_card, policy_results
+from warmprior.training.card import model_card, policy_results
 from warmprior.training.evaluation import Episode, evaluate, parallel_env, play_episode
 from warmprior.training.film import Filmstrip, record_filmstrip, record_video
 from warmprior.training.navigation import judge_navigation, play_navigation
@@ -19,7 +19,6 @@ __all__ = [
     "Episode",
     "Filmstrip",
     "NetworkOptions",
-    "PolicyResults",
     "Task",
     "TrainingConfig",
     "WorkerError",

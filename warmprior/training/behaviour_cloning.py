@@ -19,14 +19,7 @@ from torch.nn.parallel import DistributedDataParallel
 from torchrl.record.loggers.common import Logger
 from tqdm import tqdm
 
-from warmprior.io.distributed import (
-    check_batch,
-    from_leader,
-    mean_over_processes,
-    process_group,
-    rank,
-    world_size,
-)
+from warmprior.io.distributed import check_batch, from_leader, rank, world_size
 from warmprior.io.files import exclusive
 from warmprior.io.workers import count_devices
 from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
@@ -70,7 +63,7 @@ HASHED_AT_ONCE = 2**26
 WINDOWS_SEED = 1_000_003
 """Added to the seed of windows that have a generator of their own: other draws than those of the sources."""
 
-STATE_FORMAT = 5
+STATE_FORMAT = 6
 """Part of every state's identity; raised whenever the same options give other weights."""
 
 
@@ -208,7 +201,7 @@ class BehaviourCloning:
         self.config = config
         self.directory = Path(directory)
         self.logger = logger
-        self.rank, self.processes = rank(), world_size()
+        self.rank = rank()
         home = data.device or torch.device("cpu")
         device = next((p.device for p in actor.network.parameters()), home)
         self.generator = torch.Generator(device).manual_seed(config.seed)
@@ -223,7 +216,7 @@ class BehaviourCloning:
         self.replay_buffer = window_replay_buffer(
             data,
             actor.prior,
-            batch_size=config.batch_size // self.processes,
+            batch_size=config.batch_size // world_size(),
             observation_steps=observation_steps,
             see_history=see_history,
             withhold=config.cold_probability,
@@ -295,10 +288,8 @@ class BehaviourCloning:
             mode = "reduce-overhead" if self._graphs else None
             self.loss_module.velocity_network.compile(mode=mode)
         self._loss: nn.Module = _Loss(self.loss_module, self.trained)
-        self._unchecked = self.processes > 1
-        if self.processes > 1:
-            with process_group():
-                self._loss = DistributedDataParallel(self._loss, broadcast_buffers=False)
+        if world_size() > 1:
+            self._loss = DistributedDataParallel(self._loss, broadcast_buffers=False)
 
     @property
     def state_path(self) -> Path:
@@ -315,40 +306,20 @@ class BehaviourCloning:
         """One gradient step: sample, loss, backward, optimiser, schedule, averaging.
 
         Returns:
-            The loss, a detached scalar; of all processes together.
-
-        Raises:
-            ValueError: if several processes train a network with a weight that has no part in its output.
-            WorkerError: if another process ended.
+            The loss of this process's part of the batch, a detached scalar.
         """
         if self._graphs:  # what the graphs of the last step have left may be overwritten
             torch.compiler.cudagraph_mark_step_begin()
         batch = self.replay_buffer.sample() if self._prefetch is None else self._prefetch()
-        with process_group():
-            with self._precision():
-                loss = self._loss(batch)
-            self.optimizer.zero_grad()
-            loss.backward()
-            whole = loss.detach()
-            if self.processes > 1:
-                mean_over_processes(whole)
-        if self._unchecked:
-            self._check_gradients()
+        with self._precision():
+            loss = self._loss(batch)
+        self.optimizer.zero_grad()
+        loss.backward()
         self.optimizer.step()
         self.schedule.step()
         self.ema.update_parameters(self.trained)
         self.iteration += 1
-        return whole
-
-    def _check_gradients(self) -> None:
-        # DDP waits for all of them, and complains in the step after, in words of its own.
-        for name, parameter in self.trained.named_parameters():
-            if parameter.requires_grad and parameter.grad is None:
-                raise ValueError(
-                    f"{name} has no part in the loss, so that several processes cannot train it together: "
-                    "freeze it with requires_grad_(False), or train with one process"
-                )
-        self._unchecked = False
+        return loss.detach()
 
     def run(
         self,
@@ -371,20 +342,16 @@ class BehaviourCloning:
         with exclusive(self.directory) if not self.rank else nullcontext():
             from_leader(lambda: None)  # it has the lock
             self._restore()  # what another process did since this object was built
+            if from_leader(lambda: self.iteration) != self.iteration:
+                raise OSError(
+                    f"the processes read different states at {self.state_path}: give --out a folder that all "
+                    "machines share"
+                )
             try:
-                self._check_together()
                 self._run(description, progress)
             finally:
                 if self._prefetch is not None:
                     self._prefetch.close()
-
-    def _check_together(self) -> None:
-        iteration = from_leader(lambda: self.iteration)
-        if iteration != self.iteration:
-            raise OSError(
-                f"the processes read different states at {self.state_path}, of iterations {iteration} and "
-                f"{self.iteration}: give --out a folder that all machines share"
-            )
 
     def _run(self, description: str | None, progress: Callable[[int], object] | None) -> None:
         config = self.config
@@ -480,15 +447,7 @@ class BehaviourCloning:
             **named("rng", rng_tensors(self.generator) | self._windows_state()),
             "running": torch.stack(self._running) if self._running else torch.empty(0),
         }
-        schedule = self.schedule.state_dict()
-        del schedule["lr_lambdas"]
-        facts = {
-            "identity": self.identity,
-            "iteration": self.iteration,
-            "losses": self.losses,
-            "schedule": schedule,
-            "optimizer": sorted(select("optimizer", tensors)),
-        }
+        facts = {"identity": self.identity, "iteration": self.iteration, "losses": self.losses}
         save_state(self.state_path, tensors, facts)
         self._restored = self.state_path.stat().st_mtime
 
@@ -535,33 +494,20 @@ class BehaviourCloning:
         self._restored = written
 
     def _load(self, tensors: dict[str, torch.Tensor], facts: dict[str, Any]) -> None:
-        iteration = facts["iteration"]
-        if type(iteration) is not int or not 0 < iteration <= self.config.iterations:
-            raise ValueError(f"it is of iteration {iteration!r} of {self.config.iterations}")
-        rates = [
-            base * factor(iteration)
-            for base, factor in zip(self.schedule.base_lrs, self.schedule.lr_lambdas, strict=True)
-        ]
-        schedule = {"last_epoch": iteration, "_last_lr": rates}
-        if any(facts["schedule"][name] != value for name, value in schedule.items()):
-            raise ValueError(f"its schedule is not that of iteration {iteration}")
-        optimizer = select("optimizer", tensors)
-        if not optimizer or sorted(optimizer) != facts["optimizer"]:
-            raise ValueError("it lacks entries of the optimiser")
-        losses = [(i, float(loss)) for i, loss in facts["losses"]]
-        if not all(type(i) is int and 0 < i <= iteration for i, _ in losses):
-            raise ValueError(f"it has losses of iterations other than 1 to {iteration}")
-        numbers = [torch.tensor([loss for _, loss in losses]), tensors["running"]]
-        if not all(bool(torch.isfinite(v).all()) for v in (*numbers, *optimizer.values())):
-            raise ValueError("a loss or an entry of the optimiser is NaN or infinite")
         restore_module(self.trained, select("trained", tensors))
         restore_module(self.ema, select("ema", tensors))
-        restore_optimizer(self.optimizer, optimizer)
-        self.schedule.load_state_dict(self.schedule.state_dict() | schedule)
-        for group, rate in zip(self.optimizer.param_groups, rates, strict=True):
-            group["lr"] = rate
+        restore_optimizer(self.optimizer, select("optimizer", tensors))
+        self.iteration = facts["iteration"]
+        self.losses = [(i, float(loss)) for i, loss in facts["losses"]]
+        self.schedule.last_epoch = self.iteration
+        for group, base, factor in zip(
+            self.optimizer.param_groups,
+            self.schedule.base_lrs,
+            self.schedule.lr_lambdas,
+            strict=True,
+        ):
+            group["lr"] = base * factor(self.iteration)
         self._running = list(tensors["running"].to(self.generator.device))
-        self.iteration, self.losses = iteration, losses
         restore_rng(self.generator, select("rng", tensors))
         if self._windows is not None:
             self._restore_windows(tensors.get("rng/windows"))

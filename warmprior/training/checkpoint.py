@@ -1,4 +1,4 @@
-"""Training state on disk: one safetensors file, replaced atomically, never a pickle."""
+"""Policies, trainings and agents on disk: one safetensors file each, replaced atomically, never a pickle."""
 
 from __future__ import annotations
 
@@ -34,8 +34,15 @@ def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, An
     write_atomic(path, lambda temporary: save_file(cpu, temporary, metadata=metadata))
 
 
-def load_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what :func:`save_state` wrote.
+def load_state(
+    path: Path, what: str = "training state", advice: str = "Remove it to train again"
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read what :func:`save_state` wrote, once: what is checked is what is given back.
+
+    Args:
+        path: the file.
+        what: it holds, for the error.
+        advice: what to do about a damaged one, likewise.
 
     Raises:
         ValueError: if the file is damaged or was written by something else.
@@ -47,9 +54,7 @@ def load_state(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         if facts.pop("sha256") != _digest(facts, tensors):
             raise ValueError("its content has changed since it was written")
     except Exception as error:  # the format's own errors, those of JSON, or a failing disk
-        raise ValueError(
-            f"{path} is not a readable training state: {error}. Remove it to train again."
-        ) from error
+        raise ValueError(f"{path} is not a readable {what}: {error}. {advice}.") from error
     return tensors, facts
 
 
@@ -101,17 +106,10 @@ def snapshot_optimizer(optimizer: Optimizer) -> dict[str, Tensor]:
 
 
 def restore_optimizer(optimizer: Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Load :func:`snapshot_optimizer`'s tensors into an optimiser of the same parameters.
-
-    Raises:
-        ValueError: if an entry has another shape than its parameter.
-    """
-    parameters = [p for group in optimizer.param_groups for p in group["params"]]
+    """Load :func:`snapshot_optimizer`'s tensors into an optimiser of the same parameters."""
     state: dict[int, dict[str, Tensor]] = {}
     for key, value in tensors.items():
         index, name = key.split(".", 1)
-        if value.ndim and value.shape != parameters[int(index)].shape:
-            raise ValueError(f"the optimiser's {key} has shape {tuple(value.shape)}")
         state.setdefault(int(index), {})[name] = value
     optimizer.load_state_dict({**optimizer.state_dict(), "state": state})
 
@@ -136,21 +134,8 @@ def module_tensors(module: nn.Module) -> dict[str, Tensor]:
 
 
 def restore_module(module: nn.Module, tensors: Mapping[str, Tensor]) -> None:
-    """Load what :func:`module_tensors` gave.
-
-    Raises:
-        RuntimeError: if names or shapes differ.
-        ValueError: if a trained value is NaN or infinite.
-    """
-    own = module_tensors(module)
-    for name in own.keys() & tensors.keys():
-        value = tensors[name]
-        # Infinite where it was built so, as a mask is.
-        if (value.isnan() | (value.isinf() & ~own[name].isinf())).any():
-            raise ValueError(f"{name} holds NaN or infinity")
-        if value.dtype != own[name].dtype:
-            raise ValueError(f"{name} has type {value.dtype}, not {own[name].dtype}")
-    plain = dict(zip(own, module.state_dict(), strict=True))
+    """Load what :func:`module_tensors` gave; a ``RuntimeError`` if names or shapes differ."""
+    plain = dict(zip(module_tensors(module), module.state_dict(), strict=True))
     module.load_state_dict({plain.get(name, name): value for name, value in tensors.items()})
 
 
