@@ -149,7 +149,7 @@ def _success(results: Sequence[Mapping[str, Any]]) -> str:
         "uniform prior: it says how few the episodes are, and not how training seeds differ."
     )
     if results[0].get("demonstrations", {}).get("source") == "scripted":
-        words += " A scripted expert recorded the demonstrations: do not set the numbers beside published ones."
+        words += " A scripted expert recorded the data: do not set these beside published numbers."
     return (
         f"{_table((*conditions, 'episodes', 'solved', '95% of the posterior'), shown)}\n\n{words}"
     )
