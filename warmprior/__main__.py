@@ -64,6 +64,8 @@ def evaluate(args: argparse.Namespace) -> None:
     from warmprior.training.evaluation import evaluate as play
     from warmprior.training.film import check_video, record_video
 
+    if args.episodes < 1:
+        raise ValueError(f"--episodes must be at least 1, got {args.episodes}")
     actor = _policy(args)
     nfe = actor.ode.nfe if args.nfe is None else args.nfe
     actor.ode.check_nfe(nfe)
@@ -107,8 +109,9 @@ def evaluate(args: argparse.Namespace) -> None:
 def push(args: argparse.Namespace) -> None:
     """Send a saved policy to the Hugging Face hub, with a card that tells what is known of it."""
     from warmprior.training.card import model_card, policy_results
-    from warmprior.training.saved import push_policy
+    from warmprior.training.saved import check_repository, push_policy
 
+    check_repository(args.repository)
     branch, args.revision = args.revision, None  # of the repository, not of the folder
     if not Path(args.folder).is_dir():
         raise FileNotFoundError(f"no policy at {args.folder}: there is no such folder")

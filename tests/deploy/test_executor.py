@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from concurrent.futures import Executor, Future
@@ -293,27 +294,51 @@ def test_a_slow_policy_does_not_hold_the_loop_up():
 
 
 class Failing(Told):
+    """Raises at the decisions whose numbers are named."""
+
+    def __init__(self, length, fails):
+        super().__init__(length)
+        self.fails, self.decisions = fails, 0
+
     def forward(self, data):
-        if len(self.given) == 1:
-            self.given.append(data)
+        self.decisions += 1
+        if self.decisions - 1 in self.fails:
             raise ZeroDivisionError("the camera fell off")
         return super().forward(data)
 
 
+def failing(fails, latency):
+    policy = Failing(8, fails)
+    options = {"prior": GaussianPrior(8), "action_dim": 2, "execute": 4, "observation_steps": 1}
+    return policy, AsyncExecutor(policy, **options, timeout=30.0, latency=latency)
+
+
+def test_a_decision_that_fails_is_tried_again_while_actions_are_left():
+    policy, executor = failing({1, 2}, latency=1)
+    found = [executor.act(torch.tensor([float(tick)])) for tick in range(12)]
+    # Which decision an action is of, and for which step: those of the steps 4 and 5 failed.
+    assert [action[1].item() for action in found] == list(range(12))
+    assert [action[0].item() for action in found] == [0.0] * 7 + [6.0] * 4 + [10.0]
+    last = policy.given[1]["history"]
+    assert last["actions"][-6:].tolist() == [[0.0, float(tick)] for tick in range(6)]
+    assert int(last["forecast_steps"]) == 2 and last["forecast"][:2, 1].tolist() == [6.0, 7.0]
+    assert not last["forecast"][2:].any()
+
+
 @pytest.mark.parametrize("latency", [None, 1])
-def test_errors_of_the_thread_reach_the_loop(latency):
-    policy = Failing(8)
-    with AsyncExecutor(
-        policy, prior=GaussianPrior(8), action_dim=2, execute=4, timeout=30.0, latency=latency
-    ) as executor:
-        with pytest.raises(ZeroDivisionError, match="camera"):
-            for tick in range(9):
-                executor.act(torch.tensor([float(tick)]))
-        for _ in range(2):  # until it is begun anew
+def test_an_error_reaches_the_loop_once_no_action_is_left(latency):
+    policy, executor = failing(range(1, 99), latency)
+    with executor:
+        for tick in range(8):
+            assert executor.act(torch.tensor([float(tick)]))[1] == tick
+        for _ in range(3):
             with pytest.raises(ZeroDivisionError, match="camera"):
-                executor.act(torch.zeros(1))
-        executor.reset()
-        assert executor.act(torch.tensor([3.0])).tolist() == [3.0, 3.0]
+                executor.act(torch.tensor([8.0]))
+        policy.fails = ()
+        while True:  # in a thread, the last call may still have failed
+            with contextlib.suppress(ZeroDivisionError):
+                assert executor.act(torch.tensor([9.0]))[0] == 9.0
+                return
 
 
 def test_a_reset_forgets_what_is_under_way():

@@ -195,3 +195,36 @@ def test_a_decision_costs_few_operations_beside_the_network():
     with torch.no_grad(), Operations() as operations:
         actor(data)
     assert operations.count <= 16
+
+
+class Chunks(nn.Module):
+    """A policy with tensors in place of tensordicts, as export wants it."""
+
+    def __init__(self, actor):
+        super().__init__()
+        self.actor = actor
+
+    def forward(self, observation, *history):
+        shape = observation.shape[:1]
+        data = TensorDict(dict(zip(ENTRIES, history, strict=True)), shape)
+        data = TensorDict({"observation": observation, "history": data}, shape)
+        return self.actor(data)[keys.CHUNK]
+
+
+def test_policies_compile_and_export_for_every_batch_size():
+    policy = Chunks(actor_for(PastPrior(H, sigma=0.0), nfe=2).eval())
+
+    def inputs(count):
+        data = batch(policy.actor.prior, count)
+        data["history", "steps"] = torch.full((count, 1), H)  # nothing is drawn
+        return (data["observation"], *(data["history", name] for name in ENTRIES))
+
+    rows = torch.export.Dim("rows", min=2, max=64)
+    options = {"dynamic_shapes": {"observation": {0: rows}, "history": ({0: rows},) * 4}}
+    with torch.no_grad():
+        exported = torch.export.export(policy, inputs(3), **options).module()
+        compiled = torch.compile(policy, backend="eager")
+        for count in (2, 3, 5):
+            given = inputs(count)
+            torch.testing.assert_close(exported(*given), policy(*given))
+            torch.testing.assert_close(compiled(*given), policy(*given))

@@ -150,3 +150,12 @@ def test_units_of_their_own():
     torch.testing.assert_close(normalizer.normalize(data)["action"], expected)
     torch.testing.assert_close(normalizer.scale("action"), torch.tensor([0.5, 2.0, 0.5]))
     torch.testing.assert_close(normalizer.loc("action"), torch.tensor([1.1, 0.0, 5.0]))
+
+
+def test_entries_of_an_observation_are_named_one_by_one():
+    raw = data()
+    raw["observation"] = TensorDict({"state": raw["observation"]}, [40])
+    with pytest.raises(ValueError, match=r"with the entries \['state'\]: name each with keys="):
+        Normalizer.fit(raw)
+    nested = Normalizer.fit(raw, (("observation", "state"), "action"))
+    assert nested.normalize(raw)["observation", "state"].amax() <= 1.0001

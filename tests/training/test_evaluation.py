@@ -22,11 +22,13 @@ from tests.processes import ended
 from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
     GaussianPrior,
+    Normalizer,
     PastPrior,
     PreviewPrior,
     PriorAnchor,
     PriorDecoder,
     ResidualSampler,
+    VelocityMLP,
     WarmPriorActor,
     policy_transforms,
 )
@@ -510,3 +512,20 @@ def test_a_chunk_of_another_name(place, wrapped):
     for one, two in zip(*found, strict=True):
         assert (one.decisions == two.decisions).all()
         assert one.decisions["vla_action", "chunk"].any()
+
+
+def test_policy_and_environment_need_one_normaliser():
+    ones = {"observation": torch.ones(2 + ACTION_DIM), "action": torch.ones(ACTION_DIM)}
+    mine, other = (Normalizer({k: -s * v for k, v in ones.items()}, ones) for s in (1.0, 3.0))
+    network = VelocityMLP(ACTION_DIM, 2 + ACTION_DIM, H, hidden_dim=8)
+    actor = WarmPriorActor(network, PastPrior(H), nfe=1, normalizer=mine)
+
+    def play(normalizer):
+        transforms = policy_transforms(PastPrior(H), normalizer=normalizer)
+        env = TransformedEnv(SeededEnv(), transforms)
+        return evaluate(actor, env, episodes=1, first_seed=0)
+
+    assert play(mine)[0].steps == length_of(0)
+    for wrong, said in ((None, "has no normaliser"), (other, "has another normaliser")):
+        with pytest.raises(ValueError, match=f"{said}.*normalizer=policy.normalizer"):
+            play(wrong)

@@ -98,3 +98,11 @@ def test_average_is_the_recurrence():
 def test_bad_rate(rate):
     with pytest.raises(ValueError, match="EMA rate"):
         ema_of(nn.Linear(1, 1), rate)
+
+
+def test_a_compiled_network_has_the_same_groups():
+    network = VelocityMLP(2, 3, 4, hidden_dim=8)
+    plain, compiled = (make_optimizer(part) for part in (network, torch.compile(network)))
+    for one, two in zip(plain.param_groups, compiled.param_groups, strict=True):
+        assert one["weight_decay"] == two["weight_decay"]
+        assert [id(p) for p in one["params"]] == [id(p) for p in two["params"]]

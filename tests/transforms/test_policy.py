@@ -132,3 +132,13 @@ def test_episodes_do_not_share_observations():
     assert torch.equal(stack[0], stack[1])
     fresh = env.reset()["observation"]
     assert fresh[0, 1] > stack[0, 1]  # the episode's number
+
+
+def test_the_normaliser_knows_the_action():
+    ones = {"observation": torch.ones(4), "move": torch.ones(2)}
+    normalizer = Normalizer({key: -2 * value for key, value in ones.items()}, ones)
+    with pytest.raises(ValueError, match=r"'move'.*not the environment's action 'action'"):
+        policy_transforms(PastPrior(3), normalizer=normalizer)
+    transforms = policy_transforms(PastPrior(3), normalizer=normalizer, action_key="move")
+    moved = transforms[:2].inv(TensorDict({"move": torch.ones(2)}))["move"]
+    assert moved.tolist() == [1.0, 1.0]  # of the range from -2 to 1

@@ -14,7 +14,7 @@ from torchrl.data import (
     Sequence,
     TensorDictReplayBuffer,
 )
-from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
+from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement, SliceSampler
 
 from tests.toy_env import random_history
 from warmprior import (
@@ -393,3 +393,22 @@ def test_bad_values_are_located_in_every_part_of_the_data(bad):
     value[1999, 1] = float("inf")
     with pytest.raises(ValueError, match=f"'observation' holds NaN or Inf, first at step {bad}$"):
         check_finite("observation", value, memory=90)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"batch_size": 0}, "batch_size must be at least 1"),
+        ({"sampler": SliceSampler(num_slices=2, traj_key="episode")}, "take RandomSampler"),
+    ],
+)
+def test_buffers_that_cannot_be(options, said):
+    with pytest.raises(ValueError, match=said):
+        window_replay_buffer(steps([20]), PastPrior(2), **({"batch_size": 4} | options))
+
+
+def test_whole_numbers_are_no_actions():
+    data = steps([20])
+    data["action"] = data["action"].long()
+    with pytest.raises(ValueError, match=r"vector of real numbers, 'action'.*int64.*\.float\(\)"):
+        ActionWindow(data, 2)

@@ -157,6 +157,7 @@ class AsyncExecutor:
         if pending is not None:
             pending.cancel()
         self._pending: Future[Tensor] | None = None
+        self._failed = False
         self._frames.clear()
         self._history = cold_history([], self.prior.history_length, *self._shape)
         # The chunk as it is executed from the last decision on, and how much of it there is.
@@ -174,13 +175,16 @@ class AsyncExecutor:
         Raises:
             TimeoutError: if no action is left, and the next chunk is not there in time.
             RuntimeError: after :meth:`close`.
-            Exception: whatever the policy raised in its thread; at every call until :meth:`reset`.
+            Exception: whatever the policy raised, once no action is left. Until then, and at every further
+                call, another decision is tried.
         """
         if self._closed:
             raise RuntimeError("the executor is closed")
         self._see(observation)
         self._collect()
-        if self._pending is None and self._executed >= min(self.execute, self._left):
+        if self._pending is None and (
+            self._failed or self._executed >= min(self.execute, self._left)
+        ):
             self._decide()
             self._collect()
         if self._executed >= self._usable:
@@ -215,7 +219,9 @@ class AsyncExecutor:
         """Begin a decision; what is left of the chunk is at the positions of the new one from here on."""
         if self._left:
             self._history = advance(self._history, self._chunk, torch.tensor([self._executed]))
-        self._chunk, self._executed = self._history["forecast"], 0
+            # Less than a whole chunk where the last decision failed.
+            self._history["forecast_steps"] = torch.tensor([self._left - self._executed])
+        self._chunk, self._executed, self._failed = self._history["forecast"], 0, False
         self._left = int(self._history["forecast_steps"])
         frames = torch.stack(list(self._frames))
         if isinstance(frames, TensorDictBase):
@@ -254,7 +260,13 @@ class AsyncExecutor:
         """Let the chunk under way take effect, if it is there."""
         if self._pending is None or not self._pending.done():
             return
-        if self.latency is not None and not self._first and self._executed < self.latency:
+        if (error := self._pending.exception()) is not None:
+            self._pending, self._failed = None, True
+            if self._executed < self._left:
+                return  # there are actions left: go on with them, and try again
+            raise error
+        latency = 0 if self.latency is None or self._first else self.latency
+        if self._executed < min(latency, self._left):
             return
         chunk = self._pending.result()
         self._chunk = with_leftover(chunk, self._chunk, torch.tensor([self._executed]))

@@ -90,6 +90,12 @@ class Normalizer(nn.Module):
         missing = [key for key in keys if data.get(key, None) is None]
         if missing:
             raise KeyError(f"cannot fit a normaliser: the data lack {missing}")
+        for key in keys:
+            if not isinstance(data[key], Tensor):
+                raise ValueError(
+                    f"cannot fit a normaliser to {key!r}, with the entries {sorted(data[key].keys())}: name "
+                    f'each with keys=, such as ("{key}", "state")'
+                )
         low = {key: data[key].amin(0).clone() for key in keys}
         high = {key: data[key].amax(0).clone() for key in keys}
         for key, unit in (units or {}).items():
@@ -122,7 +128,7 @@ class Normalizer(nn.Module):
                 data.set(key, data.get(key) * self.scale(key) + self.loc(key))
         return data
 
-    def env_transforms(self) -> list[Transform]:
+    def env_transforms(self, action_key: NestedKey = keys.ACTION) -> list[Transform]:
         """TorchRL transforms that do the same next to the base environment.
 
         Observations are normalised on the way out and actions denormalised on the way in. Append them
@@ -131,7 +137,7 @@ class Normalizer(nn.Module):
         transforms: list[Transform] = []
         for key in self.keys:
             loc, scale = self.loc(key).clone(), self.scale(key).clone()
-            if key == keys.ACTION:
+            if key == action_key:
                 transforms.append(
                     ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale)
                 )

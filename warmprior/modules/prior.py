@@ -45,7 +45,9 @@ class Source:
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
         """Draw ``a_0``, ``[*B, P, d_a]``; of PyTorch's global generator by default."""
         loc = self.loc
-        like: dict[str, Any] = {"dtype": loc.dtype, "device": loc.device, "generator": generator}
+        like: dict[str, Any] = {"dtype": loc.dtype, "device": loc.device}
+        if generator is not None:  # torch.compile and torch.export take no argument that is None
+            like["generator"] = generator
         eps = torch.randn(loc.shape, **like)
         if self.correlation:
             common = torch.randn((*loc.shape[:-2], 1, loc.shape[-1]), **like)

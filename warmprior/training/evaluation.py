@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import Compose
+from torchrl.envs.transforms import ActionScaling, Compose
 from tqdm import tqdm
 
 from warmprior import keys
@@ -299,6 +299,7 @@ def play_episode(
     if env.batch_size:
         raise ValueError(f"play_episode needs a single environment, got {env.batch_size}")
     _check_keys(env, success, measures or {})
+    _check_units(policy, env)
     policy.eval()
     device = _device(policy)
     home = env.device or torch.device("cpu")
@@ -357,7 +358,8 @@ def evaluate(
 
     Raises:
         ValueError: if ``episodes < 1``, or the environment has several batch dimensions, cannot play the
-            episodes of given seeds in its rows, or adds an offset to them.
+            episodes of given seeds in its rows, or adds an offset to them; if the policy keeps a normaliser
+            that the environment lacks.
         KeyError: if it lacks ``success``, one of ``measures``, or the policy's transforms.
         WorkerError: if a worker process dies, a ``RuntimeError``.
 
@@ -416,6 +418,7 @@ def _play_batched(
 ) -> None:
     num_envs = env.batch_size[0]
     _check_keys(env, success, measures)
+    _check_units(policy, env)
     policy.eval()
     device = _device(policy)
     home = env.device or torch.device("cpu")
@@ -496,6 +499,24 @@ def _check_keys(env: EnvBase, success: NestedKey, measures: Measures) -> None:
         raise KeyError(
             f"the environment lacks {keys.EXECUTED!r} or {keys.HISTORY!r}: give it the policy's transforms, "
             "see warmprior.policy_transforms"
+        )
+
+
+def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
+    """Whether the environment denormalises actions by the normaliser that the policy keeps."""
+    normalizer = getattr(policy, "normalizer", None)
+    if normalizer is None or isinstance(_base_of(env), SerialEnv | ParallelEnv):
+        return  # what lies inside of workers cannot be asked
+    scalings = [t for t in getattr(env, "transform", ()) if isinstance(t, ActionScaling)]
+    loc, scale = normalizer.loc(keys.ACTION), normalizer.scale(keys.ACTION)
+    if not any(
+        torch.equal(t.loc.cpu(), loc.cpu()) and torch.equal(t.scale.cpu(), scale.cpu())
+        for t in scalings
+    ):
+        found = "has another normaliser" if scalings else "has no normaliser"
+        raise ValueError(
+            f"the policy was trained in the units of its normaliser, and the environment {found}: give "
+            "policy_transforms(..., normalizer=policy.normalizer)"
         )
 
 

@@ -11,6 +11,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
+from warmprior.modules.compiled import uncompiled
 from warmprior.modules.network import VelocityNetwork
 
 __all__ = ["ema_of", "make_optimizer", "warmup_cosine"]
@@ -45,6 +46,7 @@ def make_optimizer(
         >>> [group["weight_decay"] for group in optimizer.param_groups]
         [1e-05, 0.0]
     """
+    network = uncompiled(network)
     if isinstance(network, VelocityNetwork):
         groups = network.parameter_groups(weight_decay)
     else:

@@ -29,6 +29,7 @@ from warmprior.modules.start import StartPoint
 from warmprior.training.checkpoint import load_state, save_state
 
 __all__ = [
+    "check_repository",
     "check_saveable",
     "load_policy",
     "policy_config",
@@ -47,7 +48,13 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Weights and configuration of the policy in a folder."""
     path = folder / WEIGHTS
     if not path.exists():
-        raise FileNotFoundError(f"no policy at {folder}: {WEIGHTS} is missing")
+        kept = sorted(found.parent.name for found in folder.glob(f"*/{WEIGHTS}"))
+        reason = f"{WEIGHTS} is missing"
+        if folder.is_file():
+            reason = "it is a file, and a policy is a folder"
+        elif kept:
+            reason = f"it holds the policies {', '.join(kept)}: name one of them"
+        raise FileNotFoundError(f"no policy at {folder}: {reason}")
     tensors, config = load_state(path, "policy", "Copy it again")
     if config.get("format") != FORMAT:
         raise ValueError(
@@ -81,6 +88,12 @@ def _folder(
         raise ValueError(f"{place} at the hub holds no policy of warmprior: look at its {CONFIG}")
     # Of the same commit, whatever happens to the branch meanwhile.
     return snapshot(place, [WEIGHTS], revision=folder.name, **options)
+
+
+def check_repository(name: str) -> None:
+    """Raise ValueError if a text has not the form of a repository's name at the hub."""
+    if not _is_repository(name):
+        raise ValueError(f"{name!r} is no name of a repository at the hub: use user/name")
 
 
 def _is_repository(name: str) -> bool:
@@ -259,8 +272,7 @@ def push_policy(
         >>> push_policy(actor, "user/square-past", card=model_card(actor))  # doctest: +SKIP
         '0123456789abcdef0123456789abcdef01234567'
     """
-    if not _is_repository(repository):
-        raise ValueError(f"{repository!r} is no name of a repository at the hub: use user/name")
+    check_repository(repository)
     api = require("huggingface_hub", "sim").HfApi(endpoint=endpoint, token=token)
 
     def send(folder: Path) -> str:

@@ -68,7 +68,8 @@ def policy_transforms(
         measures: see :class:`ChunkStep`.
 
     Raises:
-        ValueError: for numbers that do not go together, see :class:`ChunkStep` and :class:`InferenceDelay`.
+        ValueError: if the normaliser lacks the action, or for numbers that do not go together, see
+            :class:`ChunkStep` and :class:`InferenceDelay`.
 
     See Also:
         - :func:`~warmprior.window_transforms`: the same for batches of demonstrations.
@@ -81,6 +82,11 @@ def policy_transforms(
         >>> env.reset()["observation"].shape
         torch.Size([2, 3])
     """
+    if normalizer is not None and action_key not in normalizer.keys:
+        raise ValueError(
+            f"the normaliser has {normalizer.keys}, and not the environment's action {action_key!r}: "
+            "fit it to data that call the action so, or name the action with action_key"
+        )
     late: list[Transform] = []
     seen = [HistoryObservation(observation_key=observation_key)] if see_history else []
     if delay is not None:
@@ -89,7 +95,7 @@ def policy_transforms(
         check_delay(delay, execute, prior.prediction_length)
         late = [InferenceDelay(delay, execute=execute, chunk_key=chunk_key)]
     per_step = [transform.clone() for transform in (actions, images) if transform is not None]
-    per_step += [] if normalizer is None else normalizer.env_transforms()
+    per_step += [] if normalizer is None else normalizer.env_transforms(action_key)
     return Compose(
         *per_step,
         ObservationStack(observation_steps, observation_key=observation_key),

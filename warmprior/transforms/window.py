@@ -7,7 +7,7 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer, TensorStorage
-from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.samplers import Sampler, SliceSampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 from torchrl.envs.transforms import Compose, Transform
 
@@ -167,9 +167,10 @@ def _checked(
     observation, action, episode = entries
     if data.ndim != 1 or not len(data):
         raise ValueError(f"the data must be flat steps [N] with N > 0, got {tuple(data.shape)}")
-    if action.ndim != 2:
+    if action.ndim != 2 or not action.is_floating_point():
         raise ValueError(
-            f"an action is one vector, {action_key!r} [N, d_a], got {tuple(action.shape)}: flatten it"
+            f"an action is one vector of real numbers, {action_key!r} [N, d_a], got {tuple(action.shape)} of "
+            f"{action.dtype}: flatten it, or convert it with .float()"
         )
     observations = {observation_key: observation}
     if is_tensor_collection(observation):
@@ -301,6 +302,9 @@ def window_replay_buffer(
         generator: source of randomness of sampler and what is withheld; PyTorch's global one by default.
         renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
 
+    Raises:
+        ValueError: if ``batch_size < 1``, for a ``SliceSampler``, or see :class:`ActionWindow`.
+
     See Also:
         - :func:`~warmprior.window_transforms`: its transforms, for a buffer of your own.
         - :class:`~warmprior.FlowMatchingLoss`: takes its batches.
@@ -315,6 +319,13 @@ def window_replay_buffer(
         >>> batch["vla_action", "chunk"].shape, batch["observation"].shape
         (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
     """
+    if batch_size < 1:
+        raise ValueError(f"batch_size must be at least 1, got {batch_size}")
+    if isinstance(sampler, SliceSampler):
+        raise ValueError(
+            "SliceSampler needs whole steps in the storage, and this one holds step numbers: every window is "
+            "a slice already, so take RandomSampler or SamplerWithoutReplacement"
+        )
     windows = window_transforms(
         data,
         prior,
