@@ -7,36 +7,39 @@ python benchmarks/curvature.py --data mh --preset cpu         # of these options
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import torch
 from common import finished_policies, observations_of, policies_of, replace_rows, trained_actors
 from measures import held_out, straightness
-from options import PRESETS, Flat, HeldOut, MeasuredOptions, PolicyOptions, parse, started, study
+from options import (
+    PRESETS,
+    Flat,
+    HeldOut,
+    MeasuredOptions,
+    PolicyOptions,
+    parse,
+    script,
+    started,
+    study,
+)
 from plots import plot_flow_paths
 from report import curvature_table, labelled, write_report
 from robomimic import train_all
 
 from warmprior.diagnostics import SharedObservations, encoded_windows, flow_paths
 from warmprior.diagnostics.flow import sees_history
-from warmprior.io.script import run_script
 
 SHOWN = 40
 
 
 @dataclass(frozen=True)
 class CurvatureOptions(MeasuredOptions):
-    """What to measure.
-
-    Attributes:
-        policies: of another run, instead of those of the options.
-        coordinate: of the action, in flow_paths.png.
-    """
+    """What to measure."""
 
     policies: Annotated[PolicyOptions, Flat] = field(default_factory=PolicyOptions)
-    coordinate: int = 0
+    coordinate: int = 0  # of the action, in flow_paths.png
 
     @property
     def name(self) -> str:
@@ -52,7 +55,8 @@ def check_coordinate(options: CurvatureOptions, observations: SharedObservations
         raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
 
 
-def run(argv: Sequence[str] | None) -> None:
+@script("curvature.py")
+def main(argv: list[str] | None) -> None:
     """Train the policies, or take those of a run, and measure how straight their flows are."""
     many = HeldOut(observations=2_000)
     presets = {n: study(CurvatureOptions, base, held_out=many) for n, base in PRESETS.items()}
@@ -103,11 +107,6 @@ def run(argv: Sequence[str] | None) -> None:
         plot_flow_paths(paths, out / "flow_paths.png", title=title)
         table = curvature_table(rows, {"task": name, "data": style, **facts}, source)
         write_report(out, table, table, rows)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study."""
-    return run_script(lambda: run(argv), "curvature.py")
 
 
 if __name__ == "__main__":

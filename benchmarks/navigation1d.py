@@ -16,13 +16,12 @@ import pandas as pd
 import torch
 from common import Policy, policies_of, replace_rows, trained_actors
 from measures import straightness
-from options import Evaluation, Options, Sources, check_single, parse, started
+from options import Evaluation, Options, Sources, check_single, parse, script, started
 from plots import plot_flow_paths, plot_navigation
 from report import labelled, navigation_table, write_report
 from robomimic import beside, train_all
 
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
-from warmprior.io.script import run_script
 from warmprior.training import (
     NetworkOptions,
     TrainingConfig,
@@ -120,7 +119,8 @@ def draw(
     plot_flow_paths(paths, out / "flow_paths.png", title=title)
 
 
-def run(argv: Sequence[str] | None) -> None:
+@script("navigation1d.py", together=True)
+def main(argv: list[str] | None) -> None:
     """Train the policies, roll them out and measure their flows."""
     options = parse(
         NAVIGATION_PRESETS, argv, "navigation1d", __doc__, adapt=lambda base, asked: base
@@ -159,11 +159,6 @@ def run(argv: Sequence[str] | None) -> None:
         # Before the pictures, which are the lesser loss: the trainings took the time.
         write_report(out, table, table, pd.concat([rows, curvatures]))
         draw(options, policies, rows, observations)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the toy."""
-    return run_script(lambda: run(argv), "navigation1d.py", together=True)
 
 
 if __name__ == "__main__":
