@@ -33,7 +33,6 @@ class BudgetOptions(MeasuredOptions):
     budgets: tuple[int, ...] = (2_500, 5_000, 10_000, 20_000)  # iterations, instead of --iterations
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work."""
         super().check()
         check_single(self, "sigma")
         check_counts(self, "budgets")

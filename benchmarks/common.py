@@ -58,11 +58,10 @@ from warmprior.training.checkpoint import (
 from warmprior.training.task import task_places
 from warmprior.transforms import policy_transforms
 
-LEARNING_SHARE = 0.25
-"""Gradient steps of sources that learn before the flow, per step of the flow."""
-
-EPISODES_PER_JOB = 5
-"""Few enough that all cores stay busy to the end, and enough that a policy is loaded seldom."""
+LEARNING_SHARE = 0.25  # gradient steps of sources that learn before the flow, per step of the flow
+EPISODES_PER_JOB = (
+    5  # so few that all cores are busy to the end; so many that policies are loaded seldom
+)
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,6 @@ class Policy:
 
     @property
     def losses(self) -> list[tuple[int, float]]:
-        """The training curve."""
         return load_state(self.folder / "state.safetensors")[1]["losses"]
 
     @property

@@ -31,11 +31,8 @@ from warmprior.io.processes import fresh_processes
 from warmprior.io.script import ERRORS
 from warmprior.io.workers import available_cores
 
-DEATHS = 3
-"""Workers that a job may lose before it counts as failed."""
-
-LINES_EVERY = 30.0
-"""Seconds between two reports on running trainings where there is no terminal."""
+DEATHS = 3  # workers that a job may lose before it counts as failed
+LINES_EVERY = 30.0  # seconds between two reports on running trainings where there is no terminal
 
 
 @dataclass(eq=False)

@@ -113,7 +113,6 @@ class AgentsOptions(Options):
         return TOY if self.is_toy else super().name
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work."""
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "data", "chunk", "sigma", "nfe")

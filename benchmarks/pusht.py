@@ -45,12 +45,7 @@ def task(options: DataOptions) -> Task:
     if options.demonstrations:
         steps = steps[steps["episode"] < options.demonstrations[0]]
     return Task.of(
-        "pusht",
-        steps,
-        make_env,
-        success="is_success",
-        measures={"coverage": "max"},
-        film_rate=10,
+        "pusht", steps, make_env, success="is_success", measures={"coverage": "max"}, film_rate=10
     )
 
 

@@ -55,7 +55,6 @@ class DelayOptions(Options):
         return super().name + ("-navigation" if self.toy == "beside" else "")
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work."""
         super().check()
         check_single(self, "chunk")
         for name in ("delay", "guidance"):

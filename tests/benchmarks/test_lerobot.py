@@ -14,14 +14,7 @@ pytest.importorskip("lerobot")
 import curvature
 import robomimic
 
-from tests.benchmarks.script_parts import (
-    command_line,
-    described,
-    options,
-    refused,
-    stored,
-    written,
-)
+from tests.benchmarks.script_parts import command_line, described, options, refused, stored, written
 from warmprior.data import convert_robomimic
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")

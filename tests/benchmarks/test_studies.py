@@ -8,14 +8,7 @@ import shutil
 
 import pytest
 
-from tests.benchmarks.script_parts import (
-    command_line,
-    is_png,
-    options,
-    refused,
-    stored,
-    written,
-)
+from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
 from tests.data.synthetic import write_robomimic_file
 
 pytest.importorskip("robosuite")
