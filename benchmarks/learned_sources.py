@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -16,7 +16,6 @@ from torchrl.modules import MLP
 from warmprior import keys
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.prior import GaussianPrior, PastPrior, Source
-from warmprior.modules.registry import Registered
 from warmprior.modules.start import StartPoint
 from warmprior.training.optim import warmup_cosine
 from warmprior.transforms.window import window_replay_buffer, without_images
@@ -46,7 +45,7 @@ class Learner(nn.Module):
     network: nn.Module
 
     def _set_widths(self, widths: Sequence[int] | None, hidden_dim: int) -> None:
-        """Make the networks, if the widths of the data are known; :meth:`sized` tells them."""
+        """Make the networks, if the widths of the data are known."""
         check_whole_numbers(hidden_dim=hidden_dim)
         self.hidden_dim = hidden_dim
         if widths is not None:
@@ -60,13 +59,6 @@ class Learner(nn.Module):
             self.build()
             self.requires_grad_(False)
 
-    def sized(self, action_dim: int, observation_dim: int, observation_steps: int) -> Self:
-        """The same with fresh networks for data of these widths, ``d_a``, ``d_o`` and ``To``."""
-        assert isinstance(self, Registered)
-        kind: Any = type(self)
-        widths = [action_dim, observation_dim, observation_steps]
-        return kind(**(self._resolved() | {"widths": widths}))
-
     def build(self) -> None:
         raise NotImplementedError
 
@@ -75,7 +67,7 @@ class Learner(nn.Module):
         if not hasattr(self, "action_dim"):
             name = type(self).__name__
             raise ValueError(
-                f"{name} has no networks yet: take .sized(d_a, d_o, To), and learn(...)"
+                f"{name} has no networks yet: give widths=[d_a, d_o, To], and learn(...)"
             )
 
     def learning_loss(
@@ -124,7 +116,7 @@ class Learner(nn.Module):
 class LearnedPrior(PastPrior, Learner, abstract=True):
     """A learned source around which agents can search: warm where the network is, that is everywhere.
 
-    `widths` are ``d_a``, ``d_o`` and ``To``, which :meth:`sized` fills in; `hidden_dim` is of both layers.
+    `widths` are ``d_a``, ``d_o`` and ``To``, known once there are data; `hidden_dim` is of both layers.
     """
 
     def __init__(
