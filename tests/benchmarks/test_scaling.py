@@ -49,12 +49,12 @@ def test_more_cores_never_take_longer_when_episodes_are_equal():
     assert all(a >= b for a, b in itertools.pairwise(times))
 
 
+@pytest.mark.slow
 def test_the_script(tmp_path, monkeypatch):
     monkeypatch.setattr(scaling, "TRAINED", 10)
     torch.manual_seed(0)
     prior = PastPrior(8)
     environment = environment_description(task_env_args("lift"), "ph", 2)
-    environment["robosuite"]["horizon"] = 24  # three decisions
     network = VelocityMLP(7, 19, 8, 2, hidden_dim=16)
     save_policy(WarmPriorActor(network, prior, environment=environment), tmp_path / "policy")
     out = tmp_path / "out"
