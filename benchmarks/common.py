@@ -133,6 +133,11 @@ class Policy:
 cached_task = cache(load_task)
 
 
+def facts_of(task: Task) -> dict[str, Any]:
+    """A task's name and style, and what its demonstrations are."""
+    return {"task": task.name, "data": task.style, **task.facts}
+
+
 def policies_folder(run: Run) -> Path:
     """Where policies lie: beside the run, so that others share them."""
     return run.folder.absolute().parent / "policies"
@@ -354,9 +359,7 @@ def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObs
         return shared, "the TRAINING demonstrations (not held out)"
     return held_out(
         options.held_out,
-        task.name,
-        task.style,
-        task.facts,
+        facts_of(task),
         task.normalizer,
         chunk_length=chunk_length,
         observation_steps=steps,
@@ -377,8 +380,8 @@ def trained_actors(policies: Sequence[Policy]) -> dict[Method, dict[int, WarmPri
 
 def finished_policies(
     run: Path, device: str
-) -> tuple[str, str, dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
-    """Of a finished run of one task: its name, style and facts, and the last policies by method and seed."""
+) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
+    """Of a finished run of one task: the task's facts, and the last policies by method and seed."""
     paths = run / "results.jsonl", run / "tasks.json"
     if not all(path.is_file() for path in paths):
         raise FileNotFoundError(f"--run {run}: it has no results.jsonl; name a run of robomimic.py")
@@ -399,8 +402,7 @@ def finished_policies(
         raise ValueError(
             f"--run {run}: name a run of one task and style, with one sigma and chunk length"
         )
-    facts = tasks[0]
-    return facts.pop("task"), facts.pop("data"), facts, actors
+    return tasks[0], actors
 
 
 @dataclass(frozen=True)

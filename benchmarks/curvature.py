@@ -11,7 +11,14 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import torch
-from common import finished_policies, observations_of, policies_of, replace_rows, trained_actors
+from common import (
+    facts_of,
+    finished_policies,
+    observations_of,
+    policies_of,
+    replace_rows,
+    trained_actors,
+)
 from measures import held_out, straightness
 from options import (
     PRESETS,
@@ -70,17 +77,13 @@ def main(argv: list[str] | None) -> None:
             observations, source = observations_of(options, policies[0])
             check_coordinate(options, observations)
             train_all(options, policies)
-            task = policies[0].task()
-            name, style, facts = task.name, task.style, task.facts
-            actors = trained_actors(policies)
+            task, actors = facts_of(policies[0].task()), trained_actors(policies)
         else:
-            name, style, facts, actors = finished_policies(options.policies.run, options.run.device)
+            task, actors = finished_policies(options.policies.run, options.run.device)
             first: Any = next(iter(next(iter(actors.values())).values()))
             observations, source = held_out(
                 options.held_out,
-                name,
-                style,
-                facts,
+                task,
                 first.normalizer,
                 chunk_length=first.prior.chunk_length,
                 observation_steps=first.network.observation_steps,
@@ -103,9 +106,10 @@ def main(argv: list[str] | None) -> None:
                 windows = encoded_windows(actor, windows)
                 path = flow_paths(actor, windows, options.held_out.steps, generator=generator)
                 paths[labels[str(method)]] = path[..., 0, options.coordinate].cpu()
-        title = f"{name} {style}: action coordinate {options.coordinate} along the flow,\n{source}"
+        where = f"{task['task']} {task['data']}: action coordinate {options.coordinate}"
+        title = f"{where} along the flow,\n{source}"
         plot_flow_paths(paths, out / "flow_paths.png", title=title)
-        table = curvature_table(rows, {"task": name, "data": style, **facts}, source)
+        table = curvature_table(rows, task, source)
         write_report(out, table, table, rows)
 
 

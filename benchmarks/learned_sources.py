@@ -74,8 +74,8 @@ class Learner(nn.Module):
         self, windows: LearningWindows, generator: torch.Generator | None = None
     ) -> Tensor:
         """What the networks minimise on windows; the error of their forecast by default."""
-        forecast = self.as_chunk(self.outputs(windows.history, windows.observation))
-        return windows.mean((windows.a1 - forecast).square())
+        predicted = self.predicted(windows.history, windows.observation)
+        return windows.mean((windows.a1 - predicted).square())
 
     def calibrate(self, windows: LearningWindows) -> None:
         """Correct the source by its error on windows that were held out; nothing by default."""
@@ -107,6 +107,10 @@ class Learner(nn.Module):
         """What the network says, ``[*B, n]``; see :meth:`seen`."""
         seen = self.seen(history, observation)  # first: it tells if there is no network
         return self.network(seen)
+
+    def predicted(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+        """The chunk that the network says, ``[*B, H, d_a]``."""
+        return self.as_chunk(self.outputs(history, observation))
 
     def as_chunk(self, out: Tensor) -> Tensor:
         """Outputs ``[*B, H d_a]`` as ``[*B, H, d_a]``."""
@@ -213,7 +217,7 @@ class A2APrior(LearnedPrior):
         self.network = self.mlp(self.seen_dim, self.chunk_dim)
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
-        mean = self.as_chunk(self.outputs(history, observation))
+        mean = self.predicted(history, observation)
         return self._everywhere(mean, torch.full_like(mean[..., :1], self.sigma))
 
 
@@ -336,16 +340,13 @@ class ForecastStart(StartPoint, Learner):
     def build(self) -> None:
         self.network = self.mlp(self.seen_dim, self.chunk_dim)
 
-    def _forecast(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        return self.as_chunk(self.outputs(history, observation))
-
     def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """Share of the forecast."""
-        return self.time * self._forecast(history, observation)
+        return self.time * self.predicted(history, observation)
 
     def forward(self, noise: Tensor, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """Noise and forecast, mixed as on the path at ``start_time``."""
-        forecast = self._forecast(history, observation)
+        forecast = self.predicted(history, observation)
         last = history["actions"][..., -self.chunk_length :, :]
         moved = (forecast - last).square().mean((-1, -2), keepdim=True).sqrt()
         known = (history["steps"] >= self.chunk_length).unsqueeze(-1)

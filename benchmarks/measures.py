@@ -109,8 +109,6 @@ def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
 
 def held_out(
     options: HeldOut,
-    name: str,
-    style: str,
     facts: Mapping[str, Any],
     normalizer: Normalizer,
     *,
@@ -120,13 +118,14 @@ def held_out(
 ) -> tuple[SharedObservations, str]:
     """Observations that no policy of a task was trained on, and what they are in words."""
     place: Path | str
+    name, style = facts["task"], facts["data"]
     if "file" not in facts:
         raise ValueError(f"{name} is a task of one's own: name it with --task in place of --run")
     if options.validation is not None:
         place, words = options.validation, ""
     elif facts.get("source") != "scripted":
         raise ValueError(
-            f"these policies are trained on demonstrations of {facts.get('file', name)}: add --validation "
+            f"these policies are trained on demonstrations of {facts['file']}: add --validation "
             "FILE with others (or with the same file, to measure on the training data)"
         )
     else:

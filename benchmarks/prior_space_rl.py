@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
-from common import Rows, finished_policies, policies_of, slug, trained_actors
+from common import Rows, facts_of, finished_policies, policies_of, slug, trained_actors
 from methods import Method
 from navigation1d import NAVIGATION_PRESETS
 from options import (
@@ -250,34 +250,28 @@ def frozen_policies(
     if run is None:
         policies = policies_of(options, methods)
         train_all(options, policies)
-        task = policies[0].task()
-        return {"task": task.name, "data": task.style, **task.facts}, trained_actors(policies)
-    name, style, facts, actors = finished_policies(run, options.run.device)
-    if options.data.task not in ((), (name,)):
-        raise ValueError(f"--run {run} is of {name}, not of {options.data.task[0]}")
+        return facts_of(policies[0].task()), trained_actors(policies)
+    task, actors = finished_policies(run, options.run.device)
+    if options.data.task not in ((), (task["task"],)):
+        raise ValueError(f"--run {run} is of {task['task']}, not of {options.data.task[0]}")
     found = {}
     for text in options.sources.prior:
         # What is not typed is as the method of the run has it.
+        sigma_typed = "sigma" in options_of(text)
         asked = [
             own
             for own in actors
-            if own
-            == Method(text, own.chunk_length, None if "sigma" in options_of(text) else own.sigma)
+            if own == Method(text, own.chunk_length, None if sigma_typed else own.sigma)
         ]
         if not asked:
-            raise ValueError(
-                f"--run {run} has policies of {'; '.join(map(str, actors))}, none of {text}"
-            )
+            known = "; ".join(map(str, actors))
+            raise ValueError(f"--run {run} has policies of {known}, none of {text}")
         group = actors[asked[0]]
-        if missing := set(options.seeds) - group.keys():
-            print(
-                f"--run has {len(group)} seeds of {text}: agents {sorted(missing)} share policies"
-            )
-        known = list(group.values())
-        found[asked[0]] = {
-            seed: group.get(seed, known[seed % len(known)]) for seed in options.seeds
-        }
-    return {"task": name, "data": style, **facts}, found
+        if missing := sorted(set(options.seeds) - group.keys()):
+            print(f"--run has {len(group)} seeds of {text}: agents {missing} share policies")
+        several = list(group.values())
+        found[asked[0]] = {s: group.get(s, several[s % len(several)]) for s in options.seeds}
+    return task, found
 
 
 def environment(options: AgentsOptions, actor: WarmPriorActor) -> Callable[[int], EnvBase]:

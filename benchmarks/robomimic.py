@@ -24,6 +24,7 @@ from common import (
     Policy,
     Rows,
     batches,
+    facts_of,
     measure,
     play,
     policies_folder,
@@ -129,8 +130,7 @@ def train_all(options: Options, policies: Sequence[Policy]) -> None:
 def describe(options: Options, policies: Sequence[Policy]) -> None:
     """Write `tasks.json`: what the demonstrations are."""
     tasks = {policy.place: policy.task() for policy in policies}.values()
-    facts = [{"task": task.name, "data": task.style, **task.facts} for task in tasks]
-    text = json.dumps(facts, indent=1) + "\n"
+    text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
     if not rank():
         write_atomic(options.run.folder / "tasks.json", lambda path: path.write_text(text))
 

@@ -192,7 +192,7 @@ class TestStep:
 
     def start(self, forecast=0.4, **options):
         start = built(ForecastStart, hidden_dim=8, **options)
-        start._forecast = lambda history, observation: torch.full_like(
+        start.predicted = lambda history, observation: torch.full_like(
             history["forecast"], forecast
         )
         return start
