@@ -216,8 +216,6 @@ def test_bad_options_stop_before_any_work(tmp_path, capsys, no_work, words, mess
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--algorithm dsrl-xy", "invalid choice 'dsrl-xy'"),
-        ("--rl.detla 0.5", "--rl.detla"),
         ("--delta 0.5", "--delta"),  # the agents' own options have their prefix
         ("--rl.evaluation-episodes 3", "--rl.evaluation-episodes"),  # that is --episodes
         ("--rl.seed 3", "--rl.seed"),

@@ -233,13 +233,3 @@ def test_a_run_that_cannot_be_compared_is_named(scripts, finished, tmp_path, cap
     said = refused(scripts["curvature"].main, command_line(run=run, out=tmp_path / "out"), capsys)
     missing = change.get("policy") is not None
     assert ("is missing: finish the run" if missing else "one sigma and chunk length") in said
-
-
-def test_measuring_a_run_twice_keeps_both_results(
-    scripts, finished, validation, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    for name in ("curvature-main-quick", "curvature-main-quick-2"):
-        argv = command_line(run=finished, **measured(None, validation))
-        assert scripts["curvature"].main(argv) == 0
-        assert len(stored(tmp_path / "runs" / name, "curvature")) == 15
