@@ -15,30 +15,24 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from common import Policy, observations_of, policies_of, replace_rows
-from options import PRESETS, HeldOut, MeasuredOptions, check_single, parse, started, study
+from options import PRESETS, HeldOut, MeasuredOptions, check_single, parse, script, started, study
 from plots import plot_budget
 from report import budget_table, write_report
 from robomimic import compare
 
 from warmprior.diagnostics import SharedObservations, action_error, encoded_windows
 from warmprior.io.files import read_lines
-from warmprior.io.script import run_script
 from warmprior.training import TrainingConfig
 from warmprior.training.options import check_counts
 
 
 @dataclass(frozen=True)
 class BudgetOptions(MeasuredOptions):
-    """A comparison at several lengths of training.
+    """A comparison at several lengths of training."""
 
-    Attributes:
-        budgets: iterations to train for, instead of --iterations.
-    """
-
-    budgets: tuple[int, ...] = (2_500, 5_000, 10_000, 20_000)
+    budgets: tuple[int, ...] = (2_500, 5_000, 10_000, 20_000)  # iterations, instead of --iterations
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work."""
         super().check()
         check_single(self, "sigma")
         check_counts(self, "budgets")
@@ -65,7 +59,8 @@ def errors(
     return found
 
 
-def run(argv: Sequence[str] | None) -> None:
+@script("budget.py")
+def main(argv: list[str] | None) -> None:
     """Train and play a policy per source and number of iterations."""
     few = HeldOut(observations=1_000)
     presets = {name: study(BudgetOptions, base, held_out=few) for name, base in PRESETS.items()}
@@ -83,11 +78,6 @@ def run(argv: Sequence[str] | None) -> None:
         plot_budget(rows, out / "budget.png", top_k=top_k, title=title)
         table = budget_table(rows, top_k) + f"- Error: on {source}.\n"
         write_report(out, table, table, rows, failures)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study."""
-    return run_script(lambda: run(argv), "budget.py")
 
 
 if __name__ == "__main__":

@@ -10,18 +10,16 @@ The policies of robomimic.py with the same options are used, not trained again.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 
 from common import policies_of
-from options import PRESETS, check_single, parse, started, with_parts
+from options import PRESETS, check_single, parse, script, started, with_parts
 from plots import plot_bars, plot_chunk_lengths, plot_success
 from report import chunk_table, last_checkpoints, write_report
 from robomimic import compare
 
-from warmprior.io.script import run_script
 
-
-def run(argv: Sequence[str] | None) -> None:
+@script("chunking.py")
+def main(argv: list[str] | None) -> None:
     """Train and play a policy per source and chunk length."""
     chunks = {"sources": {"chunk": (1, 2, 4, 8, 16)}}
     presets = {name: with_parts(preset, **chunks) for name, preset in PRESETS.items()}
@@ -41,11 +39,6 @@ def run(argv: Sequence[str] | None) -> None:
         plot_success(short, out / "violins.png", title=f"{title}, H = {shortest}")
         table = chunk_table(rows, top_k)
         write_report(out, table, table, rows, failures)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study."""
-    return run_script(lambda: run(argv), "chunking.py")
 
 
 if __name__ == "__main__":

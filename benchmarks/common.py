@@ -24,7 +24,7 @@ from filelock import FileLock
 from learned_sources import Learner, learn
 from measures import held_out, measured
 from methods import Method
-from options import Evaluation, MeasuredOptions, Options
+from options import Evaluation, MeasuredOptions, Options, Run
 from report import read_rows
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.record.loggers import get_logger
@@ -58,11 +58,10 @@ from warmprior.training.checkpoint import (
 from warmprior.training.task import task_places
 from warmprior.transforms import policy_transforms
 
-LEARNING_SHARE = 0.25
-"""Gradient steps of sources that learn before the flow, per step of the flow."""
-
-EPISODES_PER_JOB = 5
-"""Few enough that all cores stay busy to the end, and enough that a policy is loaded seldom."""
+LEARNING_SHARE = 0.25  # gradient steps of sources that learn before the flow, per step of the flow
+EPISODES_PER_JOB = (
+    5  # so few that all cores are busy to the end; so many that policies are loaded seldom
+)
 
 
 @dataclass(frozen=True)
@@ -74,19 +73,15 @@ class Policy:
     network: NetworkOptions
     method: Method
     training: TrainingConfig  # with its seed
-    device: str
-    compile: bool
-    logger: str
+    run: Run  # with an absolute folder
     grid: str
-    directory: Path  # where all policies lie
-    logs: Path
     name: str = ""  # of its own folder
     facts: dict[str, Any] = field(default_factory=dict, compare=False)  # what every row of it says
 
     @property
     def folder(self) -> Path:
         """Where its training lies, or will lie."""
-        return self.directory / self.name
+        return policies_folder(self.run) / self.name
 
     def __str__(self) -> str:
         return (
@@ -124,7 +119,6 @@ class Policy:
 
     @property
     def losses(self) -> list[tuple[int, float]]:
-        """The training curve."""
         return load_state(self.folder / "state.safetensors")[1]["losses"]
 
     @property
@@ -139,6 +133,16 @@ class Policy:
 cached_task = cache(load_task)
 
 
+def facts_of(task: Task) -> dict[str, Any]:
+    """A task's name and style, and what its demonstrations are."""
+    return {"task": task.name, "data": task.style, **task.facts}
+
+
+def policies_folder(run: Run) -> Path:
+    """Where policies lie: beside the run, so that others share them."""
+    return run.folder.absolute().parent / "policies"
+
+
 def policies_of(
     options: Options, methods: Sequence[Method], *more: tuple[str, str], only: bool = False
 ) -> list[Policy]:
@@ -146,8 +150,8 @@ def policies_of(
 
     The tasks are those that the options name and `more`, or with `only` the latter alone.
     """
-    parent = options.run.folder.absolute().parent / "policies"
-    check_writable(parent)
+    check_writable(policies_folder(options.run))
+    run = replace(options.run, out=options.run.folder.absolute())
     with leader_first():  # other processes find what it has generated, rendered or downloaded
         places = [*([] if only else task_places(options.data)), *more]
         steps = options.network.observation_steps
@@ -161,6 +165,7 @@ def policies_of(
     for place, task in tasks.items():
         if place[0] is not None and ":" in place[0]:
             check_environment(task)
+        network = options.network if task.images else options.network.without_images()
         for training in options.trainings():
             for method in methods:
                 if method.chunk_length > task.longest:
@@ -169,20 +174,8 @@ def policies_of(
                         f"{task.longest}: choose a shorter --chunk"
                     )
                 for seed in options.seeds:
-                    run = options.run
-                    like = Policy(
-                        place,
-                        options.data,
-                        options.network if task.images else options.network.without_images(),
-                        method,
-                        replace(training, seed=seed),
-                        run.device,
-                        run.compile,
-                        run.logger,
-                        options.evaluation.grid,
-                        parent,
-                        run.folder.absolute() / "logs",
-                    )
+                    seeded, grid = replace(training, seed=seed), options.evaluation.grid
+                    like = Policy(place, options.data, network, method, seeded, run, grid)
                     found.append(policy_of(task, like, method))
     return list({policy.folder: policy for policy in found}.values())
 
@@ -213,8 +206,8 @@ def policy_of(task: Task, like: Policy, method: Method) -> Policy:
         asdict(like.training),
         method.config(),
         asdict(like.network),
-        like.device,
-        like.compile,
+        like.run.device,
+        like.run.compile,
         version("torch"),
         version("warmprior"),
         STATE_FORMAT,
@@ -254,7 +247,7 @@ def train(policy: Policy) -> None:
             return
         task, method = policy.task(), policy.method
         # A worker that trains on a GPU sees no other.
-        device = torch.device(policy.device).type
+        device = torch.device(policy.run.device).type
         training = method.recipe(policy.training)
         widths = (
             task.data["action"].shape[-1],
@@ -262,16 +255,14 @@ def train(policy: Policy) -> None:
             policy.network.observation_steps,
         )
         prior, start = method.prior(widths), method.start(widths)
-        progress = Status(policy.status, training.iterations)
+        progress = status_writer(policy.status, training.iterations)
         for part in (prior, start):
             if isinstance(part, Learner):
                 with leader_first():
                     learned(part, policy, training)
-        logger = None
-        if policy.logger != "none" and not rank():
-            logger = get_logger(
-                policy.logger, logger_name=str(policy.logs), experiment_name=policy.folder.name
-            )
+        logger, logs = None, str(policy.run.folder / "logs")
+        if policy.run.logger != "none" and not rank():
+            logger = get_logger(policy.run.logger, logger_name=logs, experiment_name=policy.name)
         # Every step draws a_0 from `prior`; the loss is `warmprior.FlowMatchingLoss.forward`.
         train_policy(
             task,
@@ -284,12 +275,12 @@ def train(policy: Policy) -> None:
             see_history=method.parts.sees_history,
             max_nfe=None if method.is_flow else 1,
             device=device,
-            compile=policy.compile,
+            compile=policy.run.compile,
             logger=logger,
             description=None,
             progress=progress,
         )
-        progress.write()
+        progress(training.iterations)  # the last policy is saved as well
     if torch.cuda.is_initialized():
         torch.cuda.empty_cache()  # for the next training, which may be another worker's
 
@@ -304,28 +295,21 @@ def clock(status: Path) -> float:
         ) from error
 
 
-class Status:
-    """Writes how far a training is, once a second, and the processor time, of earlier starts as well."""
+def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
+    """Write how far a training is, once a second, and the processor time, of earlier starts as well."""
+    began = time.process_time() - (clock(path) if path.exists() else 0.0)
+    wrote = time.monotonic()
 
-    def __init__(self, path: Path, iterations: int) -> None:
-        self.path, self.iteration, self.iterations = path, 0, iterations
-        before = clock(path) if path.exists() else 0.0
-        self._began, self._wrote = time.process_time() - before, time.monotonic()
-
-    def __call__(self, iteration: int) -> None:
-        """Called after every gradient step."""
-        self.iteration = iteration
-        if time.monotonic() - self._wrote > 1.0:
-            self.write()
-
-    def write(self) -> None:
-        """Write it now."""
-        if rank():
+    def write(iteration: int) -> None:
+        nonlocal wrote
+        if rank() or (time.monotonic() - wrote < 1.0 and iteration < iterations):
             return
-        self._wrote = time.monotonic()
-        seconds = time.process_time() - self._began
-        status = {"iteration": self.iteration, "iterations": self.iterations, "seconds": seconds}
-        write_atomic(self.path, lambda path: path.write_text(json.dumps(status)))
+        wrote = time.monotonic()
+        seconds = time.process_time() - began
+        status = {"iteration": iteration, "iterations": iterations, "seconds": seconds}
+        write_atomic(path, lambda path: path.write_text(json.dumps(status)))
+
+    return write
 
 
 def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
@@ -367,7 +351,7 @@ def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObs
     if task.normalizer is None or "file" not in task.facts:  # of a task of one's own
         if options.held_out.validation is not None:
             raise ValueError(f"--validation belongs to robosuite's tasks, and {task.name} is none")
-        data = task.data.to(policy.device)
+        data = task.data.to(policy.run.device)
         shared = SharedObservations(data, chunk_length, observation_steps=steps)
         if len(shared) > count:
             generator = torch.Generator().manual_seed(0)
@@ -375,13 +359,11 @@ def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObs
         return shared, "the TRAINING demonstrations (not held out)"
     return held_out(
         options.held_out,
-        task.name,
-        task.style,
-        task.facts,
+        facts_of(task),
         task.normalizer,
         chunk_length=chunk_length,
         observation_steps=steps,
-        device=policy.device,
+        device=policy.run.device,
     )
 
 
@@ -391,15 +373,15 @@ def trained_actors(policies: Sequence[Policy]) -> dict[Method, dict[int, WarmPri
     found: dict[Method, dict[int, WarmPriorActor]] = {}
     for policy in policies:
         if policy.is_trained:
-            actor = policy.load().to(policy.device)
+            actor = policy.load().to(policy.run.device)
             found.setdefault(policy.method, {})[policy.training.seed] = actor
     return {method: actors for method, actors in found.items() if actors.keys() == seeds}
 
 
 def finished_policies(
     run: Path, device: str
-) -> tuple[str, str, dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
-    """Of a finished run of one task: its name, style and facts, and the last policies by method and seed."""
+) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
+    """Of a finished run of one task: the task's facts, and the last policies by method and seed."""
     paths = run / "results.jsonl", run / "tasks.json"
     if not all(path.is_file() for path in paths):
         raise FileNotFoundError(f"--run {run}: it has no results.jsonl; name a run of robomimic.py")
@@ -420,8 +402,7 @@ def finished_policies(
         raise ValueError(
             f"--run {run}: name a run of one task and style, with one sigma and chunk length"
         )
-    facts = tasks[0]
-    return facts.pop("task"), facts.pop("data"), facts, actors
+    return tasks[0], actors
 
 
 @dataclass(frozen=True)

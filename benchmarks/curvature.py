@@ -7,36 +7,46 @@ python benchmarks/curvature.py --data mh --preset cpu         # of these options
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import torch
-from common import finished_policies, observations_of, policies_of, replace_rows, trained_actors
+from common import (
+    facts_of,
+    finished_policies,
+    observations_of,
+    policies_of,
+    replace_rows,
+    trained_actors,
+)
 from measures import held_out, straightness
-from options import PRESETS, Flat, HeldOut, MeasuredOptions, PolicyOptions, parse, started, study
+from options import (
+    PRESETS,
+    Flat,
+    HeldOut,
+    MeasuredOptions,
+    PolicyOptions,
+    parse,
+    script,
+    started,
+    study,
+)
 from plots import plot_flow_paths
 from report import curvature_table, labelled, write_report
 from robomimic import train_all
 
 from warmprior.diagnostics import SharedObservations, encoded_windows, flow_paths
 from warmprior.diagnostics.flow import sees_history
-from warmprior.io.script import run_script
 
 SHOWN = 40
 
 
 @dataclass(frozen=True)
 class CurvatureOptions(MeasuredOptions):
-    """What to measure.
-
-    Attributes:
-        policies: of another run, instead of those of the options.
-        coordinate: of the action, in flow_paths.png.
-    """
+    """What to measure."""
 
     policies: Annotated[PolicyOptions, Flat] = field(default_factory=PolicyOptions)
-    coordinate: int = 0
+    coordinate: int = 0  # of the action, in flow_paths.png
 
     @property
     def name(self) -> str:
@@ -52,7 +62,8 @@ def check_coordinate(options: CurvatureOptions, observations: SharedObservations
         raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
 
 
-def run(argv: Sequence[str] | None) -> None:
+@script("curvature.py")
+def main(argv: list[str] | None) -> None:
     """Train the policies, or take those of a run, and measure how straight their flows are."""
     many = HeldOut(observations=2_000)
     presets = {n: study(CurvatureOptions, base, held_out=many) for n, base in PRESETS.items()}
@@ -66,17 +77,13 @@ def run(argv: Sequence[str] | None) -> None:
             observations, source = observations_of(options, policies[0])
             check_coordinate(options, observations)
             train_all(options, policies)
-            task = policies[0].task()
-            name, style, facts = task.name, task.style, task.facts
-            actors = trained_actors(policies)
+            task, actors = facts_of(policies[0].task()), trained_actors(policies)
         else:
-            name, style, facts, actors = finished_policies(options.policies.run, options.run.device)
+            task, actors = finished_policies(options.policies.run, options.run.device)
             first: Any = next(iter(next(iter(actors.values())).values()))
             observations, source = held_out(
                 options.held_out,
-                name,
-                style,
-                facts,
+                task,
                 first.normalizer,
                 chunk_length=first.prior.chunk_length,
                 observation_steps=first.network.observation_steps,
@@ -99,15 +106,11 @@ def run(argv: Sequence[str] | None) -> None:
                 windows = encoded_windows(actor, windows)
                 path = flow_paths(actor, windows, options.held_out.steps, generator=generator)
                 paths[labels[str(method)]] = path[..., 0, options.coordinate].cpu()
-        title = f"{name} {style}: action coordinate {options.coordinate} along the flow,\n{source}"
+        where = f"{task['task']} {task['data']}: action coordinate {options.coordinate}"
+        title = f"{where} along the flow,\n{source}"
         plot_flow_paths(paths, out / "flow_paths.png", title=title)
-        table = curvature_table(rows, {"task": name, "data": style, **facts}, source)
+        table = curvature_table(rows, task, source)
         write_report(out, table, table, rows)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study."""
-    return run_script(lambda: run(argv), "curvature.py")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from options import Run
 from tqdm import tqdm
@@ -31,11 +31,8 @@ from warmprior.io.processes import fresh_processes
 from warmprior.io.script import ERRORS
 from warmprior.io.workers import available_cores
 
-DEATHS = 3
-"""Workers that a job may lose before it counts as failed."""
-
-LINES_EVERY = 30.0
-"""Seconds between two reports on running trainings where there is no terminal."""
+DEATHS = 3  # workers that a job may lose before it counts as failed
+LINES_EVERY = 30.0  # seconds between two reports on running trainings where there is no terminal
 
 
 @dataclass(eq=False)
@@ -45,28 +42,23 @@ class Job:
     name: str
     function: Callable[..., Any]
     args: tuple[Any, ...]
-    after: Job | None  # it starts once this one is done
-    group: str  # after a failure, the other jobs of its group are left out
-    then: Callable[[Any], object] | None  # called here with the result
-    training: bool  # it is long, and takes a GPU if there is one
-    status: Path | None  # where it reports its progress: {"iteration": ..., "iterations": ...}
+    after: Job | None = None  # it starts once this one is done
+    group: str = ""  # after a failure, the other jobs of its group are left out
+    then: Callable[[Any], object] | None = None  # called here with the result
+    training: bool = False  # it is long, and takes a GPU if there is one
+    status: Path | None = (
+        None  # where it reports its progress: {"iteration": ..., "iterations": ...}
+    )
     deaths: int = 0
     done: bool = False
 
-
-class Engine(Protocol):
-    """Who computes."""
-
-    workers: int
-
-    def takes(self, job: Job) -> bool:
-        """Whether a job would start at once."""
-
-    def submit(self, job: Job) -> Future[tuple[Any, str | None]]:
-        """Start it. Its future raises if the worker dies."""
-
-    def close(self, kill: bool) -> None:
-        """End all workers; if `kill`, whatever they do."""
+    def iterations(self) -> tuple[int, int] | None:
+        """How many iterations of a training are done, of how many."""
+        try:
+            status = json.loads(self.status.read_text()) if self.status else {}
+            return status["iteration"], status["iterations"]
+        except (OSError, ValueError, KeyError):  # none yet, or another machine is writing it
+            return None
 
 
 def _call(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, str | None]:
@@ -88,17 +80,15 @@ class Local:
     """Processes of this machine, one thread each; the first ones have a GPU each, where one is asked for."""
 
     def __init__(self, workers: int | None, device: str) -> None:
-        gpus = _gpus(device)
+        self._gpus = _gpus(device)
         self.workers = workers or available_cores()
-        self._gpus = [gpus[i] if i < len(gpus) else "" for i in range(self.workers)]
-        self._on_gpu = bool(gpus)
-        self._pools: list[Any] = [None] * self.workers
+        self._pools: dict[int, Any] = {}
         self._busy: dict[int, Future[Any]] = {}
 
     def _slot(self, job: Job) -> int | None:
         free = [i for i in range(self.workers) if i not in self._busy or self._busy[i].done()]
-        if self._on_gpu and job.training:
-            return next((i for i in free if self._gpus[i]), None)
+        if self._gpus and job.training:
+            return next((i for i in free if i < len(self._gpus)), None)
         return free[-1] if free else None
 
     def takes(self, job: Job) -> bool:
@@ -109,20 +99,17 @@ class Local:
         """Start it in a free process, which is started with its first job."""
         slot = self._slot(job)
         assert slot is not None, "takes(job) says so"
-        if self._pools[slot] is not None:
-            try:
-                self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
-                return self._busy[slot]
-            except BrokenProcessPool:  # its process died with an earlier job
-                pass
-        env = {"CUDA_VISIBLE_DEVICES": self._gpus[slot]} if self._on_gpu else None
-        self._pools[slot] = fresh_processes(1, env=env)
-        self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
+        try:
+            self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
+        except (KeyError, BrokenProcessPool):  # none yet, or it died with an earlier job
+            env = {"CUDA_VISIBLE_DEVICES": "".join(self._gpus[slot : slot + 1])}
+            self._pools[slot] = fresh_processes(1, env=env if self._gpus else None)
+            self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
         return self._busy[slot]
 
     def close(self, kill: bool) -> None:
         """End the processes: what they have done is in files, or was given back."""
-        for pool in filter(None, self._pools):
+        for pool in self._pools.values():
             pool.shutdown(kill_workers=kill)
 
 
@@ -163,8 +150,7 @@ class Ray:
         # Lost ones are started again by `Jobs`, here as on one machine.
         options = {"num_cpus": 1, "num_gpus": gpus, "max_retries": 0}
         task = self._task.options(**options).remote(job.function, job.args)
-        future = task.future()
-        self._running[future] = task
+        self._running[future := task.future()] = task
         return future
 
     def close(self, kill: bool) -> None:
@@ -183,8 +169,10 @@ class Jobs:
     """
 
     def __init__(self, run: Run, folders: list[Path] | None = None) -> None:
-        on_ray = run.engine == "ray"
-        self.engine: Engine = Ray(run, folders or []) if on_ray else Local(run.envs, run.device)
+        # Either says what it `takes`, starts it (a future that raises if the worker dies), and closes.
+        self.engine: Local | Ray = (
+            Ray(run, folders or []) if run.engine == "ray" else Local(run.envs, run.device)
+        )
         self._waiting: list[Job] = []
         self._failed: dict[str, str] = {}  # by group, why
         self._all = 0
@@ -196,18 +184,10 @@ class Jobs:
         self.engine.close(kill=kind is not None)
 
     def submit(
-        self,
-        name: str,
-        function: Callable[..., Any],
-        *args: Any,
-        after: Job | None = None,
-        group: str | None = None,
-        then: Callable[[Any], object] | None = None,
-        training: bool = False,
-        status: Path | None = None,
+        self, name: str, function: Callable[..., Any], *args: Any, group: str = "", **options: Any
     ) -> Job:
-        """Add a job; :meth:`wait` computes it."""
-        job = Job(name, function, args, after, group or name, then, training, status)
+        """Add a job, with options of :class:`Job`; :meth:`wait` computes it."""
+        job = Job(name, function, args, group=group or name, **options)
         self._waiting.append(job)
         self._all += 1
         return job
@@ -253,13 +233,9 @@ class Jobs:
             if job.deaths < DEATHS and not hasattr(error, "cause"):
                 self._waiting.insert(0, job)
                 return 0
-            result, reason = (
-                None,
-                (
-                    f"its worker died {job.deaths} times ({type(error).__name__}), perhaps for lack of "
-                    "memory: use fewer with --envs"
-                ),
-            )
+            result, kind = None, type(error).__name__
+            reason = f"its worker died {job.deaths} times ({kind}), perhaps for lack of memory: use fewer "
+            reason += "with --envs"
         if reason is None:
             job.done = True
             if job.then is not None:
@@ -300,7 +276,7 @@ class Progress:
         self._whole.refresh()
         if not self._whole.disable:
             for bar, job in zip_longest(self._bars, running[: len(self._bars)]):
-                done = job and iterations_of(job)
+                done = job and job.iterations()
                 bar.n, bar.total = done or (0, 1)
                 bar.bar_format = (
                     "{desc}: {percentage:3.0f}%|{bar}| {n}/{total}" if done else "{desc}"
@@ -309,14 +285,5 @@ class Progress:
         elif time.monotonic() - self._spoke > LINES_EVERY:
             self._spoke = time.monotonic()
             for job in running:
-                if done := iterations_of(job):
+                if done := job.iterations():
                     print(f"{job.name}: {done[0]:,} of {done[1]:,} iterations", flush=True)
-
-
-def iterations_of(job: Job) -> tuple[int, int] | None:
-    """How many iterations of a training are done, of how many."""
-    try:
-        status = json.loads(job.status.read_text()) if job.status else {}
-        return status["iteration"], status["iterations"]
-    except (OSError, ValueError, KeyError):  # none yet, or another machine is writing it
-        return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDictBase
@@ -16,25 +16,12 @@ from torchrl.modules import MLP
 from warmprior import keys
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.prior import GaussianPrior, PastPrior, Source
-from warmprior.modules.registry import Registered
 from warmprior.modules.start import StartPoint
 from warmprior.training.optim import warmup_cosine
 from warmprior.transforms.window import window_replay_buffer, without_images
 
-__all__ = [
-    "A2APrior",
-    "CVAEPrior",
-    "ForecastPrior",
-    "ForecastStart",
-    "LeapPrior",
-    "Learner",
-    "learn",
-]
-
+# Smallest calibrated standard deviation of a learned Gaussian source, in normalised action units.
 SCALE_FLOOR = 0.02
-"""Smallest standard deviation of a learned Gaussian source, calibrated, in normalised action units and
-before ``sigma`` multiplies it."""
-
 CALIBRATION_WINDOWS = 4_096
 
 
@@ -47,18 +34,18 @@ class Learner(nn.Module):
     """
 
     sees_history: ClassVar[bool] = True
-    """Whether the network is given the last actions."""
     sees_observation: ClassVar[bool] = True
-    """Whether the network is given the observation."""
     chunk_length: int
     action_dim: int
     observation_dim: int
     observation_steps: int
     hidden_dim: int
+    chunk_dim: int  # numbers in a chunk, H d_a
+    seen_dim: int  # numbers that the network is given
     network: nn.Module
 
     def _set_widths(self, widths: Sequence[int] | None, hidden_dim: int) -> None:
-        """Make the networks, if the widths of the data are known; :meth:`sized` tells them."""
+        """Make the networks, if the widths of the data are known."""
         check_whole_numbers(hidden_dim=hidden_dim)
         self.hidden_dim = hidden_dim
         if widths is not None:
@@ -66,18 +53,13 @@ class Learner(nn.Module):
             given = dict(zip(names, widths, strict=True))
             check_whole_numbers(**given)
             self.__dict__.update(given)
+            self.chunk_dim = self.chunk_length * self.action_dim
+            observed = self.sees_observation * self.observation_steps * self.observation_dim
+            self.seen_dim = self.sees_history * (self.chunk_dim + 1) + observed
             self.build()
             self.requires_grad_(False)
 
-    def sized(self, action_dim: int, observation_dim: int, observation_steps: int) -> Self:
-        """The same with fresh networks for data of these widths, ``d_a``, ``d_o`` and ``To``."""
-        assert isinstance(self, Registered)
-        kind: Any = type(self)
-        widths = [action_dim, observation_dim, observation_steps]
-        return kind(**(self._resolved() | {"widths": widths}))
-
     def build(self) -> None:
-        """Make the networks, once the widths are known."""
         raise NotImplementedError
 
     def check_built(self) -> None:
@@ -85,31 +67,20 @@ class Learner(nn.Module):
         if not hasattr(self, "action_dim"):
             name = type(self).__name__
             raise ValueError(
-                f"{name} has no networks yet: take .sized(d_a, d_o, To), and learn(...)"
+                f"{name} has no networks yet: give widths=[d_a, d_o, To], and learn(...)"
             )
 
     def learning_loss(
         self, windows: LearningWindows, generator: torch.Generator | None = None
     ) -> Tensor:
-        """What the networks minimise on windows, a scalar."""
-        raise NotImplementedError
+        """What the networks minimise on windows; the error of their forecast by default."""
+        predicted = self.predicted(windows.history, windows.observation)
+        return windows.mean((windows.a1 - predicted).square())
 
     def calibrate(self, windows: LearningWindows) -> None:
         """Correct the source by its error on windows that were held out; nothing by default."""
 
-    @property
-    def chunk_dim(self) -> int:
-        """Numbers in a chunk, ``H d_a``."""
-        return self.chunk_length * self.action_dim
-
-    @property
-    def seen_dim(self) -> int:
-        """Numbers that the network is given."""
-        observed = self.observation_steps * self.observation_dim
-        return self.sees_history * (self.chunk_dim + 1) + self.sees_observation * observed
-
     def mlp(self, inputs: int, outputs: int) -> MLP:
-        """A network of the learner's width."""
         return MLP(inputs, outputs, num_cells=[self.hidden_dim] * 2, activation_class=nn.GELU)
 
     def seen(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
@@ -137,6 +108,10 @@ class Learner(nn.Module):
         seen = self.seen(history, observation)  # first: it tells if there is no network
         return self.network(seen)
 
+    def predicted(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
+        """The chunk that the network says, ``[*B, H, d_a]``."""
+        return self.as_chunk(self.outputs(history, observation))
+
     def as_chunk(self, out: Tensor) -> Tensor:
         """Outputs ``[*B, H d_a]`` as ``[*B, H, d_a]``."""
         return out.unflatten(-1, (self.chunk_length, self.action_dim))
@@ -145,13 +120,7 @@ class Learner(nn.Module):
 class LearnedPrior(PastPrior, Learner, abstract=True):
     """A learned source around which agents can search: warm where the network is, that is everywhere.
 
-    Args:
-        chunk_length: ``H``.
-
-    Keyword Args:
-        widths: ``d_a``, ``d_o`` and ``To``, which :meth:`sized` fills in.
-        hidden_dim: width of the network's two hidden layers.
-        sigma: see the subclass.
+    `widths` are ``d_a``, ``d_o`` and ``To``, known once there are data; `hidden_dim` is of both layers.
     """
 
     def __init__(
@@ -189,7 +158,6 @@ class ForecastPrior(LearnedPrior):
     typical_scale: Tensor
 
     def build(self) -> None:
-        """One network for mean and scale, the calibration, and the typical scale that it finds."""
         self.network = self.mlp(self.seen_dim, 2 * self.chunk_dim)
         self.register_buffer("calibration", torch.ones(self.chunk_length, self.action_dim))
         self.register_buffer("typical_scale", torch.ones(()))
@@ -206,14 +174,12 @@ class ForecastPrior(LearnedPrior):
         return mean, SCALE_FLOOR + nn.functional.softplus(raw)
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
-        """The learned mean and the calibrated scale."""
         mean, scale = self._gaussian(history, observation)
         return self._everywhere(mean, self.sigma * self._calibrated(scale))
 
     def learning_loss(
         self, windows: LearningWindows, generator: torch.Generator | None = None
     ) -> Tensor:
-        """Negative log-likelihood per coordinate, without its constant."""
         mean, scale = self._gaussian(windows.history, windows.observation)
         return windows.mean(scale.log() + 0.5 * ((windows.a1 - mean) / scale).square())
 
@@ -248,20 +214,11 @@ class A2APrior(LearnedPrior):
     sees_observation = False
 
     def build(self) -> None:
-        """The encoder of the history."""
         self.network = self.mlp(self.seen_dim, self.chunk_dim)
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
-        """The encoded history, and ``sigma`` around it, 0 by default."""
-        mean = self.as_chunk(self.outputs(history, observation))
+        mean = self.predicted(history, observation)
         return self._everywhere(mean, torch.full_like(mean[..., :1], self.sigma))
-
-    def learning_loss(
-        self, windows: LearningWindows, generator: torch.Generator | None = None
-    ) -> Tensor:
-        """Mean squared error."""
-        forecast = self.as_chunk(self.outputs(windows.history, windows.observation))
-        return windows.mean((windows.a1 - forecast).square())
 
 
 @dataclass(frozen=True)
@@ -290,12 +247,7 @@ class CVAEPrior(LearnedPrior):
     with :math:`D = P d_a` coordinates of a chunk and :math:`d_z` of ``z``; the first term is the mean over
     the coordinates inside the episode (Chen et al., 2024). The flow from it is that of every other prior;
     BRIDGER's own path adds noise between the ends and is sampled as a stochastic differential equation. The
-    source is no Gaussian and has no mean: agents search around zero.
-
-    Keyword Args:
-        latent_dim: width of ``z``.
-        beta: weight of the divergence.
-        sigma: noise of the source around the decoder's output.
+    source is no Gaussian and has no mean: agents search around zero. `latent_dim` is the width of ``z``.
     """
 
     name = "cvae"
@@ -322,12 +274,10 @@ class CVAEPrior(LearnedPrior):
         super().__init__(chunk_length, widths=widths, hidden_dim=hidden_dim, sigma=sigma)
 
     def build(self) -> None:
-        """Encoder and decoder."""
         self.encoder = self.mlp(self.seen_dim + self.chunk_dim, 2 * self.latent_dim)
         self.decoder = self.mlp(self.seen_dim + self.latent_dim, self.chunk_dim)
 
     def decode(self, seen: Tensor, z: Tensor) -> Tensor:
-        """The chunk of a latent."""
         return self.as_chunk(self.decoder(torch.cat([seen, z], -1)))
 
     mean = GaussianPrior.mean  # none: cold everywhere
@@ -340,7 +290,6 @@ class CVAEPrior(LearnedPrior):
     def learning_loss(
         self, windows: LearningWindows, generator: torch.Generator | None = None
     ) -> Tensor:
-        """Mean squared error of the reconstruction, and divergence of the code."""
         seen = self.seen(windows.history, windows.observation)
         found = self.encoder(torch.cat([seen, (windows.a1 * windows.counted).flatten(-2)], -1))
         mean, log_variance = found.chunk(2, -1)
@@ -361,18 +310,8 @@ class ForecastStart(StartPoint, Learner):
         a_{t_s} = (1 - t_s) \varepsilon + t_s f_\phi(o, h),
 
     from which the flow is integrated to ``t = 1`` (Li et al., 2026). Where the forecast stays where the last
-    chunk was (root mean square distance per coordinate below ``stall``), the robot may be stuck, and the
-    noise is multiplied by ``1 + stall_noise`` (velocity-aware noise).
-
-    Args:
-        chunk_length: ``H``.
-
-    Keyword Args:
-        start_time: :math:`t_s`.
-        stall: see above, in normalised action units.
-        stall_noise: see above.
-        widths: see :class:`LearnedPrior`.
-        hidden_dim: see :class:`LearnedPrior`.
+    chunk was (root mean square distance per coordinate below ``stall``, in normalised action units), the
+    robot may be stuck, and the noise is multiplied by ``1 + stall_noise`` (velocity-aware noise).
     """
 
     name = "step"
@@ -399,48 +338,30 @@ class ForecastStart(StartPoint, Learner):
         self._set_widths(widths, hidden_dim)
 
     def build(self) -> None:
-        """The forecaster."""
         self.network = self.mlp(self.seen_dim, self.chunk_dim)
-
-    def _forecast(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        return self.as_chunk(self.outputs(history, observation))
 
     def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """Share of the forecast."""
-        return self.time * self._forecast(history, observation)
+        return self.time * self.predicted(history, observation)
 
     def forward(self, noise: Tensor, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """Noise and forecast, mixed as on the path at ``start_time``."""
-        forecast = self._forecast(history, observation)
+        forecast = self.predicted(history, observation)
         last = history["actions"][..., -self.chunk_length :, :]
         moved = (forecast - last).square().mean((-1, -2), keepdim=True).sqrt()
         known = (history["steps"] >= self.chunk_length).unsqueeze(-1)
         noise = torch.where(known & (moved < self.stall), (1 + self.stall_noise) * noise, noise)
         return (1 - self.time) * noise + self.time * forecast
 
-    def learning_loss(
-        self, windows: LearningWindows, generator: torch.Generator | None = None
-    ) -> Tensor:
-        """Mean squared error."""
-        forecast = self._forecast(windows.history, windows.observation)
-        return windows.mean((windows.a1 - forecast).square())
-
 
 @dataclass(frozen=True)
 class LearningWindows:
-    """Windows of demonstrations, as a :class:`Learner` is given them.
+    """Windows of demonstrations, as a :class:`Learner` is given them."""
 
-    Attributes:
-        a1: targets, ``[B, P, d_a]``.
-        counted: positions inside the episode, bool ``[B, P, 1]``.
-        history: before them, ``[B]``, see :mod:`warmprior.history`.
-        observation: ``[B, To, d_o]``.
-    """
-
-    a1: Tensor
-    counted: Tensor
-    history: TensorDictBase
-    observation: Tensor
+    a1: Tensor  # targets, [B, P, d_a]
+    counted: Tensor  # positions inside the episode, bool [B, P, 1]
+    history: TensorDictBase  # before them, [B], see warmprior.history
+    observation: Tensor  # [B, To, d_o]
 
     @classmethod
     def of(cls, batch: TensorDictBase) -> LearningWindows:

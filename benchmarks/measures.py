@@ -32,19 +32,16 @@ from warmprior.diagnostics import (
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history, sees_history
 from warmprior.training.task import read_like
 
-MEASURED_WINDOWS = 512
-"""Observations of the training data on which every policy is measured."""
+MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
+HELD_OUT_SEED = 50  # of generated demonstrations that no training uses; training data have seed 0
 
-HELD_OUT_SEED = 50
-"""Of generated demonstrations that no training uses; training data have seed 0."""
-
+# Ratios to the baseline: the entry of `curvature` that each compares.
 RATIOS = {
-    "ratio": ("kappa", "whole prediction"),
-    "ratio_executed": ("kappa_executed", "executed H"),
-    "ratio_relative": ("relative_executed", "executed H, per squared mean velocity"),
-    "ratio_one_step": ("one_step_error_executed", "error of one Euler step, executed H"),
+    "ratio": "kappa",
+    "ratio_executed": "kappa_executed",
+    "ratio_relative": "relative_executed",
+    "ratio_one_step": "one_step_error_executed",
 }
-"""Ratios to the baseline: the entry of `curvature` that each compares, and what it is in words."""
 
 
 def measured(
@@ -112,8 +109,6 @@ def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
 
 def held_out(
     options: HeldOut,
-    name: str,
-    style: str,
     facts: Mapping[str, Any],
     normalizer: Normalizer,
     *,
@@ -123,13 +118,14 @@ def held_out(
 ) -> tuple[SharedObservations, str]:
     """Observations that no policy of a task was trained on, and what they are in words."""
     place: Path | str
+    name, style = facts["task"], facts["data"]
     if "file" not in facts:
         raise ValueError(f"{name} is a task of one's own: name it with --task in place of --run")
     if options.validation is not None:
         place, words = options.validation, ""
     elif facts.get("source") != "scripted":
         raise ValueError(
-            f"these policies are trained on demonstrations of {facts.get('file', name)}: add --validation "
+            f"these policies are trained on demonstrations of {facts['file']}: add --validation "
             "FILE with others (or with the same file, to measure on the training data)"
         )
     else:
@@ -169,8 +165,8 @@ def straightness(
     if not policies:
         raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
     seeds = sorted(next(iter(policies.values())))
-    measured: dict[tuple[Method, str], list[TensorDict]] = {}
-    bound: dict[tuple[Method, str], list[Tensor]] = {}
+    # By method and mean, of each seed: curvatures, and bounds of the branching cost.
+    measured: dict[tuple[Method, str], list[tuple[TensorDict, Tensor]]] = {}
     jobs = [(method, actors[s]) for method, actors in policies.items() for s in seeds]
     for method, actor in tqdm(jobs, desc="curvature", disable=None):
         device = next(actor.parameters()).device
@@ -187,19 +183,16 @@ def straightness(
                 values = curvature(actor, batch, n_steps, draws=draws, generator=generator).cpu()
             except FloatingPointError as error:
                 raise FloatingPointError(f"{method}, {mean} mean: {error}") from error
-            coupled = method.parts.coupling is not None
-            measured.setdefault((method, mean), []).append(values)
-            bound.setdefault((method, mean), []).append(bounds(actor.prior, batch, coupled))
-    first = measured[next(iter(policies)), "training"]
+            limits = bounds(actor.prior, batch, method.parts.coupling is not None)
+            measured.setdefault((method, mean), []).append((values, limits))
+    first = [values for values, _ in measured[next(iter(policies)), "training"]]
     rows = []
-    for (method, mean), per_seed in measured.items():
-        parts: list[tuple[int | None, TensorDict, TensorDict, Tensor]] = list(
-            zip(seeds, per_seed, first, bound[method, mean], strict=True)
-        )
+    for (method, mean), found in measured.items():
+        parts = [(s, *pair, base) for s, pair, base in zip(seeds, found, first, strict=True)]
         if len(seeds) > 1:
-            whole = torch.stack(bound[method, mean]).mean(0)
-            parts.append((None, average(per_seed), average(first), whole))
-        for s, values, baseline, limits in parts:
+            values, limits = zip(*found, strict=True)
+            parts.append((None, average(values), torch.stack(limits).mean(0), average(first)))
+        for s, values, limits, baseline in parts:
             rows.append(
                 {
                     "policy": str(method),
@@ -231,7 +224,7 @@ def ratios(
     found: dict[str, float] = {}
     # A field that predicts no motion has no error of one step either, and no merit in that.
     still = values["kappa_executed"].isnan() | baseline["kappa_executed"].isnan()
-    for name, (key, _) in RATIOS.items():
+    for name, key in RATIOS.items():
         generator = torch.Generator().manual_seed(seed)
         counted = values[key]
         if name == "ratio_one_step":

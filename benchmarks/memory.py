@@ -12,13 +12,13 @@ import sys
 from pathlib import Path
 
 import pandas as pd
+from options import script
 from plots import colors_of, legend_below, new_figure, save
 from report import markdown, read_rows, summary
 
-from warmprior.io.script import run_script
 
-
-def run(argv: list[str] | None) -> None:
+@script("memory.py")
+def main(argv: list[str] | None) -> None:
     """Read the runs, print a table and draw a point per task, method and NFE."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
@@ -48,11 +48,6 @@ def run(argv: list[str] | None) -> None:
     )
     table = lines.set_index("cell")[["memory_gain", "gain"]].map("{:.3f}".format)
     print(markdown(table, "cell"), f"\nPicture: {args.out}", sep="")
-
-
-def main(argv: list[str] | None = None) -> int:
-    """Run the study."""
-    return run_script(lambda: run(argv), "memory.py")
 
 
 if __name__ == "__main__":

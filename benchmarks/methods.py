@@ -46,7 +46,6 @@ class PointPrior(GaussianPrior):
         self.sigma = 0.0
 
     def distribution(self, history: Any, observation: Any = None) -> Source:
-        """The point 0."""
         loc, scale, warm = super().distribution(history, observation)
         return _Point(loc, torch.zeros_like(scale), warm)
 
@@ -69,9 +68,7 @@ class Composition:
     color: str
     prior: type[Prior] = GaussianPrior
     start: type | None = None  # where samplers start, if not at the source
-    coupling: Callable[..., Coupling] | None = (
-        None  # pairs sources and targets, if not as they come
-    )
+    coupling: Callable[..., Coupling] | None = None  # of sources and targets, if not as they come
     teacher: str | None = None  # the method whose policy the coupling needs
     sees_history: bool = False  # the network sees the last actions
     regresses: bool = False  # the field is trained at t = 0 alone, for one network evaluation
@@ -92,7 +89,7 @@ METHODS: dict[str, Composition] = {
     "leap": Composition("Learnable prior", "#b8a9c9", LeapPrior),
 }
 
-OWN_COLORS = (
+OWN_COLORS = [
     "#1b9e77",
     "#e7298a",
     "#66a61e",
@@ -101,7 +98,7 @@ OWN_COLORS = (
     "#377eb8",
     "#984ea3",
     "#17becf",
-)
+]
 
 
 def composition(name: str) -> Composition:
@@ -150,16 +147,12 @@ class Method:
         try:
             parts = composition(typed)
         except ValueError as error:
-            raise ValueError(
-                f"--prior {self.text}: {error}; methods: {', '.join(METHODS)}"
-            ) from error
+            names = ", ".join(METHODS)
+            raise ValueError(f"--prior {self.text}: {error}; methods: {names}") from error
         object.__setattr__(self, "parts", parts)
-        known = {
-            k: v
-            for p in (parts.prior, parts.start, parts.coupling)
-            if p
-            for k, v in _parameters(p).items()
-        }
+        known: dict[str, Any] = {}
+        for part in filter(None, (parts.prior, parts.start, parts.coupling)):
+            known |= _parameters(part)
         known |= {"sigma": parts.prior.default_sigma} if "sigma" in known else {}
         given = options_of(self.text)
         if self.sigma_asked is not None and "sigma" in known:
@@ -220,17 +213,14 @@ class Method:
 
     @cached_property
     def sigma(self) -> float:
-        """Residual noise of the source."""
         return float(self.prior().sigma)
 
     @property
     def takes_sigma(self) -> bool:
-        """Whether --sigma has an effect."""
         return "sigma" in _parameters(self.parts.prior)
 
     @cached_property
     def prediction_length(self) -> int:
-        """`P`."""
         return self.prior().prediction_length
 
     @property
@@ -246,9 +236,8 @@ class Method:
     @property
     def needs_vector(self) -> bool:
         """Whether it reads the observation as one tensor, so that it cannot go with images."""
-        seen = any(
-            getattr(p, "sees_observation", False) for p in (self.parts.prior, self.parts.start)
-        )
+        parts = self.parts.prior, self.parts.start
+        seen = any(getattr(part, "sees_observation", False) for part in parts)
         return seen or (self.pairs_in_batch and self.arguments.get("observation_weight", 1.0) > 0)
 
     @cached_property
@@ -284,26 +273,25 @@ class Method:
 
     def prior(self, widths: Sequence[int] = ()) -> Prior:
         """A fresh source; one that learns is given the widths d_a, d_o and To."""
-        return self._part(self.parts.prior, widths)
+        return self._make(self.parts.prior, widths)
 
     def start(self, widths: Sequence[int] = ()) -> Any:
         """A fresh start point, or None."""
-        return None if self.parts.start is None else self._part(self.parts.start, widths)
+        return None if self.parts.start is None else self._make(self.parts.start, widths)
 
     def coupling(self, teacher: WarmPriorActor | None = None) -> Coupling | None:
         """How sources and targets are paired, if not as they come."""
         make = self.parts.coupling
-        if make is None:
-            return None
-        options = {k: v for k, v in self.arguments.items() if k in _parameters(make)}
-        return make(**options) if teacher is None else make(teacher, **options)
+        return None if make is None else make(*([teacher] if teacher else []), **self._own(make))
 
-    def _part(self, kind: Any, widths: Sequence[int]) -> Any:
-        taken = _parameters(kind)
-        options = {k: v for k, v in self.arguments.items() if k in taken}
-        if widths and issubclass(kind, Learner):
-            options["widths"] = list(widths)
-        return kind(self.chunk_length, **options)
+    def _own(self, make: Any) -> dict[str, Any]:
+        """Those of its options that a part takes."""
+        return {k: v for k, v in self.arguments.items() if k in _parameters(make)}
+
+    def _make(self, kind: Any, widths: Sequence[int]) -> Any:
+        learns = widths and issubclass(kind, Learner)
+        more = {"widths": list(widths)} if learns else {}
+        return kind(self.chunk_length, **self._own(kind), **more)
 
 
 def _parameters(part: Any) -> dict[str, Any]:

@@ -13,12 +13,9 @@ the way of that package: Python looks for modules beside a script first.)
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 
-from options import PRESETS, Options, adapted, with_parts
+from options import PRESETS, Options, adapted, script, with_parts
 from robomimic import run
-
-from warmprior.io.script import run_script
 
 # The paper's number of demonstrations, and a training for so few.
 FEW = {
@@ -44,10 +41,9 @@ def adapt(preset: Options, asked: Options) -> Options:
     return with_parts(chosen, data={"task": tasks, "data": ("source",)})
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark."""
-    script = lambda: run(argv, FEW, "mimicgen", __doc__ or "", adapt=adapt)  # noqa: E731
-    return run_script(script, "mimicgen_tasks.py", together=True)
+@script("mimicgen_tasks.py", together=True)
+def main(argv: list[str] | None) -> None:
+    run(argv, FEW, "mimicgen", __doc__, adapt=adapt)
 
 
 if __name__ == "__main__":

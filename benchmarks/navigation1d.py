@@ -11,24 +11,19 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
 import torch
 from common import Policy, policies_of, replace_rows, trained_actors
 from measures import straightness
-from options import Evaluation, Options, Sources, check_single, parse, started
+from options import Evaluation, Options, Sources, check_single, parse, script, started
 from plots import plot_flow_paths, plot_navigation
 from report import labelled, navigation_table, write_report
 from robomimic import beside, train_all
 
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
-from warmprior.io.script import run_script
-from warmprior.training import (
-    NetworkOptions,
-    TrainingConfig,
-    judge_navigation,
-    play_navigation,
-)
+from warmprior.training import NetworkOptions, TrainingConfig, judge_navigation, play_navigation
 
 STEPS = 32  # half of an episode: the longest chunk
 
@@ -46,40 +41,29 @@ class NavigationOptions(Options):
         return f"h{'-'.join(map(str, self.sources.chunk))}"
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work."""
         super().check()
         check_single(self, "chunk")
         if self.sources.chunk[0] > STEPS:
             raise ValueError(f"--chunk must be at most {STEPS}, got {self.sources.chunk[0]}")
 
 
-SHARED = {
-    "sources": Sources(("gaussian", "regression", "history", "past", "preview"), (4,), (0.1, 0.5)),
-    "evaluation": Evaluation(episodes=256, nfe=(9, 1)),
-}
+def preset(width: int, **training: Any) -> NavigationOptions:
+    """All sources, with a network of a width and its recipe."""
+    return NavigationOptions(
+        network=NetworkOptions(hidden_dim=width, observation_steps=1),
+        training=TrainingConfig(
+            batch_size=256, checkpoints=1, cold_probability=WITHHELD, **training
+        ),
+        sources=Sources(("gaussian", "regression", "history", "past", "preview"), (4,), (0.1, 0.5)),
+        evaluation=Evaluation(episodes=256, nfe=(9, 1)),
+    )
+
+
 NAVIGATION_PRESETS = {
     # All policies in a few minutes on two cores.
-    "quick": NavigationOptions(
-        network=NetworkOptions(hidden_dim=128, observation_steps=1),
-        training=TrainingConfig(
-            iterations=3_000,
-            batch_size=256,
-            learning_rate=2e-3,
-            warmup_ratio=0.0,
-            checkpoints=1,
-            save_every=3_000,
-            cold_probability=WITHHELD,
-        ),
-        **SHARED,  # type: ignore[arg-type]
-    ),
+    "quick": preset(128, iterations=3_000, learning_rate=2e-3, warmup_ratio=0.0, save_every=3_000),
     # The paper's network and iterations: hours on a CPU.
-    "wide": NavigationOptions(
-        network=NetworkOptions(hidden_dim=1024, observation_steps=1),
-        training=TrainingConfig(
-            iterations=50_000, batch_size=256, checkpoints=1, cold_probability=WITHHELD
-        ),
-        **SHARED,  # type: ignore[arg-type]
-    ),
+    "wide": preset(1024, iterations=50_000),
 }
 
 
@@ -120,7 +104,8 @@ def draw(
     plot_flow_paths(paths, out / "flow_paths.png", title=title)
 
 
-def run(argv: Sequence[str] | None) -> None:
+@script("navigation1d.py", together=True)
+def main(argv: list[str] | None) -> None:
     """Train the policies, roll them out and measure their flows."""
     options = parse(
         NAVIGATION_PRESETS, argv, "navigation1d", __doc__, adapt=lambda base, asked: base
@@ -159,11 +144,6 @@ def run(argv: Sequence[str] | None) -> None:
         # Before the pictures, which are the lesser loss: the trainings took the time.
         write_report(out, table, table, pd.concat([rows, curvatures]))
         draw(options, policies, rows, observations)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the toy."""
-    return run_script(lambda: run(argv), "navigation1d.py", together=True)
 
 
 if __name__ == "__main__":

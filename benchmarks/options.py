@@ -24,6 +24,7 @@ from warmprior.data.opening import check_place, name_of_place, resolved_place
 from warmprior.io.distributed import check_batch, check_device, from_leader, launched, rank
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
 from warmprior.io.machine import facts_of_machine
+from warmprior.io.script import run_script
 from warmprior.modules import imagenet_weights
 from warmprior.modules.grid import check_grid
 from warmprior.training import DataOptions, NetworkOptions, TrainingConfig
@@ -34,19 +35,16 @@ Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
 
 @dataclass(frozen=True)
 class Sources:
-    """The methods to compare.
+    """The methods to compare."""
 
-    Attributes:
-        prior: by name (gaussian, past, preview, forecast, history, regression, ot, reflow, step, cvae, a2a,
-            leap) or, your own, as package.module:Class, which Python has to find (PYTHONPATH); options
-            follow as in preview,correlation=0.5. Gains are over the first.
-        chunk: chunk lengths H.
-        sigma: residual noise of the warm priors, one policy each (default: past 0.5, preview 1.0).
-    """
-
+    # By name (gaussian, past, preview, forecast, history, regression, ot, reflow, step, cvae, a2a, leap) or,
+    # your own, as package.module:Class, which Python has to find (PYTHONPATH); options follow as in
+    # preview,correlation=0.5. Gains are over the first.
     prior: tuple[str, ...] = ("gaussian", "past", "preview")
-    chunk: tuple[int, ...] = (8,)
-    sigma: tuple[float, ...] = ()
+    chunk: tuple[int, ...] = (8,)  # chunk lengths H
+    sigma: tuple[
+        float, ...
+    ] = ()  # noise of the warm priors, a policy each (default: past 0.5, preview 1.0)
 
     def __post_init__(self) -> None:
         check_counts(self, "chunk")
@@ -67,24 +65,16 @@ class Sources:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How policies are played.
+    """How policies are played."""
 
-    Attributes:
-        seeds: number of training seeds, from --seed on.
-        episodes: evaluation episodes per cell.
-        nfe: network evaluations per chunk.
-        top_k: best checkpoints averaged per seed.
-        play_on: go on after success, up to the time limit; solved is solved at any step.
-        grid: of the integration: uniform, or dense-jump (one last step from half way; dense-jump:0.7 from
-            there).
-    """
-
-    seeds: int = 1
-    episodes: int = 25
-    nfe: tuple[int, ...] = (9, 3, 1)
-    top_k: int = 1
-    play_on: bool = False
-    grid: str = "uniform"
+    seeds: int = 1  # number of training seeds, from --seed on
+    episodes: int = 25  # evaluation episodes per cell
+    nfe: tuple[int, ...] = (9, 3, 1)  # network evaluations per chunk
+    top_k: int = 1  # best checkpoints averaged per seed
+    play_on: bool = False  # go on after success, up to the time limit; solved is solved at any step
+    grid: str = (
+        "uniform"  # uniform, or dense-jump (one last step from half way; dense-jump:0.7 from there)
+    )
 
     def __post_init__(self) -> None:
         check_counts(self, "seeds", "episodes", "nfe", "top_k")
@@ -94,35 +84,28 @@ class Evaluation:
 
     @property
     def environment(self) -> dict[str, Any]:
-        """Options of the environment."""
         return {"terminate_on_success": False} if self.play_on else {}
 
 
 @dataclass(frozen=True)
 class Run:
-    """Where and how to compute.
+    """Where and how to compute."""
 
-    Attributes:
-        preset: the budget that the other options start from.
-        out: output folder (default: a numbered one under runs/).
-        resume: continue in --out, or in the latest default folder, with the options stored there.
-        envs: worker processes that train and play, with the same results (default: one per core).
-        device: of networks and data, such as cuda; one per process under torchrun.
-        compile: torch.compile the network in training.
-        logger: TorchRL logger of the training curves.
-        engine: who computes, with the same results: processes of this machine, or Ray, on one or many.
-        ray_address: HOST:PORT of a Ray cluster's head (default: $RAY_ADDRESS, or this machine alone).
-    """
-
-    preset: str = "quick"
-    out: Path | None = None
-    resume: bool = False
-    envs: int | None = None
-    device: str = "cpu"
-    compile: bool = False
-    logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"
-    engine: Literal["local", "ray"] = "local"
-    ray_address: str | None = None
+    preset: str = "quick"  # the budget that the other options start from
+    out: Path | None = None  # output folder (default: a numbered one under runs/)
+    resume: bool = (
+        False  # continue in --out, or in the latest default folder, with the options stored there
+    )
+    envs: int | None = None  # worker processes, with the same results (default: one per core)
+    device: str = "cpu"  # of networks and data, such as cuda; one per process under torchrun
+    compile: bool = False  # torch.compile the network in training
+    logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"  # of the training curves
+    engine: Literal["local", "ray"] = (
+        "local"  # who computes: processes of this machine, or a Ray cluster
+    )
+    ray_address: str | None = (
+        None  # HOST:PORT of its head (default: $RAY_ADDRESS, or this machine alone)
+    )
 
     def __post_init__(self) -> None:
         check_counts(self, "envs")
@@ -138,26 +121,20 @@ class Run:
 
     @property
     def folder(self) -> Path:
-        """The output folder, once :func:`parse` has chosen it."""
         assert self.out is not None
         return self.out
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Observations to measure on, which no policy was trained on.
+    """Observations to measure on, which no policy was trained on."""
 
-    Attributes:
-        validation: held-out demonstrations, as --dataset names them (default: newly generated ones).
-        observations: how many; the paper's curvature has 2000.
-        steps: Euler steps of a curvature.
-        draws: source samples per observation.
-    """
-
-    validation: Path | None = None
-    observations: int = 500
-    steps: int = 100
-    draws: int = 1
+    validation: Path | None = (
+        None  # demonstrations, as --dataset names them (default: newly generated ones)
+    )
+    observations: int = 500  # how many; the paper's curvature has 2000
+    steps: int = 100  # Euler steps of a curvature
+    draws: int = 1  # source samples per observation
 
     def __post_init__(self) -> None:
         check_counts(self, "observations", "draws", "steps")
@@ -190,15 +167,12 @@ class Options:
 
     @property
     def seeds(self) -> range:
-        """The training seeds."""
         return range(self.training.seed, self.training.seed + self.evaluation.seeds)
 
     def trainings(self) -> list[TrainingConfig]:
-        """The recipes to compare, without seeds."""
         return [self.training]
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work."""
         self.data.check()
         self.network.check(self.data)
         check_batch(self.training.batch_size)
@@ -224,13 +198,11 @@ class Options:
 
 @dataclass(frozen=True)
 class PolicyOptions:
-    """Which policies to take.
+    """Which policies to take."""
 
-    Attributes:
-        run: a finished run of robomimic.py, whose policies to take instead of training them.
-    """
-
-    run: Path | None = None
+    run: Path | None = (
+        None  # a finished run of robomimic.py, whose policies to take instead of training them
+    )
 
 
 @dataclass(frozen=True)
@@ -240,7 +212,6 @@ class MeasuredOptions(Options):
     held_out: Annotated[HeldOut, Flat] = field(default_factory=HeldOut)
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work."""
         super().check()
         check_single(self, "task", "data", "chunk")
 
@@ -470,6 +441,13 @@ def from_record[T](kind: type[T], tree: Mapping[str, Any]) -> T:
             value = Path(value)
         values[name] = value
     return kind(**values)
+
+
+def script(
+    name: str, together: bool = False
+) -> Callable[[Callable[..., object]], Callable[..., int]]:
+    """Make a function of a command line the `main` of a script, with errors as lines and an exit code."""
+    return lambda work: lambda argv=None: run_script(lambda: work(argv), name, together=together)
 
 
 @contextmanager

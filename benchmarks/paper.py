@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["PAPER_CURVATURE", "PAPER_SIGMA", "PAPER_SUCCESS", "paper_success"]
-
 STATE, IMAGE = "state", "image"
 
 
@@ -51,24 +49,12 @@ PAPER_SIGMA: dict[str, dict[float, float]] = {
 def paper_success(
     task: str, data: str, prior: str, nfe: int, chunk: int = 8, seen: str = STATE
 ) -> float | None:
-    """The paper's success rate in percent, or ``None`` where it reports none.
+    """The paper's success rate in percent at `H = chunk`, or None where it reports none.
 
-    Args:
-        task: its short name.
-        data: the style of the demonstrations.
-        prior: by name.
-        nfe: network evaluations per chunk.
-        chunk: ``H``.
-        seen: what policies see, ``"state"`` or ``"image"``.
-
-    See Also:
-        :func:`~warmprior.experiments.success_table`: puts it beside what was measured.
-
-    Examples:
-        >>> paper_success("square", "mh", "preview", 1)
-        77.8
-        >>> paper_success("square", "mh", "preview", 1, seen="image")
-        75.1
+    >>> paper_success("square", "mh", "preview", 1)
+    77.8
+    >>> paper_success("square", "mh", "preview", 1, seen="image")
+    75.1
     """
     if chunk != 8:
         return None

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from methods import Method, color
-from pandas import DataFrame
+from pandas import DataFrame, Series
 from paper import PAPER_SIGMA
 from report import agents, labelled, last_checkpoints, pooled, prior_label, seed_success, text_of
 from torch import Tensor
@@ -111,7 +111,8 @@ def bars(
     rows: DataFrame,
     group: str,
     found: Callable[[DataFrame], SeedSummary],
-    text: Callable[[float], str],
+    form: str,
+    scale: float = 1.0,
 ) -> None:
     """Bars of means, with one standard deviation over seeds and the mean in writing."""
 
@@ -120,7 +121,7 @@ def bars(
         std = None if math.isnan(point.std) else point.std
         axis.bar(x, point.mean, 0.85, yerr=std, capsize=3, **look)
         axis.annotate(
-            text(point.mean),
+            f"{scale * point.mean:{form}}",
             (x, point.mean + (std or 0.0)),  # above the error bar
             (0, 4),
             textcoords="offset points",
@@ -130,10 +131,6 @@ def bars(
         )
 
     side_by_side(axis, rows, group, draw)
-
-
-def percent(share: float) -> str:
-    return f"{100 * share:.0f}"
 
 
 def coloured(rows: DataFrame, chunks: bool = True) -> DataFrame:
@@ -180,7 +177,7 @@ def plot_bars(rows: DataFrame, path: str | Path, top_k: int, title: str) -> None
     rows = coloured(rows, chunks=False)
     rows["group"] = "H = " + rows["chunk"].astype(str)
     figure, (axis,) = new_figure(1.8 + 1.5 * rows["chunk"].nunique(), 3.6)
-    bars(axis, rows, "group", lambda cell: seed_success(cell, top_k), percent)
+    bars(axis, rows, "group", lambda cell: seed_success(cell, top_k), ".0f", 100)
     axis.set_ylim(0, 1.08)
     axis.set_ylabel(f"success rate (NFE {rows['nfe'].iloc[0]})")
     legend_below(figure)
@@ -203,10 +200,9 @@ def plot_learning_curves(
             left.plot(*zip(*curve, strict=True), color=colors.get(method), lw=1.0, label=name)
     for method, group in rows.groupby("method", sort=False):
         points = {n: seed_success(cell, 1) for n, cell in group.groupby("checkpoint")}
-        mean = [point.mean for point in points.values()]
-        std = np.nan_to_num([point.std for point in points.values()])
+        mean, std = np.array([(point.mean, point.std) for point in points.values()]).T
         look = {"marker": "o", "ms": 4, "lw": 1.0, "capsize": 2, "color": colors[method]}
-        right.errorbar(list(points), mean, yerr=std, **look)
+        right.errorbar(list(points), mean, yerr=np.nan_to_num(std), **look)
     left.set_yscale("log")
     left.set_ylabel("flow-matching loss (own source)")
     right.set_xlim(left.get_xlim())
@@ -329,24 +325,15 @@ def plot_sigma(
 
 
 def success_above(
-    rows: DataFrame,
-    x: str,
-    at: Callable[[float], float],
-    width: float,
-    top_k: int,
-    below: Callable[[Any, list[float], list[DataFrame], Any], None],
-) -> tuple[Figure, list[Any]]:
+    rows: DataFrame, x: str, scale: Callable[[float], float], width: float, top_k: int, below: Any
+) -> tuple[Figure, list[Any], list[Any]]:
     """A column per NFE, in the order of the rows: success against `x` above, and what `below` draws."""
     nfes = rows["nfe"].unique()
     figure, axes = new_figure(width * len(nfes), 6.0, 2, len(nfes))
     for nfe, upper, lower in zip(nfes, axes, axes[len(nfes) :], strict=False):
         for method, group in rows[rows["nfe"] == nfe].groupby("method", sort=False):
-            found = dict(list(group.groupby(x)))
-            places, cells, own = (
-                [at(value) for value in found],
-                [*found.values()],
-                group["color"].iloc[0],
-            )
+            found, own = dict(list(group.groupby(x))), group["color"].iloc[0]
+            places, cells = [scale(value) for value in found], list(found.values())
             points = [seed_success(cell, top_k) for cell in cells]
             band(upper, places, points, color=own, label=method)
             below(lower, places, cells, own)
@@ -357,7 +344,7 @@ def success_above(
             axis.grid(alpha=0.25)
     axes[0].set_ylabel("success rate")
     axes[0].legend(frameon=False, fontsize=8)
-    return figure, axes
+    return figure, axes, axes[len(nfes) :]
 
 
 def plot_chunk_lengths(rows: DataFrame, path: str | Path, top_k: int, title: str) -> None:
@@ -372,16 +359,15 @@ def plot_chunk_lengths(rows: DataFrame, path: str | Path, top_k: int, title: str
     def below(axis: Any, x: list[float], cells: list[DataFrame], own: Any) -> None:
         for name, style in (("boundary_jump", "-"), ("inner_jump", ":")):
             jumps = [last_checkpoints(cell)[name].astype(float).mean() for cell in cells]
-            known = [(place, jump) for place, jump in zip(x, jumps, strict=True) if jump == jump]
-            look = {"color": own, "ls": style, "marker": "o", "ms": 3, "lw": 1.2}
-            axis.plot([place for place, _ in known], [jump for _, jump in known], **look)
+            known = Series(jumps, x).dropna()
+            axis.plot(known.index, known, color=own, ls=style, marker="o", ms=3, lw=1.2)
 
-    figure, axes = success_above(rows, "chunk", chunks.index, 3.4, top_k, below)
+    figure, axes, lower = success_above(rows, "chunk", chunks.index, 3.4, top_k, below)
     for axis in axes:
         axis.set_xticks(range(len(chunks)), [str(chunk) for chunk in chunks])
-    for axis in axes[len(axes) // 2 :]:
+    for axis in lower:
         axis.set_xlabel("chunk length H")
-    axes[len(axes) // 2].set_ylabel("jump at boundaries (dotted: inside)")
+    lower[0].set_ylabel("jump at boundaries (dotted: inside)")
     save(figure, path, title)
 
 
@@ -393,14 +379,14 @@ def plot_budget(rows: DataFrame, path: str | Path, top_k: int, title: str) -> No
     def below(axis: Any, x: list[float], cells: list[DataFrame], own: Any) -> None:
         band(axis, x, [summarize_seeds(list(cell["action_error"])) for cell in cells], color=own)
 
-    figure, axes = success_above(rows, "iterations", float, 3.6, top_k, below)
+    figure, axes, lower = success_above(rows, "iterations", float, 3.6, top_k, below)
     for axis in axes:
         axis.set_xscale("log")
         axis.set_xticks(budgets, [f"{budget:,}" for budget in budgets], fontsize=8)
         axis.minorticks_off()
-    for axis in axes[len(axes) // 2 :]:
+    for axis in lower:
         axis.set_xlabel("iterations")
-    axes[len(axes) // 2].set_ylabel("squared error of executed actions, held out", fontsize=9)
+    lower[0].set_ylabel("squared error of executed actions, held out", fontsize=9)
     save(figure, path, title)
 
 
@@ -419,8 +405,8 @@ def plot_delays(rows: DataFrame, path: str | Path, top_k: int, title: str) -> No
     for panel, above, below in zip(panels, axes, axes[len(panels) :], strict=False):
         members = rows[rows["panel"] == panel]
         known = last_checkpoints(members[members["boundary_jump"].notna()])
-        bars(above, members, "group", lambda cell: seed_success(cell, top_k), percent)
-        bars(below, known, "group", jump, "{:.2f}".format)
+        bars(above, members, "group", lambda cell: seed_success(cell, top_k), ".0f", 100)
+        bars(below, known, "group", jump, ".2f")
         above.set_title(panel, fontsize=10)
         above.set_ylim(0, 1.08)
         below.margins(y=0.1)  # for the numbers above the bars

@@ -11,7 +11,7 @@ A frozen policy per source and seed comes from --run (a finished run of robomimi
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, make_dataclass, replace
 from functools import partial
 from itertools import product
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
 import tyro
-from common import Rows, finished_policies, policies_of, slug, trained_actors
+from common import Rows, facts_of, finished_policies, policies_of, slug, trained_actors
 from methods import Method
 from navigation1d import NAVIGATION_PRESETS
 from options import (
@@ -31,6 +31,7 @@ from options import (
     Sources,
     check_single,
     parse,
+    script,
     started,
     study,
     with_parts,
@@ -47,7 +48,6 @@ from warmprior.envs import GoalNavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.files import read_json
-from warmprior.io.script import run_script
 from warmprior.modules.registry import options_of
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining, has_anchor
 from warmprior.training import DataOptions, parallel_env
@@ -57,7 +57,8 @@ from warmprior.transforms import EncodeObservation
 
 TOY = "navigation"
 
-# The recipe of an agent, without what the options that all experiments share say.
+# The recipe of an agent, without what the options that all experiments share say. On a command line they have
+# a prefix: gradient steps, say, are those of behaviour cloning in all experiments.
 HINTS = get_type_hints(PriorSpaceConfig)
 SHARED = ("algorithm", "seed", "nfe", "evaluation_episodes")
 AgentOptions: Any = make_dataclass(
@@ -74,23 +75,15 @@ AgentOptions: Any = make_dataclass(
 
 @dataclass(frozen=True)
 class GroupOptions:
-    """The agents to compare.
+    """The agents to compare."""
 
-    Attributes:
-        algorithm: of their learning.
-        horizon: time limit in control steps (default: the task's).
-        base_delta: half the agent's box around zero, where --rl.delta is not given (default: 1.5).
-        num_envs: parallel environments of an agent.
-        threads: of an agent's training; more than one only wait for each other in small networks.
-        collectors: Ray actors that collect, with num-envs environments each, with --engine ray (default:
-            none, the training itself collects).
-    """
-
-    algorithm: tuple[Literal["dsrl-na", "dsrl-sac"], ...] = ("dsrl-na",)
-    horizon: int | None = None
-    base_delta: float | None = None
-    num_envs: int = 4
-    threads: int | None = None
+    algorithm: tuple[Literal["dsrl-na", "dsrl-sac"], ...] = ("dsrl-na",)  # of their learning
+    horizon: int | None = None  # time limit in control steps (default: the task's)
+    base_delta: float | None = None  # half the box around zero, without --rl.delta (default: 1.5)
+    num_envs: int = 4  # parallel environments of an agent
+    threads: int | None = None  # of a training; in small networks more than one wait for each other
+    # Ray actors that collect, with num-envs environments each, with --engine ray (default: none, the training
+    # itself collects).
     collectors: int | None = None
 
     def __post_init__(self) -> None:
@@ -103,16 +96,9 @@ class GroupOptions:
 
 @dataclass(frozen=True)
 class AgentsOptions(Options):
-    """A comparison of agents; the frozen policies are those of a comparison of sources.
-
-    Attributes:
-        policies: of a finished run, instead of those of the options.
-        rl: what all agents share.
-        agents: what is compared.
-    """
+    """A comparison of agents; the frozen policies are those of a comparison of sources."""
 
     policies: Annotated[PolicyOptions, Flat] = field(default_factory=PolicyOptions)
-    # With their prefix: gradient steps, say, are those of behaviour cloning in all experiments.
     rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
     agents: Annotated[GroupOptions, Flat] = field(default_factory=GroupOptions)
 
@@ -127,7 +113,6 @@ class AgentsOptions(Options):
         return TOY if self.is_toy else super().name
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work."""
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "data", "chunk", "sigma", "nfe")
@@ -265,34 +250,28 @@ def frozen_policies(
     if run is None:
         policies = policies_of(options, methods)
         train_all(options, policies)
-        task = policies[0].task()
-        return {"task": task.name, "data": task.style, **task.facts}, trained_actors(policies)
-    name, style, facts, actors = finished_policies(run, options.run.device)
-    if options.data.task not in ((), (name,)):
-        raise ValueError(f"--run {run} is of {name}, not of {options.data.task[0]}")
+        return facts_of(policies[0].task()), trained_actors(policies)
+    task, actors = finished_policies(run, options.run.device)
+    if options.data.task not in ((), (task["task"],)):
+        raise ValueError(f"--run {run} is of {task['task']}, not of {options.data.task[0]}")
     found = {}
     for text in options.sources.prior:
         # What is not typed is as the method of the run has it.
+        sigma_typed = "sigma" in options_of(text)
         asked = [
             own
             for own in actors
-            if own
-            == Method(text, own.chunk_length, None if "sigma" in options_of(text) else own.sigma)
+            if own == Method(text, own.chunk_length, None if sigma_typed else own.sigma)
         ]
         if not asked:
-            raise ValueError(
-                f"--run {run} has policies of {'; '.join(map(str, actors))}, none of {text}"
-            )
+            known = "; ".join(map(str, actors))
+            raise ValueError(f"--run {run} has policies of {known}, none of {text}")
         group = actors[asked[0]]
-        if missing := set(options.seeds) - group.keys():
-            print(
-                f"--run has {len(group)} seeds of {text}: agents {sorted(missing)} share policies"
-            )
-        known = list(group.values())
-        found[asked[0]] = {
-            seed: group.get(seed, known[seed % len(known)]) for seed in options.seeds
-        }
-    return {"task": name, "data": style, **facts}, found
+        if missing := sorted(set(options.seeds) - group.keys()):
+            print(f"--run has {len(group)} seeds of {text}: agents {missing} share policies")
+        several = list(group.values())
+        found[asked[0]] = {s: group.get(s, several[s % len(several)]) for s in options.seeds}
+    return task, found
 
 
 def environment(options: AgentsOptions, actor: WarmPriorActor) -> Callable[[int], EnvBase]:
@@ -353,7 +332,8 @@ def learn(
     return training
 
 
-def run(argv: Sequence[str] | None) -> None:
+@script("prior_space_rl.py")
+def main(argv: list[str] | None) -> None:
     """Train an agent per algorithm, source and seed, and compare their success."""
     options = parse(AGENT_PRESETS, argv, "rl", __doc__, adapt=adapt)
     with started(options, "rl") as out:
@@ -396,11 +376,6 @@ def run(argv: Sequence[str] | None) -> None:
         plot_success(ends, out / "success.png", title=title, group="algorithm")
         table = agent_table(found)
         write_report(out, table, table, found, failures)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the comparison."""
-    return run_script(lambda: run(argv), "prior_space_rl.py")
 
 
 if __name__ == "__main__":

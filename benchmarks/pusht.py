@@ -11,16 +11,14 @@ that the block covers; it is solved above 0.95.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 
-from options import PRESETS, with_parts
+from options import PRESETS, script, with_parts
 from robomimic import run
 from torchrl.envs import EnvBase
 
 from warmprior.data import lerobot_steps
 from warmprior.envs import gym_env
 from warmprior.io.extras import require
-from warmprior.io.script import run_script
 from warmprior.training import DataOptions, Task
 
 OBSERVATION = [
@@ -47,12 +45,7 @@ def task(options: DataOptions) -> Task:
     if options.demonstrations:
         steps = steps[steps["episode"] < options.demonstrations[0]]
     return Task.of(
-        "pusht",
-        steps,
-        make_env,
-        success="is_success",
-        measures={"coverage": "max"},
-        film_rate=10,
+        "pusht", steps, make_env, success="is_success", measures={"coverage": "max"}, film_rate=10
     )
 
 
@@ -60,11 +53,10 @@ def task(options: DataOptions) -> Task:
 HUMAN = {"data": {"task": ("pusht:task",), "demonstrations": ()}}
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark."""
+@script("pusht.py", together=True)
+def main(argv: list[str] | None) -> None:
     presets = {name: with_parts(preset, **HUMAN) for name, preset in PRESETS.items()}
-    script = lambda: run(argv, presets, "pusht", __doc__ or "")  # noqa: E731
-    return run_script(script, "pusht.py", together=True)
+    run(argv, presets, "pusht", __doc__)
 
 
 if __name__ == "__main__":

@@ -13,18 +13,16 @@ of robomimic.py with the same options are used, not trained again.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Literal
 
 from common import Cell, policies_of
 from methods import Method
-from options import PRESETS, Options, check_single, parse, started, study
+from options import PRESETS, Options, check_single, parse, script, started, study
 from plots import plot_delays
 from report import delay_table, write_report
 from robomimic import compare
 
-from warmprior.io.script import run_script
 from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.transforms.delay import check_delay
@@ -34,22 +32,20 @@ STUDY = "real-time-chunking"
 
 @dataclass(frozen=True)
 class DelayOptions(Options):
-    """A comparison under injected latency.
+    """A comparison under injected latency."""
 
-    Attributes:
-        delay: control steps until chunks take effect, an evaluation each.
-        execute: actions executed per decision, the same at all delays (default: as many as the largest
-            delay leaves of H).
-        guidance: without any, and by Real-Time Chunking.
-        toy: the navigation toy: beside the tasks, alone, or not at all.
-        rtc: of the guidance.
-    """
-
-    delay: tuple[int, ...] = (0, 2, 4)
-    execute: int | None = None
-    guidance: tuple[Literal["none", "rtc"], ...] = ("none", "rtc")
-    toy: Literal["beside", "alone", "no"] = "beside"
-    rtc: RealTimeChunking = field(default_factory=RealTimeChunking)
+    delay: tuple[int, ...] = (0, 2, 4)  # control steps until chunks take effect, an evaluation each
+    execute: int | None = (
+        None  # actions per decision (default: as many as the largest delay leaves of H)
+    )
+    guidance: tuple[Literal["none", "rtc"], ...] = (
+        "none",
+        "rtc",
+    )  # without any, and by Real-Time Chunking
+    toy: Literal["beside", "alone", "no"] = (
+        "beside"  # the navigation toy: beside the tasks, or alone
+    )
+    rtc: RealTimeChunking = field(default_factory=RealTimeChunking)  # of the guidance
 
     @property
     def name(self) -> str:
@@ -59,7 +55,6 @@ class DelayOptions(Options):
         return super().name + ("-navigation" if self.toy == "beside" else "")
 
     def check(self) -> None:
-        """Refuse what cannot work, before any work."""
         super().check()
         check_single(self, "chunk")
         for name in ("delay", "guidance"):
@@ -104,7 +99,8 @@ class DelayOptions(Options):
         ]
 
 
-def run(argv: Sequence[str] | None) -> None:
+@script("real_time_chunking.py")
+def main(argv: list[str] | None) -> None:
     """Train the policies, and play them at every delay."""
     # Nine network evaluations per chunk: guidance corrects step by step.
     presets = {
@@ -132,11 +128,6 @@ def run(argv: Sequence[str] | None) -> None:
         )
         table = delay_table(rows, top_k, guidance)
         write_report(out, table, table, rows, failures)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the comparison."""
-    return run_script(lambda: run(argv), "real_time_chunking.py")
 
 
 if __name__ == "__main__":

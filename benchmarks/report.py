@@ -347,18 +347,10 @@ def terminal_table(summary: DataFrame, width: int = 120) -> str:
         line for _, part in rows.groupby("place", sort=False) for line in part["line"].unique()
     ]
     frame = frame.loc[lines].fillna("-")
-    names = [textwrap.shorten(name, width * 2 // 3, placeholder=" ...") for name in frame.index]
-    left, wide = max(map(len, names)), 2 + max(frame.map(len).to_numpy().max(), 5)
-    step = max(1, (width - left) // wide)  # NFEs that fit side by side
-    lines = [headline(summary, width)]
-    for start in range(0, len(frame.columns), step):
-        part = frame.iloc[:, start : start + step]
-        lines.append("")
-        for name, texts in (("", part.columns), *zip(names, part.to_numpy(), strict=True)):
-            lines.append(f"{name:{left}}" + "".join(f"{text:>{wide}}" for text in texts))
+    frame.index = [textwrap.shorten(n, width * 2 // 3, placeholder=" ...") for n in frame.index]
     base = rows["method"].iloc[0]
     legend = f"Success (%), gain over {base}. >: the best. *: above both deviations over seeds."
-    return "\n".join([*lines, "", legend])
+    return "\n".join([headline(summary, width), "", frame.to_string(line_width=width), "", legend])
 
 
 def success_report(summary: DataFrame, notes: Sequence[str] = (), source: str | None = None) -> str:
@@ -548,9 +540,12 @@ def curvature_table(rows: DataFrame, facts: Mapping[str, Any], source: str) -> s
         value = known.get(rows["prior"].iloc[0])
         return f"{value:.3f}" if same and len(known) > 1 and value is not None else None
 
-    words = {"ratio": "whole prediction", "ratio_executed": "executed H"}
-    words["ratio_relative"] = "executed H, per squared mean velocity"
-    words["ratio_one_step"] = "error of one Euler step, executed H"
+    words = {
+        "ratio": "whole prediction",
+        "ratio_executed": "executed H",
+        "ratio_relative": "executed H, per squared mean velocity",
+        "ratio_one_step": "error of one Euler step, executed H",
+    }
     means = [mean for mean in ("training", "deployed") if mean in set(chosen["mean"])]
     kinds = {f"{words[name]}, {mean} mean": ratio(name, mean) for name in words for mean in means}
     seeds = rows["seed"].nunique()

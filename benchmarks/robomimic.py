@@ -19,21 +19,37 @@ from itertools import product
 from typing import Any
 
 import pandas as pd
-from common import Cell, Policy, Rows, batches, measure, play, policies_of, row, train
+from common import (
+    Cell,
+    Policy,
+    Rows,
+    batches,
+    facts_of,
+    measure,
+    play,
+    policies_folder,
+    policies_of,
+    row,
+    train,
+)
 from jobs import Jobs
 from methods import Method
-from options import PRESETS, Options, parse, started
+from options import PRESETS, Evaluation, Options, parse, script, started
 from pictures import draw
 from report import success_report, summary, terminal_table, write_report
 
 from warmprior.io.distributed import go_on_alone, rank, world_size
 from warmprior.io.files import write_atomic
-from warmprior.io.script import PartialFailure, run_script
+from warmprior.io.script import PartialFailure
 from warmprior.training import Episode
 
 
 def run(
-    argv: Sequence[str] | None, presets: Mapping[str, Options], study: str, doc: str, **parsing: Any
+    argv: list[str] | None,
+    presets: Mapping[str, Options],
+    study: str,
+    doc: str | None,
+    **parsing: Any,
 ) -> None:
     """The whole benchmark: options, data, training and playing, table and pictures."""
     options = parse(presets, argv, study, doc, **parsing)
@@ -80,11 +96,8 @@ def compare(
         )
     describe(options, policies)
     failures = train_together(policies)
-    folders = [options.run.folder, *{policy.directory for policy in policies}]
-    with Jobs(options.run, folders) as jobs:
+    with Jobs(options.run, [options.run.folder, policies_folder(options.run)]) as jobs:
         for policy in sorted(policies, key=lambda policy: policy.training.seed):
-            if str(policy) in failures:
-                continue
             cells = [
                 replace(condition, checkpoint=checkpoint, nfe=nfe)
                 for checkpoint, nfe, condition in product(
@@ -94,40 +107,8 @@ def compare(
                 )
             ]
             missing = [cell for cell in cells if not rows.find(policy.facts | cell.facts())]
-            collected = Collected(policy, missing, options, rows, jobs.say)
-            trained = jobs.submit(
-                f"train {policy}",
-                train,
-                policy,
-                group=str(policy),
-                training=True,
-                status=policy.status,
-                then=collected.trained,
-            )
-            if any(cell.checkpoint == policy.training.iterations for cell in missing):
-                name = f"measure {policy}"
-                nfes = evaluation.nfe
-                jobs.submit(
-                    name,
-                    measure,
-                    policy,
-                    nfes,
-                    after=trained,
-                    group=str(policy),
-                    then=collected.measured,
-                )
-            for cell, seeds in product(missing, batches(evaluation)):
-                jobs.submit(
-                    f"play {policy}, {cell}",
-                    play,
-                    policy,
-                    cell,
-                    evaluation,
-                    seeds,
-                    after=trained,
-                    group=str(policy),
-                    then=partial(collected.played, cell),
-                )
+            if str(policy) not in failures:
+                submit(jobs, policy, missing, evaluation, rows)
         failures |= jobs.wait()
     reasons = [f"{policy}: {reason}" for policy, reason in failures.items()]
     if not rows.rows:
@@ -139,8 +120,7 @@ def train_all(options: Options, policies: Sequence[Policy]) -> None:
     """Train what is missing, and play nothing."""
     describe(options, policies)
     failures = train_together(policies)
-    folders = [options.run.folder, *{policy.directory for policy in policies}]
-    with Jobs(options.run, folders) as jobs:
+    with Jobs(options.run, [options.run.folder, policies_folder(options.run)]) as jobs:
         for policy in policies:
             jobs.submit(str(policy), train, policy, training=True, status=policy.status)
         if failures := failures or jobs.wait():
@@ -150,8 +130,7 @@ def train_all(options: Options, policies: Sequence[Policy]) -> None:
 def describe(options: Options, policies: Sequence[Policy]) -> None:
     """Write `tasks.json`: what the demonstrations are."""
     tasks = {policy.place: policy.task() for policy in policies}.values()
-    facts = [{"task": task.name, "data": task.style, **task.facts} for task in tasks]
-    text = json.dumps(facts, indent=1) + "\n"
+    text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
     if not rank():
         write_atomic(options.run.folder / "tasks.json", lambda path: path.write_text(text))
 
@@ -169,48 +148,42 @@ def train_together(policies: Sequence[Policy]) -> dict[str, str]:
     return failures
 
 
-class Collected:
-    """What the jobs of one policy have given so far: a cell whose episodes are complete becomes a row."""
+def submit(
+    jobs: Jobs, policy: Policy, cells: Sequence[Cell], evaluation: Evaluation, rows: Rows
+) -> None:
+    """Train, measure and play a policy; a cell whose episodes are complete becomes a row."""
+    last, was_there = policy.training.iterations, policy.is_trained
+    episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
+    measures: dict[
+        int, dict[str, Any]
+    ] = {}  # by NFE, of the last checkpoint; others are only played
 
-    def __init__(
-        self,
-        policy: Policy,
-        cells: Sequence[Cell],
-        options: Options,
-        rows: Rows,
-        say: Callable[[str], None],
-    ) -> None:
-        self.policy, self.rows, self.say = policy, rows, say
-        self.wanted = options.evaluation.episodes
-        self.episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
-        self.measures: dict[int, dict[str, Any]] | None = None
-        self.found = policy.is_trained
+    def trained(nothing: None) -> None:
+        jobs.say(f"{'found' if was_there else 'trained'} {policy}, {last} iterations")
 
-    def trained(self, nothing: None) -> None:
-        """The policy is there."""
-        done = "found" if self.found else "trained"
-        self.say(f"{done} {self.policy}, {self.policy.training.iterations} iterations")
+    def measured(found: dict[int, dict[str, Any]]) -> None:
+        measures.update(found)
+        for cell in [cell for cell in cells if cell.checkpoint == last]:
+            played(cell, [])
 
-    def measured(self, measures: dict[int, dict[str, Any]]) -> None:
-        """The last checkpoint is measured; the others are only played."""
-        self.measures = measures
-        self._complete()
+    def played(cell: Cell, found: list[Episode]) -> None:
+        mine = episodes[cell]
+        mine += found
+        at_end = cell.checkpoint == last
+        if len(mine) == evaluation.episodes and (measures or not at_end):
+            made = row(policy, cell, mine, measures.get(cell.nfe, {}) if at_end else {})
+            rows.add(made)
+            jobs.say(f"played {policy}, {cell}: {made['successes']} of {len(mine)} solved")
 
-    def played(self, cell: Cell, episodes: list[Episode]) -> None:
-        """Some episodes of a cell are played."""
-        self.episodes[cell] += episodes
-        self._complete()
-
-    def _complete(self) -> None:
-        for cell, episodes in list(self.episodes.items()):
-            last = cell.checkpoint == self.policy.training.iterations
-            if len(episodes) == self.wanted and not (last and self.measures is None):
-                del self.episodes[cell]
-                measures = (self.measures or {}).get(cell.nfe, {}) if last else {}
-                made = row(self.policy, cell, episodes, measures)
-                self.rows.add(made)
-                solved = f"{made['successes']} of {made['episodes']} solved"
-                self.say(f"played {self.policy}, {cell}: {solved}")
+    group = str(policy)
+    training = {"training": True, "status": policy.status, "then": trained, "group": group}
+    first = jobs.submit(f"train {policy}", train, policy, **training)
+    after = {"after": first, "group": group}
+    if any(cell.checkpoint == last for cell in cells):
+        jobs.submit(f"measure {policy}", measure, policy, evaluation.nfe, then=measured, **after)
+    for cell, seeds in product(cells, batches(evaluation)):
+        more = {"then": partial(played, cell), **after}
+        jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, seeds, **more)
 
 
 def beside(options: Options, usual: Options) -> list[str]:
@@ -238,11 +211,9 @@ def smaller(options: Options, paper: Options) -> list[str]:
     return ["Network and training budget are smaller than the paper's."]
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the benchmark."""
-    return run_script(
-        lambda: run(argv, PRESETS, "robomimic", __doc__ or ""), "robomimic.py", together=True
-    )
+@script("robomimic.py", together=True)
+def main(argv: list[str] | None) -> None:
+    run(argv, PRESETS, "robomimic", __doc__)
 
 
 if __name__ == "__main__":

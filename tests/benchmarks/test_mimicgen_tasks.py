@@ -83,7 +83,7 @@ def test_without_the_package_nothing_is_begun(tmp_path, capsys, no_work, monkeyp
 def test_robosuites_stack_from_scripted_demonstrations(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
     argv = command_line(
-        demonstrations=3,
+        demonstrations=1,
         iterations=20,
         episodes=1,
         envs=1,
@@ -96,7 +96,7 @@ def test_robosuites_stack_from_scripted_demonstrations(tmp_path, capsys, monkeyp
     (row,) = stored(tmp_path / "out")
     assert (row["task"], row["data"], row["iterations"]) == ("stack", "ph", 20)
     (task,) = described(tmp_path / "out", "tasks")
-    assert task["demonstrations"] == 3 and task["source"] == "scripted"
+    assert task["demonstrations"] == 1 and task["source"] == "scripted"
     assert "paper (official data)" not in capsys.readouterr().out  # it has another Stack
 
 
@@ -108,7 +108,7 @@ def test_a_file_in_mimicgens_environment(tmp_path):
     write_robomimic_file(
         file, lengths=(30, 20, 9), task="stack_d0", env_args=env_args_14("stack_d0")
     )
-    argv = options(file, out, task=None, prior="past", envs=2, demonstrations=2)
+    argv = options(file, out, task=None, prior="past", envs=1, demonstrations=2)
     root = SCRIPT.parents[1]
     path = os.pathsep.join(map(str, (root, tmp_path / "site")))
     done = subprocess.run(

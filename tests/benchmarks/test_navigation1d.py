@@ -15,14 +15,14 @@ import navigation1d
 @pytest.mark.filterwarnings("ignore:.*curvature is NaN")
 def test_run_writes_rows_report_and_pictures(tmp_path, capsys):
     out = tmp_path / "runs" / "out"
-    argv = command_line(iterations=5, episodes=4, chunk=32, envs=1, logger="none", out=out)
+    few = {"prior": ["gaussian", "regression", "past"], "iterations": 5, "episodes": 4, "chunk": 32}
+    argv = command_line(**few, envs=1, logger="none", out=out)
     assert navigation1d.main(argv) == 0
     played, curved = stored(out), stored(out, "curvature")
     policies = {(row["prior"], row["sigma"]) for row in played}
-    warm = {(name, sigma) for name in ("past", "preview") for sigma in (0.1, 0.5)}
-    assert len(policies) == 7 and warm < policies
+    assert policies == {("gaussian", 1.0), ("regression", 0.0), ("past", 0.1), ("past", 0.5)}
     # All but the regression at 9 and at 1 network evaluation.
-    assert len(played) == 7 * 2 - 1
+    assert len(played) == 4 * 2 - 1
     fields = "task prior sigma chunk seed nfe switch_rate collision_rate route_entropy distance"
     for row in played:
         assert set(fields.split()) <= set(row)
@@ -30,9 +30,9 @@ def test_run_writes_rows_report_and_pictures(tmp_path, capsys):
     assert {row["seed"] for row in curved} == {0}
     assert {(row["prior"], row["sigma"]) for row in curved} == policies - {("regression", 0.0)}
     deployed = {row["prior"] for row in curved if row["mean"] == "deployed"}
-    assert deployed == {"history", "past", "preview"}
+    assert deployed == {"past"}
     report = (out / "report.md").read_text()
-    assert report in capsys.readouterr().out and report.count("NFE") >= 7 * 2 - 1
+    assert report in capsys.readouterr().out and report.count("NFE") >= 4 * 2 - 1
     for picture in ("navigation1d.png", "flow_paths.png"):
         assert is_png(out / picture)
 
@@ -49,25 +49,15 @@ def test_run_writes_rows_report_and_pictures(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--seeds 0", "--seeds must be"),
         ("--chunk 64", "--chunk must be at most 32, got 64"),
         ("--chunk 4 8", "this study has one --chunk"),
-        ("--iterations 0", "iterations must be at least 1"),
         ("--cold-probability 2", "cold_probability"),
-        ("--prior past,sigma=-1", "sigma"),
     ],
 )
 def test_bad_options_stop_before_any_work(tmp_path, capsys, no_work, words, message):
     out = tmp_path / "runs" / "out"
     assert message in refused(navigation1d.main, [*words.split(), "--out", out], capsys)
     assert not out.exists() and not (tmp_path / "runs" / "policies").exists()
-
-
-def test_a_training_that_diverges_ends_without_a_traceback(tmp_path, capsys):
-    out = tmp_path / "runs" / "out"
-    argv = command_line(learning_rate=1e30, iterations=40, save_every=10, prior="past", out=out)
-    said = refused(navigation1d.main, argv, capsys)
-    assert "nan" in said.lower() and not (out / "report.md").exists()
 
 
 def test_a_picture_that_cannot_be_drawn_costs_no_table(tmp_path, capsys, monkeypatch):

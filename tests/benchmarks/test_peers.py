@@ -61,11 +61,7 @@ def test_the_script(tmp_path, capsys, monkeypatch):
     said = capsys.readouterr().out
     assert "lerobot_diffusion: skipped, needs diffusers" in said
     rows = json.loads((tmp_path / "peers.json").read_text())["rows"]
-    assert [row["policy"].split(":")[0] for row in rows] == [
-        "warmprior",
-        "warmprior",
-        "torchrl",
-    ]
+    assert [row["policy"].split(":")[0] for row in rows] == ["warmprior", "warmprior", "torchrl"]
     assert all(row["samples_per_second"] > 0 for row in rows)
     assert (tmp_path / "peers.png").stat().st_size > 10_000
 

@@ -185,34 +185,24 @@ def test_resume_goes_on_where_it_stopped(tmp_path, monkeypatch):
     ("words", "message"),
     [
         ("--preset unit --rl.delta 0", "delta must be a finite number > 0, got 0.0"),
-        ("--preset unit --rl.delta -1", "delta must be a finite number > 0"),
         (
             "--preset unit --rl.warmup-steps 20000",
             "warmup_steps (20000) exceed environment_steps (12000)",
         ),
         ("--preset unit --rl.updates 0", "updates must be"),
         ("--preset unit --rl.gamma 2", "gamma must lie in (0, 1], got 2.0"),
-        ("--preset unit --episodes 0", "--episodes must be a whole number of at least 1"),
-        ("--preset unit --seeds 0", "--seeds must be a whole number of at least 1"),
-        ("--preset unit --envs 0", "--envs must be a whole number of at least 1"),
         ("--preset unit --num-envs 0", "--num-envs must be a whole number of at least 1"),
-        ("--preset unit --threads 0", "--threads must be a whole number of at least 1"),
-        ("--preset unit --iterations 0", "iterations"),
         ("--preset unit --nfe 1 2", "this study has one --nfe, got 1 2"),
         ("--preset unit --chunk 4 8", "this study has one --chunk, got 4 8"),
-        ("--preset unit --device nowhere", "--device nowhere does not work here"),
         ("--preset quick --task navigation", "navigation and --preset unit belong together"),
         ("--preset unit --task can", "navigation and --preset unit belong together"),
         ("--preset unit --prior regression", "--prior regression is no flow"),
-        ("--preset unit --prior nobodys", "unknown prior 'nobodys'"),
         ("--preset unit --prior past,cold_probability=0.3", "cold_probability is unknown to it"),
         ("--horizon 0", "--horizon must be a whole number of at least 1"),
         ("--preset unit --collectors 2", "--collectors belongs to --engine ray"),
         ("--preset quick --run {tmp}", "it has no results.jsonl; name a run of robomimic.py"),
-        ("--preset quick --dataset {tmp}/none.hdf5", "no such file"),
         ("--preset quick --task tool_hang", "there is no scripted expert for tool_hang"),
         ("--preset paper", "has hyper-parameters per task: add the --task"),
-        ("--preset nobodys", "--preset must be one of quick, unit, paper"),
     ],
 )
 def test_bad_options_stop_before_any_work(tmp_path, capsys, no_work, words, message):
@@ -226,8 +216,6 @@ def test_bad_options_stop_before_any_work(tmp_path, capsys, no_work, words, mess
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--algorithm dsrl-xy", "invalid choice 'dsrl-xy'"),
-        ("--rl.detla 0.5", "--rl.detla"),
         ("--delta 0.5", "--delta"),  # the agents' own options have their prefix
         ("--rl.evaluation-episodes 3", "--rl.evaluation-episodes"),  # that is --episodes
         ("--rl.seed 3", "--rl.seed"),

@@ -69,6 +69,8 @@ def test_rows_are_read_as_they_were_written(tmp_path):
     path.write_text('{"outcomes": "0011", "kappa": null}\n{"outcomes": "01"}\n')
     rows = report.read_rows(path)
     assert list(rows["outcomes"]) == ["0011", "01"] and rows["kappa"].isna().all()
+    path.write_text("".join(json.dumps(one) + "\n" for one in compared().to_dict("records")))
+    assert table(report.read_rows(path)) == table(compared())
 
 
 @pytest.mark.parametrize("line", ['{"seed": 1', "[1]", "", "3"])
@@ -389,9 +391,3 @@ def test_lines_without_any_cell_are_left_out():
     rows = pd.DataFrame({"a": ["0", "1"], "b": ["x", "y"], "kappa": [None, 1.0]})
     frame = report.cells(rows, "a", "b", {"": report.mean_cell("kappa", ".1f")})
     assert report.markdown(frame, "h") == "| h | x | y |\n|---|---|---|\n| 1 | - | 1.0 |\n"
-
-
-def test_rows_of_json_make_the_same_table(tmp_path):
-    path = tmp_path / "results.jsonl"
-    path.write_text("".join(json.dumps(one) + "\n" for one in compared().to_dict("records")))
-    assert table(report.read_rows(path)) == table(compared())

@@ -49,7 +49,9 @@ def test_more_cores_never_take_longer_when_episodes_are_equal():
     assert all(a >= b for a, b in itertools.pairwise(times))
 
 
-def test_the_script(tmp_path, capsys):
+@pytest.mark.slow
+def test_the_script(tmp_path, monkeypatch):
+    monkeypatch.setattr(scaling, "TRAINED", 10)
     torch.manual_seed(0)
     prior = PastPrior(8)
     environment = environment_description(task_env_args("lift"), "ph", 2)

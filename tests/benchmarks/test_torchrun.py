@@ -91,6 +91,7 @@ def test_a_killed_process_ends_all_and_one_process_resumes(tmp_path):
     assert load_state(states[0])[1]["iteration"] == 2000 and "WP-Past" in said
 
 
+@pytest.mark.slow
 def test_scripts_of_one_process_refuse_several(tmp_path):
     code, _, err = run("prior_space_rl.py", ["--preset", "unit", "--out", tmp_path / "out"])
     assert code != 0 and "trains with one process; start it without torchrun" in err

@@ -112,7 +112,7 @@ def test_bad_input_is_named():
     data = windows(torch.zeros(5, H, 2), torch.zeros(5, H, 2))
     with pytest.raises(ValueError, match="no window"):
         branching_bound(data[:0], GaussianPrior(H))
-    decoded = CVAEPrior(H).sized(2, 4, 1)
+    decoded = CVAEPrior(H, widths=[2, 4, 1])
     with pytest.raises(ValueError, match="of a Gaussian source"):
         branching_bound(data, decoded)
     with pytest.raises(ValueError, match="no path of 2 steps"):

@@ -73,7 +73,7 @@ def test_cold_sources_are_standard_normal():
 
 
 def test_what_is_no_gaussian_has_none():
-    prior = CVAEPrior(H).sized(D_A, 1, 1)
+    prior = CVAEPrior(H, widths=[D_A, 1, 1])
     assert math.isnan(source_coverage(actor(prior), windows(prior, 1.0)))
     with pytest.raises(ValueError, match=r"level must be in \(0, 1\)"):
         source_coverage(actor(PastPrior(H)), windows(PastPrior(H), 1.0), level=1.0)

@@ -69,14 +69,14 @@ def test_without_a_mean_there_is_no_error():
 
 def test_the_mean_is_that_of_the_source():
     """Of a learned one wherever it is, and none where it is no Gaussian."""
-    prior = ForecastPrior(H).sized(D_A, 1, 1)
+    prior = ForecastPrior(H, widths=[D_A, 1, 1])
     batch = windows(prior, warm=False)
     mean = prior.distribution(batch["history"], batch["observation"]).loc
     counted = ~batch["action_is_pad"].unsqueeze(-1)
     squared = ((mean - batch["vla_action", "chunk"]).square() * counted).sum() / counted.sum() / D_A
     found = mean_error(WarmPriorActor(Still(), prior), batch, nfe=1)
     assert found.target == pytest.approx(float(squared.sqrt()))
-    other = CVAEPrior(H).sized(D_A, 1, 1)
+    other = CVAEPrior(H, widths=[D_A, 1, 1])
     found = mean_error(WarmPriorActor(Still(), other), windows(other), nfe=1)
     assert math.isnan(found.target)
 

@@ -175,7 +175,7 @@ def test_a_network_that_sees_images_and_the_mean():
 
 def test_a_learned_source_is_asked_with_the_shifted_history():
     torch.manual_seed(0)
-    prior = ForecastPrior(H).sized(D_A, 4, 1)
+    prior = ForecastPrior(H, widths=[D_A, 4, 1])
     data = windows(prior)
     field = policy(lambda t, a, o: torch.zeros_like(a), prior)  # executes its source
     found = memory_gain(field, data, nfes=(1,), shift=0.05)[1]
@@ -186,7 +186,7 @@ def test_a_learned_source_is_asked_with_the_shifted_history():
 def test_it_measures_where_samplers_start():
     """STEP starts at a later time, from its forecast of what is remembered and less noise."""
     torch.manual_seed(0)
-    prior, start = GaussianPrior(H), ForecastStart(H, start_time=0.5).sized(D_A, 4, 1)
+    prior, start = GaussianPrior(H), ForecastStart(H, start_time=0.5, widths=[D_A, 4, 1])
     data = windows(prior)
     stays = policy(lambda t, a, o: torch.zeros_like(a), start=start)
     found = memory_gain(stays, data, nfes=(1,), shift=0.05)[1]

@@ -77,7 +77,7 @@ CASES = {
     "learned": lambda: (
         CONFIG,
         dataset(),
-        actor_for(ForecastPrior(4).sized(2, 3, 2), mlp()),
+        actor_for(ForecastPrior(4, widths=[2, 3, 2]), mlp()),
     ),
     "images": lambda: (CONFIG, *with_images()),
 }
