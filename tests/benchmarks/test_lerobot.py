@@ -79,7 +79,7 @@ def test_what_does_not_fit_is_refused(folder, bare, tmp_path, capsys, no_work):
         (
             undescribed,
             {"task": "can"},
-            r"info\.json: the observations are .* those of PickPlaceCan",
+            r"the observations are .* those of PickPlaceCan",
         ),
         (
             undescribed,

@@ -157,7 +157,7 @@ def test_part_of_a_file(converted, tmp_path):
     assert not equal(part.data, whole.data)
     train = LeRobotExperienceReplay(folder, filter_key="train")
     assert train.episode_lengths.tolist() == [6]
-    with pytest.raises(DatasetError, match=r"warmprior\.json: unknown filter key 'test'.*train"):
+    with pytest.raises(DatasetError, match=r"unknown filter key 'test'.*train"):
         LeRobotExperienceReplay(folder, filter_key="test")
 
 
@@ -260,6 +260,7 @@ def test_command(converted, tmp_path, capsys):
 
 
 @pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
+@pytest.mark.slow
 @apart
 def test_images_are_compared_with_the_simulators(tmp_path_factory):
     from warmprior.data import generate_demonstrations, render_demonstrations
