@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import struct
 
 import h5py
 import numpy as np
@@ -147,6 +148,26 @@ def test_fault_is_refused_by_name(square_file, tmp_path, change, said):
         read_index(path)
     for word in ["square.hdf5", *said]:
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("damage", ["place", "overlap", "behind the end"])
+def test_an_index_of_chunks_that_is_damaged(square_file, damage):
+    """HDF5 reads a chunk that it does not find as zeros, and two that share a place as the same."""
+    path, _ = square_file
+    with h5py.File(path, "a") as file:
+        _replace(file, "data/demo_1/actions", shape=(5, 7), dtype="f8", chunks=(2, 7))
+        file["data/demo_1/actions"][...] = 1
+        first, second = (
+            file["data/demo_1/actions"].id.get_chunk_info(i).byte_offset for i in (0, 1)
+        )
+    # An entry of the index: where in the array, and where in the file.
+    before, size = struct.pack("<4Q", 2, 0, 0, second), path.stat().st_size
+    after = {"place": (8, second), "overlap": (2, first), "behind the end": (2, size - 8)}[damage]
+    content = path.read_bytes()
+    assert content.count(before) == 1
+    path.write_bytes(content.replace(before, struct.pack("<4Q", after[0], 0, 0, after[1])))
+    with pytest.raises(DatasetError, match=r"square\.hdf5: data/demo_1/actions: its .* again"):
+        RobomimicExperienceReplay(path)
 
 
 def test_soft_links_inside_the_file_are_followed(square_file):
