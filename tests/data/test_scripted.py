@@ -201,6 +201,17 @@ def generated(monkeypatch, path, run_episode, **options):
     return kept
 
 
+def test_a_file_is_replaced_only_when_asked(tmp_path, monkeypatch):
+    def run_episode(loop, task, style, seed):
+        return fake_episode(seed, success=True)
+
+    path = tmp_path / "mine.hdf5"
+    path.write_bytes(b"mine")
+    with pytest.raises(FileExistsError, match=r"mine\.hdf5 exists: .*--overwrite"):
+        generated(monkeypatch, path, run_episode, n=2)
+    assert len(generated(monkeypatch, path, run_episode, n=2, overwrite=True)) == 2
+
+
 @pytest.mark.parametrize("workers", [1, 2, 7])
 def test_operators_contribute_equally(workers, tmp_path, monkeypatch):
     def run_episode(loop, task, style, seed):
