@@ -208,8 +208,9 @@ def test_a_file_is_replaced_only_when_asked(tmp_path, monkeypatch):
     path = tmp_path / "mine.hdf5"
     path.write_bytes(b"mine")
     with pytest.raises(FileExistsError, match=r"mine\.hdf5 exists: .*--overwrite"):
-        generated(monkeypatch, path, run_episode, n=2)
-    assert len(generated(monkeypatch, path, run_episode, n=2, overwrite=True)) == 2
+        generated(monkeypatch, path, run_episode, style="mh", n=6)
+    kept = generated(monkeypatch, path, run_episode, style="mh", n=6, overwrite=True)
+    assert len(kept) == 6
 
 
 @pytest.mark.parametrize("workers", [1, 2, 7])
