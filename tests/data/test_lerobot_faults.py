@@ -86,11 +86,9 @@ META = {
         ["2.1", "convert_dataset_v21_to_v30"],
     ),
     "no JSON": (cut("meta/info.json"), ["LeRobot cannot read", "again"]),
-    "no features": (info(lambda i: i.pop("features")), ["LeRobot cannot read", "features"]),
     "no tasks": (without("meta/tasks.parquet"), ["no meta/tasks.parquet", "finalize()"]),
     "no episodes": (without(EPISODES), ["no meta/episodes/*/*.parquet", "finalize()"]),
     "cut-off episodes": (cut(EPISODES), ["LeRobot cannot read", "again"]),
-    "none recorded": (info(lambda i: i.update(total_episodes=0)), ["no episodes: record some"]),
     "other fps": (info(lambda i: i.update(fps=30)), ["fps is 30", "Lift", "20 Hz", "resample"]),
     "no action": (
         info(lambda i: i["features"].update({"act": i["features"].pop("action")})),
@@ -100,10 +98,6 @@ META = {
     "joints": (
         feature("action", names={"motors": [f"joint_{i}" for i in range(7)]}),
         ["actions of Lift are robot0_x, robot0_y", "named joint_0, joint_1", "to null"],
-    ),
-    "named numbers": (
-        feature("action", names={f"joint_{i}": i for i in range(7)}),
-        ["named joint_0, joint_1"],
     ),
     "other state": (
         feature("observation.state", shape=[8]),

@@ -213,7 +213,7 @@ def test_a_file_is_replaced_only_when_asked(tmp_path, monkeypatch):
     assert len(kept) == 6
 
 
-@pytest.mark.parametrize("workers", [1, 2, 7])
+@pytest.mark.parametrize("workers", [1, 7])
 def test_operators_contribute_equally(workers, tmp_path, monkeypatch):
     def run_episode(loop, task, style, seed):
         time.sleep(0.01 * (seed % 3))  # they end in another order than they began
@@ -306,7 +306,10 @@ generate.generate_demonstrations("lift", n=4, path=sys.argv[1], workers=2, progr
 """
 
 
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+SLOWLY = [pytest.param(s, marks=pytest.mark.slow) for s in (signal.SIGTERM, signal.SIGINT)]
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, *SLOWLY])
 def test_workers_end_with_whoever_generates(sent, tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-c", GENERATING, str(tmp_path / "out.hdf5")],
