@@ -237,4 +237,7 @@ def test_demonstrations(tmp_path, capsys):
     path = tmp_path / "lift.hdf5"
     assert main(["demonstrations", "lift", "--n", "1", "--out", str(path)]) == 0
     assert capsys.readouterr().out.strip().endswith("lift.hdf5") and path.is_file()
+    before = path.read_bytes()
+    assert main(["demonstrations", "lift", "--n", "1", "--out", str(path)]) == 2
+    assert f"{path} exists" in capsys.readouterr().err and path.read_bytes() == before
     assert RobosuiteEnv("lift").task.name == "lift"

@@ -182,7 +182,8 @@ def demonstrations(args: argparse.Namespace) -> None:
     """Generate scripted demonstrations."""
     from warmprior.data import generate_demonstrations
 
-    print(generate_demonstrations(args.task, args.data, args.n, path=args.out))
+    options = {"path": args.out, "overwrite": args.overwrite}
+    print(generate_demonstrations(args.task, args.data, args.n, **options))
 
 
 def render(args: argparse.Namespace) -> None:
@@ -251,6 +252,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--data", default="ph", choices=("ph", "mh"), help="one or six operators (%(default)s)")
     add("--n", type=int, default=200, help="how many (%(default)s)")
     add("--out", type=Path, help="HDF5 file (default: in the cache)")
+    add("--overwrite", action="store_true", help="replace the file if it is there")
 
     add = command(render)
     add("file", type=Path, help="robomimic HDF5 file with states")

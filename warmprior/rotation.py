@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from warmprior.io.extras import require
+
 __all__ = [
     "HAND_TO_SITE",
     "matrix_to_rotation_6d",
@@ -71,6 +73,7 @@ def rotvec_to_matrix(rotvec: Tensor) -> Tensor:
 
     Raises:
         ValueError: if the last dimension is not 3.
+        ImportError: if scipy is not installed.
 
     Examples:
         >>> rotvec_to_matrix(torch.zeros(3))
@@ -79,15 +82,7 @@ def rotvec_to_matrix(rotvec: Tensor) -> Tensor:
                 [0., 0., 1.]])
     """
     _check_width(rotvec, 3, "a rotation vector")
-    x, y, z = rotvec.unbind(-1)
-    zero = torch.zeros_like(x)
-    skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), -1).unflatten(-1, (3, 3))
-    angle = rotvec.norm(dim=-1)[..., None, None]
-    # sinc keeps Rodrigues' two coefficients exact as the angle goes to zero.
-    first = torch.sinc(angle / math.pi)
-    second = 0.5 * torch.sinc(angle / (2 * math.pi)) ** 2
-    identity = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
-    return identity + first * skew + second * (skew @ skew)
+    return _by_scipy("from_rotvec", rotvec, "as_matrix", (3,))
 
 
 def matrix_to_rotvec(matrix: Tensor) -> Tensor:
@@ -109,37 +104,22 @@ def matrix_to_rotvec(matrix: Tensor) -> Tensor:
     """
     if matrix.shape[-2:] != (3, 3):
         raise ValueError(f"a rotation matrix needs shape [..., 3, 3], got {matrix.shape}")
-    m = matrix
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    xy, xz, yz = (
-        m[..., 0, 1] + m[..., 1, 0],
-        m[..., 0, 2] + m[..., 2, 0],
-        m[..., 1, 2] + m[..., 2, 1],
-    )
-    wx, wy, wz = (
-        m[..., 2, 1] - m[..., 1, 2],
-        m[..., 0, 2] - m[..., 2, 0],
-        m[..., 1, 0] - m[..., 0, 1],
-    )
-    # 4 q q^T from the matrix: each row is the quaternion times one of its entries. The row of the
-    # largest entry is the one that loses no digits, near half turns included.
-    outer = torch.stack(
-        (
-            torch.stack((1 + xx - yy - zz, xy, xz, wx), -1),
-            torch.stack((xy, 1 - xx + yy - zz, yz, wy), -1),
-            torch.stack((xz, yz, 1 - xx - yy + zz, wz), -1),
-            torch.stack((wx, wy, wz, 1 + xx + yy + zz), -1),
-        ),
-        -2,
-    )
-    best = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    row = outer.gather(-2, best[..., None, None].expand(*best.shape, 1, 4)).squeeze(-2)
-    quaternion = normalize(row, dim=-1)
-    quaternion = torch.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
-    axis, w = quaternion[..., :3], quaternion[..., 3:]
-    sine = axis.norm(dim=-1, keepdim=True)
-    tiny = torch.finfo(matrix.dtype).tiny
-    return axis * torch.where(sine > tiny, 2 * torch.atan2(sine, w) / sine.clamp_min(tiny), 2.0)
+    return _by_scipy("from_matrix", matrix, "as_rotvec", (3, 3))
+
+
+def _by_scipy(read: str, value: Tensor, write: str, form: tuple[int, ...]) -> Tensor:
+    """What scipy's ``Rotation`` makes of one form of rotations, without gradients.
+
+    Args:
+        read: the class method that takes the form.
+        value: ``[..., *form]``.
+        write: the method that gives the other.
+        form: the shape of one rotation.
+    """
+    rotations = require("scipy.spatial.transform", "sim").Rotation
+    flat = value.detach().reshape(-1, *form).cpu().double().numpy()
+    found = torch.from_numpy(getattr(getattr(rotations, read)(flat), write)()).to(value)
+    return found.reshape(*value.shape[: value.ndim - len(form)], *found.shape[1:])
 
 
 def matrix_to_rotation_6d(matrix: Tensor) -> Tensor:

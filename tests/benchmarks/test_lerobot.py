@@ -66,13 +66,19 @@ def test_results_are_those_of_the_file(dataset, folder, tmp_path, monkeypatch):
 
 def test_what_does_not_fit_is_refused(folder, bare, tmp_path, capsys, no_work):
     whole, undescribed = f"lerobot:{folder}", f"lerobot:{bare}"
-    columns = "'action' has 7 columns, but TwoArmTransport takes 14"
-    seen = r"info\.json: the observations are .* those of PickPlaceCan"
     for place, extra, said in (
         (whole, {"task": "can"}, "was recorded in Lift, not in PickPlaceCan"),
         (undescribed, {"task": None}, "does not say which environment"),
-        (undescribed, {"task": "can"}, seen),
-        (undescribed, {"task": "transport"}, columns),
+        (
+            undescribed,
+            {"task": "can"},
+            r"the observations are .* those of PickPlaceCan",
+        ),
+        (
+            undescribed,
+            {"task": "transport"},
+            "'action' has 7 columns, but TwoArmTransport takes 14",
+        ),
         (f"lerobot:{tmp_path}/absent", {}, "no such folder"),
         (str(folder), {}, f"no such file; for a LeRobotDataset write lerobot:{folder}"),
     ):

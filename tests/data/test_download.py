@@ -126,48 +126,30 @@ def test_names_every_attempt(hub, tmp_path, missing):
     assert caught.value.__cause__ is not None
 
 
-def test_shorter_than_announced_is_refused(hub, content, tmp_path):
+BROKEN = {
+    "shorter than announced": (lambda content: content[:-5000], True, "should be of size"),
+    "cut short at the source": (lambda content: content[:-5000], False, "not a readable HDF5 file"),
+    "damaged on the way": (lambda content: content[:-100] + b"?" + content[-99:], None, "sha256"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_a_broken_file_is_refused_and_does_not_stay_in_the_way(hub, content, tmp_path, kind):
+    change, announced, said = BROKEN[kind]
     for repository in REPOSITORIES:
-        hub.put(repository, content[:-5000], announced=len(content))
-    with pytest.raises(OSError, match=f"should be of size {len(content)}"):
-        download_robomimic("square", root=tmp_path, endpoint=hub.address)
-    assert not (tmp_path / FILE).exists()
-
-
-def test_cut_short_at_the_source_is_refused(hub, content, tmp_path):
-    for repository in REPOSITORIES:
-        hub.put(repository, content[:-5000])
+        if announced is None:
+            hub.put(repository, content)
+            hub.sent[repository] = change(content)
+        else:
+            hub.put(repository, change(content), len(content) if announced else None)
     options = {"root": tmp_path, "endpoint": hub.address}
-    with pytest.raises(OSError, match=r"(?s)DatasetError: .*not a readable HDF5 file.*force=True"):
-        download_robomimic("square", **options)
-    hub.put(FIRST, content)
-    assert download_robomimic("square", force=True, **options).read_bytes() == content
-
-
-def test_a_refused_file_is_replaced_without_being_told(hub, content, tmp_path):
-    """What an interrupted or broken download left does not stay in the way for ever."""
-    for repository in REPOSITORIES:
-        hub.put(repository, content[:-5000])
-    options = {"root": tmp_path, "endpoint": hub.address}
-    with pytest.raises(OSError, match="not a readable HDF5 file"):
-        download_robomimic("square", **options)
-    hub.put(FIRST, content)
-    assert download_robomimic("square", **options).read_bytes() == content
-
-
-def test_a_damaged_file_of_the_right_size_is_refused(hub, content, tmp_path):
-    damaged = bytearray(content)
-    damaged[-100] ^= 1
-    hub.put(FIRST, content)
-    hub.put(MIRROR, content)
-    hub.sent = {repository: bytes(damaged) for repository in REPOSITORIES}
-    options = {"root": tmp_path, "endpoint": hub.address}
-    with pytest.raises(OSError, match=r"(?s)DatasetError: .*low_dim_v15\.hdf5: .*sha256"):
+    with pytest.raises(OSError, match=rf"(?s){said}.*force=True"):
         download_robomimic("square", **options)
     hub.sent = {}
+    hub.put(FIRST, content)
     path = download_robomimic("square", **options)
     assert path.read_bytes() == content
-    path.write_bytes(damaged)  # on the disk, afterwards
+    path.write_bytes(change(content))  # on the disk, afterwards
     assert download_robomimic("square", **options).read_bytes() == content
 
 
@@ -196,35 +178,25 @@ def test_default_cache(hub, content, tmp_path, monkeypatch):
     assert path.is_relative_to(tmp_path / "cache") and path.read_bytes() == content
 
 
-def test_unknown_task_or_style_asks_nobody(hub):
-    with pytest.raises(ValueError, match="choose one of lift, can, square, transport, tool_hang"):
-        download_robomimic("stack", endpoint=hub.address)
-    with pytest.raises(ValueError, match=r"task 'stack' here \(download_mimicgen has stack_d0\)"):
-        download_robomimic("stack", endpoint=hub.address)
-    with pytest.raises(ValueError, match="task 'stack' here; choose one of stack_d0"):
-        download_mimicgen("stack", endpoint=hub.address)
-    with pytest.raises(ValueError, match="'mg' data; it has: ph, mh"):
-        download_robomimic("lift", "mg", endpoint=hub.address)
-    with pytest.raises(
-        ValueError, match=r"\(download_mimicgen has coffee_d0\); choose one of lift"
-    ):
-        download_robomimic("coffee_d0", endpoint=hub.address)
-    with pytest.raises(
-        ValueError, match=r"\(download_robomimic has square\); choose one of stack_d0, cof"
-    ):
-        download_mimicgen("square", endpoint=hub.address)
-    with pytest.raises(ValueError, match="no official 'ph' data; it has: source, core"):
-        download_mimicgen("coffee_d0", "ph", endpoint=hub.address)
+@pytest.mark.parametrize(
+    ("download", "args", "said"),
+    [
+        (download_robomimic, ["stack"], "choose one of lift, can, square, transport, tool_hang"),
+        (download_robomimic, ["stack"], r"task 'stack' here \(download_mimicgen has stack_d0\)"),
+        (download_mimicgen, ["stack"], "task 'stack' here; choose one of stack_d0"),
+        (download_robomimic, ["lift", "mg"], "'mg' data; it has: ph, mh"),
+        (
+            download_mimicgen,
+            ["square"],
+            r"\(download_robomimic has square\); choose one of stack_d0",
+        ),
+        (download_mimicgen, ["coffee_d0", "ph"], "no official 'ph' data; it has: source, core"),
+    ],
+)
+def test_unknown_task_or_style_asks_nobody(hub, download, args, said):
+    with pytest.raises(ValueError, match=said):
+        download(*args, endpoint=hub.address)
     assert not hub.requests
-
-
-def test_every_official_file_has_its_address(hub, content, tmp_path):
-    for task in ("lift", "can", "square", "transport", "tool_hang"):
-        for style in TASKS[task].official:
-            name = f"v1.5/{task}/{style}/low_dim_v15.hdf5"
-            hub.files[FIRST, name] = (len(content), content)
-            path = download_robomimic(task, style, root=tmp_path, endpoint=hub.address)
-            assert path == tmp_path / name
 
 
 @pytest.mark.parametrize(
@@ -233,15 +205,15 @@ def test_every_official_file_has_its_address(hub, content, tmp_path):
         ("stack_d0", "source", "source/stack.hdf5"),
         ("coffee_d0", "source", "source/coffee.hdf5"),
         ("threading_d0", "core", "core/threading_d0.hdf5"),
+        ("tool_hang", "ph", "v1.5/tool_hang/ph/low_dim_v15.hdf5"),
+        ("lift", "mh", "v1.5/lift/mh/low_dim_v15.hdf5"),
     ],
 )
-def test_mimicgens_files_have_their_addresses(hub, content, tmp_path, task, style, name):
-    hub.files[MIMICGEN_REPOSITORY, name] = (len(content), content)
-    path = download_mimicgen(task, style, root=tmp_path, endpoint=hub.address)
-    assert path == tmp_path / name
-    hub.sent = {MIMICGEN_REPOSITORY: content[:-7] + b"damaged"}
-    with pytest.raises(OSError, match="sha256"):
-        download_mimicgen(task, style, root=tmp_path, endpoint=hub.address, force=True)
+def test_files_have_their_addresses(hub, content, tmp_path, task, style, name):
+    mimicgen = task.endswith("_d0")
+    download = download_mimicgen if mimicgen else download_robomimic
+    hub.files[MIMICGEN_REPOSITORY if mimicgen else FIRST, name] = (len(content), content)
+    assert download(task, style, root=tmp_path, endpoint=hub.address) == tmp_path / name
 
 
 def test_mimicgens_buffer_fetches_its_file(hub, tmp_path, monkeypatch):

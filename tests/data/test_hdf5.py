@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import json
-
 import h5py
 import numpy as np
 import pytest
@@ -101,127 +99,15 @@ def test_missing_file(tmp_path):
         read_index(tmp_path)  # a folder
 
 
-@pytest.mark.parametrize("keep", [0.0, 0.001, 0.5, 0.99])
+@pytest.mark.parametrize("keep", [0.0, 0.001, 0.5, 0.99, None])
 def test_truncated_file(square_file, keep):
     path, _ = square_file
     content = path.read_bytes()
-    path.write_bytes(content[: int(keep * len(content))])
+    path.write_bytes(
+        b"<html>please log in" if keep is None else content[: int(keep * len(content))]
+    )
     with pytest.raises(DatasetError, match=r"square\.hdf5: not a readable HDF5.*download it again"):
         read_index(path)
-
-
-def test_not_hdf5(tmp_path):
-    path = tmp_path / "page.hdf5"
-    path.write_text("<html>please log in</html>" * 100)
-    with pytest.raises(DatasetError, match=r"page\.hdf5: not a readable HDF5"):
-        read_index(path)
-
-
-def _no_data(file):
-    file.move("data", "elsewhere")
-
-
-def _no_demos(file):
-    for name in list(file["data"]):
-        del file["data"][name]
-
-
-def _no_env_args(file):
-    del file["data"].attrs["env_args"]
-
-
-def _bad_json(file):
-    file["data"].attrs["env_args"] = "{"
-
-
-def _no_env_name(file):
-    file["data"].attrs["env_args"] = json.dumps({"type": 1})
-
-
-def _bad_name(file):
-    file.move("data/demo_1", "data/second")
-
-
-def _no_obs(file):
-    del file["data/demo_1/obs"]
-
-
-def _no_key(file):
-    del file["data/demo_1/obs/object"]
-
-
-def _no_actions(file):
-    del file["data/demo_1/actions"]
-
-
-def _no_rewards(file):
-    del file["data/demo_1/rewards"]
-
-
-def _no_steps(file):
-    _replace(file, "data/demo_1/actions", np.zeros((0, 7)))
-
-
-def _short_observation(file):
-    _replace(file, "data/demo_1/obs/object", np.zeros((4, 14)))
-
-
-def _scalar_actions(file):
-    _replace(file, "data/demo_1/actions", 3.0)
-
-
-def _wide_action(file):
-    _replace(file, "data/demo_1/actions", np.zeros((5, 8)))
-
-
-def _wide_object(file):
-    _replace(file, "data/demo_1/obs/object", np.zeros((5, 15)))
-
-
-def _uneven_key(file):
-    _replace(file, "data/demo_1/obs/robot0_eef_pos", np.zeros((5, 2)))
-
-
-def _text(file):
-    _replace(file, "data/demo_1/obs/object", np.array([b"a"] * 5))
-
-
-def _replace(file, name, value):
-    del file[name]
-    file[name] = value
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (_no_data, ["no group 'data'", "elsewhere"]),
-        (_no_demos, ["no demos"]),
-        (_no_env_args, ["env_args", "copy it"]),
-        (_bad_json, ["env_args", "JSON"]),
-        (_no_env_name, ["env_name"]),
-        (_bad_name, ["data/second", "rename"]),
-        (_no_obs, ["data/demo_1", "'obs'", "low_dim"]),
-        (_no_key, ["data/demo_1", "obs/object", "robot0_eef_pos"]),
-        (_no_actions, ["data/demo_1", "'actions'", "rewards"]),
-        (_no_rewards, ["data/demo_1", "'rewards'", "actions"]),
-        (_no_steps, ["data/demo_1", "no steps", "(0, 7)", "mask"]),
-        (_short_observation, ["data/demo_1/obs/object", "(4, 14)", "5 rows", "mask"]),
-        (_scalar_actions, ["data/demo_1", "no steps", "()"]),
-        (_wide_action, ["data/demo_1/actions", "(5, 8)", "NutAssemblySquare", "7 columns"]),
-        (_wide_object, ["data/demo_1/obs/object", "(5, 15)", "14 columns"]),
-        (_uneven_key, ["data/demo_1/obs/robot0_eef_pos", "(5, 2)", "3 columns"]),
-        (_text, ["data/demo_1/obs/object", "vectors of numbers"]),
-    ],
-    ids=lambda value: value.__name__.strip("_") if callable(value) else "",
-)
-def test_bad_file_says_what_and_where(square_file, change, said):
-    path, _ = square_file
-    with h5py.File(path, "a") as file:
-        change(file)
-    with pytest.raises(DatasetError) as caught:
-        read_index(path)
-    for word in ["square.hdf5", *said]:
-        assert word in str(caught.value)
 
 
 def test_images_are_not_part_of_a_state(square_file):
@@ -273,21 +159,6 @@ def test_filter_keys(square_file, tmp_path):
     write_robomimic_file(bare)
     with pytest.raises(DatasetError, match="'train'; this file has none"):
         read_index(bare, filter_key="train")
-
-
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e39])
-@pytest.mark.parametrize("key", ["actions", "rewards", "obs/object"])
-def test_non_finite_values(square_file, key, value):
-    path, _ = square_file
-    with h5py.File(path, "a") as file:
-        file[f"data/demo_2/{key}"][17, ...] = value
-        width = 1 if key == "rewards" else file[f"data/demo_2/{key}"].shape[1]
-    out = np.empty((30, width), np.float32)  # 1e39 is finite only in float64
-    with (
-        h5py.File(path) as file,
-        pytest.raises(DatasetError, match=rf"square.hdf5: data/demo_2/{key}.*row 17\."),
-    ):
-        read_rows(file, "demo_2", key, out)
 
 
 def test_corrupt_values(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import struct
 
 import h5py
 import numpy as np
@@ -23,15 +24,22 @@ def _replace(file, name, value=None, **options):
         file.create_dataset(name, **options)
 
 
+def replaced(name, value=None, **options):
+    return lambda file, folder: _replace(file, f"data/demo_1/{name}", value, **options)
+
+
+def without(name):
+    return lambda file, folder: file.pop(f"data/demo_1/{name}")
+
+
+def env_args(value):
+    return lambda file, folder: file["data"].attrs.update(env_args=value)
+
+
 def _external_storage(file, folder):
     (folder / "secret").write_bytes(b"\x01" * 5 * 7 * 8)
-    _replace(
-        file,
-        "data/demo_1/actions",
-        shape=(5, 7),
-        dtype="f8",
-        external=[(str(folder / "secret"), 0, 5 * 7 * 8)],
-    )
+    place = [(str(folder / "secret"), 0, 5 * 7 * 8)]
+    _replace(file, "data/demo_1/actions", shape=(5, 7), dtype="f8", external=place)
 
 
 def _virtual_without_source(file, folder):
@@ -41,24 +49,17 @@ def _virtual_without_source(file, folder):
     file.create_virtual_dataset("data/demo_1/actions", layout)
 
 
-def _never_written(file, folder):
-    _replace(file, "data/demo_1/actions", shape=(5, 7), dtype="f8")
-
-
 def _written_in_part(file, folder):
     _replace(file, "data/demo_1/actions", shape=(5, 7), dtype="f8", chunks=(2, 7))
     file["data/demo_1/actions"][:3] = 1
 
 
-def _external_link(file, folder):
-    with h5py.File(folder / "other.hdf5", "w") as other:
-        other["actions"] = np.ones((5, 7))
-    _replace(file, "data/demo_1/actions", h5py.ExternalLink(str(folder / "other.hdf5"), "/actions"))
+def _external(name):
+    def change(file, folder):
+        write_robomimic_file(folder / "other.hdf5")
+        _replace(file, name, h5py.ExternalLink(str(folder / "other.hdf5"), f"/{name}"))
 
-
-def _external_group(file, folder):
-    write_robomimic_file(folder / "other.hdf5")
-    _replace(file, "data/demo_1", h5py.ExternalLink(str(folder / "other.hdf5"), "/data/demo_1"))
+    return change
 
 
 def _soft_link_to_an_external_one(file, folder):
@@ -67,86 +68,114 @@ def _soft_link_to_an_external_one(file, folder):
     _replace(file, "data/demo_1/actions", h5py.SoftLink("/elsewhere/actions"))
 
 
-def _endless_soft_link(file, folder):
-    _replace(file, "data/demo_1/actions", h5py.SoftLink("/data/demo_1/actions"))
-
-
 def _group_for_a_dataset(file, folder):
     del file["data/demo_1/actions"]
     file.create_group("data/demo_1/actions")
 
 
-def _dataset_for_a_group(file, folder):
-    _replace(file, "data/demo_1", np.zeros(3))
+def _no_demos(file, folder):
+    for name in list(file["data"]):
+        del file["data"][name]
 
 
-def _dataset_for_the_observations(file, folder):
-    _replace(file, "data/demo_0/obs", np.zeros(3))
+ACTIONS, OBJECT = "data/demo_1/actions", "data/demo_1/obs/object"
+HUGE = {"shape": (5, 7), "chunks": (32_000_000, 7), "maxshape": (None, 7), "compression": "gzip"}
+FAULTS = {
+    "external storage": (_external_storage, [ACTIONS, "another file", "copy"]),
+    "virtual without a source": (_virtual_without_source, [ACTIONS, "virtual", "copy"]),
+    "never written": (replaced("actions", shape=(5, 7), dtype="f8"), [ACTIONS, "never written"]),
+    "written in part": (_written_in_part, [ACTIONS, "never written"]),
+    "external link": (_external(ACTIONS), [ACTIONS, "link to another file", "other.hdf5"]),
+    "external group": (_external("data/demo_1"), ["data/demo_1", "link to another file"]),
+    "link to a link": (_soft_link_to_an_external_one, ["elsewhere", "link to another file"]),
+    "endless link": (replaced("actions", h5py.SoftLink(f"/{ACTIONS}")), [ACTIONS, "links"]),
+    "group for a dataset": (_group_for_a_dataset, [ACTIONS, "a group", "dataset"]),
+    "dataset for a group": (replaced("", np.zeros(3)), ["data/demo_1", "a dataset", "group"]),
+    "dataset for obs": (replaced("obs", np.zeros(3)), ["data/demo_1/obs", "a dataset", "group"]),
+    "dataset for data": (
+        lambda file, folder: _replace(file, "data", np.zeros(3)),
+        ["data", "a dataset", "group"],
+    ),
+    "empty actions": (replaced("actions", h5py.Empty("f8")), ["data/demo_1", "no steps"]),
+    "huge chunk": (replaced("actions", dtype="f8", **HUGE), [ACTIONS, "chunk", "h5repack"]),
+    "deep JSON": (env_args("[" * 100_000), ["env_args", "JSON"]),
+    "no UTF-8": (env_args(np.bytes_(b'{"a": "\xff\xfe"}')), ["env_args", "JSON"]),
+    "no JSON": (env_args("{"), ["env_args", "JSON"]),
+    "empty env_args": (env_args(h5py.Empty("S1")), ["env_args", "text"]),
+    "a number": (env_args(3), ["env_args", "text"]),
+    "numbers": (env_args(np.zeros(4)), ["env_args", "text"]),
+    "no name": (env_args(json.dumps({"type": 1})), ["env_name"]),
+    "list of names": (
+        env_args(json.dumps({"env_name": ["Lift"], "env_kwargs": {}})),
+        ["env_args", "env_name"],
+    ),
+    "number for kwargs": (
+        env_args(json.dumps({"env_name": "Lift", "env_kwargs": 3})),
+        ["env_args", "env_kwargs"],
+    ),
+    "no data": (lambda f, folder: f.move("data", "elsewhere"), ["no group 'data'", "elsewhere"]),
+    "no demos": (_no_demos, ["no demos"]),
+    "no env_args": (lambda f, folder: f["data"].attrs.pop("env_args"), ["env_args", "copy it"]),
+    "other name": (
+        lambda f, folder: f.move("data/demo_1", "data/second"),
+        ["data/second", "rename"],
+    ),
+    "no obs": (without("obs"), ["data/demo_1", "'obs'", "low_dim"]),
+    "no key": (without("obs/object"), ["data/demo_1", "obs/object", "robot0_eef_pos"]),
+    "no actions": (without("actions"), ["data/demo_1", "'actions'", "rewards"]),
+    "no rewards": (without("rewards"), ["data/demo_1", "'rewards'", "actions"]),
+    "no steps": (
+        replaced("actions", np.zeros((0, 7))),
+        ["data/demo_1", "no steps", "(0, 7)", "mask"],
+    ),
+    "short object": (
+        replaced("obs/object", np.zeros((4, 14))),
+        [OBJECT, "(4, 14)", "5 rows", "mask"],
+    ),
+    "scalar actions": (replaced("actions", 3.0), ["data/demo_1", "no steps", "()"]),
+    "wide actions": (
+        replaced("actions", np.zeros((5, 8))),
+        [ACTIONS, "(5, 8)", "NutAssemblySquare", "7 columns"],
+    ),
+    "wide object": (replaced("obs/object", np.zeros((5, 15))), [OBJECT, "(5, 15)", "14 columns"]),
+    "uneven key": (
+        replaced("obs/robot0_eef_pos", np.zeros((5, 2))),
+        ["data/demo_1/obs/robot0_eef_pos", "(5, 2)", "3 columns"],
+    ),
+    "text": (replaced("obs/object", np.array([b"a"] * 5)), [OBJECT, "vectors of numbers"]),
+}
 
 
-def _dataset_for_data(file, folder):
-    _replace(file, "data", np.zeros(3))
-
-
-def _empty_actions(file, folder):
-    _replace(file, "data/demo_1/actions", h5py.Empty("f8"))
-
-
-def _huge_chunk(file, folder):
-    _replace(
-        file,
-        "data/demo_1/actions",
-        shape=(5, 7),
-        dtype="f8",
-        chunks=(32_000_000, 7),
-        maxshape=(None, 7),
-        compression="gzip",
-    )
-
-
-def _env_args(value):
-    def change(file, folder):
-        file["data"].attrs["env_args"] = value
-
-    change.__name__ = f"env_args_{str(value)[:12]}"
-    return change
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (_external_storage, ["data/demo_1/actions", "another file", "copy"]),
-        (_virtual_without_source, ["data/demo_1/actions", "virtual", "copy"]),
-        (_never_written, ["data/demo_1/actions", "never written"]),
-        (_written_in_part, ["data/demo_1/actions", "never written"]),
-        (_external_link, ["data/demo_1/actions", "link to another file", "other.hdf5"]),
-        (_external_group, ["data/demo_1", "link to another file"]),
-        (_soft_link_to_an_external_one, ["elsewhere", "link to another file"]),
-        (_endless_soft_link, ["data/demo_1/actions", "links"]),
-        (_group_for_a_dataset, ["data/demo_1/actions", "a group", "dataset"]),
-        (_dataset_for_a_group, ["data/demo_1", "a dataset", "group"]),
-        (_dataset_for_the_observations, ["data/demo_0/obs", "a dataset", "group"]),
-        (_dataset_for_data, ["data", "a dataset", "group"]),
-        (_empty_actions, ["data/demo_1", "no steps"]),
-        (_huge_chunk, ["data/demo_1/actions", "chunk", "h5repack"]),
-        (_env_args("[" * 100_000), ["env_args", "JSON"]),
-        (_env_args(np.bytes_(b'{"a": "\xff\xfe"}')), ["env_args", "JSON"]),
-        (_env_args(h5py.Empty("S1")), ["env_args", "text"]),
-        (_env_args(3), ["env_args", "text"]),
-        (_env_args(np.zeros(4)), ["env_args", "text"]),
-        (_env_args(json.dumps({"env_name": ["Lift"], "env_kwargs": {}})), ["env_args", "env_name"]),
-        (_env_args(json.dumps({"env_name": "Lift", "env_kwargs": 3})), ["env_args", "env_kwargs"]),
-    ],
-    ids=lambda value: value.__name__.strip("_") if callable(value) else "",
-)
-def test_fault_is_refused_by_name(square_file, tmp_path, change, said):
+@pytest.mark.parametrize("name", FAULTS)
+def test_fault_is_refused_by_name(square_file, tmp_path, name):
     path, _ = square_file
+    change, said = FAULTS[name]
     with h5py.File(path, "a") as file:
         change(file, tmp_path)
     with pytest.raises(DatasetError) as caught:
         read_index(path)
     for word in ["square.hdf5", *said]:
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("damage", ["place", "overlap", "behind the end"])
+def test_an_index_of_chunks_that_is_damaged(square_file, damage):
+    """HDF5 reads a chunk that it does not find as zeros, and two that share a place as the same."""
+    path, _ = square_file
+    with h5py.File(path, "a") as file:
+        _replace(file, "data/demo_1/actions", shape=(5, 7), dtype="f8", chunks=(2, 7))
+        file["data/demo_1/actions"][...] = 1
+        first, second = (
+            file["data/demo_1/actions"].id.get_chunk_info(i).byte_offset for i in (0, 1)
+        )
+    # An entry of the index: where in the array, and where in the file.
+    before, size = struct.pack("<4Q", 2, 0, 0, second), path.stat().st_size
+    after = {"place": (8, second), "overlap": (2, first), "behind the end": (2, size - 8)}[damage]
+    content = path.read_bytes()
+    assert content.count(before) == 1
+    path.write_bytes(content.replace(before, struct.pack("<4Q", after[0], 0, 0, after[1])))
+    with pytest.raises(DatasetError, match=r"square\.hdf5: data/demo_1/actions: its .* again"):
+        RobomimicExperienceReplay(path)
 
 
 def test_soft_links_inside_the_file_are_followed(square_file):
@@ -205,7 +234,7 @@ def test_more_rows_than_memory_are_refused_before_any_is_taken(square_file, monk
     RobomimicExperienceReplay(path)
 
 
-@pytest.mark.parametrize("value", [1e38, -1e38, 1e10])
+@pytest.mark.parametrize("value", [np.nan, -np.inf, 1e39, -1e38, 1e10])
 @pytest.mark.parametrize("key", ["actions", "rewards", "obs/object"])
 def test_values_that_no_robot_has(square_file, key, value):
     """One of them would make all others of its feature equal after normalisation."""

@@ -17,7 +17,6 @@ pytest.importorskip("robosuite")
 
 import h5py
 
-from tests.data.synthetic import write_robomimic_file
 from tests.processes import apart
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.data import (
@@ -129,6 +128,7 @@ def test_the_layout_is_robomimics(recorded, rendered):
     assert (kwargs["camera_names"], kwargs["camera_heights"]) == (list(CAMERAS), 16)
 
 
+@pytest.mark.slow
 def test_images_do_not_depend_on_the_number_of_workers(recorded, rendered, tmp_path):
     found = render(recorded, CAMERAS, out=tmp_path / "two.hdf5", workers=2)
     expected = images_of(rendered)
@@ -140,6 +140,7 @@ def full(path, write):
     raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
 
+@pytest.mark.slow
 def test_what_is_finished_outlives_a_full_disk(copy, rendered, monkeypatch):
     """And is not rendered again; what was there before stays until the new file is complete."""
     before = copy.read_bytes()
@@ -165,6 +166,7 @@ def test_what_is_finished_outlives_a_full_disk(copy, rendered, monkeypatch):
         np.testing.assert_array_equal(images[f"demo_1/{key}"], expected[f"demo_1/{key}"])
 
 
+@pytest.mark.slow
 def test_the_cache_is_asked_first(copy, tmp_path, monkeypatch):
     cached = render(copy, CAMERAS[:1], cache_dir=tmp_path / "cache")
     monkeypatch.setattr(render_module, "require_rendering", lambda: pytest.fail("rendered again"))
@@ -172,6 +174,7 @@ def test_the_cache_is_asked_first(copy, tmp_path, monkeypatch):
     assert "agentview16fast" in cached.name
 
 
+@pytest.mark.slow
 def test_one_quality_goes_for_all_cameras_of_a_file(recorded, tmp_path):
     first = render(recorded, CAMERAS[:1], out=tmp_path / "first.hdf5")
     with pytest.raises(ValueError, match=r"agentview were rendered fast.*add --fast, or .*all"):
@@ -200,7 +203,7 @@ def not_a_number(file):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (without_states, r"data/demo_0 has no states to render"),
+        pytest.param(without_states, r"demo_0 has no states to render", marks=pytest.mark.slow),
         (not_a_number, r"data/demo_0/states has NaN or infinity in row 2"),
         (of_another_environment, r"states has shape \(4, 45\).*Lift has \(4, 32\)"),
     ],
@@ -228,6 +231,7 @@ def test_bad_options(copy, options, said):
         render(copy, **{"out": copy, **options})
 
 
+@pytest.mark.slow
 def test_images_too_large_for_opengl_are_told(copy):
     with pytest.raises(ValueError, match="cannot render images of 20000 x 20000 pixels here"):
         render(copy, CAMERAS[:1], out=copy, size=20_000)
@@ -264,6 +268,7 @@ def test_demos_with_images_of_several_sizes_are_refused(picture):
         RobomimicExperienceReplay(picture, image_keys=IMAGES[:1])
 
 
+@pytest.mark.slow
 def test_images_upside_down_are_refused(picture):
     key = f"data/demo_0/obs/{IMAGES[0]}"
     compare_images(picture, IMAGES, fast=True)
@@ -310,12 +315,7 @@ def test_windows_hold_the_last_images_alone(rendered, tmp_path, storage):
             np.testing.assert_array_equal(image.permute(1, 2, 0), frames[at])
 
 
-def test_a_file_of_random_states_has_none_of_its_simulator(tmp_path):
-    write_robomimic_file(tmp_path / "lift.hdf5", lengths=(3,), task="lift")
-    with pytest.raises(DatasetError, match="its robots or objects are others"):
-        render(tmp_path / "lift.hdf5", out=tmp_path / "out.hdf5")
-
-
+@pytest.mark.slow
 def test_fixtures_that_a_reset_moves_are_in_no_state(recorded, tmp_path):
     """Robosuite's Door places the door itself, and not a joint."""
     path = Path(shutil.copy(recorded, tmp_path / "door.hdf5"))

@@ -201,7 +201,19 @@ def generated(monkeypatch, path, run_episode, **options):
     return kept
 
 
-@pytest.mark.parametrize("workers", [1, 2, 7])
+def test_a_file_is_replaced_only_when_asked(tmp_path, monkeypatch):
+    def run_episode(loop, task, style, seed):
+        return fake_episode(seed, success=True)
+
+    path = tmp_path / "mine.hdf5"
+    path.write_bytes(b"mine")
+    with pytest.raises(FileExistsError, match=r"mine\.hdf5 exists: .*--overwrite"):
+        generated(monkeypatch, path, run_episode, style="mh", n=6)
+    kept = generated(monkeypatch, path, run_episode, style="mh", n=6, overwrite=True)
+    assert len(kept) == 6
+
+
+@pytest.mark.parametrize("workers", [1, 7])
 def test_operators_contribute_equally(workers, tmp_path, monkeypatch):
     def run_episode(loop, task, style, seed):
         time.sleep(0.01 * (seed % 3))  # they end in another order than they began
@@ -294,7 +306,10 @@ generate.generate_demonstrations("lift", n=4, path=sys.argv[1], workers=2, progr
 """
 
 
-@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+SLOWLY = [pytest.param(s, marks=pytest.mark.slow) for s in (signal.SIGTERM, signal.SIGINT)]
+
+
+@pytest.mark.parametrize("sent", [signal.SIGKILL, *SLOWLY])
 def test_workers_end_with_whoever_generates(sent, tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-c", GENERATING, str(tmp_path / "out.hdf5")],

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Any
 from warmprior.data.convert import convert_robomimic
 from warmprior.data.download import download_lerobot, download_mimicgen, download_robomimic
 from warmprior.data.hdf5 import DatasetError
-from warmprior.data.lerobot import LeRobotExperienceReplay
-from warmprior.data.lerobot_steps import lerobot_steps
+from warmprior.data.lerobot import LeRobotExperienceReplay, lerobot_steps
 from warmprior.data.mimicgen import MimicGenExperienceReplay
 from warmprior.data.robomimic import RobomimicExperienceReplay
 

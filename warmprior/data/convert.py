@@ -19,14 +19,13 @@ from warmprior.data.hdf5 import open_robomimic, read_index, read_masks
 from warmprior.data.hdf5_members import DatasetError, member
 from warmprior.data.index import DatasetIndex
 from warmprior.data.lerobot_index import (
-    ENVIRONMENT_STATE,
+    DESCRIPTION,
     REWARD,
-    ROBOT_STATE,
     SUCCESS,
     action_names,
+    layout_of,
     state_names,
 )
-from warmprior.data.lerobot_meta import DESCRIPTION
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
@@ -140,38 +139,26 @@ def convert_robomimic(
     return folder
 
 
-def _layout(index: DatasetIndex) -> dict[str, dict[str, int]]:
-    """The width of each observation, by the feature that holds it."""
-    widths = dict(zip(index.observation_keys, index.observation_dims, strict=True))
-    robots = {key: width for key, width in widths.items() if key.startswith("robot")}
-    others = {key: width for key, width in widths.items() if key not in robots}
-    layout = {ENVIRONMENT_STATE: others, ROBOT_STATE: robots}
-    return {feature: parts for feature, parts in layout.items() if parts}
-
-
 def _features(
     index: DatasetIndex, layout: Mapping[str, Mapping[str, int]], images: str | None
 ) -> dict[str, Any]:
+    def feature(dtype: str, shape: tuple[int, ...], names: list[str] | None) -> dict[str, Any]:
+        return {"dtype": dtype, "shape": shape, "names": names}
+
     arms, rest = divmod(index.action_dim, 7)
-    deltas = action_names(arms) if rest == 0 else None
-    features: dict[str, Any] = {"action": _vector(index.action_dim, deltas)}
-    for feature, widths in layout.items():
-        names = state_names(widths)
-        features[feature] = _vector(len(names), names)
-    features[REWARD] = _vector(1, None)
-    for flag in ("next.done", SUCCESS):
-        features[flag] = {"dtype": "bool", "shape": (1,), "names": None}
-    for key in index.image_keys:
-        features[_camera(key)] = {
-            "dtype": images,
-            "shape": (index.image_size, index.image_size, 3),
-            "names": ["height", "width", "channels"],
+    names = {"action": action_names(arms) if rest == 0 else None}
+    names |= {name: state_names(widths) for name, widths in layout.items()}
+    sizes = {"action": index.action_dim} | {name: sum(w.values()) for name, w in layout.items()}
+    pixels = (index.image_size, index.image_size, 3)
+    return (
+        {name: feature("float32", (size,), names[name]) for name, size in sizes.items()}
+        | {REWARD: feature("float32", (1,), None)}
+        | {flag: feature("bool", (1,), None) for flag in ("next.done", SUCCESS)}
+        | {
+            _camera(key): feature(str(images), pixels, ["height", "width", "channels"])
+            for key in index.image_keys
         }
-    return features
-
-
-def _vector(width: int, names: list[str] | None) -> dict[str, Any]:
-    return {"dtype": "float32", "shape": (width,), "names": names}
+    )
 
 
 def _camera(key: str) -> str:
@@ -186,7 +173,7 @@ def _write(
     images: Literal["image", "video"] | None,
     progress: bool,
 ) -> None:
-    layout = _layout(index)
+    layout = layout_of(dict(zip(index.observation_keys, index.observation_dims, strict=True)))
     task = index.env_args["env_name"].lower() if index.task is None else index.task.name
     data = RobomimicExperienceReplay(
         index.path,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import product
 from math import ceil, prod
 from typing import TYPE_CHECKING, Literal
 
@@ -21,6 +22,7 @@ __all__ = ["DatasetError", "member", "names", "reading"]
 
 CHUNK_BYTES = 2**28  # HDF5 unpacks whole chunks, however few rows are asked for
 _MAX_SOFT_LINKS = 16
+_AGAIN = "Copy or download the file again."
 
 
 class DatasetError(ValueError):
@@ -156,8 +158,12 @@ def _check_stored(dataset: h5py.Dataset) -> None:
         )
     if not dataset.size:
         return
+    places: list[tuple[int, int]] = []  # in the file, of the stored parts: first byte and size
     if dataset.chunks is None:
-        complete = dataset.id.get_storage_size() >= dataset.size * dataset.dtype.itemsize
+        stored = dataset.id.get_storage_size()
+        complete = stored >= dataset.size * dataset.dtype.itemsize
+        if dataset.id.get_offset() is not None:  # a compact one lies in its header
+            places.append((dataset.id.get_offset(), stored))
     else:
         chunk = prod(dataset.chunks) * dataset.dtype.itemsize
         if chunk > CHUNK_BYTES:
@@ -165,8 +171,18 @@ def _check_stored(dataset: h5py.Dataset) -> None:
                 f"{what} has shape {dataset.shape} in chunks of {chunk:.1e} bytes, which would have to "
                 "be unpacked whole: write it in smaller ones (h5repack -l CHUNK=...)"
             )
-        needed = prod(ceil(n / c) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
-        complete = dataset.id.get_num_chunks() >= needed
+        steps = list(zip(dataset.shape, dataset.chunks, strict=True))
+        complete = dataset.id.get_num_chunks() >= prod(ceil(n / c) for n, c in steps)
+        if complete:
+            parts: dict[tuple[int, ...], tuple[int, int]] = {}
+            dataset.id.chunk_iter(lambda p: parts.update({p.chunk_offset: (p.byte_offset, p.size)}))
+            places = sorted(parts.values())
+            # HDF5 reads a part that its index does not find as zeros.
+            if not all(start in parts for start in product(*(range(0, n, c) for n, c in steps))):
+                raise DatasetError(f"{what}: its index of chunks is damaged. {_AGAIN}")
+    ends = [*(first for first, _ in places[1:]), dataset.file.id.get_filesize()]
+    if any(first + size > end for (first, size), end in zip(places, ends, strict=bool(places))):
+        raise DatasetError(f"{what}: its values overlap, or lie behind the file's end. {_AGAIN}")
     if not complete:
         raise DatasetError(
             f"{what} has shape {dataset.shape}, but some of its values were never written: the recording "

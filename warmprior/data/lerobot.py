@@ -1,21 +1,48 @@
-"""LeRobot's demonstrations as a TorchRL replay buffer."""
+"""LeRobot's demonstrations: as a TorchRL replay buffer, or as plain contiguous steps."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
+from tensordict import TensorDict
+from torch import Tensor
 
 from warmprior.data.download import download_lerobot
-from warmprior.data.lerobot_index import LeRobotIndex, read_lerobot_index
-from warmprior.data.lerobot_meta import DESCRIPTION
-from warmprior.data.lerobot_reader import open_lerobot
-from warmprior.data.replay import DemonstrationReplay, check_storage
+from warmprior.data.hdf5_members import DatasetError
+from warmprior.data.index import store_finite
+from warmprior.data.lerobot_index import (
+    DESCRIPTION,
+    REWARD,
+    SUCCESS,
+    LeRobotIndex,
+    episode_file,
+    read_lerobot_index,
+    read_metadata,
+    vector_widths,
+)
+from warmprior.data.replay import DemonstrationReader, DemonstrationReplay, check_storage
+from warmprior.io.extras import require
+from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
-__all__ = ["LeRobotExperienceReplay", "fetch_lerobot", "find_lerobot", "is_repository"]
+__all__ = [
+    "LeRobotExperienceReplay",
+    "LeRobotReader",
+    "fetch_lerobot",
+    "find_lerobot",
+    "is_repository",
+    "lerobot_steps",
+]
+
+DECODED = 2**26  # bytes of frames unpacked at once
+TOLERANCE = 1e-4  # seconds between a step and its frame, LeRobot's own
+_REBUILD = "Record the episode again or remove it (lerobot-edit-dataset), or leave it out."
 
 
 def is_repository(dataset: str | Path) -> bool:
@@ -27,10 +54,19 @@ def is_repository(dataset: str | Path) -> bool:
     return named and not path.exists()
 
 
+def _root(
+    dataset: str | Path, files: Sequence[str] = ("meta/*",), revision: str | None = None
+) -> Path:
+    """The folder of a dataset, with files of it fetched if it is in the hub."""
+    if is_repository(dataset):
+        return download_lerobot(str(dataset), files, revision=revision)
+    return Path(dataset).expanduser()
+
+
 def find_lerobot(
     dataset: str | Path, *, revision: str | None = None, **options: Any
 ) -> LeRobotIndex:
-    """Check what describes a LeRobotDataset; of one in the hub nothing else is fetched.
+    """Read what describes a LeRobotDataset; of one in the hub nothing else is fetched.
 
     Args:
         dataset: its folder, or its repository in the hub.
@@ -44,41 +80,166 @@ def find_lerobot(
         DatasetError: if it is not as it should be.
         OSError: if a download fails.
     """
-    root = Path(dataset).expanduser()
-    if is_repository(dataset):
-        root = download_lerobot(str(dataset), revision=revision)
-    return read_lerobot_index(root, **options)
+    return read_lerobot_index(_root(dataset, revision=revision), **options)
 
 
 def fetch_lerobot(
     dataset: str | Path, *, revision: str | None = None, **options: Any
 ) -> LeRobotIndex:
-    """Check a LeRobotDataset, and then fetch what is to be read of it, where it is in the hub.
+    """As :func:`find_lerobot`, and then fetch what is to be read, where the dataset is in the hub."""
+    index = find_lerobot(dataset, revision=revision, **options)
+    if not all((index.path / file).is_file() for file in index.files):
+        index = replace(index, path=_root(dataset, index.files, revision))
+    return index
+
+
+class _Columns:
+    """The numbers of a dataset's features: one file at a time, of it each column that is asked for, once.
 
     Args:
-        dataset: as of :func:`find_lerobot`.
-
-    Keyword Args:
-        revision: likewise.
-        options: likewise.
-
-    Raises:
-        FileNotFoundError: likewise.
-        DatasetError: likewise.
-        OSError: likewise.
+        root: the dataset's folder.
+        metadata: see :func:`~warmprior.data.lerobot_index.read_metadata`.
     """
-    index = find_lerobot(dataset, revision=revision, **options)
-    if is_repository(dataset) and not all((index.path / file).is_file() for file in index.files):
-        needed = [str(file) for file in index.files]
-        index = replace(index, path=download_lerobot(str(dataset), needed, revision=revision))
-    return index
+
+    def __init__(self, root: Path, metadata: Any) -> None:
+        self.root, self.metadata = root, metadata
+        self._file, self._read = "", {}  # type: ignore[var-annotated]
+
+    def of(self, episode: Mapping[str, Any], feature: str) -> np.ndarray:
+        """All rows of an episode, ``[rows, width]``."""
+        file = episode_file(self.metadata, episode)
+        if file != self._file:
+            self._file, self._read = file, {}
+        start, number = episode["dataset_from_index"], episode["episode_index"]
+        with _reading(self.root / file):
+            index, numbers = self._column("index")[:, 0], self._column("episode_index")[:, 0]
+            first = int(np.searchsorted(index, start))
+            rows = slice(first, first + episode["length"])
+            expected = np.arange(start, start + episode["length"])
+            if not np.array_equal(index[rows], expected) or (numbers[rows] != number).any():
+                raise ValueError(f"episode {number} is not where meta/episodes says")
+            return self._column(feature)[rows]
+
+    def _column(self, name: str) -> np.ndarray:
+        """A column of the file, ``[rows, width]``."""
+        if name not in self._read:
+            arrow = require("pyarrow", "lerobot")
+            parquet = require("pyarrow.parquet", "lerobot")
+            table = parquet.read_table(self.root / self._file, columns=[name])
+            column, width = (
+                table.column(name).combine_chunks(),
+                self.metadata.features[name]["shape"][0],
+            )
+            if hasattr(column, "flatten") and arrow.types.is_nested(column.type):
+                # The cast refuses rows of another length.
+                column = column.cast(arrow.list_(column.type.value_type, width)).flatten()
+            values = column.to_numpy(zero_copy_only=False).reshape(len(table), width)
+            self._read[name] = values
+        return self._read[name]
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Name the file in whatever goes wrong while it is read."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:  # pyarrow's own, OSError, KeyError for its columns...
+        raise DatasetError(
+            f"{path}: damaged, or not of this dataset ({error}). Copy or download it again, or record or "
+            "convert the dataset anew; a recording has to end with LeRobotDataset.finalize()."
+        ) from error
+
+
+class LeRobotReader(DemonstrationReader):
+    """The values of a dataset.
+
+    Args:
+        index: what is selected.
+    """
+
+    def __init__(self, index: LeRobotIndex) -> None:
+        self.index = index
+        self._columns = _Columns(index.path, index.metadata)
+        self._episodes = dict(zip(index.demos, index.episodes, strict=True))
+        features = index.metadata.features
+        self._reward = next((name for name in (REWARD, SUCCESS) if name in features), None)
+
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """Read rows of one array of an episode; see the base class.
+
+        Rewards of a dataset without ``next.reward`` are its ``next.success``, or else zeros.
+        """
+        feature, part = self._place(key)
+        if feature is None:
+            out[...] = 0
+            return
+        block = self._columns.of(self._episodes[demo], feature)[first : first + len(out), part]
+        store_finite(block, out, self.name(demo, key), first, _REBUILD)
+
+    def _place(self, key: str) -> tuple[str | None, slice]:
+        if key == "rewards":
+            return self._reward, slice(None)
+        if key == "actions":
+            return "action", slice(None)
+        return self.index.columns[key.removeprefix("obs/")]
+
+    def name(self, demo: str, key: str) -> str:
+        """What errors call an array of an episode, with the file that holds it."""
+        file = episode_file(self.index.metadata, self._episodes[demo])
+        feature, observation = self._place(key)[0], key.removeprefix("obs/")
+        inside = f" ({observation})" if key != observation != feature else ""
+        return f"{self.index.path / file}: {feature}{inside} of episode {demo}"
+
+    def images(self, demo: str, key: str, out: Tensor) -> None:
+        """Read the first frames of an episode; see the base class."""
+        episode, feature = self._episodes[demo], self.index.images[key]
+        video = feature if feature in self.index.metadata.video_keys else None
+        path = self.index.path / episode_file(self.index.metadata, episode, video)
+        step = max(1, DECODED // max(1, out[0].numel()))
+        with _reading(path):
+            frames = (
+                self._video(episode, path, feature) if video else _pictures(episode, path, feature)
+            )
+            for first in range(0, len(out), step):
+                part = out[first : first + step]
+                found = frames(first, first + len(part))
+                if found.shape != part.shape:
+                    raise ValueError(
+                        f"{feature} of episode {demo} has frames of shape {tuple(found.shape[1:])}, but "
+                        f"meta/info.json says {tuple(part.shape[1:])}"
+                    )
+                part.copy_(found)
+
+    def _video(self, episode: Mapping[str, Any], path: Path, feature: str) -> Any:
+        decode = require("lerobot.datasets.video_utils", "lerobot").decode_video_frames
+        times = self._columns.of(episode, "timestamp")[:, 0].astype(np.float64)
+        times += episode[f"videos/{feature}/from_timestamp"]
+        return lambda first, stop: decode(
+            path, times[first:stop].tolist(), TOLERANCE, return_uint8=True
+        )
+
+
+def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:
+    image, parquet = require("PIL.Image", "lerobot"), require("pyarrow.parquet", "lerobot")
+    mine = [("episode_index", "==", episode["episode_index"])]
+    column = parquet.read_table(path, columns=[feature], filters=mine).column(feature)
+
+    def frames(first: int, stop: int) -> Tensor:
+        # Their bytes alone: a path in them could lead anywhere.
+        files = [io.BytesIO(value["bytes"]) for value in column[first:stop].to_pylist()]
+        pictures = [np.array(image.open(file).convert("RGB")) for file in files]
+        return torch.from_numpy(np.stack(pictures)).permute(0, 3, 1, 2)
+
+    return frames
 
 
 class LeRobotExperienceReplay(DemonstrationReplay):
     """Demonstrations of a LeRobotDataset v3, as one immutable TorchRL replay buffer.
 
     The counterpart of :class:`RobomimicExperienceReplay`, with the same entries and properties. Columns of
-    the parquet files are read as they lie there, episode by episode, instead of item by item through
+    the parquet files are read whole, instead of item by item through
     ``LeRobotDataset.__getitem__``; :class:`~warmprior.ActionWindow` makes windows of them, whose history and
     padding are those of ``delta_timestamps``, but that what lies outside an episode is masked and zero
     where LeRobot repeats its first action, which is part of the target.
@@ -110,20 +271,17 @@ class LeRobotExperienceReplay(DemonstrationReplay):
         storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``.
         scratch_dir: folder of the memory maps; temporary files if ``None``.
         device: device of the tensors; ``"cpu"`` for ``"memmap"``.
-        batch_size: steps per :meth:`sample`.
-        sampler: a TorchRL sampler; random with replacement by default.
-        transform: a TorchRL transform applied to each sample.
         **kwargs: further arguments of :class:`~torchrl.data.TensorDictReplayBuffer`, such as
-            ``prefetch``, ``pin_memory`` or ``generator``.
+            ``batch_size``, ``sampler``, ``transform``, ``prefetch`` or ``generator``.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
         DatasetError: if the dataset is not as it should be, or does not fit the environment; says which
-            file and key.
+            folder or file, and why.
         ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
             of a controller without pose deltas.
         OSError: if a download fails, or there is no space for memory maps.
-        ImportError: if pyarrow, or for videos lerobot, is not installed.
+        ImportError: if lerobot is not installed.
 
     Examples:
         >>> data = LeRobotExperienceReplay("square_lerobot", batch_size=256)  # doctest: +SKIP
@@ -149,9 +307,6 @@ class LeRobotExperienceReplay(DemonstrationReplay):
         storage: Literal["memory", "memmap"] = "memory",
         scratch_dir: str | Path | None = None,
         device: torch.device | str = "cpu",
-        batch_size: int | None = None,
-        sampler: Any = None,
-        transform: Any = None,
         **kwargs: Any,
     ) -> None:
         device = check_storage(storage, device)
@@ -165,17 +320,68 @@ class LeRobotExperienceReplay(DemonstrationReplay):
             demos=demos,
             env_args=env_args,
         )
-        told = f"{index.path / DESCRIPTION}: env_args" if env_args is None else "env_args"
         super().__init__(
             index,
-            open_lerobot(index),
-            described=told,
+            nullcontext(LeRobotReader(index)),
+            described=f"{index.path / DESCRIPTION}: env_args" if index.described else "env_args",
             absolute_actions=absolute_actions,
             storage=storage,
             scratch_dir=scratch_dir,
             device=device,
-            batch_size=batch_size,
-            sampler=sampler,
-            transform=transform,
             **kwargs,
         )
+
+
+def lerobot_steps(
+    dataset: str | Path,
+    observation_keys: Sequence[str] = ("observation.state",),
+    action_key: str = "action",
+) -> TensorDict:
+    """Read the steps of a LeRobotDataset of any robot, in raw units.
+
+    Args:
+        dataset: its folder, or ``user/name`` of its repository at the hub.
+        observation_keys: features that make the observation, concatenated in this order.
+        action_key: the feature that is the action.
+
+    Returns:
+        ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]``, float32, and ``"episode"`` ``[N]``, as
+        :meth:`Task.of <warmprior.training.Task.of>` takes them.
+
+    Raises:
+        FileNotFoundError: if there is no such dataset.
+        DatasetError: if there is no such feature, or it is no vector of numbers; if the dataset is damaged.
+        OSError: if a download fails.
+        ImportError: if LeRobot is not installed.
+
+    See Also:
+        :class:`~warmprior.training.Task`: takes them, with an environment.
+
+    Examples:
+        >>> steps = lerobot_steps("lerobot/pusht_keypoints")  # doctest: +SKIP
+        >>> steps["action"].shape  # doctest: +SKIP
+        torch.Size([25650, 2])
+    """
+    root = _root(dataset)
+    metadata = read_metadata(root)
+    widths = vector_widths(metadata.features)
+    for key in (*observation_keys, action_key):
+        if key not in widths:
+            raise DatasetError(f"{dataset} has no vector {key!r} of numbers: it has {widths}")
+    episodes = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
+    files = sorted({episode_file(metadata, episode) for episode in episodes})
+    if not all((root / file).is_file() for file in files):
+        root = _root(dataset, files)
+    columns = _Columns(root, metadata)
+
+    def vectors(keys: Sequence[str]) -> Tensor:
+        rows = [np.concatenate([columns.of(e, key) for key in keys], -1) for e in episodes]
+        return torch.from_numpy(np.concatenate(rows)).float()
+
+    lengths = torch.tensor([episode["length"] for episode in episodes])
+    steps = {
+        OBSERVATION: vectors(observation_keys),
+        ACTION: vectors([action_key]),
+        EPISODE: torch.arange(len(episodes)).repeat_interleave(lengths),
+    }
+    return TensorDict(steps, [int(lengths.sum())])

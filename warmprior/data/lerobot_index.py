@@ -1,69 +1,41 @@
-"""What a LeRobotDataset v3 holds, with errors that say which file and key is wrong.
-
-:func:`read_lerobot_index` looks at ``meta/`` alone, and finds all that is wrong with it before anything big
-is read or fetched.
-"""
+"""What a LeRobotDataset v3 holds: LeRobot reads its ``meta/``, and observations are found in it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from itertools import accumulate, pairwise
+from pathlib import Path
 from typing import Any
 
 from warmprior.data.hdf5_members import DatasetError
-from warmprior.data.index import DatasetIndex, check_count, task_of_env
-from warmprior.data.lerobot_meta import (
-    DESCRIPTION,
-    LeRobotEpisode,
-    check_statistics,
-    info_path,
-    read_description,
-    read_episodes,
-    read_info,
-)
+from warmprior.data.index import DatasetIndex, check_count, check_env_args, task_of_env
 from warmprior.envs.tasks import TaskSpec
+from warmprior.io.extras import require
+from warmprior.io.files import digest_of, file_digest, read_json
 
 __all__ = [
+    "DESCRIPTION",
     "ENVIRONMENT_STATE",
     "REWARD",
     "ROBOT_STATE",
     "SUCCESS",
     "LeRobotIndex",
-    "LeRobotSlice",
     "action_names",
+    "episode_file",
+    "layout_of",
     "read_lerobot_index",
+    "read_metadata",
     "state_names",
+    "vector_widths",
 ]
+
+DESCRIPTION = "meta/warmprior.json"
+"""What :func:`warmprior.data.convert_robomimic` writes beside LeRobot's own files, which LeRobot ignores."""
 
 ENVIRONMENT_STATE, ROBOT_STATE = "observation.environment_state", "observation.state"
 REWARD, SUCCESS = "next.reward", "next.success"
-FLOATS = ("float16", "float32", "float64")
 _ARM_ACTIONS = ("x", "y", "z", "rx", "ry", "rz", "gripper")
-
-
-@dataclass(frozen=True)
-class LeRobotSlice:
-    """Columns of a vector feature.
-
-    Attributes:
-        feature: its name, such as ``"observation.state"``.
-        start: the first column.
-        stop: the one after the last.
-
-    See Also:
-        :class:`~warmprior.data.lerobot_index.LeRobotIndex`: has one per observation.
-
-    Examples:
-        >>> gripper = LeRobotSlice("observation.state", start=7, stop=9)
-        >>> frame = {"observation.state": list(range(9))}
-        >>> frame[gripper.feature][gripper.start : gripper.stop]
-        [7, 8]
-    """
-
-    feature: str
-    start: int
-    stop: int
 
 
 @dataclass(frozen=True)
@@ -71,45 +43,114 @@ class LeRobotIndex(DatasetIndex):
     """What a LeRobotDataset holds, without its values.
 
     Attributes:
-        episodes: where each selected episode is.
-        slices: where each observation is.
-        features: all of ``meta/info.json``.
+        metadata: LeRobot's own, a ``LeRobotDatasetMetadata``.
+        episodes: the rows of ``meta/episodes`` of the selected episodes.
+        columns: of each observation the feature that holds it, and where in it.
         images: the feature of each of the images to read.
-        rendering: how the images were rendered, where that is known.
-        first_state: of the simulator in the first step of all, where that is known.
+        described: what ``meta/warmprior.json`` says; empty for datasets that were not converted.
 
     See Also:
         :func:`~warmprior.data.lerobot_index.read_lerobot_index`: makes it.
 
     Examples:
-        >>> episode = LeRobotEpisode(0, 0, 120, PurePosixPath("data/chunk-000/file-000.parquet"), 0, {})
-        >>> index = LeRobotIndex(
-        ...     path=Path("square_lerobot"), demos=("0",), lengths=(120,), observation_keys=("object",),
-        ...     observation_dims=(14,), image_keys=(), image_size=0, available_keys=("object",),
-        ...     action_dim=7, env_args={}, task=None, episodes=(episode,),
-        ...     slices={"object": LeRobotSlice(ENVIRONMENT_STATE, 0, 14)}, features={}, images={},
-        ...     rendering=None, first_state=None)
-        >>> [str(file) for file in index.files]
+        >>> index = read_lerobot_index("square_lerobot")  # doctest: +SKIP
+        >>> index.files  # doctest: +SKIP
         ['data/chunk-000/file-000.parquet']
     """
 
-    episodes: tuple[LeRobotEpisode, ...]
-    slices: Mapping[str, LeRobotSlice]
-    features: Mapping[str, Mapping[str, Any]]
+    metadata: Any
+    episodes: tuple[Mapping[str, Any], ...]
+    columns: Mapping[str, tuple[str, slice]]
     images: Mapping[str, str]
-    rendering: Mapping[str, Any] | None
-    first_state: Sequence[float] | None
+    described: Mapping[str, Any]
 
     @property
-    def files(self) -> list[PurePosixPath]:
-        """The files outside ``meta/`` that hold what is selected."""
-        videos = {
-            episode.videos[feature][0]
-            for episode in self.episodes
-            for feature in self.images.values()
-            if feature in episode.videos
-        }
-        return sorted({episode.file for episode in self.episodes} | videos)
+    def files(self) -> list[str]:
+        """The files outside ``meta/`` that hold what is selected, below the folder."""
+        videos = [name for name in self.images.values() if name in self.metadata.video_keys]
+        return sorted(
+            {
+                episode_file(self.metadata, e, name)
+                for e in self.episodes
+                for name in [None, *videos]
+            }
+        )
+
+    def digest(self) -> str:
+        """SHA-256 of the contents that can be read: names and bytes of their files.
+
+        These are all numbers, however few episodes are selected of a file, and the images that are. What
+        LeRobot or the hub keeps beside (statistics, a card, a cache) does not count.
+        """
+        meta = ("meta/info.json", DESCRIPTION, "meta/episodes/*/*.parquet")
+        files = {path for pattern in meta for path in self.path.glob(pattern)}
+        files |= {self.path / file for file in self.files}
+        return digest_of([[str(p.relative_to(self.path)), file_digest(p)] for p in sorted(files)])
+
+
+def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = None) -> str:
+    """The file, below the dataset's folder, that holds an episode's numbers or one of its videos.
+
+    Args:
+        metadata: see :func:`read_metadata`.
+        episode: its row of ``meta/episodes``.
+        video: the feature; the file of the numbers if ``None``.
+    """
+    part = "data" if video is None else f"videos/{video}"
+    numbers = {f"{n}_index": episode[f"{part}/{n}_index"] for n in ("chunk", "file")}
+    template = metadata.data_path if video is None else metadata.video_path
+    return template.format(video_key=video, **numbers)
+
+
+def read_metadata(root: Path) -> Any:
+    """Let LeRobot read what describes a dataset in a folder; the hub is never asked.
+
+    Args:
+        root: the dataset's folder.
+
+    Returns:
+        A ``LeRobotDatasetMetadata``.
+
+    Raises:
+        FileNotFoundError: if there is no dataset.
+        DatasetError: if it is empty or not whole, or LeRobot cannot read it.
+        ImportError: if lerobot is not installed.
+    """
+    if not (root / "meta" / "info.json").is_file():
+        raise FileNotFoundError(
+            f"{root}: no meta/info.json there, so no LeRobotDataset; check the path"
+        )
+    datasets = require("lerobot.datasets", "lerobot")
+    again = "Copy or download it again, or record or convert it anew"
+    for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet"):
+        if not any(root.glob(pattern)):  # LeRobot would look for it at the hub
+            raise DatasetError(
+                f"{root} has no {pattern}: the dataset has no episodes, or its recording did not end with "
+                f"LeRobotDataset.finalize(). {again}."
+            )
+    try:
+        metadata = datasets.LeRobotDatasetMetadata(f"local/{root.name}", root=root)
+    except Exception as error:  # of json, pyarrow, datasets and LeRobot itself
+        raise DatasetError(
+            f"{root}: LeRobot cannot read the meta/ of this dataset ({error}). {again}."
+        ) from error
+    if not metadata.total_episodes:
+        raise DatasetError(f"{root}: the dataset has no episodes: record some")
+    return metadata
+
+
+def vector_widths(features: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
+    """The widths of the features that are vectors of numbers.
+
+    Examples:
+        >>> vector_widths({"action": {"dtype": "float32", "shape": (7,)}})
+        {'action': 7}
+    """
+    return {
+        name: feature["shape"][0]
+        for name, feature in features.items()
+        if len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint"))
+    }
 
 
 def action_names(arms: int) -> list[str]:
@@ -146,6 +187,22 @@ def state_names(widths: Mapping[str, int]) -> list[str]:
     return [f"{key}_{i}" for key, width in widths.items() for i in range(width)]
 
 
+def layout_of(widths: Mapping[str, int]) -> dict[str, dict[str, int]]:
+    """Which feature of a converted dataset holds each observation of robomimic, and their widths.
+
+    Args:
+        widths: of the observations.
+
+    Examples:
+        >>> layout_of({"robot0_eef_pos": 3, "object": 10})
+        {'observation.environment_state': {'object': 10}, 'observation.state': {'robot0_eef_pos': 3}}
+    """
+    robots = {key: width for key, width in widths.items() if key.startswith("robot")}
+    others = {key: width for key, width in widths.items() if key not in robots}
+    layout = {ENVIRONMENT_STATE: others, ROBOT_STATE: robots}
+    return {feature: parts for feature, parts in layout.items() if parts}
+
+
 def read_lerobot_index(
     root: str | Path,
     *,
@@ -156,7 +213,7 @@ def read_lerobot_index(
     demos: int | None = None,
     env_args: Mapping[str, Any] | None = None,
 ) -> LeRobotIndex:
-    """Check the ``meta/`` of a LeRobotDataset v3 and say what it holds. No values are read.
+    """Say what a LeRobotDataset v3 holds, by its ``meta/``. No values are read.
 
     A dataset that :func:`warmprior.data.convert_robomimic` wrote says in which environment it was recorded,
     and where each of robomimic's observations is. In any other ``env_args`` says the former, and of a task of
@@ -178,8 +235,7 @@ def read_lerobot_index(
 
     Raises:
         FileNotFoundError: if there is no such dataset.
-        DatasetError: if it is of another version, its files are cut short or disagree, it has another
-            frequency or action than the environment, or a key or its statistics are missing.
+        DatasetError: if LeRobot cannot read it, it does not fit the environment, or a key is missing.
         ValueError: if no demos are to be taken.
 
     Examples:
@@ -194,255 +250,199 @@ def read_lerobot_index(
     root = Path(root)
     if demos is not None and demos < 1:
         raise ValueError(f"demos must be at least 1, got {demos}")
-    info = read_info(root)
-    features = info["features"]
-    described = read_description(root, features)
-    recorded = _environment(root, described, env_args)
+    metadata = read_metadata(root)
+    described = _description(root)
+    recorded = described.get("env_args") or dict(env_args or {})
+    if env_args and recorded["env_name"] != env_args["env_name"]:
+        raise DatasetError(
+            f"{root}: the dataset was recorded in {recorded['env_name']}, not in {env_args['env_name']}: "
+            "leave the task (env_args) out or correct it"
+        )
     task = task_of_env(recorded) if recorded else None
-    _check_frequency(root, info, recorded)
-    vectors = {name: width for name in features if (width := _width(features[name])) is not None}
-    action_dim = _action_dim(root, features, vectors, task, recorded)
-    slices = _slices(root, features, vectors, described, task)
-    if observation_keys is not None:
-        keys = tuple(observation_keys)
-    elif task is not None:
-        keys = task.low_dim_keys
-    elif described:
-        keys = tuple(slices)
-    else:
-        keys = tuple(key for key in (ENVIRONMENT_STATE, ROBOT_STATE) if key in slices)
-    if not keys:
+    widths = vector_widths(metadata.features)
+    if "action" not in widths:
+        raise DatasetError(
+            f"{root}: there is no feature 'action' that is a vector of numbers, but {widths}"
+        )
+    if recorded:
+        _check_actions(root, metadata, recorded, task)
+    columns = _columns(root, metadata.features, widths, described, task)
+    if observation_keys is None:
+        observation_keys = tuple(columns)
+        if task is not None:
+            observation_keys = task.low_dim_keys
+        elif not described:
+            observation_keys = [key for key in (ENVIRONMENT_STATE, ROBOT_STATE) if key in columns]
+    arms = range(min(widths["action"] // 7, 2)) if poses else ()
+    for key in [
+        *observation_keys,
+        *(f"robot{a}_eef_{end}" for a in arms for end in ("pos", "quat")),
+    ]:
+        if key not in columns:
+            raise DatasetError(
+                f"{root}: there is no observation {key!r} among {', '.join(columns)}: choose others with "
+                "observation_keys, or convert or record the dataset with it"
+            )
+    if not observation_keys:
         raise DatasetError(
             f"{root}: no observations are chosen; name some with observation_keys: "
-            f"{', '.join(slices) or 'there are none'}"
+            f"{', '.join(columns) or 'there are none'}"
         )
-    wanted = list(keys)
-    if poses:
-        for arm in range(min(action_dim // 7, 2)):
-            wanted += [f"robot{arm}_eef_pos", f"robot{arm}_eef_quat"]
-    for key in wanted:
-        if key not in slices:
-            raise DatasetError(
-                f"{info_path(root)}: there is no observation {key!r} among {', '.join(slices)}: choose "
-                "others with observation_keys, or convert or record the dataset with it"
-            )
-    if task is not None and observation_keys is None:
-        _check_widths(root, slices, task)
-    check_statistics(root, ["action", *(slices[key].feature for key in wanted)])
-    cameras = _cameras(features)
-    images, size = _images(root, features, cameras, image_keys)
-    videos = [name for name in images.values() if features[name]["dtype"] == "video"]
-    episodes = _selected(root, read_episodes(root, info, videos), described, filter_key)
+    cameras = {
+        f"{name.rpartition('.')[2]}_image": name
+        for name in metadata.camera_keys
+        if name not in metadata.depth_keys
+    }
+    episodes = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
+    if filter_key is not None:
+        masks = described.get("masks", {})
+        if filter_key not in masks:
+            known = f"choose one of {', '.join(masks)}" if masks else "this dataset has none"
+            raise DatasetError(f"{root}: unknown filter key {filter_key!r}; {known}")
+        episodes = [row for row in episodes if row["episode_index"] in masks[filter_key]]
     check_count(root, demos, len(episodes))
     episodes = episodes[:demos]
     return LeRobotIndex(
         path=root,
-        demos=tuple(str(episode.number) for episode in episodes),
-        lengths=tuple(episode.stop - episode.start for episode in episodes),
-        observation_keys=keys,
-        observation_dims=tuple(slices[key].stop - slices[key].start for key in keys),
+        demos=tuple(str(row["episode_index"]) for row in episodes),
+        lengths=tuple(row["length"] for row in episodes),
+        observation_keys=tuple(observation_keys),
+        observation_dims=tuple(
+            columns[key][1].stop - columns[key][1].start for key in observation_keys
+        ),
         image_keys=tuple(image_keys),
-        image_size=size,
-        available_keys=(*slices, *cameras),
-        action_dim=action_dim,
+        image_size=_image_size(root, metadata.features, cameras, image_keys),
+        available_keys=(*columns, *cameras),
+        action_dim=widths["action"],
         env_args=recorded,
         task=task,
+        metadata=metadata,
         episodes=tuple(episodes),
-        slices=slices,
-        features=features,
-        images=images,
-        rendering=described.get("rendering"),
-        first_state=described.get("first_state"),
+        columns=columns,
+        images={key: cameras[key] for key in image_keys},
+        described=described,
     )
 
 
-def _environment(
-    root: Path, described: Mapping[str, Any], env_args: Mapping[str, Any] | None
-) -> dict[str, Any]:
-    """The one that the dataset describes, or else the given one."""
-    if not described or env_args is None:
-        return described.get("env_args") or dict(env_args or {})
-    mine, theirs = described["env_args"]["env_name"], env_args["env_name"]
-    if mine != theirs:
-        raise DatasetError(
-            f"{root / DESCRIPTION}: the dataset was recorded in {mine}, not in {theirs}: leave the task "
-            "(env_args) out or correct it"
-        )
-    return described["env_args"]
+def _description(root: Path) -> dict[str, Any]:
+    path = root / DESCRIPTION
+    if not path.exists():
+        return {}
+    try:
+        found = read_json(path)
+    except ValueError as error:
+        raise DatasetError(f"{error}. Convert the file again.") from error
+    if not isinstance(found, dict) or found.get("format") != 1 or "observations" not in found:
+        raise DatasetError(f"{path} is not of this version: convert the file again, or remove it")
+    check_env_args(f"{path}: env_args", found.get("env_args"))
+    return found
 
 
-def _check_frequency(root: Path, info: Mapping[str, Any], env_args: Mapping[str, Any]) -> None:
-    if not env_args:
-        return
-    control = env_args["env_kwargs"].get("control_freq", 20)
-    if info["fps"] != control:
-        raise DatasetError(
-            f"{info_path(root)}: fps is {info['fps']}, but {env_args['env_name']} is controlled at "
-            f"{control} Hz, and one action per control step is needed: resample the dataset, or name "
-            "another task"
-        )
-
-
-def _width(feature: Mapping[str, Any]) -> int | None:
-    """Of a vector of numbers; ``None`` for any other feature."""
-    vector = len(feature["shape"]) == 1 and feature["dtype"] in FLOATS
-    return feature["shape"][0] if vector else None
-
-
-def _names(feature: Mapping[str, Any]) -> list[str] | None:
-    """The names of a vector's numbers, of whatever form; ``None`` if there are none."""
+def _check_names(root: Path, feature: Mapping[str, Any], expected: list[str], what: str) -> None:
     names = feature.get("names")
-    if isinstance(names, dict):
+    if isinstance(names, dict):  # {"motors": [...]} or {"x": 0, "y": 1, ...}
         lists = [value for value in names.values() if isinstance(value, list)]
-        # {"motors": [...]} or {"x": 0, "y": 1, ...}
         names = [name for value in lists for name in value] if lists else list(names)
-    return names or None
+    # Seven numbers may be joints as well as a pose.
+    if names and names != expected:
+        raise DatasetError(
+            f"{root}: {what} {', '.join(expected)}, but here they are named {', '.join(map(str, names))}: "
+            "choose another task or dataset or, if these are only other names, set the feature's names in "
+            "meta/info.json to null"
+        )
 
 
-def _check_names(
-    root: Path, features: Mapping[str, Any], name: str, expected: Sequence[str], what: str
+def _check_actions(
+    root: Path, metadata: Any, env_args: Mapping[str, Any], task: TaskSpec | None
 ) -> None:
-    names = _names(features[name])
-    if names is not None and names != list(expected):
+    """Whether the actions are those of an environment, one per control step."""
+    control = env_args["env_kwargs"].get("control_freq", 20)
+    if metadata.fps != control:
         raise DatasetError(
-            f"{info_path(root)}: {name!r} is named {', '.join(map(str, names))}, but {what} "
-            f"{', '.join(expected)}: choose another task or dataset or, if these are only other names, set "
-            f"features[{name!r}]['names'] to null"
+            f"{root}: fps is {metadata.fps}, but {env_args['env_name']} is controlled at {control} Hz, and "
+            "one action per control step is needed: resample the dataset, or name another task"
         )
+    if task is None:
+        return
+    action = metadata.features["action"]
+    if tuple(action["shape"]) != (task.action_dim,):
+        raise DatasetError(
+            f"{root}: 'action' has {action['shape'][0]} columns, but {task.env_name} takes "
+            f"{task.action_dim}: choose another task or dataset"
+        )
+    _check_names(root, action, action_names(task.arms), f"the actions of {task.env_name} are")
 
 
-def _action_dim(
+def _columns(
     root: Path,
     features: Mapping[str, Any],
-    vectors: Mapping[str, int],
-    task: TaskSpec | None,
-    env_args: Mapping[str, Any],
-) -> int:
-    if "action" not in vectors:
-        told = ", ".join(f"{n} {f['dtype']}{f['shape']}" for n, f in features.items())
-        raise DatasetError(
-            f"{info_path(root)}: there is no feature 'action' that is a vector of floating-point "
-            f"numbers, but {told}: rename or flatten it"
-        )
-    width = vectors["action"]
-    if task is not None:
-        told = f"{env_args['env_name']} takes"
-        if width != task.action_dim:
-            raise DatasetError(
-                f"{info_path(root)}: 'action' has {width} columns, but {told} {task.action_dim}: choose "
-                "another task or dataset"
-            )
-        _check_names(root, features, "action", action_names(task.arms), told)
-    return width
-
-
-def _slices(
-    root: Path,
-    features: Mapping[str, Any],
-    vectors: Mapping[str, int],
+    widths: Mapping[str, int],
     described: Mapping[str, Any],
     task: TaskSpec | None,
-) -> dict[str, LeRobotSlice]:
+) -> dict[str, tuple[str, slice]]:
     """Where the observations are."""
+    theirs = {name: width for name, width in widths.items() if name.startswith("observation.")}
     if described:
-        return {key: LeRobotSlice(*value) for key, value in described["observations"].items()}
-    prefix = "observation."
-    theirs = {name: width for name, width in vectors.items() if name.startswith(prefix)}
+        found = {
+            key: (name, slice(*ends)) for key, (name, *ends) in described["observations"].items()
+        }
+        needed = {} if task is None else task.low_dim_widths
+        for key, (name, part) in found.items():
+            width = needed.get(key, part.stop - part.start)
+            if not 0 <= part.start < part.stop == part.start + width <= theirs.get(name, 0):
+                raise DatasetError(
+                    f"{root / DESCRIPTION}: observations[{key!r}] are columns {part.start} to {part.stop} of "
+                    f"{name}, which do not fit the dataset or its task: convert the file again"
+                )
+        return found
     if task is None:
-        return {name: LeRobotSlice(name, 0, width) for name, width in theirs.items()}
-    widths = task.low_dim_widths
-    if all(theirs.get(prefix + key) == width for key, width in widths.items()):
-        return {key: LeRobotSlice(prefix + key, 0, width) for key, width in widths.items()}
-    robots = {key: width for key, width in widths.items() if key != "object"}
-    layouts = [
-        {ROBOT_STATE: widths},
-        {ENVIRONMENT_STATE: {"object": task.object_dim}, ROBOT_STATE: robots},
+        return {name: (name, slice(0, width)) for name, width in theirs.items()}
+    layouts: list[dict[str, dict[str, int]]] = [
+        {f"observation.{key}": {key: width} for key, width in task.low_dim_widths.items()},
+        layout_of(task.low_dim_widths),
+        {ROBOT_STATE: task.low_dim_widths},
     ]
-    layout = layouts[ENVIRONMENT_STATE in theirs]
-    needed = {name: sum(parts.values()) for name, parts in layout.items()}
-    if any(theirs.get(name) != width for name, width in needed.items()):
-        told = ", ".join(f"{name} of {width}" for name, width in theirs.items()) or "none"
-        ways = " or ".join(
-            ", ".join(f"{name} of {sum(parts.values())}" for name, parts in layout.items())
-            for layout in layouts
-        )
+    sums = [{name: sum(parts.values()) for name, parts in layout.items()} for layout in layouts]
+    fits = [total.items() <= theirs.items() for total in sums]
+    # Robots alone may be as wide as the whole state of another task.
+    fits[2] = fits[2] and ENVIRONMENT_STATE not in theirs
+    if not any(fits):
         raise DatasetError(
-            f"{info_path(root)}: the observations are {told}, but those of {task.env_name} are {ways}, "
-            f"or each of {', '.join(widths)} after 'observation.': choose another task or dataset"
+            f"{root}: the observations are {theirs}, but those of {task.env_name} are "
+            f"{' or '.join(map(str, reversed(sums)))}: choose another task or dataset"
         )
+    layout = layouts[fits.index(True)]
     found = {}
     for name, parts in layout.items():
-        _check_names(root, features, name, state_names(parts), f"{task.env_name} has")
-        start = 0
-        for key, width in parts.items():
-            found[key] = LeRobotSlice(name, start, start + width)
-            start += width
-    return {key: found[key] for key in widths}
+        if name in (ENVIRONMENT_STATE, ROBOT_STATE):
+            what = f"the numbers of {name} in {task.env_name} are"
+            _check_names(root, features[name], state_names(parts), what)
+        ends = pairwise(accumulate(parts.values(), initial=0))
+        found |= {key: (name, slice(*end)) for key, end in zip(parts, ends, strict=True)}
+    return {key: found[key] for key in task.low_dim_widths}
 
 
-def _check_widths(root: Path, slices: Mapping[str, LeRobotSlice], task: TaskSpec) -> None:
-    for key, width in task.low_dim_widths.items():
-        columns = slices[key].stop - slices[key].start
-        if columns != width:
-            raise DatasetError(
-                f"{root}: the observation {key!r} has {columns} columns, but that of {task.env_name} has "
-                f"{width}: convert the file again"
-            )
-
-
-def _cameras(features: Mapping[str, Any]) -> dict[str, str]:
-    """The feature of every image, by our names."""
-    return {
-        f"{name.rpartition('.')[2]}_image": name
-        for name, feature in features.items()
-        if feature["dtype"] in ("image", "video")
-        and not (isinstance(feature.get("info"), dict) and feature["info"].get("is_depth_map"))
-    }
-
-
-def _images(
+def _image_size(
     root: Path, features: Mapping[str, Any], cameras: Mapping[str, str], keys: Sequence[str]
-) -> tuple[dict[str, str], int]:
-    """The features of the images to read, and their side in pixels."""
-    path, sizes = info_path(root), {}
+) -> int:
+    """The side of the images to read, in pixels; 0 if there are none."""
+    sizes = set()
     for key in keys:
         if key not in cameras:
             known = ", ".join(f"{k} ({name})" for k, name in cameras.items()) or "none"
             raise DatasetError(
-                f"{path}: there are no images {key!r}; there are {known}. Choose other cameras, or render "
+                f"{root}: there are no images {key!r}; there are {known}. Choose other cameras, or render "
                 "them into a robomimic file (python -m warmprior render) and convert that with --images"
             )
-        shape = features[cameras[key]]["shape"]
-        if len(shape) != 3 or 3 not in (shape[0], shape[-1]):
-            raise DatasetError(f"{path}: {cameras[key]!r} has shape {shape}, not [side, side, 3]")
-        height, width = shape[:2] if shape[-1] == 3 else shape[1:]
-        if height != width:
+        shape = tuple(features[cameras[key]]["shape"])
+        side = max(shape)
+        if shape not in ((side, side, 3), (3, side, side)):
             raise DatasetError(
-                f"{path}: {cameras[key]!r} has shape {shape}; only square images can be used"
+                f"{root}: {cameras[key]!r} has shape {shape}; only square images of three colours can be used"
             )
-        sizes[key] = height
-    if len(set(sizes.values())) > 1:
-        told = ", ".join(f"{key} {size}" for key, size in sizes.items())
-        raise DatasetError(f"{path}: images have several sizes: {told}. Choose those of one size")
-    return {key: cameras[key] for key in keys}, next(iter(sizes.values()), 0)
-
-
-def _selected(
-    root: Path,
-    episodes: list[LeRobotEpisode],
-    described: Mapping[str, Any],
-    filter_key: str | None,
-) -> list[LeRobotEpisode]:
-    if filter_key is None:
-        return episodes
-    masks = described.get("masks", {})
-    if filter_key not in masks:
-        known = f"choose one of {', '.join(masks)}" if masks else "this dataset has none"
-        raise DatasetError(f"{root / DESCRIPTION}: unknown filter key {filter_key!r}; {known}")
-    numbers = set(masks[filter_key])
-    if not numbers or not numbers <= set(range(len(episodes))):
+        sizes.add(side)
+    if len(sizes) > 1:
         raise DatasetError(
-            f"{root / DESCRIPTION}: masks[{filter_key!r}] names no episodes, or such as there are not: "
-            "choose another filter key"
+            f"{root}: the images have several sizes, {sizes}: choose those of one size"
         )
-    return [episode for episode in episodes if episode.number in numbers]
+    return next(iter(sizes), 0)

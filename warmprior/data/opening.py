@@ -14,12 +14,12 @@ from warmprior.data.hdf5 import read_index
 from warmprior.data.index import DatasetIndex
 from warmprior.data.lerobot import (
     LeRobotExperienceReplay,
+    LeRobotReader,
     fetch_lerobot,
     find_lerobot,
     is_repository,
 )
 from warmprior.data.lerobot_index import LeRobotIndex
-from warmprior.data.lerobot_reader import lerobot_digest, open_lerobot
 from warmprior.data.replay import DemonstrationReplay
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
@@ -72,7 +72,7 @@ def check_place(place: str | Path, option: str) -> None:
             hint = f"; for a LeRobotDataset write {LEROBOT}{place}" if folder else ""
             raise FileNotFoundError(f"{option} {place}: no such file{hint}")
         return
-    require("pyarrow.parquet", "lerobot")
+    require("lerobot.datasets", "lerobot")
     if not is_repository(dataset) and not Path(dataset).expanduser().is_dir():
         raise FileNotFoundError(
             f"{option} {place}: no such folder, and no repository user/name of the hub"
@@ -256,7 +256,7 @@ class LeRobotFolder(Demonstrations):
 
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
         """SHA-256 of the files that are read."""
-        return lerobot_digest(self._fetched(image_keys=image_keys, demos=demos))
+        return self._fetched(image_keys=image_keys, demos=demos).digest()
 
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
@@ -266,16 +266,16 @@ class LeRobotFolder(Demonstrations):
 
         keys = [f"{camera}_image" for camera in cameras]
         index, images = self._fetched(image_keys=keys, demos=1), {}
-        with open_lerobot(index) as reader:
-            for key in keys:
-                image = torch.empty(1, 3, index.image_size, index.image_size, dtype=torch.uint8)
-                reader.images(index.demos[0], key, image)
-                images[key] = image[0].permute(1, 2, 0).numpy()
+        for key in keys:
+            image = torch.empty(1, 3, index.image_size, index.image_size, dtype=torch.uint8)
+            LeRobotReader(index).images(index.demos[0], key, image)
+            images[key] = image[0].permute(1, 2, 0).numpy()
+        state = index.described.get("first_state")
         compare_first_images(
             index,
             images,
-            state=None if index.first_state is None else np.asarray(index.first_state),
-            rendering=index.rendering,
+            state=None if state is None else np.asarray(state, np.float64),
+            rendering=index.described.get("rendering"),
             fast=fast,
             advice="render the robomimic file anew (python -m warmprior render) and convert it again",
         )

@@ -110,7 +110,7 @@ def _allocate(
         data.set(key, torch.zeros((), dtype=dtype).expand(steps, *width))
     needed = sum(value.numel() * value.element_size() for value in data.values(True, True))
     available = available_memory()
-    if storage == "memory" and available is not None and needed > available:
+    if storage == "memory" and needed > available:
         raise DatasetError(
             f"{index.path}: {steps} steps need {needed / 1e9:.1f} GB of memory, but "
             f"{available / 1e9:.1f} GB are free: use storage='memmap', or choose fewer with demos "

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -47,10 +49,7 @@ def success_posterior(successes: int, episodes: int) -> Any:
     """
     if not 0 <= successes <= episodes:
         raise ValueError(f"need 0 <= successes <= episodes, got {successes} and {episodes}")
-    require("scipy", "sim")
-    from scipy.stats import beta
-
-    return beta(successes + 1, episodes - successes + 1)
+    return require("scipy.stats", "sim").beta(successes + 1, episodes - successes + 1)
 
 
 def probability_better(
@@ -65,8 +64,8 @@ def probability_better(
         P(p_a > p_b) = \sum_{i=0}^{\alpha_a - 1} \frac{B(\alpha_b + i, \beta_a + \beta_b)}
             {(\beta_a + i)\, B(1 + i, \beta_a)\, B(\alpha_b, \beta_b)},
 
-    exact for whole numbers. Episodes of one training seed are independent; those of several seeds
-    pooled are not quite, and the probability is then too certain.
+    the distribution function of a beta negative binomial. Episodes of one training seed are independent;
+    those of several seeds pooled are not quite, and the probability is then too certain.
 
     Args:
         successes_a: ``k`` of ``a``.
@@ -76,6 +75,7 @@ def probability_better(
 
     Raises:
         ValueError: if not ``0 <= successes <= episodes``, for either.
+        ImportError: if scipy is missing.
 
     Examples:
         >>> round(probability_better(18, 20, 12, 20), 3)
@@ -83,26 +83,12 @@ def probability_better(
         >>> round(probability_better(0, 0, 0, 0), 3)  # nothing is known
         0.5
     """
-    counts = []
-    for successes, episodes in ((successes_a, episodes_a), (successes_b, episodes_b)):
-        if not 0 <= successes <= episodes:
-            raise ValueError(f"need 0 <= successes <= episodes, got {successes} and {episodes}")
-        counts.append((successes + 1, episodes - successes + 1))
-    (alpha_a, beta_a), (alpha_b, beta_b) = counts
-
-    def log_beta(a: int, b: int) -> float:
-        return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
-
-    terms = (
-        math.exp(
-            log_beta(alpha_b + i, beta_a + beta_b)
-            - math.log(beta_a + i)
-            - log_beta(1 + i, beta_a)
-            - log_beta(alpha_b, beta_b)
-        )
-        for i in range(alpha_a)
+    (alpha_a, beta_a), (alpha_b, beta_b) = (
+        success_posterior(*counts).args
+        for counts in ((successes_a, episodes_a), (successes_b, episodes_b))
     )
-    return min(1.0, math.fsum(terms))
+    better = require("scipy.stats", "sim").betanbinom(beta_a, beta_b, alpha_b)
+    return min(1.0, float(better.cdf(alpha_a - 1)))
 
 
 def top_k_mean(rates: Sequence[float], k: int) -> float:
@@ -120,8 +106,7 @@ def top_k_mean(rates: Sequence[float], k: int) -> float:
     """
     if not rates or k < 1:
         raise ValueError(f"need at least one rate and k >= 1, got {len(rates)} rates and k={k}")
-    best = sorted(rates, reverse=True)[:k]
-    return math.fsum(best) / len(best)
+    return statistics.fmean(sorted(rates, reverse=True)[:k])
 
 
 def paired_probability_better(wins: int, losses: int) -> float:
@@ -143,17 +128,17 @@ def paired_probability_better(wins: int, losses: int) -> float:
 
     Raises:
         ValueError: if one is negative.
+        ImportError: if scipy is missing.
 
     Examples:
-        >>> paired_probability_better(3, 0)  # 15 / 16
+        >>> round(paired_probability_better(3, 0), 4)  # 15 / 16
         0.9375
-        >>> paired_probability_better(4, 4)
+        >>> round(paired_probability_better(4, 4), 4)
         0.5
     """
     if wins < 0 or losses < 0:
         raise ValueError(f"need counts of at least 0, got {wins} and {losses}")
-    n = wins + losses + 1
-    return sum(math.comb(n, i) for i in range(wins + 1)) / 2**n
+    return float(success_posterior(wins, wins + losses).sf(0.5))
 
 
 @dataclass(frozen=True)
@@ -196,12 +181,8 @@ def summarize_seeds(values: Sequence[float]) -> SeedSummary:
     """
     if not values:
         raise ValueError("need at least one seed")
-    n = len(values)
-    mean = math.fsum(values) / n
-    if n == 1:
-        return SeedSummary(mean, math.nan, 1)
-    variance = math.fsum((value - mean) ** 2 for value in values) / (n - 1)
-    return SeedSummary(mean, math.sqrt(variance), n)
+    std = statistics.stdev(values) if len(values) > 1 else math.nan
+    return SeedSummary(statistics.fmean(values), std, len(values))
 
 
 def exceeds_one_sigma(method: SeedSummary, base: SeedSummary) -> bool:
@@ -251,6 +232,7 @@ def bootstrap_ratio(
 
     Raises:
         ValueError: if the shapes differ, or an option is out of range.
+        ImportError: if scipy is missing.
 
     See Also:
         :func:`~warmprior.diagnostics.curvature`: a measure whose ratio it judges.
@@ -278,10 +260,13 @@ def bootstrap_ratio(
     ratio = float(total[0] / total[1])
     if len(sums) == 1:
         return ratio, math.nan, math.nan
-    drawn = torch.randint(len(sums), (resamples, len(sums)), generator=generator)
-    resampled = sums[drawn].sum(1)
-    tail = (1.0 - level) / 2
-    ends = torch.quantile(
-        resampled[:, 0] / resampled[:, 1], torch.tensor([tail, 1 - tail]).double()
+    found = require("scipy.stats", "sim").bootstrap(
+        tuple(sums.T.numpy()),
+        lambda above, below, axis: above.sum(axis) / below.sum(axis),
+        n_resamples=resamples,
+        confidence_level=level,
+        paired=True,
+        method="percentile",
+        rng=np.random.default_rng(int(torch.randint(2**62, (), generator=generator))),
     )
-    return ratio, float(ends[0]), float(ends[1])
+    return ratio, float(found.confidence_interval.low), float(found.confidence_interval.high)

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 from torch import Tensor
 
 __all__ = [
@@ -193,18 +194,10 @@ def _remove_stale(path: Path) -> None:
         # Elsewhere only age tells: no write takes a day.
         here = node.partition(".")[2] == platform.node()
         with contextlib.suppress(OSError):
-            if (here and not _runs(int(process))) or time.time() - old.stat().st_mtime > 86_400:
+            if (
+                here and not psutil.pid_exists(int(process))
+            ) or time.time() - old.stat().st_mtime > 86_400:
                 old.unlink()
-
-
-def _runs(process: int) -> bool:
-    try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        pass  # another user's
-    return True
 
 
 def _remove(path: Path) -> None:

@@ -45,6 +45,7 @@ def generate_demonstrations(
     seed: int = 0,
     *,
     path: str | Path | None = None,
+    overwrite: bool = False,
     cache_dir: str | Path | None = None,
     workers: int | None = None,
     progress: bool = True,
@@ -63,8 +64,9 @@ def generate_demonstrations(
         style: ``"ph"`` for one skilled operator, ``"mh"`` for six of three levels.
         n: number of demonstrations.
         seed: 0 to 99; files of different seeds share no episode.
-        path: where to write, replacing what is there. ``None`` for the cache, from which a file
-            generated earlier with the same arguments is returned at once.
+        path: where to write. ``None`` for the cache, from which a file generated earlier with the same
+            arguments is returned at once.
+        overwrite: replace what is at ``path``.
         cache_dir: ``None`` for ``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set.
         workers: number of processes; ``None`` for one per available core.
         progress: show a bar with the remaining time.
@@ -74,6 +76,7 @@ def generate_demonstrations(
 
     Raises:
         ImportError: if robosuite, h5py or tqdm is not installed.
+        FileExistsError: if there is something at ``path``.
         ValueError: if the task is unknown or has no scripted expert, or an option is out of range.
         RuntimeError: if the experts fail too often to reach ``n``.
 
@@ -106,6 +109,10 @@ def generate_demonstrations(
         if path.exists():
             return path
     path = Path(path)
+    if path.exists() and not overwrite:
+        raise FileExistsError(
+            f"{path} exists: choose another file, or replace it (overwrite, --overwrite)"
+        )
     for module in ("h5py", "tqdm"):
         require(module, "sim")
     import_robosuite()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +12,7 @@ import numpy as np
 from warmprior.data.scripted.episode import Episode
 from warmprior.data.scripted.operators import LEVELS
 from warmprior.io.extras import require
+from warmprior.io.files import write_atomic
 
 __all__ = ["write_robomimic"]
 
@@ -53,35 +52,27 @@ def write_robomimic(
         9378
     """
     h5py = require("h5py", "sim")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
-    os.close(handle)
-    partial = Path(name)
-    try:
-        total = 0
-        levels: list[str] = []
-        with h5py.File(partial, "w") as file:
+    steps: list[int] = []
+    levels: list[str] = []
+
+    def write(temporary: Path) -> None:
+        with h5py.File(temporary, "w") as file:
             data = file.create_group("data")
             for episode in episodes:
                 demo = data.create_group(f"demo_{len(levels)}")
                 _write_demo(demo, episode)
                 demo.attrs["model_file"] = model_file
                 levels.append(episode.level)
-                total += len(episode.actions)
-            data.attrs["total"] = total
+                steps.append(len(episode.actions))
+            data.attrs["total"] = sum(steps)
             data.attrs["env_args"] = json.dumps(env_args, indent=4)
             data.attrs.update(attributes or {})
             for key, demos in _filter_keys(levels, np.random.default_rng(seed)).items():
                 names = sorted(f"demo_{i}" for i in demos)
                 file.create_dataset(f"mask/{key}", data=np.array(names, dtype="S"))
-        # mkstemp makes files private; take the permissions that open() would have given.
-        umask = os.umask(0)
-        os.umask(umask)
-        partial.chmod(0o666 & ~umask)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
-    return total
+
+    write_atomic(path, write)
+    return sum(steps)
 
 
 def _write_demo(demo: Any, episode: Episode) -> None:
