@@ -376,7 +376,7 @@ def test_batches_that_do_not_fit(policy):
         with pytest.raises(KeyError, match=f"lacks {name}"):
             adapter.loss(short)
     with pytest.raises(
-        ValueError, match=r"windows of \[8\] actions, expected \[16\].*history_indices\(8, 8, 0\)"
+        ValueError, match=r"windows of \[8\] actions, expected \[16\].*adapter.action_indices"
     ):
         adapter.loss(
             {

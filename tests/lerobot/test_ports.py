@@ -54,6 +54,8 @@ def test_shapes(family, policy):
     assert port.length(made) == LENGTH
     assert port.width(made) == width(family)
     assert port.lead(made) == lead(family)
+    last = LENGTH - lead(family)  # H before the current step, and what the chunk has from there on
+    assert adapter_of(family, made).action_indices == list(range(-last, last))
 
 
 @pytest.mark.parametrize("family", [f for f in FAMILIES if f != "xvla"])

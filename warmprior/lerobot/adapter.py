@@ -50,7 +50,7 @@ class WarmPriorAdapter:
     own units, after LeRobot's preprocessor and before its postprocessor.
 
     For training, the dataset gives ``H`` more actions in front of each chunk: set
-    ``delta_timestamps["action"]`` to :func:`history_indices` over the frame rate. They ride in
+    ``delta_timestamps["action"]`` to :attr:`action_indices` over the frame rate. They ride in
     ``batch["action"]`` ``[B, H + T, d_a]``, and ``batch["action_is_pad"]`` tells which of them lie before
     the episode. LeRobot fills those with the episode's first action, the very target, so they are never used.
     GR00T's preprocessor takes no longer chunks: give it the history as ``"action_history"`` with
@@ -134,6 +134,11 @@ class WarmPriorAdapter:
         self._state: Tensor | None = None
         self._now: Tensor | None = None
         self._sampling = False
+
+    @property
+    def action_indices(self) -> list[int]:
+        """The :func:`history_indices` of prior and policy."""
+        return history_indices(self.prior.history_length, self.source.length, self.source.lead)
 
     def loss(
         self,
@@ -288,7 +293,7 @@ class WarmPriorAdapter:
             expected = [length, history]
         else:
             past, past_is_pad = actions, is_pad
-            expected = [len(history_indices(history, length, self.source.lead))]
+            expected = [len(self.action_indices)]
             if actions.shape[1] == expected[0]:
                 before = max(history, self.source.lead)
                 past, past_is_pad = (value[:, :before][:, -history:] for value in (actions, is_pad))
@@ -296,8 +301,8 @@ class WarmPriorAdapter:
         if given != expected:
             raise ValueError(
                 f"the batch has windows of {given} actions, expected {expected}: {history} before the "
-                f"current step and T={length} of the chunk. Take the steps of history_indices({history}, "
-                f"{length}, {self.source.lead}) from the dataset"
+                f"current step and T={length} of the chunk. Take the steps of adapter.action_indices "
+                "from the dataset"
             )
         for name, mask, values in (
             ("action_is_pad", is_pad, actions),

@@ -29,6 +29,8 @@ class WarmPriorActor(TensorDictModuleBase):
     arrives under keys (written by :class:`~warmprior.ActionHistory` in an environment and by
     :class:`~warmprior.ActionWindow` in a replay buffer) and everything it predicts leaves under keys,
     so it works unchanged in ``env.rollout``, collectors, batched environments and replay buffers.
+    TorchRL's ``ExplorationType`` is not read, for a flow needs its noise: seed the generator, or take a prior
+    with ``sigma=0``.
 
     Args:
         network: velocity network, see :class:`ODEActor`.
