@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import gc
 import multiprocessing
 import traceback
 from pathlib import Path
@@ -28,6 +29,7 @@ def apart(function):
         ours, theirs = fork.Pipe(duplex=False)
 
         def work():
+            gc.freeze()  # what has threads, as video decoders have, ends in the process that they are in
             end_with_parent()
             try:
                 outcome = function(*args, **kwargs), None
@@ -36,6 +38,7 @@ def apart(function):
                 outcome = None, error
             theirs.send(outcome)
 
+        gc.collect()
         process = fork.Process(target=work)
         process.start()
         theirs.close()
