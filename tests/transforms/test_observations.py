@@ -264,9 +264,14 @@ def test_nested_entries_are_normalised_on_both_sides():
     torch.testing.assert_close(first, normal["observation", "state"][0])
 
 
-@pytest.mark.parametrize("shape", [(9,), (9, 2, 2)])
-def test_windows_refuse_actions_that_are_no_vector(shape):
-    data = TensorDict({"observation": torch.zeros(9, 3), "action": torch.zeros(shape)}, [9])
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [((9,), None), ((9, 2, 2), None), ((9, 2), torch.int64)]
+)
+def test_windows_refuse_actions_that_are_no_vector_of_numbers(shape, dtype):
+    actions = torch.zeros(shape, dtype=dtype)
+    data = TensorDict({"observation": torch.zeros(9, 3), "action": actions}, [9])
     data["episode"] = torch.zeros(9, dtype=torch.int64)
-    with pytest.raises(ValueError, match=r"one vector, 'action' \[N, d_a\], got \(9"):
+    with pytest.raises(
+        ValueError, match=r"one vector of real numbers, 'action' \[N, d_a\], got \(9"
+    ):
         ActionWindow(data, H)

@@ -405,10 +405,3 @@ def test_bad_values_are_located_in_every_part_of_the_data(bad):
 def test_buffers_that_cannot_be(options, said):
     with pytest.raises(ValueError, match=said):
         window_replay_buffer(steps([20]), PastPrior(2), **({"batch_size": 4} | options))
-
-
-def test_whole_numbers_are_no_actions():
-    data = steps([20])
-    data["action"] = data["action"].long()
-    with pytest.raises(ValueError, match=r"vector of real numbers, 'action'.*int64.*\.float\(\)"):
-        ActionWindow(data, 2)
