@@ -104,7 +104,7 @@ def test_the_quickstart_runs_from_the_wheel(python, tmp_path):
     assert [float(line) < 0 for line in told.split()] == [True, True]
     told = run(python, "-m", "warmprior", "info", "policy", cwd=tmp_path)
     assert "PastPrior(chunk_length=8" in told
-    assert f"warmprior {PROJECT['version']}, format 3" in told
+    assert f"warmprior {PROJECT['version']}, format 5" in told
 
 
 def test_the_plugin_and_the_citation_have_the_same_version():
