@@ -280,7 +280,7 @@ except OSError as error:
 
 def test_names_of_repositories(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert lerobot.is_repository("user/name")
+    assert lerobot.is_remote("user/name")
     os.makedirs("user/name")
     for name in ("user/name", "name", "./name", "a/b/c", "/user/name", "~/name"):
-        assert not lerobot.is_repository(name)
+        assert not lerobot.is_remote(name)

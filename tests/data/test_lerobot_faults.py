@@ -86,6 +86,10 @@ META = {
         ["2.1", "convert_dataset_v21_to_v30"],
     ),
     "no JSON": (cut("meta/info.json"), ["LeRobot cannot read", "again"]),
+    "files elsewhere": (
+        info(lambda i: i.update(data_path="../{chunk_index:03d}/{file_index:03d}.parquet")),
+        ["info.json names '../000/000.parquet'", "not in the folder"],
+    ),
     "no tasks": (without("meta/tasks.parquet"), ["no meta/tasks.parquet", "finalize()"]),
     "no episodes": (without(EPISODES), ["no meta/episodes/*/*.parquet", "finalize()"]),
     "cut-off episodes": (cut(EPISODES), ["LeRobot cannot read", "again"]),

@@ -315,7 +315,8 @@ def failing(fails, latency):
 
 def test_a_decision_that_fails_is_tried_again_while_actions_are_left():
     policy, executor = failing({1, 2}, latency=1)
-    found = [executor.act(torch.tensor([float(tick)])) for tick in range(12)]
+    with pytest.warns(UserWarning, match=r"decision failed.*camera.*the 4 actions that are left"):
+        found = [executor.act(torch.tensor([float(tick)])) for tick in range(12)]
     # Which decision an action is of, and for which step: those of the steps 4 and 5 failed.
     assert [action[1].item() for action in found] == list(range(12))
     assert [action[0].item() for action in found] == [0.0] * 7 + [6.0] * 4 + [10.0]
@@ -325,6 +326,7 @@ def test_a_decision_that_fails_is_tried_again_while_actions_are_left():
     assert not last["forecast"][2:].any()
 
 
+@pytest.mark.filterwarnings("ignore:a decision failed")
 @pytest.mark.parametrize("latency", [None, 1])
 def test_an_error_reaches_the_loop_once_no_action_is_left(latency):
     policy, executor = failing(range(1, 99), latency)

@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, EnvBase, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
 from tests.processes import ended
 from tests.toy_env import ACTION_DIM, CountingEnv
@@ -526,6 +526,13 @@ def test_policy_and_environment_need_one_normaliser():
         return evaluate(actor, env, episodes=1, first_seed=0)
 
     assert play(mine)[0].steps == length_of(0)
+    # Wherever the transforms are.
+    transforms = [StepCounter(), policy_transforms(PastPrior(H), normalizer=mine)]
+    for env in (
+        TransformedEnv(SeededEnv(), Compose(*transforms)),
+        TransformedEnv(TransformedEnv(SeededEnv(), transforms[1].clone()), StepCounter()),
+    ):
+        assert evaluate(actor, env, episodes=1, first_seed=0)[0].steps == length_of(0)
     for wrong, said in ((None, "has no normaliser"), (other, "has another normaliser")):
         with pytest.raises(ValueError, match=f"{said}.*normalizer=policy.normalizer"):
             play(wrong)

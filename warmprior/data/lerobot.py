@@ -29,6 +29,7 @@ from warmprior.data.lerobot_index import (
 )
 from warmprior.data.replay import DemonstrationReader, DemonstrationReplay, check_storage
 from warmprior.io.extras import require
+from warmprior.io.hub import is_repository
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
 __all__ = [
@@ -36,7 +37,7 @@ __all__ = [
     "LeRobotReader",
     "fetch_lerobot",
     "find_lerobot",
-    "is_repository",
+    "is_remote",
     "lerobot_steps",
 ]
 
@@ -45,20 +46,16 @@ TOLERANCE = 1e-4  # seconds between a step and its frame, LeRobot's own
 _REBUILD = "Record the episode again or remove it (lerobot-edit-dataset), or leave it out."
 
 
-def is_repository(dataset: str | Path) -> bool:
+def is_remote(dataset: str | Path) -> bool:
     """Whether a name is a repository of the hub, ``user/name``, and no folder here."""
-    path = Path(dataset)
-    named = (
-        len(path.parts) == 2 and not path.is_absolute() and path.parts[0] not in (".", "..", "~")
-    )
-    return named and not path.exists()
+    return is_repository(str(dataset)) and not Path(dataset).exists()
 
 
 def _root(
     dataset: str | Path, files: Sequence[str] = ("meta/*",), revision: str | None = None
 ) -> Path:
     """The folder of a dataset, with files of it fetched if it is in the hub."""
-    if is_repository(dataset):
+    if is_remote(dataset):
         return download_lerobot(str(dataset), files, revision=revision)
     return Path(dataset).expanduser()
 

@@ -99,7 +99,12 @@ def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = 
     part = "data" if video is None else f"videos/{video}"
     numbers = {f"{n}_index": episode[f"{part}/{n}_index"] for n in ("chunk", "file")}
     template = metadata.data_path if video is None else metadata.video_path
-    return template.format(video_key=video, **numbers)
+    file = template.format(video_key=video, **numbers)
+    if file.startswith("/") or ".." in file.split("/"):
+        raise DatasetError(
+            f"{metadata.root}: meta/info.json names {file!r}, which is not in the folder"
+        )
+    return file
 
 
 def read_metadata(root: Path) -> Any:

@@ -17,7 +17,7 @@ from warmprior.data.lerobot import (
     LeRobotReader,
     fetch_lerobot,
     find_lerobot,
-    is_repository,
+    is_remote,
 )
 from warmprior.data.lerobot_index import LeRobotIndex
 from warmprior.data.replay import DemonstrationReplay
@@ -73,7 +73,7 @@ def check_place(place: str | Path, option: str) -> None:
             raise FileNotFoundError(f"{option} {place}: no such file{hint}")
         return
     require("lerobot.datasets", "lerobot")
-    if not is_repository(dataset) and not Path(dataset).expanduser().is_dir():
+    if not is_remote(dataset) and not Path(dataset).expanduser().is_dir():
         raise FileNotFoundError(
             f"{option} {place}: no such folder, and no repository user/name of the hub"
         )
@@ -100,9 +100,7 @@ def resolved_place(place: Path) -> str:
     dataset = _lerobot(place)
     if dataset is None:
         return str(place.resolve())
-    return (
-        str(place) if is_repository(dataset) else f"{LEROBOT}{Path(dataset).expanduser().resolve()}"
-    )
+    return str(place) if is_remote(dataset) else f"{LEROBOT}{Path(dataset).expanduser().resolve()}"
 
 
 def open_demonstrations(

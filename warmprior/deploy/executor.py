@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections import deque
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from concurrent.futures import TimeoutError as NotDone
@@ -263,7 +264,12 @@ class AsyncExecutor:
         if (error := self._pending.exception()) is not None:
             self._pending, self._failed = None, True
             if self._executed < self._left:
-                return  # there are actions left: go on with them, and try again
+                warnings.warn(
+                    f"a decision failed ({error!r}): the {self._left - self._executed} actions that are left "
+                    "are executed, and the decision is tried again",
+                    stacklevel=3,
+                )
+                return
             raise error
         latency = 0 if self.latency is None or self._first else self.latency
         if self._executed < min(latency, self._left):

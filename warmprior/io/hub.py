@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -10,7 +11,7 @@ from pathlib import Path
 
 from warmprior.io.extras import require
 
-__all__ = ["deadline", "snapshot", "until"]
+__all__ = ["deadline", "is_repository", "snapshot", "until"]
 
 LIMIT_SECONDS = 3600.0
 """For everything that one call fetches or sends, whatever a server does."""
@@ -19,6 +20,17 @@ LIMIT_SECONDS = 3600.0
 def deadline() -> float:
     """When a call that begins now has to be done, by ``time.monotonic()``."""
     return time.monotonic() + LIMIT_SECONDS
+
+
+def is_repository(name: str) -> bool:
+    """Whether a text has the form of a repository's name at the hub.
+
+    Examples:
+        >>> [is_repository(name) for name in ("user/name", "runs/a/b", "../name", "policy", "/tmp/name")]
+        [True, False, False, False, False]
+    """
+    part = r"[A-Za-z0-9_]([A-Za-z0-9._-]*[A-Za-z0-9_])?"
+    return bool(re.fullmatch(f"{part}/{part}", name))
 
 
 def snapshot(

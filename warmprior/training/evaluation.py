@@ -507,7 +507,10 @@ def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
     normalizer = getattr(policy, "normalizer", None)
     if normalizer is None or isinstance(_base_of(env), SerialEnv | ParallelEnv):
         return  # what lies inside of workers cannot be asked
-    scalings = [t for t in getattr(env, "transform", ()) if isinstance(t, ActionScaling)]
+    scalings: list[ActionScaling] = []
+    while isinstance(env, TransformedEnv):
+        scalings += [t for t in env.transform.modules() if isinstance(t, ActionScaling)]
+        env = env.base_env
     loc, scale = normalizer.loc(keys.ACTION), normalizer.scale(keys.ACTION)
     if not any(
         torch.equal(t.loc.cpu(), loc.cpu()) and torch.equal(t.scale.cpu(), scale.cpu())
@@ -516,7 +519,8 @@ def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
         found = "has another normaliser" if scalings else "has no normaliser"
         raise ValueError(
             f"the policy was trained in the units of its normaliser, and the environment {found}: give "
-            "policy_transforms(..., normalizer=policy.normalizer)"
+            "policy_transforms(..., normalizer=policy.normalizer), or play policy.replace(normalizer=None) "
+            "where the environment is in these units already"
         )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import tempfile
 from collections.abc import Mapping
 from importlib.metadata import version
@@ -17,7 +16,7 @@ from torch import Tensor, nn
 
 from warmprior.io.extras import require
 from warmprior.io.files import as_json, read_json, write_atomic
-from warmprior.io.hub import deadline, snapshot, until
+from warmprior.io.hub import deadline, is_repository, snapshot, until
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled, without_compilation
 from warmprior.modules.network import VelocityNetwork
@@ -73,7 +72,7 @@ def _folder(
 ) -> Path:
     """Where the files of a policy lie, fetched from the hub if need be."""
     path = Path(place)
-    if path.exists() or not (isinstance(place, str) and _is_repository(place)):
+    if path.exists() or not (isinstance(place, str) and is_repository(place)):
         if revision is not None:
             raise ValueError(
                 f"{place} is a folder on this machine, or no user/name of a repository at the hub: leave out "
@@ -92,13 +91,8 @@ def _folder(
 
 def check_repository(name: str) -> None:
     """Raise ValueError if a text has not the form of a repository's name at the hub."""
-    if not _is_repository(name):
+    if not is_repository(name):
         raise ValueError(f"{name!r} is no name of a repository at the hub: use user/name")
-
-
-def _is_repository(name: str) -> bool:
-    part = r"[A-Za-z0-9_]([A-Za-z0-9._-]*[A-Za-z0-9_])?"
-    return bool(re.fullmatch(f"{part}/{part}", name))
 
 
 def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
