@@ -32,9 +32,7 @@ def main(argv: list[str] | None) -> None:
         title = f"{policies[0].task().title}, {options.evaluation.seeds} seed(s)"
         plot_chunk_lengths(rows, out / "chunk_lengths.png", top_k=top_k, title=title)
         fewest = rows[rows.nfe == min(rows.nfe)]
-        plot_bars(
-            fewest[fewest.chunk.isin((shortest, 8))], out / "bars.png", top_k=top_k, title=title
-        )
+        plot_bars(fewest[fewest.chunk.isin((shortest, 8))], out / "bars.png", top_k=top_k, title=title)
         short = last_checkpoints(rows[rows.chunk == shortest])
         plot_success(short, out / "violins.png", title=f"{title}, H = {shortest}")
         table = chunk_table(rows, top_k)

@@ -59,9 +59,7 @@ from warmprior.training.task import task_places
 from warmprior.transforms import policy_transforms
 
 LEARNING_SHARE = 0.25  # gradient steps of sources that learn before the flow, per step of the flow
-EPISODES_PER_JOB = (
-    5  # so few that all cores are busy to the end; so many that policies are loaded seldom
-)
+EPISODES_PER_JOB = 5  # so few that all cores are busy to the end; so many that policies are loaded seldom
 
 
 @dataclass(frozen=True)
@@ -84,9 +82,7 @@ class Policy:
         return policies_folder(self.run) / self.name
 
     def __str__(self) -> str:
-        return (
-            f"{self.facts['task']} {self.facts['data']}, {self.method}, seed {self.training.seed}"
-        )
+        return f"{self.facts['task']} {self.facts['data']}, {self.method}, seed {self.training.seed}"
 
     @property
     def path(self) -> Path:
@@ -399,9 +395,7 @@ def finished_policies(
         same = row["sigma"], row["chunk"], row["iterations"]
         variants.setdefault((method.name, method.options), set()).add(same)
     if len(tasks) > 1 or any(len(found) > 1 for found in variants.values()):
-        raise ValueError(
-            f"--run {run}: name a run of one task and style, with one sigma and chunk length"
-        )
+        raise ValueError(f"--run {run}: name a run of one task and style, with one sigma and chunk length")
     return tasks[0], actors
 
 
@@ -447,9 +441,7 @@ def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int
 
 
 @lru_cache(maxsize=1)
-def prepared(
-    policy: Policy, checkpoint: int, cell: Cell, play_on: bool
-) -> tuple[WarmPriorActor, EnvBase]:
+def prepared(policy: Policy, checkpoint: int, cell: Cell, play_on: bool) -> tuple[WarmPriorActor, EnvBase]:
     """A policy and its environment: an episode after one of the same policy needs no preparation."""
     key = (policy.data, *policy.place, policy.network.observation_steps)
     actor = policy.load(checkpoint).replace(guidance=cell.guidance)

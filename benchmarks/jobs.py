@@ -46,9 +46,7 @@ class Job:
     group: str = ""  # after a failure, the other jobs of its group are left out
     then: Callable[[Any], object] | None = None  # called here with the result
     training: bool = False  # it is long, and takes a GPU if there is one
-    status: Path | None = (
-        None  # where it reports its progress: {"iteration": ..., "iterations": ...}
-    )
+    status: Path | None = None  # where it reports its progress: {"iteration": ..., "iterations": ...}
     deaths: int = 0
     done: bool = False
 
@@ -215,9 +213,7 @@ class Jobs:
     def _next(self) -> Job | None:
         """The job that starts now, if one can."""
         ready = [
-            job
-            for job in self._waiting
-            if (job.after is None or job.after.done) and self.engine.takes(job)
+            job for job in self._waiting if (job.after is None or job.after.done) and self.engine.takes(job)
         ]
         trainings = [job for job in ready if job.training]
         if trainings and sum(job.training for job in self._waiting) <= self.engine.workers:
@@ -259,9 +255,7 @@ class Progress:
         # disable=None: no bars without a terminal.
         options: dict[str, Any] = {"leave": False, "dynamic_ncols": True, "disable": None}
         self._whole = tqdm(total=total, desc="jobs", **options)
-        self._bars = [
-            tqdm(position=1 + i, bar_format="{desc}", **options) for i in range(min(workers, 8))
-        ]
+        self._bars = [tqdm(position=1 + i, bar_format="{desc}", **options) for i in range(min(workers, 8))]
 
     def __enter__(self) -> Self:
         return self
@@ -278,9 +272,7 @@ class Progress:
             for bar, job in zip_longest(self._bars, running[: len(self._bars)]):
                 done = job and job.iterations()
                 bar.n, bar.total = done or (0, 1)
-                bar.bar_format = (
-                    "{desc}: {percentage:3.0f}%|{bar}| {n}/{total}" if done else "{desc}"
-                )
+                bar.bar_format = "{desc}: {percentage:3.0f}%|{bar}| {n}/{total}" if done else "{desc}"
                 bar.set_description_str(job.name if job else "")
         elif time.monotonic() - self._spoke > LINES_EVERY:
             self._spoke = time.monotonic()

@@ -66,13 +66,9 @@ class Learner(nn.Module):
         """Whether there are networks."""
         if not hasattr(self, "action_dim"):
             name = type(self).__name__
-            raise ValueError(
-                f"{name} has no networks yet: give widths=[d_a, d_o, To], and learn(...)"
-            )
+            raise ValueError(f"{name} has no networks yet: give widths=[d_a, d_o, To], and learn(...)")
 
-    def learning_loss(
-        self, windows: LearningWindows, generator: torch.Generator | None = None
-    ) -> Tensor:
+    def learning_loss(self, windows: LearningWindows, generator: torch.Generator | None = None) -> Tensor:
         """What the networks minimise on windows; the error of their forecast by default."""
         predicted = self.predicted(windows.history, windows.observation)
         return windows.mean((windows.a1 - predicted).square())
@@ -165,9 +161,7 @@ class ForecastPrior(LearnedPrior):
     def _calibrated(self, scale: Tensor) -> Tensor:
         return (self.calibration * scale).clamp_min(SCALE_FLOOR)
 
-    def _gaussian(
-        self, history: TensorDictBase, observation: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
+    def _gaussian(self, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
         """Mean and scale before the calibration."""
         out = self.outputs(history, observation)
         mean, raw = out.unflatten(-1, (2, self.chunk_length, self.action_dim)).unbind(-3)
@@ -177,9 +171,7 @@ class ForecastPrior(LearnedPrior):
         mean, scale = self._gaussian(history, observation)
         return self._everywhere(mean, self.sigma * self._calibrated(scale))
 
-    def learning_loss(
-        self, windows: LearningWindows, generator: torch.Generator | None = None
-    ) -> Tensor:
+    def learning_loss(self, windows: LearningWindows, generator: torch.Generator | None = None) -> Tensor:
         mean, scale = self._gaussian(windows.history, windows.observation)
         return windows.mean(scale.log() + 0.5 * ((windows.a1 - mean) / scale).square())
 
@@ -287,9 +279,7 @@ class CVAEPrior(LearnedPrior):
         loc, scale, warm = super().distribution(history, observation)
         return _Decoded(loc, scale, warm, prior=self, seen=self.seen(history, observation))
 
-    def learning_loss(
-        self, windows: LearningWindows, generator: torch.Generator | None = None
-    ) -> Tensor:
+    def learning_loss(self, windows: LearningWindows, generator: torch.Generator | None = None) -> Tensor:
         seen = self.seen(windows.history, windows.observation)
         found = self.encoder(torch.cat([seen, (windows.a1 * windows.counted).flatten(-2)], -1))
         mean, log_variance = found.chunk(2, -1)
@@ -328,9 +318,7 @@ class ForecastStart(StartPoint, Learner):
     ) -> None:
         check_finite_numbers(start_time=start_time, stall=stall, stall_noise=stall_noise)
         if not 0.0 < start_time < 1.0 or stall < 0:
-            raise ValueError(
-                f"need 0 < start_time < 1 and stall >= 0, got {start_time} and {stall}"
-            )
+            raise ValueError(f"need 0 < start_time < 1 and stall >= 0, got {start_time} and {stall}")
         nn.Module.__init__(self)
         self.chunk_length = chunk_length
         self.time, self.noise_share = start_time, 1.0 - start_time
@@ -390,9 +378,7 @@ def learn(
 ) -> None:
     """Train the networks of a learner, in place, and calibrate it on episodes that it does not learn from."""
     if iterations < 1 or not 0.0 < held_out <= 0.5:
-        raise ValueError(
-            f"need iterations >= 1 and 0 < held_out <= 0.5, got {iterations} and {held_out}"
-        )
+        raise ValueError(f"need iterations >= 1 and 0 < held_out <= 0.5, got {iterations} and {held_out}")
     learner.check_built()
     data = without_images(data)  # no learner sees them
     episodes = data[keys.EPISODE].flatten()

@@ -217,9 +217,7 @@ def average(per_seed: Sequence[TensorDict]) -> TensorDict:
     return TensorDict(mean, batch_size=per_seed[0].shape)
 
 
-def ratios(
-    values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int
-) -> dict[str, float]:
+def ratios(values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int) -> dict[str, float]:
     """The ratios to the baseline, with their 95% intervals."""
     found: dict[str, float] = {}
     # A field that predicts no motion has no error of one step either, and no merit in that.

@@ -20,9 +20,7 @@ from report import markdown, read_rows, summary
 @script("memory.py")
 def main(argv: list[str] | None) -> None:
     """Read the runs, print a table and draw a point per task, method and NFE."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("runs", nargs="+", type=Path, help="folders of finished runs")
     parser.add_argument("--out", type=Path, default=Path("memory.png"), help="the picture")
     args = parser.parse_args(argv)
@@ -43,9 +41,7 @@ def main(argv: list[str] | None) -> None:
     legend_below(figure)
     save(figure, args.out, f"{len(found)} cells of {len(args.runs)} runs")
 
-    lines = found.assign(
-        cell=found.problem + ", NFE " + found.nfe.astype(str) + ", " + found.method
-    )
+    lines = found.assign(cell=found.problem + ", NFE " + found.nfe.astype(str) + ", " + found.method)
     table = lines.set_index("cell")[["memory_gain", "gain"]].map("{:.3f}".format)
     print(markdown(table, "cell"), f"\nPicture: {args.out}", sep="")
 

@@ -157,17 +157,13 @@ class Method:
         given = options_of(self.text)
         if self.sigma_asked is not None and "sigma" in known:
             if "sigma" in given:
-                raise ValueError(
-                    f"--prior {self.text} and --sigma {self.sigma_asked:g} both set sigma"
-                )
+                raise ValueError(f"--prior {self.text} and --sigma {self.sigma_asked:g} both set sigma")
             given["sigma"] = float(self.sigma_asked)
         own = {k: v for k, v in sorted(given.items()) if v is not None and v != known.get(k)}
         object.__setattr__(self, "arguments", own)
         try:
             if unknown := given.keys() - known.keys():
-                raise ValueError(
-                    f"{', '.join(sorted(unknown))} is unknown to it, or without effect"
-                )
+                raise ValueError(f"{', '.join(sorted(unknown))} is unknown to it, or without effect")
             self.prior(), self.start()
             if self.pairs_in_batch:
                 self.coupling()
@@ -261,9 +257,7 @@ class Method:
         """Those numbers of network evaluations for which its field means anything, the largest first."""
         allowed = [nfe for nfe in sorted(set(asked), reverse=True) if self.is_flow or nfe == 1]
         if not allowed:
-            raise ValueError(
-                f"--prior {self.text} is trained for --nfe 1 alone: add 1, or leave it out"
-            )
+            raise ValueError(f"--prior {self.text} is trained for --nfe 1 alone: add 1, or leave it out")
         return allowed
 
     def recipe(self, training: TrainingConfig) -> TrainingConfig:

@@ -51,9 +51,7 @@ def preset(width: int, **training: Any) -> NavigationOptions:
     """All sources, with a network of a width and its recipe."""
     return NavigationOptions(
         network=NetworkOptions(hidden_dim=width, observation_steps=1),
-        training=TrainingConfig(
-            batch_size=256, checkpoints=1, cold_probability=WITHHELD, **training
-        ),
+        training=TrainingConfig(batch_size=256, checkpoints=1, cold_probability=WITHHELD, **training),
         sources=Sources(("gaussian", "regression", "history", "past", "preview"), (4,), (0.1, 0.5)),
         evaluation=Evaluation(episodes=256, nfe=(9, 1)),
     )
@@ -107,9 +105,7 @@ def draw(
 @script("navigation1d.py", together=True)
 def main(argv: list[str] | None) -> None:
     """Train the policies, roll them out and measure their flows."""
-    options = parse(
-        NAVIGATION_PRESETS, argv, "navigation1d", __doc__, adapt=lambda base, asked: base
-    )
+    options = parse(NAVIGATION_PRESETS, argv, "navigation1d", __doc__, adapt=lambda base, asked: base)
     with started(options, "navigation1d") as out:
         policies = policies_of(options, options.sources.methods(), ("navigation", "toy"), only=True)
         train_all(options, policies)

@@ -42,9 +42,7 @@ class Sources:
     # preview,correlation=0.5. Gains are over the first.
     prior: tuple[str, ...] = ("gaussian", "past", "preview")
     chunk: tuple[int, ...] = (8,)  # chunk lengths H
-    sigma: tuple[
-        float, ...
-    ] = ()  # noise of the warm priors, a policy each (default: past 0.5, preview 1.0)
+    sigma: tuple[float, ...] = ()  # noise of the warm priors, a policy each (default: past 0.5, preview 1.0)
 
     def __post_init__(self) -> None:
         check_counts(self, "chunk")
@@ -72,9 +70,7 @@ class Evaluation:
     nfe: tuple[int, ...] = (9, 3, 1)  # network evaluations per chunk
     top_k: int = 1  # best checkpoints averaged per seed
     play_on: bool = False  # go on after success, up to the time limit; solved is solved at any step
-    grid: str = (
-        "uniform"  # uniform, or dense-jump (one last step from half way; dense-jump:0.7 from there)
-    )
+    grid: str = "uniform"  # uniform, or dense-jump (one last step from half way; dense-jump:0.7 from there)
 
     def __post_init__(self) -> None:
         check_counts(self, "seeds", "episodes", "nfe", "top_k")
@@ -93,19 +89,13 @@ class Run:
 
     preset: str = "quick"  # the budget that the other options start from
     out: Path | None = None  # output folder (default: a numbered one under runs/)
-    resume: bool = (
-        False  # continue in --out, or in the latest default folder, with the options stored there
-    )
+    resume: bool = False  # continue in --out, or in the latest default folder, with the options stored there
     envs: int | None = None  # worker processes, with the same results (default: one per core)
     device: str = "cpu"  # of networks and data, such as cuda; one per process under torchrun
     compile: bool = False  # torch.compile the network in training
     logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"  # of the training curves
-    engine: Literal["local", "ray"] = (
-        "local"  # who computes: processes of this machine, or a Ray cluster
-    )
-    ray_address: str | None = (
-        None  # HOST:PORT of its head (default: $RAY_ADDRESS, or this machine alone)
-    )
+    engine: Literal["local", "ray"] = "local"  # who computes: processes of this machine, or a Ray cluster
+    ray_address: str | None = None  # HOST:PORT of its head (default: $RAY_ADDRESS, or this machine alone)
 
     def __post_init__(self) -> None:
         check_counts(self, "envs")
@@ -115,9 +105,7 @@ class Run:
         if self.engine == "ray" and launched():
             raise ValueError("--engine ray distributes the work itself: start it without torchrun")
         if self.engine == "ray" and torch.device(self.device).index is not None:
-            raise ValueError(
-                f"--device {self.device}: with --engine ray, Ray chooses the GPU: use cuda"
-            )
+            raise ValueError(f"--device {self.device}: with --engine ray, Ray chooses the GPU: use cuda")
 
     @property
     def folder(self) -> Path:
@@ -129,9 +117,7 @@ class Run:
 class HeldOut:
     """Observations to measure on, which no policy was trained on."""
 
-    validation: Path | None = (
-        None  # demonstrations, as --dataset names them (default: newly generated ones)
-    )
+    validation: Path | None = None  # demonstrations, as --dataset names them (default: newly generated ones)
     observations: int = 500  # how many; the paper's curvature has 2000
     steps: int = 100  # Euler steps of a curvature
     draws: int = 1  # source samples per observation
@@ -191,18 +177,14 @@ class Options:
             except ValueError as error:
                 raise ValueError(f"leave out {method.name}, which is no flow: {error}") from error
             if method.pairs_in_batch and self.training.batch_size < 2:
-                raise ValueError(
-                    f"{method.name} pairs within a batch: --batch-size must be at least 2"
-                )
+                raise ValueError(f"{method.name} pairs within a batch: --batch-size must be at least 2")
 
 
 @dataclass(frozen=True)
 class PolicyOptions:
     """Which policies to take."""
 
-    run: Path | None = (
-        None  # a finished run of robomimic.py, whose policies to take instead of training them
-    )
+    run: Path | None = None  # a finished run of robomimic.py, whose policies to take instead of training them
 
 
 @dataclass(frozen=True)
@@ -329,9 +311,7 @@ def parse[O: Options](
         known = (*argv, *base.sources.prior, *base.data.task)
         for name in (*stored.sources.prior, *stored.data.task):
             if ":" in name and name not in known:
-                raise ValueError(
-                    f"{out} uses {name}: name it again, with --prior or --task as before"
-                )
+                raise ValueError(f"{out} uses {name}: name it again, with --prior or --task as before")
     name = options.run.logger
     if name in ("tensorboard", "wandb") and find_spec(name) is None:
         raise ImportError(f"--logger {name} needs the package {name}: pip install it")
@@ -443,9 +423,7 @@ def from_record[T](kind: type[T], tree: Mapping[str, Any]) -> T:
     return kind(**values)
 
 
-def script(
-    name: str, together: bool = False
-) -> Callable[[Callable[..., object]], Callable[..., int]]:
+def script(name: str, together: bool = False) -> Callable[[Callable[..., object]], Callable[..., int]]:
     """Make a function of a command line the `main` of a script, with errors as lines and an exit code."""
     return lambda work: lambda argv=None: run_script(lambda: work(argv), name, together=together)
 

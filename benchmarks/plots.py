@@ -215,9 +215,7 @@ def plot_learning_curves(
     save(figure, path, title)
 
 
-def plot_filmstrip(
-    frames: Sequence[np.ndarray], labels: Sequence[str], path: str | Path, title: str
-) -> None:
+def plot_filmstrip(frames: Sequence[np.ndarray], labels: Sequence[str], path: str | Path, title: str) -> None:
     """One episode as a row of pictures, uint8 [h, w, 3], with a text below each."""
     figure, axes = new_figure(1.5 * len(frames), 2.0, columns=len(frames))
     for axis, frame, label in zip(axes, frames, labels, strict=True):
@@ -263,9 +261,7 @@ def plot_agents(rows: DataFrame, path: str | Path, title: str, warmup_steps: int
 # Studies
 
 
-def plot_sigma(
-    rows: DataFrame, curvatures: DataFrame, path: str | Path, top_k: int, title: str
-) -> None:
+def plot_sigma(rows: DataFrame, curvatures: DataFrame, path: str | Path, top_k: int, title: str) -> None:
     """Success at one NFE against sigma, and curvature and branching bound relative to the first policy's.
 
     A panel per source that takes sigma. Curvature and bound are those of the executed positions, with the
@@ -273,8 +269,7 @@ def plot_sigma(
     """
     measured = pooled(curvatures[curvatures["mean"] == "training"])
     rows, measured = (
-        part.assign(source=[prior_label(row) for row in part.to_dict("records")])
-        for part in (rows, measured)
+        part.assign(source=[prior_label(row) for row in part.to_dict("records")]) for part in (rows, measured)
     )
     first = rows.iloc[0]
     same = [first.get(name) for name in ("task", "data", "chunk", "nfe")] == ["square", "mh", 8, 1]

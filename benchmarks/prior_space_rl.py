@@ -88,9 +88,7 @@ class GroupOptions:
 
     def __post_init__(self) -> None:
         check_counts(self, "horizon", "num_envs", "threads", "collectors")
-        if (
-            self.collectors is not None and self.collectors > 10
-        ):  # their seeds are apart from others'
+        if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
             raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
 
 
@@ -123,9 +121,7 @@ class AgentsOptions(Options):
             self.network.check(self.data)
         for method in self.sources.methods():
             if not method.is_flow:
-                raise ValueError(
-                    f"--prior {method.name} is no flow: there is no source space to act in"
-                )
+                raise ValueError(f"--prior {method.name} is no flow: there is no source space to act in")
             for algorithm in self.agents.algorithm:
                 self.agent(method.has_anchor, algorithm, 0)
 
@@ -259,9 +255,7 @@ def frozen_policies(
         # What is not typed is as the method of the run has it.
         sigma_typed = "sigma" in options_of(text)
         asked = [
-            own
-            for own in actors
-            if own == Method(text, own.chunk_length, None if sigma_typed else own.sigma)
+            own for own in actors if own == Method(text, own.chunk_length, None if sigma_typed else own.sigma)
         ]
         if not asked:
             known = "; ".join(map(str, actors))
@@ -285,9 +279,7 @@ def environment(options: AgentsOptions, actor: WarmPriorActor) -> Callable[[int]
 
 def toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
     """The toy, in which nothing but the anchor is random."""
-    transforms = policy_transforms(
-        actor.prior, observation_steps=1, see_history=sees_history(actor)
-    )
+    transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
     transforms.append(PriorAnchor(actor))
     return TransformedEnv(GoalNavigationEnv(batch_size=[num_envs]), transforms)
 
@@ -362,9 +354,7 @@ def main(argv: list[str] | None) -> None:
                 failures.append(f"{name}: {error}")
                 continue
             rows.rows = [row for row in rows.rows if not facts.items() <= row.items()]
-            rows.add(
-                *({**facts, "delta": training.decoder.delta, **point} for point in training.curve)
-            )
+            rows.add(*({**facts, "delta": training.decoder.delta, **point} for point in training.curve))
         if not rows.rows:
             raise FloatingPointError("; ".join(failures))
         found = read_rows(rows.path)

@@ -44,9 +44,7 @@ def task(options: DataOptions) -> Task:
     steps = lerobot_steps(place, OBSERVATION)
     if options.demonstrations:
         steps = steps[steps["episode"] < options.demonstrations[0]]
-    return Task.of(
-        "pusht", steps, make_env, success="is_success", measures={"coverage": "max"}, film_rate=10
-    )
+    return Task.of("pusht", steps, make_env, success="is_success", measures={"coverage": "max"}, film_rate=10)
 
 
 # All human demonstrations, unless --demonstrations says how many.

@@ -35,16 +35,9 @@ class DelayOptions(Options):
     """A comparison under injected latency."""
 
     delay: tuple[int, ...] = (0, 2, 4)  # control steps until chunks take effect, an evaluation each
-    execute: int | None = (
-        None  # actions per decision (default: as many as the largest delay leaves of H)
-    )
-    guidance: tuple[Literal["none", "rtc"], ...] = (
-        "none",
-        "rtc",
-    )  # without any, and by Real-Time Chunking
-    toy: Literal["beside", "alone", "no"] = (
-        "beside"  # the navigation toy: beside the tasks, or alone
-    )
+    execute: int | None = None  # actions per decision (default: as many as the largest delay leaves of H)
+    guidance: tuple[Literal["none", "rtc"], ...] = ("none", "rtc")  # without, by Real-Time Chunking
+    toy: Literal["beside", "alone", "no"] = "beside"  # the navigation toy: beside the tasks, or alone
     rtc: RealTimeChunking = field(default_factory=RealTimeChunking)  # of the guidance
 
     @property
@@ -67,17 +60,13 @@ class DelayOptions(Options):
         for method in self.sources.methods():
             cells = self.conditions(method)
             if not cells:
-                raise ValueError(
-                    f"{method.name} is no flow to guide: add --guidance none, or leave it out"
-                )
+                raise ValueError(f"{method.name} is no flow to guide: add --guidance none, or leave it out")
             for delay, execute, guidance in ((c.delay, c.execute, c.guidance) for c in cells):
                 assert delay is not None and execute is not None
                 left = method.prediction_length - execute
                 try:
                     if execute > method.chunk_length or delay < 0:
-                        raise ValueError(
-                            f"need 0 <= delay and execute <= H = {method.chunk_length}"
-                        )
+                        raise ValueError(f"need 0 <= delay and execute <= H = {method.chunk_length}")
                     check_delay(delay, execute, method.prediction_length)
                     if guidance is not None:
                         guidance.check_delay(delay, left)
@@ -116,16 +105,10 @@ def main(argv: list[str] | None) -> None:
         top_k, several = options.evaluation.top_k, rows.nfe.nunique() > 1
         for nfe, mine in rows.groupby("nfe"):
             end = f"_nfe{nfe}.png" if several else ".png"
-            title = (
-                f"{mine.execute.iloc[0]} actions per decision, {options.evaluation.seeds} seed(s)"
-            )
+            title = f"{mine.execute.iloc[0]} actions per decision, {options.evaluation.seeds} seed(s)"
             plot_delays(mine, out / f"real_time_chunking{end}", top_k=top_k, title=title)
-        given = {
-            f.name.replace("_", " "): getattr(options.rtc, f.name) for f in fields(options.rtc)
-        }
-        guidance = ", ".join(
-            f"{name} {value}" for name, value in given.items() if value is not None
-        )
+        given = {f.name.replace("_", " "): getattr(options.rtc, f.name) for f in fields(options.rtc)}
+        guidance = ", ".join(f"{name} {value}" for name, value in given.items() if value is not None)
         table = delay_table(rows, top_k, guidance)
         write_report(out, table, table, rows, failures)
 

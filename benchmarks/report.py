@@ -343,9 +343,7 @@ def terminal_table(summary: DataFrame, width: int = 120) -> str:
     rows["column"] = "NFE " + rows["nfe"].astype(str)
     kinds = {"": lambda cell: _percent(cell.iloc[0], "success", "gain", ">{}")}
     frame = cells(rows.sort_values("nfe", ascending=False, kind="stable"), "line", "column", kinds)
-    lines = [
-        line for _, part in rows.groupby("place", sort=False) for line in part["line"].unique()
-    ]
+    lines = [line for _, part in rows.groupby("place", sort=False) for line in part["line"].unique()]
     frame = frame.loc[lines].fillna("-")
     frame.index = [textwrap.shorten(n, width * 2 // 3, placeholder=" ...") for n in frame.index]
     base = rows["method"].iloc[0]
@@ -403,9 +401,7 @@ def success_report(summary: DataFrame, notes: Sequence[str] = (), source: str | 
 
 
 def _success_notes(rows: DataFrame, base: str, source: str | None) -> list[str]:
-    rule = (
-        "`*` marks a gain above the sum of both standard deviations over seeds (the paper's rule)."
-    )
+    rule = "`*` marks a gain above the sum of both standard deviations over seeds (the paper's rule)."
     if rows["seeds"].max() == 1:
         rule = "One seed has no spread: we mark no gain. success.png shows the episodes' posterior."
     leak = (
@@ -451,9 +447,7 @@ def write_report(
     files = "report.md" if frame is None else "report.md, results.csv"
     print(f"\n{short.rstrip()}\n{missing}\nRows, {files} and pictures: {out}", flush=True)
     if failures:
-        raise PartialFailure(
-            f"{len(failures)} failed (--resume tries again): {'; '.join(failures)}"
-        )
+        raise PartialFailure(f"{len(failures)} failed (--resume tries again): {'; '.join(failures)}")
 
 
 # Tables of the studies

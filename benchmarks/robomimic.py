@@ -148,15 +148,11 @@ def train_together(policies: Sequence[Policy]) -> dict[str, str]:
     return failures
 
 
-def submit(
-    jobs: Jobs, policy: Policy, cells: Sequence[Cell], evaluation: Evaluation, rows: Rows
-) -> None:
+def submit(jobs: Jobs, policy: Policy, cells: Sequence[Cell], evaluation: Evaluation, rows: Rows) -> None:
     """Train, measure and play a policy; a cell whose episodes are complete becomes a row."""
     last, was_there = policy.training.iterations, policy.is_trained
     episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
-    measures: dict[
-        int, dict[str, Any]
-    ] = {}  # by NFE, of the last checkpoint; others are only played
+    measures: dict[int, dict[str, Any]] = {}  # by NFE, of the last checkpoint; others are only played
 
     def trained(nothing: None) -> None:
         jobs.say(f"{'found' if was_there else 'trained'} {policy}, {last} iterations")

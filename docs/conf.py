@@ -98,8 +98,7 @@ def _documented():
     """Public names by the full names under which the reference has them."""
     pages = (_Path(__file__).parent / "reference").glob("*.rst")
     found = (
-        re.findall(r"^(?:   ~|\.\. py:data:: )(warmprior[\w.]+)$", page.read_text(), re.M)
-        for page in pages
+        re.findall(r"^(?:   ~|\.\. py:data:: )(warmprior[\w.]+)$", page.read_text(), re.M) for page in pages
     )
     return {name.rsplit(".", 1)[1]: name for names in found for name in names}
 
@@ -112,9 +111,7 @@ def _resolve_other_names(app, env, node, contnode):
         return None
     target = ".".join([_documented()[parts[known[0]]], *parts[known[0] + 1 :]])
     domain = env.get_domain("py")
-    return domain.resolve_xref(
-        env, node["refdoc"], app.builder, node["reftype"], target, node, contnode
-    )
+    return domain.resolve_xref(env, node["refdoc"], app.builder, node["reftype"], target, node, contnode)
 
 
 def _fold_navigation(app, pagename, templatename, context, doctree):

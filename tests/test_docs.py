@@ -41,16 +41,12 @@ def _public(package: str) -> set[str]:
 def _reference() -> list[str]:
     """What the reference lists, page by page."""
     entry = re.compile(r"^(?:   ~|\.\. py:data:: )(warmprior[\w.]+)$", re.M)
-    return [
-        n for page in (DOCS / "reference").glob("*.rst") for n in entry.findall(page.read_text())
-    ]
+    return [n for page in (DOCS / "reference").glob("*.rst") for n in entry.findall(page.read_text())]
 
 
 def test_reference_has_every_public_name_once_and_nothing_else():
     top = set(warmprior.__all__) - {"__version__"}
-    public = {
-        f"warmprior.{n}" if n in top else f"warmprior.{p}.{n}" for p in PACKAGES for n in _public(p)
-    }
+    public = {f"warmprior.{n}" if n in top else f"warmprior.{p}.{n}" for p in PACKAGES for n in _public(p)}
     listed = _reference()
     assert len(listed) == len(set(listed))
     assert public <= set(listed)
@@ -160,9 +156,7 @@ def test_built_docs_hold_every_public_name(built):
     from sphinx.util.inventory import InventoryFile
 
     inventory = InventoryFile.loads((built / "objects.inv").read_bytes(), uri="")
-    described = {
-        name for kind, items in inventory.data.items() if kind.startswith("py:") for name in items
-    }
+    described = {name for kind, items in inventory.data.items() if kind.startswith("py:") for name in items}
     assert set(_reference()) <= described
 
 
@@ -171,9 +165,7 @@ def test_source_pages_lead_back_to_what_documents_them(built):
     links = [
         (page.parent / path, anchor)
         for page in (built / "_modules").rglob("*.html")
-        for path, anchor in re.findall(
-            r'<a class="viewcode-back" href="([^"#]*)#?([^"]*)"', page.read_text()
-        )
+        for path, anchor in re.findall(r'<a class="viewcode-back" href="([^"#]*)#?([^"]*)"', page.read_text())
     ]
     assert links
     pages = {path: path.read_text() for path, _ in links}

@@ -60,9 +60,7 @@ def assert_equal(history, expected):
     resets=st.sets(st.tuples(st.integers(0, 5), st.integers(0, 2))),
     seed=st.integers(0, 10**6),
 )
-def test_any_number_of_executed_actions_and_rows_that_begin_anew(
-    remembered, length, executed, resets, seed
-):
+def test_any_number_of_executed_actions_and_rows_that_begin_anew(remembered, length, executed, resets, seed):
     """History longer and shorter than predictions; each row executes its own number, none included."""
     g = torch.Generator().manual_seed(seed)
     history, robots = cold_history([3], remembered, length, 2), [Robot() for _ in range(3)]
@@ -168,9 +166,7 @@ def test_a_chunk_of_another_shape(shape):
 def test_a_history_that_lacks_an_entry(missing):
     with pytest.raises(KeyError) as caught:
         GaussianPrior(2).distribution(cold_history([1], 2, 2, 1).exclude(missing))
-    message = (
-        rf'^GaussianPrior.* missing: \("history", "{missing}"\)\. ActionHistory .*ActionWindow'
-    )
+    message = rf'^GaussianPrior.* missing: \("history", "{missing}"\)\. ActionHistory .*ActionWindow'
     assert re.search(message, caught.value.args[0])
 
 

@@ -46,9 +46,7 @@ def saved(tmp_path_factory):
     training = TrainingConfig(iterations=3, batch_size=8, checkpoints=1)
     task, prior = robosuite_task(path), PastPrior(8)
     network = NetworkOptions(hidden_dim=16)
-    actor = train_policy(
-        task, prior, folder / "policy", network=network, training=training, description=None
-    )
+    actor = train_policy(task, prior, folder / "policy", network=network, training=training, description=None)
     env = task.make_env().append_transform(policy_transforms(prior, normalizer=task.normalizer))
     episode = play_episode(actor, env, 10_000_000, nfe=1)
     env.close()

@@ -167,9 +167,7 @@ def test_regression_and_a_start_on_the_way_do_not_go_together():
 
 
 def test_nothing_is_withheld_behind_the_back_of_a_network_that_has_seen_it(data):
-    buffer = window_replay_buffer(
-        data, PastPrior(H), batch_size=8, observation_steps=1, see_history=True
-    )
+    buffer = window_replay_buffer(data, PastPrior(H), batch_size=8, observation_steps=1, see_history=True)
     buffer.append_transform(WithheldHistory(1.0))
     with pytest.raises(ValueError, match="put WithheldHistory before HistoryObservation"):
         buffer.sample()

@@ -75,9 +75,7 @@ def test_names_in_the_text_exist(script):
 
 def test_script_starts_from_a_seed_and_shows_a_figure(script):
     calls = [
-        ast.unparse(node)
-        for node in ast.walk(ast.parse(script.read_text()))
-        if isinstance(node, ast.Call)
+        ast.unparse(node) for node in ast.walk(ast.parse(script.read_text())) if isinstance(node, ast.Call)
     ]
     assert "torch.manual_seed(0)" in calls
     assert "plt.show()" in calls

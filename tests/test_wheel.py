@@ -83,9 +83,7 @@ def test_the_sdist_builds_the_same_wheel(built, tmp_path):
     assert not [name for name in names if built_here.search(name)]
     build(tmp_path / NAME, tmp_path, "wheel")
     with zipfile.ZipFile(built[0]) as mine, zipfile.ZipFile(tmp_path / built[0].name) as again:
-        assert {i.filename: i.CRC for i in mine.infolist()} == {
-            i.filename: i.CRC for i in again.infolist()
-        }
+        assert {i.filename: i.CRC for i in mine.infolist()} == {i.filename: i.CRC for i in again.infolist()}
 
 
 def test_the_wheel_runs_in_an_empty_environment(python, tmp_path):

@@ -30,6 +30,4 @@ def together(job, folder, processes=2, join=True):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    return torch.multiprocessing.spawn(
-        _run, (processes, port, job, folder), nprocs=processes, join=join
-    )
+    return torch.multiprocessing.spawn(_run, (processes, port, job, folder), nprocs=processes, join=join)

@@ -23,10 +23,7 @@ class CountingEnv(EnvBase):
         self.action_spec = Bounded(-1, 1, (ACTION_DIM,))
         self.reward_spec = Unbounded((1,))
         self.done_spec = Composite(
-            {
-                key: Categorical(2, dtype=torch.bool, shape=(1,))
-                for key in ("done", "terminated", "truncated")
-            }
+            {key: Categorical(2, dtype=torch.bool, shape=(1,)) for key in ("done", "terminated", "truncated")}
         )
         self.t, self.episode = 0, -1
 

@@ -41,9 +41,7 @@ def info(args: argparse.Namespace) -> None:
 
     actor = _policy(args)
     config, count = policy_config(actor), sum(p.numel() for p in actor.parameters())
-    written = policy_file(args.folder, revision=args.revision).get(
-        "warmprior", "of an unknown version"
-    )
+    written = policy_file(args.folder, revision=args.revision).get("warmprior", "of an unknown version")
     for name, value in {
         "prior": actor.prior,
         "start": actor.start or "the source",

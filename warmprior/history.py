@@ -44,8 +44,7 @@ def cold_history(
         torch.Size([5, 8, 2])
     """
     actions, forecast = (
-        torch.zeros(*batch_size, length, action_dim, **like)
-        for length in (history_length, prediction_length)
+        torch.zeros(*batch_size, length, action_dim, **like) for length in (history_length, prediction_length)
     )
     none = torch.zeros(*batch_size, 1, dtype=torch.int64, device=like.get("device"))
     return _history(batch_size, actions, none, forecast, none.clone())

@@ -96,9 +96,7 @@ def ours(name: str, make: Callable[[int], VelocityNetwork], width: int, device: 
     network = make(width).to(device)
     actor = WarmPriorActor(network, PRIOR)
     loss = FlowMatchingLoss(actor)
-    history = window_history(
-        torch.zeros(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H
-    )
+    history = window_history(torch.zeros(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
     data = TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
     return Peer(
         f"warmprior: FlowMatchingLoss, {name}",

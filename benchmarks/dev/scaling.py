@@ -166,9 +166,7 @@ def measured(
     }
 
 
-def measured_once(
-    state: State, seeds: Sequence[int], processes: int, bar: tqdm
-) -> dict[str, float]:
+def measured_once(state: State, seeds: Sequence[int], processes: int, bar: tqdm) -> dict[str, float]:
     """Seconds of the work with so many processes, once each has played an episode."""
     found: dict[str, float] = {}
     with working(processes, state) as call:
@@ -195,9 +193,7 @@ def measured_once(
     return found
 
 
-def simulated(
-    recorded: Sequence[Played], batches: dict[int, float], cores: int
-) -> dict[str, float]:
+def simulated(recorded: Sequence[Played], batches: dict[int, float], cores: int) -> dict[str, float]:
     """How many times as fast as one core the recorded episodes, several times over, are on so many."""
 
     def interpolated(n: int) -> float:

@@ -90,9 +90,7 @@ class Clock:
             self.bar.set_postfix(repeat=f"{repeat}/{self.repeats}")
         return found
 
-    def ratio(
-        self, thing: Callable[[], object], base: Callable[[], object], **options: Any
-    ) -> float:
+    def ratio(self, thing: Callable[[], object], base: Callable[[], object], **options: Any) -> float:
         """Median of the rounds' time of ``thing`` over that of ``base``."""
         one, two = self.times(thing, base, **options)
         return statistics.median(a / b for a, b in zip(one, two, strict=True))
@@ -322,9 +320,7 @@ def encoder_share(clock: Clock) -> dict[str, float]:
     actor = WarmPriorActor(VisionNetwork(encoder, network), PRIOR).eval()
     images = {name: torch.zeros(1, TO, 3, 84, 84, dtype=torch.uint8) for name in cameras}
     observation = TensorDict({"state": torch.randn(1, TO, 9), **images}, [1])
-    history = window_history(
-        torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H
-    )
+    history = window_history(torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
     data = TensorDict({"observation": observation, "history": history}, [1])
     with torch.no_grad():
         return {

@@ -122,9 +122,7 @@ def ddp_efficiency(clock: Any) -> dict[str, dict[str, float]]:
         free.close()
         torch.multiprocessing.spawn(_scale, (port, clock.repeats, folder), nprocs=2)
         found = {name: torch.load(Path(folder) / f"{name}.pt").tolist() for name in SCALED}
-    return {
-        name: dict(zip(("time", "processor"), both, strict=True)) for name, both in found.items()
-    }
+    return {name: dict(zip(("time", "processor"), both, strict=True)) for name, both in found.items()}
 
 
 def _gpu(name: str) -> bool:
@@ -160,9 +158,7 @@ def cuda_latency(clock: Any) -> dict[str, float] | None:
         return None
     actor = WarmPriorActor(paper_network().eval(), PRIOR).eval().to("cuda")
     actor.network.compile(mode="reduce-overhead")
-    history = window_history(
-        torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H
-    )
+    history = window_history(torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
     data = TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to("cuda")
     found = {}
     with torch.no_grad():

@@ -73,9 +73,7 @@ def main() -> None:
             heights = executed_actions(rollout)[0].squeeze(-1)
             axis, x = paths[column], navigation_positions()
             for c in OBSTACLES:
-                axis.fill_between(
-                    [c - HALF_WIDTH, c + HALF_WIDTH], -HALF_HEIGHT, HALF_HEIGHT, color="0.8"
-                )
+                axis.fill_between([c - HALF_WIDTH, c + HALF_WIDTH], -HALF_HEIGHT, HALF_HEIGHT, color="0.8")
             for line in heights[:24]:
                 axis.plot(x, line, color=ABOVE if line[0] > 0 else BELOW, lw=0.6, alpha=0.6)
             axis.plot(x, heights[0], color="0.1", lw=1.3, marker="o", ms=3.5, markevery=16)

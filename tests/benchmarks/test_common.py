@@ -70,9 +70,7 @@ def test_rows_have_an_order_and_do_not_depend_on_who_computes(finished, tmp_path
 
 
 @apart
-def test_rows_of_a_ray_cluster_are_those_of_this_machine(
-    finished, tmp_path, ray_address, monkeypatch
-):
+def test_rows_of_a_ray_cluster_are_those_of_this_machine(finished, tmp_path, ray_address, monkeypatch):
     monkeypatch.chdir(tmp_path)  # that of the cluster is another
     argv = arguments("out", prior="past", engine="ray", ray_address=ray_address)
     assert robomimic.main(argv) == 0
@@ -92,9 +90,7 @@ def test_a_row_is_what_episodes_played_by_hand_give(finished, cell, row):
     policies = policies_of(arguments(finished.parent / "new"))
     policy = next(p for p in policies if p.method.name == "past" and p.training.seed == 1)
     seeds = range(EVALUATION_SEED, EVALUATION_SEED + 7)
-    found = common.row(
-        policy, cell, play(policy, cell, PRESETS["quick"].evaluation, seeds)[::-1], {}
-    )
+    found = common.row(policy, cell, play(policy, cell, PRESETS["quick"].evaluation, seeds)[::-1], {})
     assert row.items() <= found.items()
 
     actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance)
@@ -106,9 +102,7 @@ def test_a_row_is_what_episodes_played_by_hand_give(finished, cell, row):
         success="solved",
     )
     env, keys = TransformedEnv(DriftEnv(), transforms), {"success": "solved"}
-    episodes = [
-        play_episode(actor, env, seed, nfe=cell.nfe, policy_seed=1, **keys) for seed in seeds
-    ]
+    episodes = [play_episode(actor, env, seed, nfe=cell.nfe, policy_seed=1, **keys) for seed in seeds]
     assert found["outcomes"] == "".join(str(int(e.success)) for e in episodes)
     assert found["mean_steps"] == sum(e.steps for e in episodes) / 7
     jumps = [smoothness(e.decisions) for e in episodes]
@@ -256,9 +250,7 @@ def test_policies_are_played_and_measured_on_the_grid(finished, tmp_path):
     assert written(finished.parent) == before
     mine = [row for row in stored(finished) if row["prior"] == "past"]
     for row, other in zip(mine, stored(out), strict=True):
-        same = [
-            row[n] == other[n] for n in ("boundary_jump", "inner_jump", "outcomes", "episode_side")
-        ]
+        same = [row[n] == other[n] for n in ("boundary_jump", "inner_jump", "outcomes", "episode_side")]
         assert all(same) if row["nfe"] == 1 else not all(same)
     assert "--grid dense-jump:0.9" in (out / "report.md").read_text()
 

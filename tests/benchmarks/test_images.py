@@ -110,9 +110,7 @@ def test_what_cannot_be_is_refused(recorded, no_work, tmp_path, capsys, extra, s
     assert said in refused(robomimic.main, [*argv, *([] if "cameras" in extra else FAST)], capsys)
 
 
-def test_studies_measure_on_what_the_encoder_makes_of_images(
-    recorded, finished, tmp_path, monkeypatch
-):
+def test_studies_measure_on_what_the_encoder_makes_of_images(recorded, finished, tmp_path, monkeypatch):
     monkeypatch.setenv("WARMPRIOR_CACHE", str(finished / "cache"))
     monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 9)
     held_out = ["--validation", str(recorded), "--observations", "6"]

@@ -60,9 +60,7 @@ def compute(run, folder, numbers=range(6)):
     found = {}
     with Jobs(run, [folder]) as pool:
         for n in numbers:
-            trained = pool.submit(
-                f"train {n}", train, folder, n, group=f"policy {n}", training=True
-            )
+            trained = pool.submit(f"train {n}", train, folder, n, group=f"policy {n}", training=True)
             for e in range(2):
                 pool.submit(
                     f"play {n} {e}",
@@ -82,9 +80,7 @@ def compute(run, folder, numbers=range(6)):
 def test_failures_cost_themselves_alone(engine, tmp_path, monkeypatch, capsys):
     if engine == "ray":
         pytest.importorskip("ray")
-    monkeypatch.setattr(
-        workers, "_forks", True
-    )  # whatever Ray makes of it, it is as before afterwards
+    monkeypatch.setattr(workers, "_forks", True)  # whatever Ray makes of it, it is as before afterwards
     monkeypatch.setattr(jobs, "DEATHS", 2)
     (tmp_path / "dies4").touch()  # its first worker is killed while it trains
     found, failures = compute(Run(envs=2, engine=engine), tmp_path, (0, 1, 2, 3, 4, 6))
@@ -185,7 +181,4 @@ def test_no_worker_outlives_the_driver(how, tmp_path):
     assert not alive
     if how == signal.SIGINT:
         assert code == 130
-        assert (
-            process.stderr.read().decode().splitlines()[-1]
-            == "sleep.py: interrupted; --resume continues"
-        )
+        assert process.stderr.read().decode().splitlines()[-1] == "sleep.py: interrupted; --resume continues"

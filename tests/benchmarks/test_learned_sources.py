@@ -192,9 +192,7 @@ class TestStep:
 
     def start(self, forecast=0.4, **options):
         start = built(ForecastStart, hidden_dim=8, **options)
-        start.predicted = lambda history, observation: torch.full_like(
-            history["forecast"], forecast
-        )
+        start.predicted = lambda history, observation: torch.full_like(history["forecast"], forecast)
         return start
 
     def test_it_is_on_the_path_to_the_forecast(self):

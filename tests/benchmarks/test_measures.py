@@ -75,10 +75,7 @@ def test_ratios_follow_from_the_fields(small_loss):
     assert rows["past", 1, "deployed"]["ratio"] == pytest.approx(1.0, rel=1e-4)
     assert rows["past", None, "training"]["ratio"] == pytest.approx(5 / 8, rel=1e-4)
     # A prediction of 2H counts up to twice when it counts whole; the executed half does not.
-    inside = [
-        int((~shared().windows(p)["action_is_pad"]).sum())
-        for p in (PreviewPrior(H), GaussianPrior(H))
-    ]
+    inside = [int((~shared().windows(p)["action_is_pad"]).sum()) for p in (PreviewPrior(H), GaussianPrior(H))]
     assert 1.3 < inside[0] / inside[1] < 2.0
     both = rows["preview", None, "training"]
     assert both["ratio"] == pytest.approx(inside[0] / inside[1] / 4, rel=1e-4)

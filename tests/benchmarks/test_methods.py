@@ -39,10 +39,7 @@ def test_methods_are_equal_if_they_do_the_same(one, two):
     "other", [("past", H + 1), ("past", H, 0.3), ("past,correlation=0.5", H), ("preview", H)]
 )
 def test_methods_differ_in_each_of_their_options(other):
-    assert (
-        Method(*other) != Method("past", H)
-        and Method(*other).config() != Method("past", H).config()
-    )
+    assert Method(*other) != Method("past", H) and Method(*other).config() != Method("past", H).config()
 
 
 def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch):

@@ -105,9 +105,7 @@ def test_a_file_in_mimicgens_environment(tmp_path):
     pytest.importorskip("matplotlib")
     write_mimicgen(tmp_path / "site")
     file, out = tmp_path / "stack.hdf5", tmp_path / "out"
-    write_robomimic_file(
-        file, lengths=(30, 20, 9), task="stack_d0", env_args=env_args_14("stack_d0")
-    )
+    write_robomimic_file(file, lengths=(30, 20, 9), task="stack_d0", env_args=env_args_14("stack_d0"))
     argv = options(file, out, task=None, prior="past", envs=1, demonstrations=2)
     root = SCRIPT.parents[1]
     path = os.pathsep.join(map(str, (root, tmp_path / "site")))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -223,3 +225,17 @@ def test_without_a_renderer_images_are_refused_as_an_option(monkeypatch):
         IMAGE.check()
     with pytest.raises(ValueError, match="belong to --obs image"):
         NetworkOptions(crop_size=9).check(DataOptions())
+
+
+@pytest.mark.parametrize("script", ["robomimic", "sigma", "prior_space_rl", "real_time_chunking", "pusht"])
+def test_help_says_what_every_option_is(script, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "90")  # one column of boxes
+    with pytest.raises(SystemExit):
+        importlib.import_module(script).main(["--help"])
+    text = capsys.readouterr().out.partition("show this help")[2]  # behind the examples
+    lines = "\n".join(line.strip("│ ") for line in text.splitlines())
+    entries = re.split(r"\n(?=--[a-z])", lines)[1:]
+    names, texts = zip(*(entry.split(maxsplit=1) for entry in entries), strict=True)
+    plain = [re.sub(r"\([^()]*\)|\{[^{}]*\}|--[\w.-]+", "", text) for text in texts]
+    silent = [n for n, text in zip(names, plain, strict=True) if not re.search("[a-z]{2}", text)]
+    assert len(names) > 40 and silent == []

@@ -48,9 +48,9 @@ def texts(artists):
 def lines_of(axis):
     """Names and heights of the lines, each of a look of its own."""
     lines = axis.get_lines()
-    assert len(
-        {(str(line.get_color()), line.get_linestyle(), line.get_marker()) for line in lines}
-    ) == len(lines)
+    assert len({(str(line.get_color()), line.get_linestyle(), line.get_marker()) for line in lines}) == len(
+        lines
+    )
     return [(line.get_label(), list(line.get_ydata())) for line in lines]
 
 
@@ -66,9 +66,7 @@ def test_violins_pool_the_seeds_of_a_method(tmp_path, figures):
     rows = compared()
     plots.plot_success(rows[rows["checkpoint"] == 100], tmp_path / "a.png", "t")
     ((axis,),) = figures
-    assert texts(axis.texts) == ["15/30", "24/30", "15/30"] and texts(axis.get_xticklabels()) == [
-        "NFE 1"
-    ]
+    assert texts(axis.texts) == ["15/30", "24/30", "15/30"] and texts(axis.get_xticklabels()) == ["NFE 1"]
     means = [line.get_ydata()[0] for line in axis.get_lines()]
     assert means == pytest.approx([16 / 32, 25 / 32, 16 / 32])  # of Beta(k + 1, n - k + 1)
     assert axis.get_legend_handles_labels()[1] == ["Base", "WP-Past", "WP-Preview"]
@@ -112,9 +110,7 @@ def test_bars_of_delays_are_one_colour_per_method_in_all_tasks(tmp_path, figures
     assert len(set(colors)) == 3 and {bar.get_facecolor() for bar in can.patches} == {colors[2]}
 
 
-@pytest.mark.parametrize(
-    "options", [[f"correlation=0.{k}" for k in range(10, 40)], ["o" * 70 + "=0.5"]]
-)
+@pytest.mark.parametrize("options", [[f"correlation=0.{k}" for k in range(10, 40)], ["o" * 70 + "=0.5"]])
 def test_names_are_not_cut_off_at_the_edges(tmp_path, figures, options):
     rows = pd.DataFrame(row(prior="past", options=o) for o in options)
     plots.plot_success(rows, tmp_path / "a.png", "t")
@@ -155,16 +151,12 @@ def test_agents_are_averaged_evaluation_by_evaluation(tmp_path, figures):
         spread = np.std(last, ddof=1)
         assert edges(axis)[105.0] == pytest.approx((np.mean(last) - spread, np.mean(last) + spread))
     names = [name for name, _ in lines_of(greedy)]
-    assert names[0] == "DSRL-NA, WP-Past (2 seeds)" and names[2].endswith(
-        "correlation=0.5 (2 seeds)"
-    )
+    assert names[0] == "DSRL-NA, WP-Past (2 seeds)" and names[2].endswith("correlation=0.5 (2 seeds)")
 
 
 def test_lines_against_chunk_length_and_budget(tmp_path, figures):
     jumps = {"boundary_jump": 1.0, "inner_jump": 0.5}
-    rows = [
-        one for chunk in (8, 1) for nfe in (1, 9) for one in variants(chunk=chunk, nfe=nfe, **jumps)
-    ]
+    rows = [one for chunk in (8, 1) for nfe in (1, 9) for one in variants(chunk=chunk, nfe=nfe, **jumps)]
     plots.plot_chunk_lengths(pd.DataFrame(rows), tmp_path / "a.png", 1, "t")
     assert imread(tmp_path / "a.png").shape[:2] == (900, 1020)  # 510 pixels per NFE
     (nine, one, below, _) = figures[0]
@@ -191,11 +183,7 @@ def test_sigma_has_a_panel_per_source_relative_to_the_first_policy(tmp_path, fig
     (panels,) = figures
     assert [axis.get_title() for axis in panels] == NAMES
     past, correlated = (dict(lines_of(axis)) for axis in panels)
-    assert (
-        past["success rate"] == [1.0, 0.5]
-        and past["paper"] == [0.701]
-        and "paper" not in correlated
-    )
+    assert past["success rate"] == [1.0, 0.5] and past["paper"] == [0.701] and "paper" not in correlated
     assert ("Base" in past) == baseline
     rights = [axis for axis in panels[0].figure.axes if axis not in panels]
     bounds = [dict(lines_of(axis))["branching bound"] for axis in rights]

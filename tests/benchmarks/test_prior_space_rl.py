@@ -242,9 +242,7 @@ def test_papers_recipes():
         methods = {method.name: method for method in recipe.sources.methods()}
         assert tuple(methods) == ("gaussian", "past", "preview")
         chunk = methods["past"].chunk_length
-        made = {
-            name: recipe.agent(method.has_anchor, "dsrl-na", 0) for name, method in methods.items()
-        }
+        made = {name: recipe.agent(method.has_anchor, "dsrl-na", 0) for name, method in methods.items()}
         base, config = made["gaussian"].delta or 1.5, made["past"]
         found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
         assert (*found, recipe.agents.horizon, chunk, base) == values
@@ -316,9 +314,7 @@ def finished(inline, short_episodes, dataset, tmp_path_factory):
         (["forecast", "past"], [0.0, 0.0]),
     ],
 )
-def test_the_options_of_a_finished_run_are_those_asked_for(
-    finished, tmp_path, priors, correlations
-):
+def test_the_options_of_a_finished_run_are_those_asked_for(finished, tmp_path, priors, correlations):
     words = " ".join(command_line(run=finished, out=tmp_path / "out", prior=priors))
     facts, kept = benchmark.frozen_policies(read(words + " --seeds 1"))
     assert facts["task"] == "lift"

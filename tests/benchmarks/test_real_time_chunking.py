@@ -45,9 +45,7 @@ def test_a_task_beside_the_toy(dataset, tmp_path, capsys):
     )
     assert script.main(argv) == 0
     rows = stored(out)
-    cells = [
-        (row["task"], row["prior"], row["delay"], row["guidance"], row["execute"]) for row in rows
-    ]
+    cells = [(row["task"], row["prior"], row["delay"], row["guidance"], row["execute"]) for row in rows]
     assert cells == [
         (task, prior, delay, guidance, 5)  # of 8, as many as the largest delay leaves
         for task in ("lift", "navigation")

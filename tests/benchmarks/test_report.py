@@ -185,9 +185,7 @@ def test_the_papers_numbers_stand_beside_the_same_experiment_alone():
 
 def test_the_report_has_the_layout_of_table_1():
     text = table(compared(), source="scripted", notes=["A note."])
-    assert text.startswith(
-        "| Success rate (%) | NFE 1: Base | NFE 1: WP-Past | NFE 1: WP-Preview |"
-    )
+    assert text.startswith("| Success rate (%) | NFE 1: Base | NFE 1: WP-Past | NFE 1: WP-Preview |")
     assert cells_of(text, "Square-PH, measured (scr") == [
         "50.0",
         "**80.0** (+30.0*)",
@@ -224,9 +222,7 @@ def test_leaks_are_marked_above_their_bound_and_no_zero_has_a_minus():
 
 @pytest.mark.parametrize("methods, nfes, tasks", [(1, 1, 1), (3, 3, 2), (15, 9, 2)])
 def test_the_terminal_table_fits_and_says_first_what_came_out(methods, nfes, tasks):
-    options = [
-        f"correlation=0.{k},a_long_name_of_an_option_beyond_the_width=1" for k in range(methods - 1)
-    ]
+    options = [f"correlation=0.{k},a_long_name_of_an_option_beyond_the_width=1" for k in range(methods - 1)]
     rows = [
         row(
             4 + (o != ""),
@@ -257,9 +253,7 @@ def test_the_first_lines_name_the_best_methods_and_how_sure_that_is():
         "Best success (%): at NFE 9 Base 60.0 (WP-Preview -10.0); at NFE 1 WP-Past 80.0 (+30.0 over Base)."
     )
     chances = [
-        (
-            np.random.beta(k + 1, n - k + 1, 200_000) > np.random.beta(b + 1, n - b + 1, 200_000)
-        ).mean()
+        (np.random.beta(k + 1, n - k + 1, 200_000) > np.random.beta(b + 1, n - b + 1, 200_000)).mean()
         for k, b, n in ((5, 6, 10), (24, 15, 30))  # of the last checkpoints of all seeds
     ]
     said = re.fullmatch(
@@ -273,9 +267,7 @@ def test_a_report_is_written_before_what_is_missing_is_an_error(tmp_path, capsys
     summary = report.summary(compared(), 1)
     with pytest.raises(PartialFailure, match=r"1 failed.*: past, seed 1: no memory"):
         report.write_report(tmp_path, "short", "# full\n", summary, ["past, seed 1: no memory"])
-    assert (
-        tmp_path / "report.md"
-    ).read_text() == "# full\n\nMissing:\n\n- past, seed 1: no memory\n"
+    assert (tmp_path / "report.md").read_text() == "# full\n\nMissing:\n\n- past, seed 1: no memory\n"
     written = pd.read_csv(tmp_path / "results.csv")
     assert list(written["success"]) == pytest.approx([0.5, 0.8, 0.5])
     shown = capsys.readouterr().out
@@ -311,16 +303,12 @@ def test_sigma_table_takes_the_mean_of_the_training_where_there_is_no_other():
 
 def test_chunk_and_budget_tables_have_a_line_per_length():
     jumps = {"boundary_jump": 0.25, "action_error": 0.01}
-    rows = pd.DataFrame(
-        [row(k, chunk=h, nfe=n, **jumps) for h, n, k in ((8, 1, 5), (1, 1, 6), (8, 9, 7))]
-    )
+    rows = pd.DataFrame([row(k, chunk=h, nfe=n, **jumps) for h, n, k in ((8, 1, 5), (1, 1, 6), (8, 9, 7))])
     text = report.chunk_table(rows, 1)
     assert text.startswith("|  | NFE 1: Base | NFE 9: Base |")
     assert cells_of(text, "H = 8, success") == ["50.0", "70.0"]
     assert cells_of(text, "H = 1, jump") == ["0.250", "-"]
-    rows = pd.DataFrame(
-        [row(k, iterations=n, checkpoint=n, **jumps) for n, k in ((90, 9), (100, 8))]
-    )
+    rows = pd.DataFrame([row(k, iterations=n, checkpoint=n, **jumps) for n, k in ((90, 9), (100, 8))])
     text = report.budget_table(rows, 1)
     assert (cells_of(text, "90"), cells_of(text, "100")) == (["90.0 (0.0100)"], ["80.0 (0.0100)"])
 
@@ -360,15 +348,11 @@ def test_navigation_table_has_the_curvature_at_the_largest_nfe():
 def test_delay_table_has_a_line_per_delay_and_a_column_per_guidance():
     jumps = {"boundary_jump": 0.5, "inner_jump": None, "execute": 4, "nfe": 9}
     rows = pd.DataFrame(
-        row(3 + d + (g == "rtc"), delay=d, guidance=g, **jumps)
-        for d in (2, 0)
-        for g in ("none", "rtc")
+        row(3 + d + (g == "rtc"), delay=d, guidance=g, **jumps) for d in (2, 0) for g in ("none", "rtc")
     )
     text = report.delay_table(rows, 1, "max weight 5")
     lines = text.splitlines()
-    assert lines[0] == "|  | Base | RTC |" and lines[2].startswith(
-        "| square ph, NFE 9, delay 0, succ"
-    )
+    assert lines[0] == "|  | Base | RTC |" and lines[2].startswith("| square ph, NFE 9, delay 0, succ")
     assert cells_of(text, "square ph, NFE 9, delay 2, success") == ["50.0", "60.0"]
     assert "step inside |" not in text and "- RTC: max weight 5." in text
     assert cells_of(table(rows), "Square-PH, delay 2, measured") == ["50.0", "**60.0** (+10.0)"]

@@ -214,9 +214,7 @@ def test_what_is_no_finished_run_is_named(scripts, finished, tmp_path, capsys, w
     assert (finished / "options.json").read_bytes() == before
 
 
-@pytest.mark.parametrize(
-    "change", [{"sigma": 1.0}, {"chunk": 4}, {"iterations": 2}, {"policy": ""}]
-)
+@pytest.mark.parametrize("change", [{"sigma": 1.0}, {"chunk": 4}, {"iterations": 2}, {"policy": ""}])
 def test_a_run_that_cannot_be_compared_is_named(scripts, finished, tmp_path, capsys, change):
     """Several policies of a prior are not taken for seeds, and what is missing is missed."""
     run = tmp_path / "runs" / "run"

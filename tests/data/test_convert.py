@@ -197,9 +197,7 @@ def test_what_cannot_be_converted(tmp_path):
     write_robomimic_file(path, task="lift", lengths=(3,))
     with pytest.raises(ValueError, match="images must be one of image, video or None, got 'gif'"):
         convert_robomimic(path, folder, images="gif")
-    with pytest.raises(
-        ValueError, match="images of 4 pixels are too small for a video, which takes 32"
-    ):
+    with pytest.raises(ValueError, match="images of 4 pixels are too small for a video, which takes 32"):
         convert_robomimic(path, folder, images="video")
     with h5py.File(path, "a") as file:
         del file["data/demo_0/obs/agentview_image"]
@@ -254,19 +252,13 @@ def test_images_are_compared_with_the_simulators(tmp_path_factory):
     for kind in ("image", "video"):
         folder = convert_robomimic(path, tmp_path / kind, images=kind, progress=False)
         open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **told)
-    with pytest.raises(
-        DatasetError, match=r"rendered fast, and in evaluation.*add --fast-rendering"
-    ):
-        open_demonstrations(f"lerobot:{folder}").with_images(
-            ["agentview"], 32, demos=None, fast=False
-        )
+    with pytest.raises(DatasetError, match=r"rendered fast, and in evaluation.*add --fast-rendering"):
+        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, demos=None, fast=False)
     with pytest.raises(DatasetError, match="no images 'sideview_image'"):
         open_demonstrations(f"lerobot:{folder}").with_images(["sideview"], 32, **told)
     with h5py.File(path, "a") as file:
         for demo in file["data"].values():
             demo["obs/agentview_image"][...] = demo["obs/agentview_image"][()][:, ::-1]
     folder = convert_robomimic(path, tmp_path / "flipped", images="image", progress=False)
-    with pytest.raises(
-        DatasetError, match=r"images of agentview are upside down.*convert it again"
-    ):
+    with pytest.raises(DatasetError, match=r"images of agentview are upside down.*convert it again"):
         open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **told)

@@ -57,9 +57,7 @@ def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
     write_robomimic_file(path, lengths=range(1, 13), masks={"late": [11, 3, 10]})
     assert read_index(path, demos=11).demos == tuple(f"demo_{n}" for n in range(11))
     assert read_index(path, demos=2, filter_key="late").demos == ("demo_3", "demo_10")
-    with pytest.raises(
-        DatasetError, match=r"file\.hdf5: there are 12 demonstrations, fewer than the 13"
-    ):
+    with pytest.raises(DatasetError, match=r"file\.hdf5: there are 12 demonstrations, fewer than the 13"):
         read_index(path, demos=13)
     with pytest.raises(ValueError, match="demos must be at least 1, got 0"):
         read_index(path, demos=0)
@@ -103,9 +101,7 @@ def test_missing_file(tmp_path):
 def test_truncated_file(square_file, keep):
     path, _ = square_file
     content = path.read_bytes()
-    path.write_bytes(
-        b"<html>please log in" if keep is None else content[: int(keep * len(content))]
-    )
+    path.write_bytes(b"<html>please log in" if keep is None else content[: int(keep * len(content))])
     with pytest.raises(DatasetError, match=r"square\.hdf5: not a readable HDF5.*download it again"):
         read_index(path)
 

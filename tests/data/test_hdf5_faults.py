@@ -165,9 +165,7 @@ def test_an_index_of_chunks_that_is_damaged(square_file, damage):
     with h5py.File(path, "a") as file:
         _replace(file, "data/demo_1/actions", shape=(5, 7), dtype="f8", chunks=(2, 7))
         file["data/demo_1/actions"][...] = 1
-        first, second = (
-            file["data/demo_1/actions"].id.get_chunk_info(i).byte_offset for i in (0, 1)
-        )
+        first, second = (file["data/demo_1/actions"].id.get_chunk_info(i).byte_offset for i in (0, 1))
     # An entry of the index: where in the array, and where in the file.
     before, size = struct.pack("<4Q", 2, 0, 0, second), path.stat().st_size
     after = {"place": (8, second), "overlap": (2, first), "behind the end": (2, size - 8)}[damage]
@@ -186,9 +184,7 @@ def test_soft_links_inside_the_file_are_followed(square_file):
         file.move("data/demo_2/rewards", "data/demo_2/sparse")
         file["data/demo_2/rewards"] = h5py.SoftLink("sparse")
     data = RobomimicExperienceReplay(path).data
-    np.testing.assert_array_equal(
-        data["action"][12:17].numpy(), demos[1]["actions"].astype(np.float32)
-    )
+    np.testing.assert_array_equal(data["action"][12:17].numpy(), demos[1]["actions"].astype(np.float32))
     assert data["next", "reward"][-1] == 1
 
 

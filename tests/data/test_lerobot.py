@@ -98,9 +98,7 @@ def test_steps_are_the_vectors_themselves(written):
     root, values = written
     names = ("observation.state", "observation.environment_state")
     steps = lerobot_steps(root, names)
-    np.testing.assert_array_equal(
-        steps["observation"], np.concatenate([values[n] for n in names], -1)
-    )
+    np.testing.assert_array_equal(steps["observation"], np.concatenate([values[n] for n in names], -1))
     np.testing.assert_array_equal(steps["action"], values["action"])
     assert steps["episode"].tolist() == [0] * 6 + [1] + [2] * 9
 

@@ -31,9 +31,7 @@ def test_variants_that_are_not_in_the_table_are_read_as_well(tmp_path):
 
 
 def test_files_of_others_are_refused(tmp_path, square_file):
-    with pytest.raises(
-        DatasetError, match=r"square\.hdf5: NutAssemblySquare is none of MimicGen's"
-    ):
+    with pytest.raises(DatasetError, match=r"square\.hdf5: NutAssemblySquare is none of MimicGen's"):
         MimicGenExperienceReplay(square_file[0])
     with pytest.raises(FileNotFoundError, match=r"stack_d0: no such file.*download=True"):
         MimicGenExperienceReplay("stack_d0")

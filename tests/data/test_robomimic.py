@@ -82,9 +82,7 @@ def test_is_immutable(square_file):
 
 def test_works_with_torchrl_samplers_and_transforms(square_file):
     path, _ = square_file
-    replay = RobomimicExperienceReplay(
-        path, batch_size=47, sampler=SamplerWithoutReplacement(shuffle=True)
-    )
+    replay = RobomimicExperienceReplay(path, batch_size=47, sampler=SamplerWithoutReplacement(shuffle=True))
     assert sorted(replay.sample()["frame"].tolist()) == list(range(47))
     replay = RobomimicExperienceReplay(
         path,
@@ -102,9 +100,7 @@ def test_observation_keys(square_file):
     path, demos = square_file
     replay = RobomimicExperienceReplay(path, observation_keys=["robot0_eef_pos", "object"])
     expected = np.concatenate([demos[1]["robot0_eef_pos"], demos[1]["object"]], -1)
-    np.testing.assert_array_equal(
-        replay.data["observation"][12:17].numpy(), expected.astype(np.float32)
-    )
+    np.testing.assert_array_equal(replay.data["observation"][12:17].numpy(), expected.astype(np.float32))
 
 
 @pytest.mark.parametrize("frame", ["old", "world", "base"])
@@ -124,9 +120,7 @@ def test_absolute_actions(tmp_path, task, frame):
     if frame == "base" and task == "transport":
         quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
         base = torch.stack((quarter, quarter.mT))
-    expected = absolute_actions(
-        *map(torch.from_numpy, (demos[1]["actions"], *poses)), base_rotation=base
-    )
+    expected = absolute_actions(*map(torch.from_numpy, (demos[1]["actions"], *poses)), base_rotation=base)
     torch.testing.assert_close(replay.data["action"][12:17], expected.float())
     parts = replay.env_args["env_kwargs"]["controller_configs"]["body_parts"]
     assert parts["right"]["input_type"] == "absolute"

@@ -118,9 +118,7 @@ def test_recorded_states_and_actions_replay(lift_file):
         observations, *_ = env.step(action)
     assert env.timestep > 10
     # env.step reports poses from the start of its last 2 ms.
-    np.testing.assert_allclose(
-        observations["robot0_eef_pos"], positions[env.timestep - 1], atol=3e-3
-    )
+    np.testing.assert_allclose(observations["robot0_eef_pos"], positions[env.timestep - 1], atol=3e-3)
 
 
 def test_cached_file_is_returned_at_once(lift_file, monkeypatch):
@@ -181,9 +179,7 @@ def fake_episode(seed, style="mh", success=True):
     operator = operator_of(style, seed)
     level = ("better", "better", "okay", "okay", "worse", "worse")[operator]
     ones = np.ones((4, 7))
-    return Episode(
-        seed, operator, level, success, ones, ones, np.array([0.0, 0, 1, 1]), {"object": ones[:1]}
-    )
+    return Episode(seed, operator, level, success, ones, ones, np.array([0.0, 0, 1, 1]), {"object": ones[:1]})
 
 
 def generated(monkeypatch, path, run_episode, **options):

@@ -36,9 +36,7 @@ OBSERVATION_DIM = 2 + ACTION_DIM
 
 def actor(prior, width=0, **options):
     torch.manual_seed(0)
-    network = VelocityMLP(
-        ACTION_DIM, OBSERVATION_DIM + width, prior.prediction_length, hidden_dim=16
-    )
+    network = VelocityMLP(ACTION_DIM, OBSERVATION_DIM + width, prior.prediction_length, hidden_dim=16)
     with torch.no_grad():  # its head starts at zero
         for parameter in network.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
@@ -51,9 +49,7 @@ def actor(prior, width=0, **options):
 def test_a_simulated_latency_is_that_of_the_environment(prior, execute, latency):
     """Closed loop: the observations hold the last action, and the policy draws at every decision."""
     length = 23
-    env = TransformedEnv(
-        CountingEnv(length), policy_transforms(prior, execute=execute, delay=latency)
-    )
+    env = TransformedEnv(CountingEnv(length), policy_transforms(prior, execute=execute, delay=latency))
     with torch.no_grad():
         rollout = env.rollout(99, actor(prior, guidance=RealTimeChunking()))
     expected = executed_actions(rollout)[0]
@@ -235,9 +231,7 @@ def test_several_entries_raw_units_and_last_actions_that_networks_see():
         row = raw[i]
         one = inside.act(normalizer.normalize(row)["observation"])
         two = outside.act(row["observation"])
-        torch.testing.assert_close(
-            normalizer.denormalize(TensorDict({"action": one}))["action"], two
-        )
+        torch.testing.assert_close(normalizer.denormalize(TensorDict({"action": one}))["action"], two)
 
     class Nested(Told):
         def forward(self, data):
@@ -277,9 +271,7 @@ def test_a_slow_policy_does_not_hold_the_loop_up():
         assert executor.act(torch.tensor([float(tick)])).tolist() == [0.0, tick]
     assert time.monotonic() - started < 5  # it waited for nothing but the first chunk
     for _ in range(2):
-        with pytest.raises(
-            TimeoutError, match=r"after 3 control steps and 0\.05 s.*Hold the robot"
-        ):
+        with pytest.raises(TimeoutError, match=r"after 3 control steps and 0\.05 s.*Hold the robot"):
             executor.act(torch.tensor([8.0]))
     assert executor.delays == ()
     policy.leave.set()

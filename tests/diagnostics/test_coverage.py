@@ -46,9 +46,7 @@ def windows(prior, spread, warm=True):
 @pytest.mark.parametrize("level", [0.5, 0.9])
 @pytest.mark.parametrize("prior", [PastPrior(H, sigma=0.4), PreviewPrior(H, sigma=0.4)])
 def test_a_source_that_spreads_like_the_data_covers_its_level(prior, level):
-    assert source_coverage(actor(prior), windows(prior, 0.4), level=level) == pytest.approx(
-        level, abs=0.01
-    )
+    assert source_coverage(actor(prior), windows(prior, 0.4), level=level) == pytest.approx(level, abs=0.01)
     # Half as wide: P(|z| < q / 2) for the quantile q.
     z = torch.distributions.Normal(0.0, 1.0)
     narrow = float(2 * z.cdf(z.icdf(torch.tensor((1 + level) / 2)) / 2) - 1)

@@ -33,9 +33,7 @@ def test_a_linear_field_has_the_closed_form(n_steps):
     torch.testing.assert_close(
         out["kappa"].double(), length * factors.var(correction=0), rtol=1e-4, atol=1e-7
     )
-    torch.testing.assert_close(
-        out["speed"].double(), length * factors.mean() ** 2, rtol=1e-4, atol=1e-7
-    )
+    torch.testing.assert_close(out["speed"].double(), length * factors.mean() ** 2, rtol=1e-4, atol=1e-7)
     gap = (1 - 1 / n_steps) ** n_steps  # one step ends at 0, the path at this share of a0
     torch.testing.assert_close(
         out["one_step_error"].double(), (length / (H * D_A)).sqrt() * gap, rtol=1e-4, atol=1e-6
@@ -77,9 +75,7 @@ def test_the_split_changes_nothing():
     data, results = batch(7), []
     for split in (1, 3, 10_000):
         generator = torch.Generator().manual_seed(3)
-        results.append(
-            curvature(network_policy(), data, 20, draws=3, split=split, generator=generator)
-        )
+        results.append(curvature(network_policy(), data, 20, draws=3, split=split, generator=generator))
     for other in results[1:]:
         for key, value in results[0].items():
             torch.testing.assert_close(other[key], value, rtol=1e-4, atol=1e-6)
@@ -134,9 +130,7 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
         warnings.simplefilter("error")
         prediction = data.clone().set(("prior", "noise"), target)  # as in a rollout: no target
         assert torch.isfinite(curvature(policy(lazy, prior), prediction)["kappa_executed"]).all()
-        assert torch.isfinite(
-            curvature(policy(lazy, prior), data.exclude("vla_action"))["kappa"]
-        ).all()
+        assert torch.isfinite(curvature(policy(lazy, prior), data.exclude("vla_action"))["kappa"]).all()
 
 
 @pytest.mark.parametrize(

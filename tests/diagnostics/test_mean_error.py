@@ -52,18 +52,14 @@ def test_only_warm_positions_inside_the_episode_count(prior):
     batch = windows(prior)
     found = mean_error(WarmPriorActor(Still(), prior), batch, nfe=1)
     difference = (batch["history", "forecast"] - batch["vla_action", "chunk"])[:, :H]
-    squares = [
-        float(difference[i, p].square().mean()) for i in range(6) for p in range(H) if i or not p
-    ]
+    squares = [float(difference[i, p].square().mean()) for i in range(6) for p in range(H) if i or not p]
     assert found.target == pytest.approx(math.sqrt(sum(squares) / len(squares)))
     # What does not move predicts mean and noise.
     assert found.revision == pytest.approx(prior.sigma, rel=0.3, abs=1e-7)
 
 
 def test_without_a_mean_there_is_no_error():
-    found = mean_error(
-        WarmPriorActor(Still(), GaussianPrior(H)), windows(GaussianPrior(H), warm=False)
-    )
+    found = mean_error(WarmPriorActor(Still(), GaussianPrior(H)), windows(GaussianPrior(H), warm=False))
     assert math.isnan(found.target) and math.isnan(found.revision)
 
 

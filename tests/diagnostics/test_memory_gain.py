@@ -257,9 +257,7 @@ def test_windows_without_a_history_do_not_count():
 def test_a_guided_policy_is_measured_as_it_acts():
     """Against the policy itself, on both sides by hand; its guidance takes the source's own sigma."""
     prior = PastPrior(H, sigma=0.5)
-    guided = WarmPriorActor(
-        Field(lambda t, a, o: a.sin()), prior, nfe=4, guidance=RealTimeChunking()
-    )
+    guided = WarmPriorActor(Field(lambda t, a, o: a.sin()), prior, nfe=4, guidance=RealTimeChunking())
     data = windows(prior, 20)
     with pytest.raises(KeyError, match=r"or measure policy.replace\(guidance=None\)"):
         memory_gain(guided, data)

@@ -51,9 +51,7 @@ def test_the_forecast_of_a_guided_policy_is_what_it_would_do():
     prior = PastPrior(H, sigma=0.5)
     field = Field(lambda t, a, o: a.sin())
     actor = WarmPriorActor(field, prior, nfe=4, guidance=RealTimeChunking())
-    data = remember(
-        batch(rtc={"delay": torch.ones(5, 1, dtype=torch.int64)}), torch.rand(5, H, D_A)
-    )
+    data = remember(batch(rtc={"delay": torch.ones(5, 1, dtype=torch.int64)}), torch.rand(5, H, D_A))
     found = deployed_history(actor, data, generator=torch.Generator().manual_seed(0))
     acted = actor(data.clone(), generator=torch.Generator().manual_seed(0))
     torch.testing.assert_close(found["history", "actions"], acted[actor.chunk_key].detach())

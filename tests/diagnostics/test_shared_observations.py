@@ -51,9 +51,7 @@ def test_windows_hold_the_same_observations_and_each_priors_own_history():
     assert torch.equal(past["history", "actions"][..., 0], expected.float())
     preview = shared.windows(PreviewPrior(H))
     base = shared.windows(GaussianPrior(H))
-    assert torch.equal(
-        preview["history", "forecast"][:, :H, 0], preview["vla_action", "chunk"][:, :H, 0]
-    )
+    assert torch.equal(preview["history", "forecast"][:, :H, 0], preview["vla_action", "chunk"][:, :H, 0])
     assert not base["history", "forecast_steps"].any()
     for windows in (past, preview, base):
         assert torch.equal(windows["observation"][:, 0, 0], frames.float())
@@ -93,9 +91,7 @@ def test_the_deployed_mean_is_the_policys_own_prediction():
     met = shared.deployed(actor)
     # Predicted H steps earlier, the chunk's second half forecasts exactly the current one.
     expected = shared.frames[:, None] + torch.arange(H)
-    torch.testing.assert_close(
-        met["history", "forecast"][:, :H, 0], expected.float(), atol=1e-4, rtol=0
-    )
+    torch.testing.assert_close(met["history", "forecast"][:, :H, 0], expected.float(), atol=1e-4, rtol=0)
     assert torch.equal(met["vla_action", "chunk"], shared.windows(prior)["vla_action", "chunk"])
 
 

@@ -132,12 +132,8 @@ def test_history_shift_disturbs_what_the_policy_sees_and_nothing_else(see_histor
     network = VelocityMLP(1, 3 + width, 2, 1, hidden_dim=8)
     for parameter in network.parameters():
         parameter.data.normal_()  # the last layer begins at zero
-    actor = WarmPriorActor(
-        network, prior, observation_key=key, generator=torch.Generator().manual_seed(0)
-    )
-    data = TensorDict(
-        {"observation": torch.zeros(4, 1, 3), "history": cold_history([4], 2, 2, 1)}, [4]
-    )
+    actor = WarmPriorActor(network, prior, observation_key=key, generator=torch.Generator().manual_seed(0))
+    data = TensorDict({"observation": torch.zeros(4, 1, 3), "history": cold_history([4], 2, 2, 1)}, [4])
     data["history", "actions"][:2] = 1.0
     data["history", "steps"][:2] = 2
     expected = data.clone()

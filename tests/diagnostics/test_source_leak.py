@@ -74,9 +74,7 @@ def test_spread_and_steps_against_separate_draws():
             ]
         )
         deviation = chunks.std(0)
-        assert result[nfe].spread == pytest.approx(
-            float(deviation.square().mean().sqrt()), rel=1e-5
-        )
+        assert result[nfe].spread == pytest.approx(float(deviation.square().mean().sqrt()), rel=1e-5)
         steps = [
             math.dist(chunks[d, i, p].tolist(), chunks[d, i, p + 1].tolist())
             for d in range(3)
@@ -115,9 +113,7 @@ def test_one_exact_step_from_a_telling_source_spreads_less_than_the_data():
     warm = torch.arange(2 * H).view(1, -1, 1) < H
     remember(data, data["vla_action", "chunk"])
     # The forecast beyond H is wild, and not executed.
-    actor = policy(
-        lambda t, a, o: torch.where(warm, gain - 1, 99.0) * a, PreviewPrior(H, sigma=sigma)
-    )
+    actor = policy(lambda t, a, o: torch.where(warm, gain - 1, 99.0) * a, PreviewPrior(H, sigma=sigma))
     result = source_leak(actor, data, nfes=(1,))[1]
     assert result.spread == pytest.approx(gain * sigma, rel=0.03)
     assert result.data_spread == pytest.approx(s, rel=0.06)
@@ -142,9 +138,7 @@ def test_data_spread_against_loops(data):
     rows["action_is_pad"] = torch.arange(H) >= length[:, None]
     squares = []
     for i in range(n):
-        distance = [
-            math.dist(rows["observation"][i].flatten(), o.flatten()) for o in rows["observation"]
-        ]
+        distance = [math.dist(rows["observation"][i].flatten(), o.flatten()) for o in rows["observation"]]
         best = {}
         for j in sorted(range(n), key=distance.__getitem__):
             if episodes[j] != episodes[i]:

@@ -92,7 +92,5 @@ def write_mimicgen(folder: Path, **modules: str) -> None:
     for package in (tasks, tasks.parent):
         (package / "__init__.py").touch()
     (tasks.parents[1] / "__init__.py").write_text(TOP)
-    for name, text in (
-        {"stack": STACK, "coffee": COFFEE, "threading": THREADING} | modules
-    ).items():
+    for name, text in ({"stack": STACK, "coffee": COFFEE, "threading": THREADING} | modules).items():
         (tasks / f"{name}.py").write_text(text)

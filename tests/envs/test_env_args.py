@@ -45,13 +45,9 @@ def test_rotvec_round_trip_against_scipy(rotvec):
     np.testing.assert_allclose(matrix, reference.as_matrix(), atol=1e-12)
     back = matrix_to_rotvec(matrix).numpy()
     assert np.linalg.norm(back) <= np.pi + 1e-9
-    np.testing.assert_allclose(
-        Rotation.from_rotvec(back).as_matrix(), reference.as_matrix(), atol=1e-9
-    )
+    np.testing.assert_allclose(Rotation.from_rotvec(back).as_matrix(), reference.as_matrix(), atol=1e-9)
     again = rotation_6d_to_rotvec(matrix_to_rotation_6d(matrix)).numpy()
-    np.testing.assert_allclose(
-        Rotation.from_rotvec(again).as_matrix(), reference.as_matrix(), atol=1e-9
-    )
+    np.testing.assert_allclose(Rotation.from_rotvec(again).as_matrix(), reference.as_matrix(), atol=1e-9)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-6, np.pi - 1e-9, np.pi])
@@ -71,9 +67,7 @@ def test_quaternions_against_scipy():
     expected = Rotation.from_quat(quaternions).as_matrix()
     np.testing.assert_allclose(quaternion_to_matrix(torch.from_numpy(quaternions)), expected)
     # Neither sign nor length of a quaternion means anything.
-    np.testing.assert_allclose(
-        quaternion_to_matrix(torch.from_numpy(-3 * quaternions)), expected, atol=1e-12
-    )
+    np.testing.assert_allclose(quaternion_to_matrix(torch.from_numpy(-3 * quaternions)), expected, atol=1e-12)
 
 
 @settings(deadline=None, max_examples=100)

@@ -53,9 +53,7 @@ def played(env, seed):
     for action in actions():
         data = env.step(data.set("action", action))["next"]
         found.append(data)
-    return [
-        [d[key].squeeze().tolist() for d in found] for key in ("observation", "solved", "height")
-    ]
+    return [[d[key].squeeze().tolist() for d in found] for key in ("observation", "solved", "height")]
 
 
 @pytest.mark.parametrize("seed", [0, 7])

@@ -114,9 +114,7 @@ def test_another_package_of_the_name_is_refused_without_running_it(path, kind):
 
 def test_package_that_lacks_something_is_named(path):
     write_mimicgen(path, coffee="import robosuite_task_zoo_of_theirs")
-    with pytest.raises(
-        ImportError, match=r"mimicgen cannot be imported: .*robosuite_task_zoo_of_th"
-    ):
+    with pytest.raises(ImportError, match=r"mimicgen cannot be imported: .*robosuite_task_zoo_of_th"):
         register_mimicgen()
 
 

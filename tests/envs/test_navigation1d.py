@@ -51,9 +51,7 @@ def test_collision_of_a_segment_against_dense_points(x, width, y):
     share = torch.linspace(0, 1, 20_001, dtype=torch.float64)
     px, py = x + share * width, y[0] + share * (y[1] - y[0])
     # How deep the deepest point lies inside an obstacle; touching it is too close to call.
-    depth = max(
-        float(torch.minimum(0.12 - (px - c).abs(), 0.45 - py.abs()).max()) for c in (-0.45, 0.45)
-    )
+    depth = max(float(torch.minimum(0.12 - (px - c).abs(), 0.45 - py.abs()).max()) for c in (-0.45, 0.45))
     hit = navigation_collides(
         torch.tensor([x, x + width], dtype=torch.float64), torch.tensor(y, dtype=torch.float64)
     )

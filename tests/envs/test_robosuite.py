@@ -190,9 +190,7 @@ def test_built_from_the_env_args_of_a_file(lift):
     env = RobosuiteEnv(env_args=legacy)
     assert env.horizon == TASKS["lift"].horizon_ph
     actions = torch.rand(8, 7, generator=torch.manual_seed(0)) * 2 - 1
-    torch.testing.assert_close(
-        play(env, actions, seed=4), play(lift, actions, seed=4), atol=1e-3, rtol=0
-    )
+    torch.testing.assert_close(play(env, actions, seed=4), play(lift, actions, seed=4), atol=1e-3, rtol=0)
     rollout = env.rollout(3)
     assert set(rollout["next", "reward"].unique().tolist()) <= {0.0, 1.0}
 

@@ -192,17 +192,11 @@ def mutate(folder: Path, rng: np.random.Generator) -> tuple[str, Callable[[], Ou
         if must_refuse:
             return Outcome("silent", "was read")
         expected = RobomimicExperienceReplay(whole, **options)
-        same = replay.data.shape == expected.data.shape and bool(
-            (replay.data == expected.data).all()
-        )
+        same = replay.data.shape == expected.data.shape and bool((replay.data == expected.data).all())
         if same and replay.env_args == expected.env_args:
             return Outcome("equal")
         # HDF5 keeps no checksum of plain values: then the file must say so to any reader.
-        return (
-            Outcome("as stored")
-            if _says_so(path, replay, options)
-            else Outcome("silent", "differs")
-        )
+        return Outcome("as stored") if _says_so(path, replay, options) else Outcome("silent", "differs")
 
     return how, load, str(path)
 
@@ -214,9 +208,7 @@ def _says_so(path: Path, replay: RobomimicExperienceReplay, options: dict) -> bo
         if options["filter_key"]:
             demos = [demo for demo in demos if demo.encode() in set(file["mask/train"][()])]
         values = [
-            np.concatenate(
-                [file[f"data/{demo}/obs/{key}"][()] for key in replay.observation_keys], -1
-            )
+            np.concatenate([file[f"data/{demo}/obs/{key}"][()] for key in replay.observation_keys], -1)
             for demo in demos
         ]
         actions = np.concatenate([file[f"data/{demo}/actions"][()] for demo in demos])

@@ -33,9 +33,7 @@ def make(folder: Path) -> None:
         "chi": ChiTransformer(2, 5, 3, embedding_dim=8, num_layers=1, num_heads=2),
     }
     for name, network in networks.items():
-        actor = WarmPriorActor(
-            network, PastPrior(3), nfe=2, clip=1.0, normalizer=Normalizer.fit(data)
-        )
+        actor = WarmPriorActor(network, PastPrior(3), nfe=2, clip=1.0, normalizer=Normalizer.fit(data))
         save_policy(actor, folder / name)
 
 
@@ -50,9 +48,7 @@ def mutate(folder: Path, rng: np.random.Generator) -> tuple[str, Callable[[], Ou
     def load() -> Outcome:
         actor, expected = load_policy(case), load_policy(whole)
         state, theirs = actor.state_dict(), expected.state_dict()
-        same = state.keys() == theirs.keys() and all(
-            torch.equal(state[n], theirs[n]) for n in state
-        )
+        same = state.keys() == theirs.keys() and all(torch.equal(state[n], theirs[n]) for n in state)
         if same and policy_config(actor) == policy_config(expected):
             return Outcome("equal")
         return Outcome("silent", "differs")

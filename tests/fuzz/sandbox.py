@@ -72,9 +72,7 @@ def attempt(load: Callable[[], Outcome], names: str) -> Outcome:
 def _pages() -> tuple[int, int]:
     """Bytes that this process has mapped, and those of them that are in memory."""
     with open("/proc/self/statm") as file:
-        mapped, resident = (
-            int(pages) * resource.getpagesize() for pages in file.read().split()[:2]
-        )
+        mapped, resident = (int(pages) * resource.getpagesize() for pages in file.read().split()[:2])
     return mapped, resident
 
 
@@ -92,6 +90,4 @@ def _judge(load: Callable[[], Outcome], names: str) -> Outcome:
         clear = names in str(error) and len(text) < 4000
         return Outcome("refused" if clear else "unclear", text)
     except BaseException as error:
-        return Outcome(
-            "unclear", f"{type(error).__name__}: {error} ({time.monotonic() - started:.1f} s)"
-        )
+        return Outcome("unclear", f"{type(error).__name__}: {error} ({time.monotonic() - started:.1f} s)")

@@ -51,9 +51,7 @@ def test_machines_that_could_not_do_the_work_are_refused(ray_address, tmp_path, 
 
 def test_what_is_no_cluster_is_refused_within_seconds(monkeypatch):
     started = time.monotonic()
-    with pytest.raises(
-        ConnectionError, match=r"127\.0\.0\.1:1 is no cluster.*refused.*ray start --head"
-    ):
+    with pytest.raises(ConnectionError, match=r"127\.0\.0\.1:1 is no cluster.*refused.*ray start --head"):
         check_ray("127.0.0.1:1")
     for address in ("localhost", "ray://head:10001"):
         with pytest.raises(ValueError, match="HOST:PORT"):

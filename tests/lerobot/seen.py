@@ -34,9 +34,7 @@ def watch(family: str, policy: Any) -> Any:
         handles.append(module.register_forward_pre_hook(hook, with_kwargs=True))
 
     def after(module: Any, take: Any = lambda out: out) -> None:
-        handles.append(
-            module.register_forward_hook(lambda m, a, out: seen.out.append(take(out).detach()))
-        )
+        handles.append(module.register_forward_hook(lambda m, a, out: seen.out.append(take(out).detach())))
 
     if family in ("smolvla", "pi0", "pi05"):
         before(policy.model.action_in_proj, lambda args, kwargs: args[0])

@@ -88,21 +88,15 @@ def history_of(actions):
 
 def actor_of(made, prior, **options):
     generator = torch.Generator().manual_seed(0)
-    return LeRobotActor(
-        made, prior, names=NAMES, preprocess=preprocessed, generator=generator, **options
-    )
+    return LeRobotActor(made, prior, names=NAMES, preprocess=preprocessed, generator=generator, **options)
 
 
 def environment(prior, base=None):
-    return TransformedEnv(
-        Arm() if base is None else base, policy_transforms(prior, observation_steps=1)
-    )
+    return TransformedEnv(Arm() if base is None else base, policy_transforms(prior, observation_steps=1))
 
 
 @pytest.mark.parametrize("family", ["smolvla", "pi05", "xvla"])
-@pytest.mark.parametrize(
-    "prior", [PastPrior(LENGTH, sigma=0.0), PreviewPrior(LENGTH // 2, sigma=0.0)]
-)
+@pytest.mark.parametrize("prior", [PastPrior(LENGTH, sigma=0.0), PreviewPrior(LENGTH // 2, sigma=0.0)])
 def test_rollouts_start_from_the_mean(policy, family, prior):
     made = policy(family)
     env, actor = environment(prior), actor_of(made, prior)
@@ -248,9 +242,7 @@ def test_residuals_around_its_means(policy, prior):
     anchor, executed = rollout["prior", "anchor"], rollout["history", "actions"]
     assert torch.equal(rollout["prior", "noise"], anchor + rollout["prior", "delta"])
     assert torch.equal(executed[1:], rollout["vla_action", "chunk"][:-1])
-    assert torch.equal(
-        anchor[1:], executed[1:] if prior.name == "past" else torch.zeros_like(executed[1:])
-    )
+    assert torch.equal(anchor[1:], executed[1:] if prior.name == "past" else torch.zeros_like(executed[1:]))
 
 
 def test_what_cannot_be_done_is_said(policy):
@@ -268,8 +260,6 @@ def test_what_cannot_be_done_is_said(policy):
     with pytest.raises(ValueError, match=r"what are speed of the observation"):
         actor(data.clone().set(("observation", "speed"), torch.zeros(1, 2)))
     with pytest.raises(ValueError, match="compute no gradients"):
-        actor.ode(
-            data.clone().set(("prior", "noise"), torch.zeros(LENGTH, ACTION, requires_grad=True))
-        )
+        actor.ode(data.clone().set(("prior", "noise"), torch.zeros(LENGTH, ACTION, requires_grad=True)))
     with pytest.raises(ValueError, match="at least 1, got 0"):
         actor(data.clone(), nfe=0)

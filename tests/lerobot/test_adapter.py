@@ -236,9 +236,7 @@ def test_sources_and_targets_are_coupled_in_the_models_units(policy):
         seen.append((a0, a1))
         return a0.flip(0), a1 + 1.0
 
-    source = WarmPriorAdapter(
-        made, PastPrior(LENGTH, sigma=0.5), sigma_unit="std", action_std=std
-    ).source
+    source = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.5), sigma_unit="std", action_std=std).source
     before, target = batch["action"].split(LENGTH, 1)
     valid = ~batch["action_is_pad"][:, :LENGTH]
     plain, same = source.learn(before, valid, target, generator())
@@ -263,9 +261,7 @@ def test_sigma_in_units_of_the_data(policy):
         generator=generator(),
     )
     loc = torch.full((500, LENGTH, ACTION), 2.0)
-    warm, cold = (
-        window_history(loc, torch.full((500, 1), steps), loc, LENGTH) for steps in (LENGTH, 0)
-    )
+    warm, cold = (window_history(loc, torch.full((500, 1), steps), loc, LENGTH) for steps in (LENGTH, 0))
     drawn = adapter.source.draw(warm, generator(1)) - loc
     torch.testing.assert_close(drawn.flatten(0, 1).std(0), 0.5 * std, rtol=0.1, atol=0)
     cold = adapter.source.draw(cold, generator(1))
@@ -275,9 +271,7 @@ def test_sigma_in_units_of_the_data(policy):
 def test_the_standard_deviation_in_a_policys_units(policy):
     values = torch.randn(1000, ACTION, generator=generator()) * torch.linspace(0.1, 3.0, ACTION)
     quantile = {f"q{p:02d}": values.quantile(p / 100, dim=0) for p in (1, 10, 90, 99)}
-    stats = {
-        "action": {"std": values.std(0), "min": values.amin(0), "max": values.amax(0), **quantile}
-    }
+    stats = {"action": {"std": values.std(0), "min": values.amin(0), "max": values.amax(0), **quantile}}
     by_hand = {
         "smolvla": values / values.std(0),
         "pi05": 2 * (values - quantile["q01"]) / (quantile["q99"] - quantile["q01"]) - 1,
@@ -330,9 +324,7 @@ def test_relative_actions_follow_the_state(built):
     }
     preprocess, postprocess = pipelines(made, stats)
     relative = RelativeActions(preprocess, postprocess)
-    adapter = WarmPriorAdapter(
-        made, PastPrior(LENGTH, sigma=0.0), relative=relative, generator=generator()
-    )
+    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), relative=relative, generator=generator())
     with pytest.raises(ValueError, match="relative=RelativeActions"):
         WarmPriorAdapter(made, PastPrior(LENGTH))
     batch = observations("pi0", 2)

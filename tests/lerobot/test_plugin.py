@@ -69,9 +69,7 @@ def small(name):
 def test_a_base_checkpoint_becomes_a_warm_policy(found, name, built, tmp_path):
     base = built(name.removeprefix("warm_"))
     base.save_pretrained(tmp_path / "base")
-    taken = {
-        f.name: getattr(base.config, f.name) for f in dataclasses.fields(base.config) if f.init
-    }
+    taken = {f.name: getattr(base.config, f.name) for f in dataclasses.fields(base.config) if f.init}
     config = found[name].config_class(**taken, prior="past,sigma=0.0")
     assert config.action_delta_indices == list(range(-LENGTH, LENGTH))
     with small(name):
@@ -202,18 +200,13 @@ def write_dataset(root, episodes=3, steps=12):
 
     widths = {"observation.state": STATE, "observation.environment_state": OBJECT, "action": 7}
     features = {
-        name: {"dtype": "float32", "shape": (width,), "names": None}
-        for name, width in widths.items()
+        name: {"dtype": "float32", "shape": (width,), "names": None} for name, width in widths.items()
     }
-    dataset = LeRobotDataset.create(
-        "local/tiny", fps=20, root=root, use_videos=False, features=features
-    )
+    dataset = LeRobotDataset.create("local/tiny", fps=20, root=root, use_videos=False, features=features)
     rng = np.random.default_rng(0)
     for _ in range(episodes):
         for _ in range(steps):
-            frame = {
-                name: rng.uniform(-1, 1, width).astype("float32") for name, width in widths.items()
-            }
+            frame = {name: rng.uniform(-1, 1, width).astype("float32") for name, width in widths.items()}
             dataset.add_frame({**frame, "task": "lift the cube"})
         dataset.save_episode()
     dataset.finalize()

@@ -168,9 +168,7 @@ def test_a_policy_is_left_as_it_was(family, policy):
     # Its own noise again: two chunks differ.
     chunks = []
     for _ in range(2):
-        with port_for(made).sampling(
-            made, lambda s, dtype, device: torch.randn(s), chunks.append, None
-        ):
+        with port_for(made).sampling(made, lambda s, dtype, device: torch.randn(s), chunks.append, None):
             port_for(made).predict(made, observations(family, 2))
     assert not torch.equal(*chunks)
 
@@ -181,9 +179,7 @@ def test_the_number_of_steps(family, policy):
     for nfe, calls in ((1, 1), (3, 3), (None, STEPS)):
         with (
             watch(family, made) as seen,
-            port_for(made).sampling(
-                made, lambda s, dtype, device: torch.zeros(s), lambda chunk: None, nfe
-            ),
+            port_for(made).sampling(made, lambda s, dtype, device: torch.zeros(s), lambda chunk: None, nfe),
         ):
             port_for(made).predict(made, observations(family, 2))
         assert len(seen.x) == calls
@@ -238,7 +234,5 @@ def test_the_release_tells_the_port(monkeypatch):
     assert port_for(Pi0()) is PORTS["0.6"]["pi0"]
     # Those of the older release may draw their noise elsewhere.
     monkeypatch.setattr("warmprior.lerobot.ports.version", lambda name: "0.5.1")
-    with pytest.raises(
-        ValueError, match=r"Pi0 of lerobot 0\.5\.1 is not supported: .*; 0\.5\.1: groot$"
-    ):
+    with pytest.raises(ValueError, match=r"Pi0 of lerobot 0\.5\.1 is not supported: .*; 0\.5\.1: groot$"):
         port_for(Pi0())

@@ -215,9 +215,7 @@ def make_groot(**options: Any) -> Any:
         "use_bf16": False,
         **options,
     }
-    create = mock.patch.object(
-        modeling_groot.GrootPolicy, "_create_groot_model", lambda self: Model()
-    )
+    create = mock.patch.object(modeling_groot.GrootPolicy, "_create_groot_model", lambda self: Model())
     with create:
         return modeling_groot.GrootPolicy(GrootConfig(**chosen))
 
@@ -240,9 +238,7 @@ def make_groot_n15(**options: Any) -> Any:
             tokens = inputs["eagle_input_ids"]
             mask = torch.ones_like(tokens, dtype=torch.bool)
             features = self.embedding(tokens)
-            return BatchFeature(
-                data={"backbone_features": features, "backbone_attention_mask": mask}
-            )
+            return BatchFeature(data={"backbone_features": features, "backbone_attention_mask": mask})
 
     head = {
         "diffusion_model_cfg": {

@@ -96,9 +96,7 @@ def test_the_resnet_normalises_groups_and_has_no_head():
     network = encoder_of(backbone="resnet18").networks[0]
     kinds = {type(module) for module in network.modules()}
     assert nn.GroupNorm in kinds and nn.BatchNorm2d not in kinds and nn.Linear not in kinds
-    assert {
-        m.num_channels // m.num_groups for m in network.modules() if isinstance(m, nn.GroupNorm)
-    } == {16}
+    assert {m.num_channels // m.num_groups for m in network.modules() if isinstance(m, nn.GroupNorm)} == {16}
 
 
 def test_one_network_for_all_cameras():
@@ -233,9 +231,7 @@ def demonstrations() -> TensorDict:
     observation = observation_of(40)
     first = TensorDict({key: value[:, 0] for key, value in observation.items()}, [40])
     episode = torch.arange(40) // 20
-    return TensorDict(
-        {"observation": first, "action": torch.randn(40, 2), "episode": episode}, [40]
-    )
+    return TensorDict({"observation": first, "action": torch.randn(40, 2), "episode": episode}, [40])
 
 
 def test_the_encoder_runs_once_per_loss_and_learns():
@@ -292,9 +288,7 @@ def test_imagenets_weights_that_cannot_be_had(monkeypatch):
         raise OSError("no route to host")
 
     monkeypatch.setattr(ResNet18_Weights, "get_state_dict", offline)
-    with pytest.raises(
-        OSError, match=r"cannot be had \(no route to host\): connect once, put an intact"
-    ):
+    with pytest.raises(OSError, match=r"cannot be had \(no route to host\): connect once, put an intact"):
         load_imagenet(encoder_of(backbone="resnet18"))
     with pytest.raises(ValueError, match="not for 'small'"):
         load_imagenet(encoder_of())
@@ -317,9 +311,7 @@ def test_stored_weights_that_are_damaged_or_hold_code(tmp_path, monkeypatch, sto
     else:
         Planted.folder = str(tmp_path / "ran")
         torch.save({"conv1.weight": stored}, path)
-    with pytest.raises(
-        OSError, match=r"cannot be had \(.*\): connect once, put an intact resnet18"
-    ):
+    with pytest.raises(OSError, match=r"cannot be had \(.*\): connect once, put an intact resnet18"):
         load_imagenet(encoder_of(backbone="resnet18"))
     assert not (tmp_path / "ran").exists()
 

@@ -29,9 +29,7 @@ def test_velocity_is_the_derivative_of_the_path(interpolant):
     a0, a1 = torch.randn(2, 1, 4, 2).double().unbind(0)
     for time in (0.1, 0.37, 0.5, 0.99):
         t = torch.tensor([time]).double()
-        derivative = torch.autograd.functional.jacobian(
-            lambda t: interpolant(a0, a1, t)[0], t
-        ).squeeze(-1)
+        derivative = torch.autograd.functional.jacobian(lambda t: interpolant(a0, a1, t)[0], t).squeeze(-1)
         torch.testing.assert_close(interpolant(a0, a1, t)[1], derivative)
 
 

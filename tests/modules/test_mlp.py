@@ -8,9 +8,7 @@ import torch
 from warmprior import VelocityMLP
 
 
-@pytest.mark.parametrize(
-    ("action", "observation", "length", "steps"), [(1, 1, 1, 1), (7, 23, 16, 3)]
-)
+@pytest.mark.parametrize(("action", "observation", "length", "steps"), [(1, 1, 1, 1), (7, 23, 16, 3)])
 def test_shapes(action, observation, length, steps):
     network = VelocityMLP(action, observation, length, steps, hidden_dim=16)
     out = network(torch.rand(5), torch.randn(5, length, action), torch.randn(5, steps, observation))

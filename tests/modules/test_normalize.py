@@ -88,9 +88,7 @@ def test_environment_side_equals_data_side(batched):
     check_env_specs(env)
     torch.manual_seed(1)
     data_ = env.reset()
-    plain.episode = int(
-        normalizer.denormalize(data_)["observation"].reshape(-1, 4)[0, 1].round() - 1
-    )
+    plain.episode = int(normalizer.denormalize(data_)["observation"].reshape(-1, 4)[0, 1].round() - 1)
     expected = plain.reset()
     for _ in range(4):
         first = data_["observation"].reshape(-1, 4)[0]

@@ -47,9 +47,7 @@ def test_order_of_convergence(solver):
     steps = [8, 16, 32, 64]
     errors = []
     for n in steps:
-        result = integrate(
-            lambda t, a: torch.cos(t)[:, None] * a, a0, nfe=n * STAGES[solver], solver=solver
-        )
+        result = integrate(lambda t, a: torch.cos(t)[:, None] * a, a0, nfe=n * STAGES[solver], solver=solver)
         errors.append((result - exact).abs().max().item())
     slope = (math.log(errors[-1]) - math.log(errors[0])) / (math.log(8) - math.log(64))
     assert slope == pytest.approx(ORDERS[solver], abs=0.15)
@@ -146,9 +144,7 @@ def test_every_dimension_may_have_a_bound_of_its_own():
 
 def test_renamed_keys():
     data = TensorDict({"n": torch.randn(3, 4, 2), "o": {"s": torch.randn(3, 2, 3)}}, [3])
-    actor = ODEActor(
-        Counting(), nfe=1, noise_key="n", observation_key=("o", "s"), chunk_key=("x", "y")
-    )
+    actor = ODEActor(Counting(), nfe=1, noise_key="n", observation_key=("o", "s"), chunk_key=("x", "y"))
     assert actor.in_keys == ["n", ("o", "s")]
     assert actor(data)["x", "y"].shape == (3, 4, 2)
 

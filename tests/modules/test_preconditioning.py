@@ -107,9 +107,7 @@ correlations = st.floats(-0.99, 0.99)
 def test_coefficients_are_gaussian_conditioning(path, t, means, v0, v1, rho, a):
     """E[u_t | a_t] and Var[u_t | a_t] by 2 x 2 matrices in float64, for any path and any moments."""
     c = rho * math.sqrt(v0 * v1)
-    alpha, beta, d_alpha, d_beta = (
-        float(x) for x in path.coefficients(torch.tensor(t, dtype=torch.float64))
-    )
+    alpha, beta, d_alpha, d_beta = (float(x) for x in path.coefficients(torch.tensor(t, dtype=torch.float64)))
     joint = np.array([[v0, c], [c, v1]])
     maps = np.array([[alpha, beta], [d_alpha, d_beta]])
     mean_a, mean_u = maps @ np.array(means)
@@ -155,9 +153,7 @@ def test_zero_network_is_optimal_for_gaussian_data(prior, keep, withhold, path):
     dim, length = 2, prior.prediction_length
     data = gaussian_steps(keep=keep)
     windows = buffer_of(data, prior, withhold=withhold)
-    moments = SourceMoments.fit(
-        windows, prior, samples=80_000, generator=torch.Generator().manual_seed(1)
-    )
+    moments = SourceMoments.fit(windows, prior, samples=80_000, generator=torch.Generator().manual_seed(1))
     network = PreconditionedNetwork(Nothing(dim, 3, length), moments=moments, interpolant=path)
     batch = torch.cat([windows.sample() for _ in range(20)])
     batch = batch[~batch["action_is_pad"].any(1)]
@@ -191,9 +187,7 @@ def test_remainder_is_standardised():
         times = torch.full((len(a0),), t)
         a_t, u = LinearInterpolant()(a0, a1, times)
         shifted = PreconditionedNetwork(spy, moments=moments)(times, a_t, observations(a_t))
-        mean = PreconditionedNetwork(Nothing(1, 3, 1), moments=moments)(
-            times, a_t, observations(a_t)
-        )
+        mean = PreconditionedNetwork(Nothing(1, 3, 1), moments=moments)(times, a_t, observations(a_t))
         target = (u - mean) / (shifted - mean)
         both = torch.cat([spy.seen, target], dim=-1).squeeze(1)
         torch.testing.assert_close(both.mean(0), torch.zeros(2), atol=0.01, rtol=0)
@@ -270,9 +264,7 @@ def test_degenerate_ends_stay_finite(prior, path):
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.name)
 def test_full_correlation_stays_finite_at_every_time(rho, path):
     """Where source and target cancel on the way, the point has no variance to divide by."""
-    network = PreconditionedNetwork(
-        Spy(1, 3, 1), moments=moments_of(0, 0, 1, 1, rho), interpolant=path
-    )
+    network = PreconditionedNetwork(Spy(1, 3, 1), moments=moments_of(0, 0, 1, 1, rho), interpolant=path)
     t = torch.linspace(0, 1, 10_001)
     a = torch.zeros(len(t), 1, 1)
     assert torch.isfinite(network(t, a, observations(a))).all()

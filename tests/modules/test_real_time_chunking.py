@@ -42,8 +42,7 @@ def test_weights_of_every_delay_and_horizon(schedule):
     pairs = torch.cartesian_prod(torch.arange(P + 1), torch.arange(P + 1))
     found = RealTimeChunking(schedule=schedule).weights(pairs[:, 0], pairs[:, 1], P)
     expected = [
-        [reference_weight(schedule, i, start, end) for i in range(P)]
-        for start, end in pairs.tolist()
+        [reference_weight(schedule, i, start, end) for i in range(P)] for start, end in pairs.tolist()
     ]
     torch.testing.assert_close(found, torch.tensor(expected))
 
@@ -122,12 +121,8 @@ def test_without_the_jacobian_it_is_lerobots(time):
         execution_horizon=7,
     )
     with torch.no_grad():
-        theirs = rtc.RTCProcessor(config).denoise_step(
-            a, y, 3, time, lambda x: -velocity(at(1 - time, x), x)
-        )
-    ours = RealTimeChunking(
-        schedule="linear", max_guidance_weight=10.0, horizon=7, jacobian=False, sigma=1.0
-    )
+        theirs = rtc.RTCProcessor(config).denoise_step(a, y, 3, time, lambda x: -velocity(at(1 - time, x), x))
+    ours = RealTimeChunking(schedule="linear", max_guidance_weight=10.0, horizon=7, jacobian=False, sigma=1.0)
     everything, delay = torch.full((B, 1), P), torch.full((B, 1), 3)
     guided = ours.guided(velocity, y, everything, delay, sigma=torch.tensor(0.3))
     # Theirs computes the weight in single precision.
@@ -168,9 +163,9 @@ def test_known_posteriors_of_gaussians(t, std):
     found = rtc.guided(velocity, target, everything, delay, sigma)(at(t, a), a)
     expected = torch.where(left.view(1, P, 1), (y - a) / (1 - t), velocity(at(t, a), a))
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
-    published = RealTimeChunking(
-        schedule="ones", max_guidance_weight=1e9, data_std=std, sigma=1.0
-    ).guided(velocity, target, everything, delay, sigma)(at(t, a), a)
+    published = RealTimeChunking(schedule="ones", max_guidance_weight=1e9, data_std=std, sigma=1.0).guided(
+        velocity, target, everything, delay, sigma
+    )(at(t, a), a)
     warm = torch.arange(P) < P // 2
     assert (published - expected)[:, left & warm].abs().max() > 0.01
     torch.testing.assert_close(published[:, ~warm], expected[:, ~warm], rtol=1e-9, atol=1e-9)

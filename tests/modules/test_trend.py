@@ -110,9 +110,7 @@ class Seeing(GaussianPrior):
 def test_a_source_that_sees_the_observation():
     """The source's trend is that of its draws, which depend on the observation where it sees it."""
     trend = fit(windows(), Seeing(P))
-    torch.testing.assert_close(
-        trend.source[:, :-1], torch.full((P, D_A - 1), 0.5), atol=0.02, rtol=0
-    )
+    torch.testing.assert_close(trend.source[:, :-1], torch.full((P, D_A - 1), 0.5), atol=0.02, rtol=0)
 
 
 def test_against_least_squares():

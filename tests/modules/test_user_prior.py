@@ -103,14 +103,10 @@ def test_arguments_are_told_as_given():
 
 def test_the_same_prior_has_one_configuration():
     assert PastPrior(H).config() == PastPrior(H, sigma=0.5, correlation=0).config()
-    assert json.dumps(PastPrior(H, sigma=1).config()) == json.dumps(
-        PastPrior(H, sigma=1.0).config()
-    )
+    assert json.dumps(PastPrior(H, sigma=1).config()) == json.dumps(PastPrior(H, sigma=1.0).config())
 
 
-@pytest.mark.parametrize(
-    "twin", [copy.copy, copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))]
-)
+@pytest.mark.parametrize("twin", [copy.copy, copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
 @pytest.mark.parametrize("prior", [Anchor(H, gain=2.0), Learned(H), PreviewPrior(H, sigma=0.1)])
 def test_copies_keep_everything(twin, prior):
     other = twin(prior)

@@ -192,9 +192,7 @@ def test_the_loss_trains_the_actor_itself():
     prior = PastPrior(H)
     actor = actor_for(prior)
     loss = FlowMatchingLoss(actor)
-    assert {p.data_ptr() for p in loss.parameters()} == {
-        p.data_ptr() for p in actor.network.parameters()
-    }
+    assert {p.data_ptr() for p in loss.parameters()} == {p.data_ptr() for p in actor.network.parameters()}
     optimizer = torch.optim.SGD(loss.parameters(), 0.1)
     before = actor.network.embed_chunk.weight.clone()
     loss(sample(prior, 8))["loss_flow_matching"].backward()
@@ -252,9 +250,7 @@ def test_observation_key_of_the_actor():
     assert torch.equal(loss_of(actor_for(prior, observation_key=("state", "low")), data), expected)
 
 
-@pytest.mark.parametrize(
-    "missing", [("vla_action", "chunk"), "history", ("history", "steps"), "observation"]
-)
+@pytest.mark.parametrize("missing", [("vla_action", "chunk"), "history", ("history", "steps"), "observation"])
 def test_missing_key(missing):
     prior = PastPrior(H)
     data = sample(prior, 6)

@@ -123,9 +123,7 @@ def test_without_a_teacher_the_network_teaches_itself_and_no_gradient_flows_back
     twin = losses_of(actor, data, self_distillation=1.0, teacher=copy.deepcopy(actor.network))
     assert torch.equal(found["loss_self_distillation"], twin["loss_self_distillation"])
     parameters = list(actor.network.parameters())
-    mine, theirs = (
-        torch.autograd.grad(loss["loss_self_distillation"], parameters) for loss in (found, twin)
-    )
+    mine, theirs = (torch.autograd.grad(loss["loss_self_distillation"], parameters) for loss in (found, twin))
     assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=True))
 
 
@@ -167,9 +165,7 @@ def test_one_step_learns_to_reach_one_of_two_modes():
     def trained(**options):
         prior = GaussianPrior(1)
         torch.manual_seed(0)
-        network = nn.Sequential(
-            nn.Linear(3, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1)
-        )
+        network = nn.Sequential(nn.Linear(3, 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1))
 
         class Field(nn.Module):
             def __init__(self):
@@ -196,9 +192,7 @@ def test_one_step_learns_to_reach_one_of_two_modes():
             optimizer.step()
         with torch.no_grad():
             return [
-                actor(data, nfe=nfe, generator=torch.Generator().manual_seed(1))[
-                    "vla_action", "chunk"
-                ]
+                actor(data, nfe=nfe, generator=torch.Generator().manual_seed(1))["vla_action", "chunk"]
                 for nfe in (1, 18)
             ]
 

@@ -74,9 +74,7 @@ def test_the_start_is_no_draw():
 def test_shape_type_and_generator(name, dtype):
     t = draw(name, 2, 3, dtype=dtype)
     assert t.shape == (2, 3) and t.dtype == dtype
-    assert torch.equal(t, draw(name, 2, 3, dtype=dtype)) and not torch.equal(
-        t, draw(name, 2, 3, seed=1)
-    )
+    assert torch.equal(t, draw(name, 2, 3, dtype=dtype)) and not torch.equal(t, draw(name, 2, 3, seed=1))
     assert draw(name).shape == ()
 
 

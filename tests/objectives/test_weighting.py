@@ -57,9 +57,7 @@ def policy(prior, interpolant=None, network=Nothing):
     windows = batch()
     moments = SourceMoments.fit(windows, prior, generator=torch.Generator().manual_seed(1))
     inside = network(D_A, 1, H, 1)
-    return WarmPriorActor(
-        PreconditionedNetwork(inside, moments=moments, interpolant=interpolant), prior
-    )
+    return WarmPriorActor(PreconditionedNetwork(inside, moments=moments, interpolant=interpolant), prior)
 
 
 @pytest.mark.parametrize("path", [LinearInterpolant(), TrigonometricInterpolant()])
@@ -120,9 +118,7 @@ def test_errors_are_divided_coordinate_by_coordinate():
     assert not weighed[key][0, 1].any()
     plain, weighed = (errors(objective="l1", weighting=w) for w in ("velocity", "standardised"))
     torch.testing.assert_close(weighed[key], plain[key] / unit)
-    plain, weighed = (
-        errors(self_distillation=2.0, weighting=w) for w in ("velocity", "standardised")
-    )
+    plain, weighed = (errors(self_distillation=2.0, weighting=w) for w in ("velocity", "standardised"))
     key, start = "loss_self_distillation", actor.network.remainder(torch.zeros(1))
     torch.testing.assert_close(weighed[key], plain[key] / start.square())
 

@@ -35,15 +35,10 @@ def build(prior=None, delta=0.5, decoder=None, hidden_dim=8, **options):
     torch.manual_seed(0)
     actor = make_prior_space_actor(*sizes, delta=decoder.delta, hidden_dim=hidden_dim)
     chunk = [
-        make_prior_space_critic(
-            *sizes, in_keys=(keys.OBSERVATION, keys.CHUNK), hidden_dim=hidden_dim
-        )
+        make_prior_space_critic(*sizes, in_keys=(keys.OBSERVATION, keys.CHUNK), hidden_dim=hidden_dim)
         for _ in range(2)
     ]
-    noise = [
-        make_prior_space_critic(*sizes, delta=decoder.delta, hidden_dim=hidden_dim)
-        for _ in range(2)
-    ]
+    noise = [make_prior_space_critic(*sizes, delta=decoder.delta, hidden_dim=hidden_dim) for _ in range(2)]
     loss = DSRLNALoss(actor, chunk, noise, decoder, **options)
     loss.make_value_estimator(ValueEstimators.TD0, gamma=GAMMA)
     return loss

@@ -42,16 +42,12 @@ def actor_for(prior, **options):
 
 
 def history(prior, execute=None):
-    chunk = ChunkStep(
-        prior.chunk_length, execute=execute, prediction_length=prior.prediction_length
-    )
+    chunk = ChunkStep(prior.chunk_length, execute=execute, prediction_length=prior.prediction_length)
     return [chunk, ActionHistory(prior.history_length)]
 
 
 def anchored(env, prior, execute=None, **options):
-    return TransformedEnv(
-        env, Compose(*history(prior, execute), PriorAnchor(actor_for(prior), **options))
-    )
+    return TransformedEnv(env, Compose(*history(prior, execute), PriorAnchor(actor_for(prior), **options)))
 
 
 def single(prior, length, **options):
@@ -170,9 +166,7 @@ def test_a_learned_prior_is_the_anchor_s_own():
     prior = Learned(H)
     anchor = PriorAnchor(actor_for(prior)).to("meta")
     assert anchor.prior.network.weight.is_meta and not prior.network.weight.is_meta
-    assert prior.network.weight.requires_grad and not list(
-        p for p in anchor.parameters() if p.requires_grad
-    )
+    assert prior.network.weight.requires_grad and not list(p for p in anchor.parameters() if p.requires_grad)
     paper = PastPrior(H)
     assert PriorAnchor(actor_for(paper)).prior is paper
 
@@ -261,9 +255,7 @@ def test_a_copy_continues_by_itself(copy_of):
 
 def test_in_spawned_workers():
     draws = [generator(i) for i in range(2)]
-    workers = [
-        partial(single, PastPrior(H), n, generator=g) for n, g in zip(LENGTHS, draws, strict=True)
-    ]
+    workers = [partial(single, PastPrior(H), n, generator=g) for n, g in zip(LENGTHS, draws, strict=True)]
     env = ParallelEnv(2, workers, mp_start_method="spawn")
     try:
         anchor = env.reset()["prior", "anchor"]
@@ -312,17 +304,13 @@ def test_in_a_collector():
 def test_wrong_places_and_options():
     with pytest.raises(ValueError, match="cold must be 'noise' or 'zero'"):
         PriorAnchor(actor_for(PastPrior(H)), cold="warm")
-    bare = TransformedEnv(
-        CountingEnv(5), Compose(ChunkStep(H), PriorAnchor(actor_for(PastPrior(H))))
-    )
+    bare = TransformedEnv(CountingEnv(5), Compose(ChunkStep(H), PriorAnchor(actor_for(PastPrior(H)))))
     with pytest.raises(KeyError, match="ActionHistory writes it in an environment"):
         bare.reset()
     with pytest.raises(KeyError, match="append it after ActionHistory"):
         bare.observation_spec  # noqa: B018
     with pytest.raises(ValueError, match=r"PreviewPrior.* forecasts of 6, but .* has 3"):
-        inside = SerialEnv(
-            1, [lambda: TransformedEnv(CountingEnv(5), Compose(*history(PastPrior(H))))]
-        )
+        inside = SerialEnv(1, [lambda: TransformedEnv(CountingEnv(5), Compose(*history(PastPrior(H))))])
         TransformedEnv(inside, PriorAnchor(actor_for(PreviewPrior(H)))).reset()
 
 

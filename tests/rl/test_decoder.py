@@ -122,9 +122,7 @@ def test_nothing_can_change_the_decoder(network):
     data = TensorDict({"observation": torch.randn(9, D_O), "action": torch.randn(9, D_A)}, [9])
     actor = make_actor(prior, nfe=1, normalizer=Normalizer.fit(data))
     if network == "transformer":
-        net = ChiTransformer(
-            D_A, D_O, H, TO, embedding_dim=12, num_layers=1, num_heads=2, dropout=0.5
-        )
+        net = ChiTransformer(D_A, D_O, H, TO, embedding_dim=12, num_layers=1, num_heads=2, dropout=0.5)
         actor = WarmPriorActor(net, prior, nfe=1, normalizer=actor.normalizer)
     decoder = PriorDecoder(actor, delta=0.5)
     policy = TensorDictSequential(make_prior_space_actor(D_A, D_O, H, delta=0.5), decoder)
@@ -248,9 +246,7 @@ def test_check_env():
     decoder = PriorDecoder(make_actor(PastPrior(H)), delta=0.5)
     decoder.check_env(env_for(PastPrior(H)))
     decoder.check_env(TransformedEnv(env_for(PastPrior(H)), auto_unwrap=False))
-    with pytest.raises(
-        ValueError, match=r"takes chunks of \(P, d_a\) = \(6, 2\), .* predicts \(3, 2\)"
-    ):
+    with pytest.raises(ValueError, match=r"takes chunks of \(P, d_a\) = \(6, 2\), .* predicts \(3, 2\)"):
         decoder.check_env(env_for(PreviewPrior(H)))
     with pytest.raises(KeyError, match="append ChunkStep first"):
         decoder.check_env(CountingEnv(7))

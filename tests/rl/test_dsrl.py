@@ -97,9 +97,7 @@ def test_losses_by_hand(prior_class, options, delta):
         residual, log_prob = squashed(actor, after, delta)
         chunk = decode(loss, after["observation"], after["prior", "anchor"] + residual)
         v = combine(
-            torch.stack(
-                [value(c, OBSERVATION=after["observation"], CHUNK=chunk) for c in q_target]
-            ),
+            torch.stack([value(c, OBSERVATION=after["observation"], CHUNK=chunk) for c in q_target]),
             0,
         )
         if options.get("backup_entropy", True):
@@ -107,10 +105,7 @@ def test_losses_by_hand(prior_class, options, delta):
         k = after["executed_steps"][:, 0] if options.get("discount") != "decision" else 1
         end = after["terminated" if options.get("bootstrap_timeouts") else "done"][:, 0]
         y = after["reward"][:, 0] + GAMMA**k * ~end * v
-        errors = [
-            value(c, OBSERVATION=data["observation"], CHUNK=data["vla_action", "chunk"]) - y
-            for c in q
-        ]
+        errors = [value(c, OBSERVATION=data["observation"], CHUNK=data["vla_action", "chunk"]) - y for c in q]
         loss_q = sum(0.5 * e.square().mean() for e in errors)
         residual, log_prob = squashed(actor, data, delta)
         inputs = {"OBSERVATION": data["observation"], "ANCHOR": data["prior", "anchor"]}
@@ -152,9 +147,7 @@ def test_distillation_by_hand(distribution):
     for critic, noise_critic in zip(q, q_noise, strict=True):
         with torch.no_grad():
             target = value(critic, OBSERVATION=data["observation"], CHUNK=chunk)
-        expected = (
-            expected + 0.5 * (value(noise_critic, **inputs, DELTA=delta) - target).square().mean()
-        )
+        expected = expected + 0.5 * (value(noise_critic, **inputs, DELTA=delta) - target).square().mean()
     expected.backward()
     original = data.clone()
     out = loss.distillation_loss(data)

@@ -59,9 +59,7 @@ def make_env(prior, decoder=None, batched=SerialEnv, execute=None):
 def test_both_wirings_give_bit_identical_transitions(prior_class, collect, execute):
     prior = prior_class(H)
     decoder = make_decoder(prior)
-    agent = make_prior_space_actor(
-        ACTION_DIM, D_O, prior.prediction_length, TO, delta=DELTA, hidden_dim=8
-    )
+    agent = make_prior_space_actor(ACTION_DIM, D_O, prior.prediction_length, TO, delta=DELTA, hidden_dim=8)
     results = []
     for inside in (False, True):
         env = make_env(prior, decoder if inside else None, execute=execute)

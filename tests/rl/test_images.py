@@ -68,9 +68,7 @@ def policy() -> WarmPriorActor:
     torch.manual_seed(0)
     Counted.calls.clear()
     encoder = Counted(["cam"], STATE, image_size=SIZE, crop_size=8, backbone="small")
-    network = VisionNetwork(
-        encoder, VelocityMLP(ACTION_DIM, encoder.observation_dim, H, 1, hidden_dim=8)
-    )
+    network = VisionNetwork(encoder, VelocityMLP(ACTION_DIM, encoder.observation_dim, H, 1, hidden_dim=8))
     return WarmPriorActor(PreconditionedNetwork(network), PastPrior(H), nfe=2, clip=1.0)
 
 

@@ -58,9 +58,7 @@ def test_densities_in_units_of_the_box(delta):
         value, log_prob = draw()
         assert value.abs().max() <= delta
         u = (value / delta).double().clamp(-1 + 1e-7, 1 - 1e-7).atanh()
-        reference = stats.norm.logpdf(
-            u.detach().numpy(), loc.double().numpy(), scale.double().numpy()
-        )
+        reference = stats.norm.logpdf(u.detach().numpy(), loc.double().numpy(), scale.double().numpy())
         reference = torch.as_tensor(reference) - torch.log(1 - u.tanh() ** 2)
         inside = (value.abs() < 0.999 * delta).all(-1).all(-1)
         assert inside.sum() > 10

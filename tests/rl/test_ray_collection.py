@@ -90,6 +90,4 @@ def test_an_environment_that_fails_in_an_actor_ends_the_training(ray_address, tm
     with pytest.raises(WorkerError, match=r"a Ray collector failed.*the motors are off"):
         training.run()
     with pytest.raises(ValueError, match="--collectors 3 need a CPU each, and the cluster has 2"):
-        make_training(
-            tmp_path / "more", collection={"collectors": 3, "ray_address": ray_address}
-        ).run()
+        make_training(tmp_path / "more", collection={"collectors": 3, "ray_address": ray_address}).run()

@@ -41,10 +41,7 @@ def tensordicts(draw):
             unique=True,
         )
     )
-    forms = [
-        (draw(st.sampled_from(DTYPES)), draw(st.lists(st.integers(1, 3), max_size=2)))
-        for _ in paths
-    ]
+    forms = [(draw(st.sampled_from(DTYPES)), draw(st.lists(st.integers(1, 3), max_size=2))) for _ in paths]
     sizes = draw(st.lists(st.lists(st.integers(1, 3), max_size=3), max_size=3))
     generator = torch.Generator().manual_seed(draw(st.integers(0, 1_000)))
 

@@ -141,11 +141,7 @@ def test_the_agent_climbs_its_critic(tmp_path, algorithm):
         loss.zero_grad()
         loss(data.clone())["loss_actor"].backward()
         return torch.cat(
-            [
-                p.grad.flatten()
-                for p in loss.actor_network_params.values(True, True)
-                if p.requires_grad
-            ]
+            [p.grad.flatten() for p in loss.actor_network_params.values(True, True) if p.requires_grad]
         )
 
     one = gradient()
@@ -160,9 +156,7 @@ def test_both_algorithms_want_the_same_entropy(tmp_path):
     losses = {}
     for algorithm in ALGORITHMS:
         options = {"alpha_init": 3.0, "target_entropy": -2.5, "delta": 0.7}
-        training = make_training(
-            tmp_path / algorithm, algorithm=algorithm, environment_steps=30, **options
-        )
+        training = make_training(tmp_path / algorithm, algorithm=algorithm, environment_steps=30, **options)
         if algorithm == "dsrl-na":
             training.run()
             data, weights = training.buffer[:], training.agent.loss.actor_network_params

@@ -233,9 +233,7 @@ def test_a_killed_worker_ends_the_training(tmp_path):
         env.set_seed(seed or EVALUATION_SEED, static_seed=True)
         return env
 
-    training = PriorSpaceTraining(
-        actor, mortal, make_config(), tmp_path, evaluation_seed=EVALUATION_SEED
-    )
+    training = PriorSpaceTraining(actor, mortal, make_config(), tmp_path, evaluation_seed=EVALUATION_SEED)
     with pytest.raises(RuntimeError, match=r"worker \d of 2 \(exit code -9\)"):
         training.run()
     # Four episodes of five steps in two environments, with one save on the way.

@@ -93,9 +93,7 @@ def hand_rollout(decisions, lengths):
     for _ in range(decisions):
         for i, length in enumerate(lengths):
             executed = min(H, length - time[i])
-            rewards = range(
-                time[i] + 1, time[i] + executed + 1
-            )  # CountingEnv pays the step's number
+            rewards = range(time[i] + 1, time[i] + executed + 1)  # CountingEnv pays the step's number
             ended = time[i] + executed == length
             result.append((i, time[i], executed, sum(rewards), ended))
             time[i] = 0 if ended else time[i] + executed

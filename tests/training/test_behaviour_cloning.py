@@ -46,9 +46,7 @@ def test_the_loop_by_hand(tmp_path):
     other.load_state_dict(start)
     actor = actor_for(network=other)
     generator = torch.Generator().manual_seed(config.seed)
-    buffer = window_replay_buffer(
-        dataset(), actor.prior, batch_size=16, withhold=0.25, generator=generator
-    )
+    buffer = window_replay_buffer(dataset(), actor.prior, batch_size=16, withhold=0.25, generator=generator)
     loss = FlowMatchingLoss(actor, generator=generator)
     optimizer = make_optimizer(other, learning_rate=config.learning_rate)
     average, losses = None, []
@@ -282,9 +280,7 @@ def test_data_and_actor_may_name_their_keys(tmp_path):
     losses = []
     for name in ("observation", ("sensors", "state")):
         torch.manual_seed(0)
-        actor = WarmPriorActor(
-            VelocityMLP(2, 3, 4, 2, hidden_dim=8), PastPrior(4), observation_key=name
-        )
+        actor = WarmPriorActor(VelocityMLP(2, 3, 4, 2, hidden_dim=8), PastPrior(4), observation_key=name)
         generator = torch.Generator().manual_seed(0)
         data = TensorDict(
             {

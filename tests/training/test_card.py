@@ -30,9 +30,7 @@ FACTS = {
 def row(seed, checkpoint, nfe, solved, **more):
     name = f"drift-own-past-seed{seed}"
     counts = {"episodes": 5, "successes": solved, "success_rate": solved / 5}
-    return (
-        FACTS | {"seed": seed, "policy": name, "checkpoint": checkpoint, "nfe": nfe} | counts | more
-    )
+    return FACTS | {"seed": seed, "policy": name, "checkpoint": checkpoint, "nfe": nfe} | counts | more
 
 
 ROWS = [
@@ -87,9 +85,7 @@ def test_delays_have_lines_of_their_own(run):
 
 def test_what_is_not_known_is_said():
     card = model_card(ACTOR, repository="me/it")
-    assert (
-        "license" not in card and "Not measured" in card and "| environment | not known |" in card
-    )
+    assert "license" not in card and "Not measured" in card and "| environment | not known |" in card
     assert 'load_policy("me/it")' in card and "environment_of" not in card
     assert warmprior.__version__ in card
 

@@ -20,9 +20,7 @@ HOW = {"high": "max", "effort": "sum", "left": "last"}
 def values(seed, t):
     """What the environment says after step ``t`` of the episode of a seed; it ends after some steps."""
     g = torch.Generator().manual_seed(100 * seed + t)
-    high, effort = (
-        2 * torch.rand(2, generator=g) - 3
-    ).tolist()  # below 0: no maximum is that of zeros
+    high, effort = (2 * torch.rand(2, generator=g) - 3).tolist()  # below 0: no maximum is that of zeros
     return {"high": high, "effort": effort, "left": float(t), "won": t == 2 + seed % 3}
 
 
@@ -80,9 +78,7 @@ def by_hand(seed, executed=H):
 
 
 def make_env(**options):
-    transforms = policy_transforms(
-        PastPrior(H), observation_steps=1, success="won", measures=HOW, **options
-    )
+    transforms = policy_transforms(PastPrior(H), observation_steps=1, success="won", measures=HOW, **options)
     return TransformedEnv(Saying(), transforms)
 
 
@@ -122,9 +118,7 @@ def test_batched_episodes_are_those_played_alone(n):
 
 
 def test_a_chunk_combines_what_its_own_steps_say():
-    env = TransformedEnv(
-        Saying(), ChunkStep(H, event_keys=("won",), measures={**HOW, "left": "last"})
-    )
+    env = TransformedEnv(Saying(), ChunkStep(H, event_keys=("won",), measures={**HOW, "left": "last"}))
     env.set_seed(2)  # seven steps: chunks of four and three
     data = env.rollout(9, ChunkPolicy(lambda data: torch.zeros(H, ACTION_DIM)))["next"]
     chunks = [[values(2, t) for t in part] for part in (range(1, 5), range(5, 8))]
@@ -139,7 +133,5 @@ def test_a_chunk_combines_what_its_own_steps_say():
 def test_keys_that_are_not_there_are_named():
     env = make_env()
     for options in ({"success": "solved"}, {"success": "won", "measures": {"height": "max"}}):
-        with pytest.raises(
-            KeyError, match=r"does not write .*(solved|height).*success= or measures="
-        ):
+        with pytest.raises(KeyError, match=r"does not write .*(solved|height).*success= or measures="):
             play_episode(POLICY, env, 0, **options)

@@ -147,8 +147,7 @@ def test_the_figure_at_the_benchmarks_budget(trained, seed):
     names = ("gaussian", "regression", "history", "past", "wide")
     actors = {name: trained(name, 3_000, seed) for name in names}
     base, regression, history, sharp, wide = (
-        judge_navigation(actor, seed, nfe=1 if name == "regression" else 9)
-        for name, actor in actors.items()
+        judge_navigation(actor, seed, nfe=1 if name == "regression" else 9) for name, actor in actors.items()
     )
     assert base["switch_rate"] > 0.4 and base["collision_rate"] > 0.8
     assert sharp["switch_rate"] < 0.03 and sharp["collision_rate"] < 0.15

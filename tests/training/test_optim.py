@@ -50,9 +50,7 @@ def test_first_step_of_adamw_by_hand():
         torch.testing.assert_close(p.detach(), expected)
 
 
-@pytest.mark.parametrize(
-    ("iterations", "ratio"), [(10, 0.2), (100, 0.0), (7, 0.5), (1, 0.2), (3, 0.1)]
-)
+@pytest.mark.parametrize(("iterations", "ratio"), [(10, 0.2), (100, 0.0), (7, 0.5), (1, 0.2), (3, 0.1)])
 def test_schedule_in_closed_form(iterations, ratio):
     parameter = torch.zeros(1, requires_grad=True)
     optimizer = torch.optim.SGD([parameter], lr=2.0)

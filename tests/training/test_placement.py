@@ -110,9 +110,7 @@ def test_data_go_to_the_gpu_where_they_fit(monkeypatch, free, fits):
     """Half of what is free is left to the network."""
     data = dataset()
     moved = []
-    monkeypatch.setattr(
-        torch.cuda, "mem_get_info", lambda device: (int(free * data.bytes()), 10**12)
-    )
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (int(free * data.bytes()), 10**12))
     monkeypatch.setattr(type(data), "to", lambda self, device: moved.append(device) or "moved")
     assert placement.DEVICE_SHARE == 0.5
     assert placed(data, "cuda") == "moved" if fits else placed(data, "cuda") is data

@@ -76,9 +76,7 @@ def test_states_and_policies_are_float32_and_resume_is_exact(tmp_path):
     again.run(None)
     assert same(weights(again), weights(whole))
     tensors, _ = load_state(whole.state_path)
-    assert {v.dtype for n, v in tensors.items() if "trained" in n or "exp_avg" in n} == {
-        torch.float32
-    }
+    assert {v.dtype for n, v in tensors.items() if "trained" in n or "exp_avg" in n} == {torch.float32}
     policy = load_policy(whole.policy_path(40))
     assert {p.dtype for p in policy.parameters()} == {torch.float32}
     plain = training(tmp_path / "plain")

@@ -219,9 +219,7 @@ def test_an_interrupted_save_leaves_the_old_policy(tmp_path, monkeypatch):
 
 
 def test_missing_files(tmp_path):
-    with pytest.raises(
-        FileNotFoundError, match=r"no policy at .*nowhere: model.safetensors is miss"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"no policy at .*nowhere: model.safetensors is miss"):
         load_policy(tmp_path / "nowhere")
 
 

@@ -62,9 +62,7 @@ def preconditioned(prior):
 CASES = {
     "paper": lambda: (CONFIG, dataset(), actor_for()),
     "options": lambda: (
-        dataclasses.replace(
-            CONFIG, weighting="standardised", times="u-shaped", self_distillation=1.0
-        ),
+        dataclasses.replace(CONFIG, weighting="standardised", times="u-shaped", self_distillation=1.0),
         dataset(),
         preconditioned(PastPrior(4, correlation=0.5)),
     ),

@@ -51,9 +51,7 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
     assert (task.title, task.longest, task.images) == ("own human", 10, {})
     assert raw["action"].max() > 50  # the data themselves stay as they were
     # What policies are trained on is what identifies it.
-    again, other = (
-        Task.of("own", steps(action=a), CountingEnv) for a in (raw["action"], raw["action"] ** 2)
-    )
+    again, other = (Task.of("own", steps(action=a), CountingEnv) for a in (raw["action"], raw["action"] ** 2))
     assert task.identity == again.identity != other.identity
     # In other units they are equal once normalised, and yet others.
     scaled = Task.of("own", steps(action=2 * raw["action"]), CountingEnv)
@@ -62,9 +60,7 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
 
 
 def test_measures_are_combined_in_one_of_three_ways():
-    with pytest.raises(
-        ValueError, match="'effort' is combined by 'max', 'sum' or 'last', not 'mean'"
-    ):
+    with pytest.raises(ValueError, match="'effort' is combined by 'max', 'sum' or 'last', not 'mean'"):
         Task.of("own", steps(), CountingEnv, measures={"effort": "mean"})
 
 
@@ -227,9 +223,7 @@ def test_a_lerobot_dataset_is_the_task_of_its_file(path, tmp_path):
     from warmprior.data import convert_robomimic
 
     folder = convert_robomimic(path, tmp_path / "lift", progress=False)
-    file, theirs = (
-        robosuite_task(p, options=DataOptions(("lift",))) for p in (path, f"lerobot:{folder}")
-    )
+    file, theirs = (robosuite_task(p, options=DataOptions(("lift",))) for p in (path, f"lerobot:{folder}"))
     assert (file.data == theirs.data).all() and file.name == theirs.name == "lift"
     assert file.environment == theirs.environment and file.identity != theirs.identity
     (folder / "meta" / "warmprior.json").unlink()  # as from another converter

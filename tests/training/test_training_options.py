@@ -30,9 +30,7 @@ def test_the_loop_by_hand_with_the_average_as_teacher(tmp_path):
     actor = actor_for(GaussianPrior(4), mlp())
     teacher = ema_of(actor.network, 0.8)
     generator = torch.Generator().manual_seed(config.seed)
-    buffer = window_replay_buffer(
-        dataset(), actor.prior, batch_size=16, withhold=0.25, generator=generator
-    )
+    buffer = window_replay_buffer(dataset(), actor.prior, batch_size=16, withhold=0.25, generator=generator)
     loss = FlowMatchingLoss(actor, generator=generator, teacher=teacher.module, **LATER)
     optimizer = make_optimizer(actor.network, learning_rate=config.learning_rate)
     seen = []

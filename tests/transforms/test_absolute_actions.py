@@ -61,12 +61,8 @@ def rotations(draw):
 def test_round_trip(deltas, positions, hands, yaws, scale):
     bases = [Rotation.from_euler("z", yaw) for yaw in yaws]
     poses = [pose_of(positions[3 * a : 3 * a + 3], hands[a]) for a in range(2)]
-    targets = [
-        absolute(poses[a], np.array(deltas[7 * a : 7 * a + 7]), scale, bases[a]) for a in range(2)
-    ]
-    transform = AbsoluteActions(
-        scale, torch.from_numpy(np.stack([base.as_matrix() for base in bases]))
-    )
+    targets = [absolute(poses[a], np.array(deltas[7 * a : 7 * a + 7]), scale, bases[a]) for a in range(2)]
+    transform = AbsoluteActions(scale, torch.from_numpy(np.stack([base.as_matrix() for base in bases])))
     data = {
         "action": torch.from_numpy(np.concatenate(targets)),
         "eef_pose": torch.from_numpy(np.stack(poses)),
@@ -99,15 +95,11 @@ class Gripper(EnvBase):
     def __init__(self, horizon=HORIZON, seed=0):
         super().__init__(batch_size=[])
         self.horizon, self.start = horizon, seed
-        self.observation_spec = Composite(
-            observation=Unbounded((4,)), eef_pose=Unbounded((1, 3, 4))
-        )
+        self.observation_spec = Composite(observation=Unbounded((4,)), eef_pose=Unbounded((1, 3, 4)))
         self.action_spec = Bounded(-1, 1, (7,))
         self.reward_spec = Unbounded((1,))
         flags = ("done", "terminated", "truncated")
-        self.done_spec = Composite(
-            {key: Categorical(2, dtype=torch.bool, shape=(1,)) for key in flags}
-        )
+        self.done_spec = Composite({key: Categorical(2, dtype=torch.bool, shape=(1,)) for key in flags})
 
     def _read(self):
         pose = torch.from_numpy(pose_of(self.position, self.rotation)).float()
@@ -145,12 +137,8 @@ class Gripper(EnvBase):
 def transforms(*more, prior=None):
     low, high = torch.full((10,), -3.0), torch.full((10,), 5.0)
     seen = torch.ones(4)
-    normalizer = Normalizer(
-        {"action": low, "observation": -2 * seen}, {"action": high, "observation": seen}
-    )
-    made = policy_transforms(
-        prior or GaussianPrior(H), normalizer=normalizer, actions=AbsoluteActions(SCALE)
-    )
+    normalizer = Normalizer({"action": low, "observation": -2 * seen}, {"action": high, "observation": seen})
+    made = policy_transforms(prior or GaussianPrior(H), normalizer=normalizer, actions=AbsoluteActions(SCALE))
     for transform in more:
         made.insert(0, transform)
     return made
@@ -163,9 +151,7 @@ def single(horizon=HORIZON):
 PLACES = {
     "single": single,
     "serial, inside": lambda: SerialEnv(2, [single, partial(single, 6)]),
-    "serial, outside": lambda: TransformedEnv(
-        SerialEnv(2, [Gripper, partial(Gripper, 6)]), transforms()
-    ),
+    "serial, outside": lambda: TransformedEnv(SerialEnv(2, [Gripper, partial(Gripper, 6)]), transforms()),
     "parallel, inside": lambda: ParallelEnv(2, single, mp_start_method="fork"),
     "parallel, outside": lambda: TransformedEnv(
         ParallelEnv(2, Gripper, mp_start_method="fork"), transforms()

@@ -141,9 +141,7 @@ def test_chunk_one_is_the_plain_environment():
 
 @pytest.mark.parametrize("prediction", [3, 6])
 def test_specs(prediction):
-    env = TransformedEnv(
-        SerialEnv(2, partial(CountingEnv, 5)), ChunkStep(3, prediction_length=prediction)
-    )
+    env = TransformedEnv(SerialEnv(2, partial(CountingEnv, 5)), ChunkStep(3, prediction_length=prediction))
     check_env_specs(env)
     spec = env.full_action_spec["vla_action", "chunk"]
     assert spec.shape == (2, prediction, ACTION_DIM)
@@ -163,9 +161,7 @@ def test_renamed_keys():
 @pytest.mark.parametrize("length", [2, 4])
 def test_wrong_chunk_length(length):
     env = TransformedEnv(CountingEnv(5), ChunkStep(3))
-    with pytest.raises(
-        ValueError, match=rf"expects a chunk \[\*B, 3, d_a\].*found shape \({length}, 2"
-    ):
+    with pytest.raises(ValueError, match=rf"expects a chunk \[\*B, 3, d_a\].*found shape \({length}, 2"):
         env.step(ones(length)(env.reset()))
 
 
@@ -248,9 +244,7 @@ class VectorEnv(EnvBase):
         super().__init__(batch_size=[len(done_after)])
         self.ends = torch.tensor(done_after)[:, None]
         self.reward = reward
-        self.observation_spec = Composite(
-            count=Unbounded((2, 1), dtype=torch.int64), shape=self.batch_size
-        )
+        self.observation_spec = Composite(count=Unbounded((2, 1), dtype=torch.int64), shape=self.batch_size)
         self.state_spec = self.observation_spec.clone()
         self.action_spec = Bounded(-1, 1, (2, *action_shape))
         self.reward_spec = reward_spec
@@ -279,9 +273,7 @@ class VectorEnv(EnvBase):
 
 
 @pytest.mark.parametrize("gamma", [1.0, 0.9, 0.0])
-@pytest.mark.parametrize(
-    ("low", "high", "reward"), [(0.0, 1.0, 1.0), (-1.0, 0.0, -1.0), (-2.0, -1.0, -1.0)]
-)
+@pytest.mark.parametrize(("low", "high", "reward"), [(0.0, 1.0, 1.0), (-1.0, 0.0, -1.0), (-2.0, -1.0, -1.0)])
 def test_reward_spec_is_that_of_the_sum(low, high, reward, gamma):
     base = VectorEnv(Bounded(low, high, (2, 1)), reward=reward)
     env = TransformedEnv(base, ChunkStep(3, gamma=gamma))

@@ -187,9 +187,7 @@ def test_only_the_rows_of_a_partial_step_change():
         assert torch.equal(data[key][1], after[key][1]), key
     assert not torch.equal(data[keys.FORECAST][0], after[keys.FORECAST][0])
     # A reset of the other row leaves the first one as it is.
-    fresh = env.reset(
-        env.step_mdp(env.step(policy(data))).set("_reset", torch.tensor([[False], [True]]))
-    )
+    fresh = env.reset(env.step_mdp(env.step(policy(data))).set("_reset", torch.tensor([[False], [True]])))
     assert fresh["rtc", "delay"].tolist() == [[2], [0]]
     assert fresh[keys.FORECAST_STEPS].tolist() == [[2], [0]]
 
@@ -237,9 +235,7 @@ def test_episodes_keep_what_was_executed():
     prior = PRIORS["past"]
     network = VelocityMLP(ACTION_DIM, 4, 6, observation_steps=1, hidden_dim=8)
     actor = WarmPriorActor(network, prior, nfe=2, guidance=RealTimeChunking())
-    env = TransformedEnv(
-        Judged(17), policy_transforms(prior, observation_steps=1, execute=4, delay=2)
-    )
+    env = TransformedEnv(Judged(17), policy_transforms(prior, observation_steps=1, execute=4, delay=2))
     episode = play_episode(actor, env, seed=3)
     decisions = episode.decisions
     assert episode.steps == 17 and decisions["next", "executed_steps"].sum() == 17
@@ -257,9 +253,7 @@ def test_numbers_that_do_not_go_together():
         with pytest.raises(ValueError, match="whole number of control steps, at least 0"):
             InferenceDelay(delay, execute=3)
     with pytest.raises(ValueError, match=r"6 actions do not reach 5.*delay of 2.*at most 4"):
-        TransformedEnv(
-            CountingEnv(9), policy_transforms(PRIORS["past"], execute=5, delay=2)
-        ).reset()
+        TransformedEnv(CountingEnv(9), policy_transforms(PRIORS["past"], execute=5, delay=2)).reset()
     for delay in (4, 7):
         with pytest.raises(ValueError, match=rf"delay of {delay}.*too long for.* 6 .*at most 3"):
             policy_transforms(PRIORS["past"], delay=delay)
@@ -281,11 +275,7 @@ def test_numbers_that_do_not_go_together():
 
 
 def test_a_delay_alone_chooses_how_many_are_executed():
-    env = TransformedEnv(
-        CountingEnv(30), policy_transforms(PRIORS["past"], observation_steps=1, delay=2)
-    )
+    env = TransformedEnv(CountingEnv(30), policy_transforms(PRIORS["past"], observation_steps=1, delay=2))
     assert env.rollout(3, told(6))["next", "executed_steps"].flatten().tolist() == [4, 4, 4]
-    env = TransformedEnv(
-        CountingEnv(30), policy_transforms(PRIORS["preview"], observation_steps=1, delay=2)
-    )
+    env = TransformedEnv(CountingEnv(30), policy_transforms(PRIORS["preview"], observation_steps=1, delay=2))
     assert env.rollout(3, told(12))["next", "executed_steps"].flatten().tolist() == [6, 6, 6]

@@ -157,12 +157,8 @@ def test_without_chunk_step_before_it(order):
 
 
 def test_another_key_of_executed_steps():
-    env = TransformedEnv(
-        CountingEnv(5), Compose(ChunkStep(3), ActionHistory(3, executed_key="other"))
-    )
-    with pytest.raises(
-        KeyError, match="found no 'other' after the step: append it after ChunkStep"
-    ):
+    env = TransformedEnv(CountingEnv(5), Compose(ChunkStep(3), ActionHistory(3, executed_key="other")))
+    with pytest.raises(KeyError, match="found no 'other' after the step: append it after ChunkStep"):
         env.rollout(2)
 
 
@@ -240,9 +236,7 @@ def test_keys_that_it_lacks_are_named():
     env = TransformedEnv(CountingEnv(5), HistoryObservation())
     with pytest.raises(KeyError, match=r"missing: .*'actions'.*append it after ActionHistory"):
         _ = env.observation_spec
-    actor = WarmPriorActor(
-        VelocityMLP(ACTION_DIM, 11, 3), GaussianPrior(3), observation_key=keys.CONDITIONED
-    )
+    actor = WarmPriorActor(VelocityMLP(ACTION_DIM, 11, 3), GaussianPrior(3), observation_key=keys.CONDITIONED)
     data["history"] = random_history(GaussianPrior(3), 1)
     with pytest.raises(KeyError, match=r"missing: \[\('prior', 'observation'\)\]"):
         actor(data)
@@ -279,9 +273,7 @@ def momentum_env(place):
     return TransformedEnv(base, policy_transforms(Momentum(4), execute=1))
 
 
-@pytest.mark.parametrize(
-    "place", ["serial-outside", "serial-inside", "parallel-outside", "parallel-inside"]
-)
+@pytest.mark.parametrize("place", ["serial-outside", "serial-inside", "parallel-outside", "parallel-inside"])
 def test_every_decision_meets_the_mean_of_its_training_window(place):
     """To the bit, with one action per decision, rows that rest and rows that begin anew whenever."""
     prior, policy = Momentum(4), random_policy(4)

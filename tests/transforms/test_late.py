@@ -83,9 +83,7 @@ def late_of(env):
 def test_only_the_steps_that_count_are_transformed(monkeypatch, steps, runs):
     seen = []
     apply = ObservationNorm._apply_transform
-    monkeypatch.setattr(
-        ObservationNorm, "_apply_transform", lambda t, x: seen.append(x) or apply(t, x)
-    )
+    monkeypatch.setattr(ObservationNorm, "_apply_transform", lambda t, x: seen.append(x) or apply(t, x))
     env = TransformedEnv(CountingEnv(20), Compose(norm(), ObservationStack(steps), ChunkStep(8)))
     data = env.step_mdp(env.rand_step(env.reset()))  # the first one asks for specs
     seen.clear()
@@ -178,9 +176,7 @@ def test_states_that_are_not_transformed():
     """They go from step to step as the environment gives them, while others wait."""
     env = TransformedEnv(
         StatelessEnv(),
-        Compose(
-            norm("x", out_keys=["seen"]), ObservationStack(2, observation_key="seen"), ChunkStep(H)
-        ),
+        Compose(norm("x", out_keys=["seen"]), ObservationStack(2, observation_key="seen"), ChunkStep(H)),
     )
     assert late_of(env) is not None
     found = env.rollout(2)["next"]

@@ -210,9 +210,7 @@ def test_networks_of_vectors_say_so(preconditioned):
 
 def test_a_preconditioned_network_may_take_several():
     network = PreconditionedNetwork(Encoder(ACTION_DIM, 4, H, TO))
-    rollout = build("single", "nested", PastPrior(H)).rollout(
-        2, WarmPriorActor(network, PastPrior(H))
-    )
+    rollout = build("single", "nested", PastPrior(H)).rollout(2, WarmPriorActor(network, PastPrior(H)))
     assert rollout["vla_action", "chunk"].isfinite().all()
 
 
@@ -264,14 +262,10 @@ def test_nested_entries_are_normalised_on_both_sides():
     torch.testing.assert_close(first, normal["observation", "state"][0])
 
 
-@pytest.mark.parametrize(
-    ("shape", "dtype"), [((9,), None), ((9, 2, 2), None), ((9, 2), torch.int64)]
-)
+@pytest.mark.parametrize(("shape", "dtype"), [((9,), None), ((9, 2, 2), None), ((9, 2), torch.int64)])
 def test_windows_refuse_actions_that_are_no_vector_of_numbers(shape, dtype):
     actions = torch.zeros(shape, dtype=dtype)
     data = TensorDict({"observation": torch.zeros(9, 3), "action": actions}, [9])
     data["episode"] = torch.zeros(9, dtype=torch.int64)
-    with pytest.raises(
-        ValueError, match=r"one vector of real numbers, 'action' \[N, d_a\], got \(9"
-    ):
+    with pytest.raises(ValueError, match=r"one vector of real numbers, 'action' \[N, d_a\], got \(9"):
         ActionWindow(data, H)

@@ -103,9 +103,7 @@ def test_executes_fewer_than_predicted(place):
 
 def test_composes_with_other_transforms():
     prior = PastPrior(3)
-    env = TransformedEnv(
-        CountingEnv(7), Compose(StepCounter(max_steps=5), policy_transforms(prior))
-    )
+    env = TransformedEnv(CountingEnv(7), Compose(StepCounter(max_steps=5), policy_transforms(prior)))
     check_env_specs(env)
     rollout = env.rollout(10)
     assert rollout["next", "executed_steps"].flatten().tolist() == [3, 2]
@@ -118,9 +116,7 @@ def test_the_normaliser_is_not_consumed():
     before = {name: value.clone() for name, value in NORMALIZER.state_dict().items()}
     first, second = build("single", PastPrior(3)), build("single", PastPrior(3))
     first.reset()
-    torch.testing.assert_close(
-        first.reset()["observation"][..., 0], second.reset()["observation"][..., 0]
-    )
+    torch.testing.assert_close(first.reset()["observation"][..., 0], second.reset()["observation"][..., 0])
     for name, value in NORMALIZER.state_dict().items():
         assert torch.equal(value, before[name])
 

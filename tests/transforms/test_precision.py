@@ -64,9 +64,7 @@ def test_training_gives_the_loss_of_full_precision(data, network):
     found.backward()
     assert found.dtype == data  # and not the network's: errors are summed over the batch
     assert all(p.grad.dtype == network and p.grad.isfinite().all() for p in loss.parameters())
-    reference = FlowMatchingLoss(
-        actor_of(prior, torch.float64), generator=torch.Generator().manual_seed(1)
-    )
+    reference = FlowMatchingLoss(actor_of(prior, torch.float64), generator=torch.Generator().manual_seed(1))
     exact = reference(windows)["loss_flow_matching"]
     tolerance = 2e-2 if network == torch.bfloat16 else 1e-5
     torch.testing.assert_close(found.double(), exact.double(), rtol=tolerance, atol=0)

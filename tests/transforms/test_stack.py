@@ -34,9 +34,7 @@ def test_equals_cat_frames_on_a_single_environment(steps):
 
 
 def test_rows_that_reset_or_rest_alone():
-    env = TransformedEnv(
-        SerialEnv(2, [partial(CountingEnv, n) for n in (2, 9)]), ObservationStack(3)
-    )
+    env = TransformedEnv(SerialEnv(2, [partial(CountingEnv, n) for n in (2, 9)]), ObservationStack(3))
     check_env_specs(env)
     data = env.reset()
     for _ in range(2):

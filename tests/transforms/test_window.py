@@ -143,9 +143,7 @@ def test_agrees_with_torchrl_s_sequences(horizon):
 
 def stored(kind, data, folder):
     storage = (
-        LazyTensorStorage(len(data))
-        if kind == "tensor"
-        else LazyMemmapStorage(len(data), scratch_dir=folder)
+        LazyTensorStorage(len(data)) if kind == "tensor" else LazyMemmapStorage(len(data), scratch_dir=folder)
     )
     buffer = TensorDictReplayBuffer(storage=storage, batch_size=32)
     buffer.extend(data)
@@ -175,9 +173,7 @@ def test_window_as_the_transform_of_another_buffer(kind, tmp_path):
 
 def test_epochs_visit_every_step_once():
     data = steps([3, 7, 2])
-    buffer = window_replay_buffer(
-        data, PastPrior(2), batch_size=4, sampler=SamplerWithoutReplacement()
-    )
+    buffer = window_replay_buffer(data, PastPrior(2), batch_size=4, sampler=SamplerWithoutReplacement())
     seen = [i for batch in buffer for i in batch["frame"].tolist()]
     assert sorted(seen) == list(range(12))
 
@@ -196,9 +192,7 @@ def test_generator_fixes_steps_and_what_is_withheld():
 
     def draw(seed):
         generator = torch.Generator().manual_seed(seed)
-        buffer = window_replay_buffer(
-            data, PastPrior(2), batch_size=50, withhold=0.5, generator=generator
-        )
+        buffer = window_replay_buffer(data, PastPrior(2), batch_size=50, withhold=0.5, generator=generator)
         return torch.cat([buffer.sample() for _ in range(3)])
 
     one, same, other = draw(1), draw(1), draw(2)

@@ -116,9 +116,7 @@ def convert_robomimic(
                 f"{VIDEO_SIZE}: write pictures (--images), or render larger ones"
             )
     if os.path.lexists(folder):
-        raise FileExistsError(
-            f"{folder} exists: choose another folder, or remove it to convert anew"
-        )
+        raise FileExistsError(f"{folder} exists: choose another folder, or remove it to convert anew")
     fps = index.env_args["env_kwargs"].get("control_freq", 20)
     if fps != int(fps):
         raise DatasetError(
@@ -231,9 +229,7 @@ def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -
     observations: dict[str, tuple[str, int, int]] = {}
     for feature, widths in layout.items():
         borders = pairwise(np.cumsum([0, *widths.values()]).tolist())
-        observations |= {
-            key: (feature, *border) for key, border in zip(widths, borders, strict=True)
-        }
+        observations |= {key: (feature, *border) for key, border in zip(widths, borders, strict=True)}
     with open_robomimic(index.path) as file:
         rendering = file["data"].attrs.get("rendering")
         states = member(file, f"data/{index.demos[0]}/states", "dataset")

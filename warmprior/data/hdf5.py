@@ -122,9 +122,7 @@ def _mask(file: h5py.File, path: Path, filter_key: str, demos: int) -> set[str]:
             "of demos. Choose another filter key or rebuild the mask."
         )
     if len(entries) > demos:
-        raise DatasetError(
-            f"{what} has {len(entries)} names, but data holds {demos} demos; rebuild the mask"
-        )
+        raise DatasetError(f"{what} has {len(entries)} names, but data holds {demos} demos; rebuild the mask")
     with reading(file, f"mask/{filter_key}"):
         return {entry.decode() for entry in entries[()]}
 
@@ -138,8 +136,7 @@ def _selected(file: h5py.File, path: Path, filter_key: str | None) -> tuple[str,
         if absent or not selected:
             what = f"demos that data does not hold: {', '.join(absent)}" if absent else "no demos"
             raise DatasetError(
-                f"{path}: mask/{filter_key} names {what}. "
-                "Choose another filter key or rebuild the mask."
+                f"{path}: mask/{filter_key} names {what}. Choose another filter key or rebuild the mask."
             )
     # Numbers are not zero padded: demo_10 comes after demo_9.
     return tuple(sorted(selected, key=lambda name: _number(path, name)))
@@ -187,9 +184,7 @@ def read_env_args(path: str | Path) -> dict[str, Any]:
 def _demo(file: h5py.File, name: str) -> h5py.Group:
     demo = member(file["data"], name, "group")
     if demo is None:  # listed, but not to be found: its index is damaged
-        raise DatasetError(
-            f"{file.filename}: data/{name} cannot be read; copy or download the file again"
-        )
+        raise DatasetError(f"{file.filename}: data/{name} cannot be read; copy or download the file again")
     return demo
 
 

@@ -60,9 +60,7 @@ def reading(parent: h5py.Group, name: str) -> Iterator[None]:
         yield
     except DatasetError:
         raise
-    except (
-        Exception
-    ) as error:  # HDF5's errors share no base class: OSError, RuntimeError, KeyError...
+    except Exception as error:  # HDF5's errors share no base class: OSError, RuntimeError, KeyError...
         raise DatasetError(
             f"{parent.file.filename}: {_full(parent, name)} cannot be read ({error}); copy or "
             "download the file again"
@@ -136,11 +134,7 @@ def _follow(node: h5py.Group, name: str, soft_links: int) -> h5py.Group | h5py.D
             if node is None:
                 return None
         else:
-            where = (
-                links.get_val(key)[0].decode(errors="replace")
-                if kind == h5py.h5l.TYPE_EXTERNAL
-                else ""
-            )
+            where = links.get_val(key)[0].decode(errors="replace") if kind == h5py.h5l.TYPE_EXTERNAL else ""
             raise DatasetError(
                 f"{path}: {_full(node, part)} is a link to another file {where}, which is not read: "
                 "copy the data into this file"
@@ -153,9 +147,7 @@ def _check_stored(dataset: h5py.Dataset) -> None:
     what = f"{dataset.file.filename}: {dataset.name[1:]}"
     if dataset.is_virtual or dataset.external:
         how = "is a virtual dataset over" if dataset.is_virtual else "stores its values in"
-        raise DatasetError(
-            f"{what} {how} another file, which is not read: copy the data into this file"
-        )
+        raise DatasetError(f"{what} {how} another file, which is not read: copy the data into this file")
     if not dataset.size:
         return
     places: list[tuple[int, int]] = []  # in the file, of the stored parts: first byte and size

@@ -51,18 +51,14 @@ def is_remote(dataset: str | Path) -> bool:
     return is_repository(str(dataset)) and not Path(dataset).exists()
 
 
-def _root(
-    dataset: str | Path, files: Sequence[str] = ("meta/*",), revision: str | None = None
-) -> Path:
+def _root(dataset: str | Path, files: Sequence[str] = ("meta/*",), revision: str | None = None) -> Path:
     """The folder of a dataset, with files of it fetched if it is in the hub."""
     if is_remote(dataset):
         return download_lerobot(str(dataset), files, revision=revision)
     return Path(dataset).expanduser()
 
 
-def find_lerobot(
-    dataset: str | Path, *, revision: str | None = None, **options: Any
-) -> LeRobotIndex:
+def find_lerobot(dataset: str | Path, *, revision: str | None = None, **options: Any) -> LeRobotIndex:
     """Read what describes a LeRobotDataset; of one in the hub nothing else is fetched.
 
     Args:
@@ -80,9 +76,7 @@ def find_lerobot(
     return read_lerobot_index(_root(dataset, revision=revision), **options)
 
 
-def fetch_lerobot(
-    dataset: str | Path, *, revision: str | None = None, **options: Any
-) -> LeRobotIndex:
+def fetch_lerobot(dataset: str | Path, *, revision: str | None = None, **options: Any) -> LeRobotIndex:
     """As :func:`find_lerobot`, and then fetch what is to be read, where the dataset is in the hub."""
     index = find_lerobot(dataset, revision=revision, **options)
     if not all((index.path / file).is_file() for file in index.files):
@@ -196,9 +190,7 @@ class LeRobotReader(DemonstrationReader):
         path = self.index.path / episode_file(self.index.metadata, episode, video)
         step = max(1, DECODED // max(1, out[0].numel()))
         with _reading(path):
-            frames = (
-                self._video(episode, path, feature) if video else _pictures(episode, path, feature)
-            )
+            frames = self._video(episode, path, feature) if video else _pictures(episode, path, feature)
             for first in range(0, len(out), step):
                 part = out[first : first + step]
                 found = frames(first, first + len(part))
@@ -213,9 +205,7 @@ class LeRobotReader(DemonstrationReader):
         decode = require("lerobot.datasets.video_utils", "lerobot").decode_video_frames
         times = self._columns.of(episode, "timestamp")[:, 0].astype(np.float64)
         times += episode[f"videos/{feature}/from_timestamp"]
-        return lambda first, stop: decode(
-            path, times[first:stop].tolist(), TOLERANCE, return_uint8=True
-        )
+        return lambda first, stop: decode(path, times[first:stop].tolist(), TOLERANCE, return_uint8=True)
 
 
 def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:

@@ -69,11 +69,7 @@ class LeRobotIndex(DatasetIndex):
         """The files outside ``meta/`` that hold what is selected, below the folder."""
         videos = [name for name in self.images.values() if name in self.metadata.video_keys]
         return sorted(
-            {
-                episode_file(self.metadata, e, name)
-                for e in self.episodes
-                for name in [None, *videos]
-            }
+            {episode_file(self.metadata, e, name) for e in self.episodes for name in [None, *videos]}
         )
 
     def digest(self) -> str:
@@ -101,9 +97,7 @@ def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = 
     template = metadata.data_path if video is None else metadata.video_path
     file = template.format(video_key=video, **numbers)
     if file.startswith("/") or ".." in file.split("/"):
-        raise DatasetError(
-            f"{metadata.root}: meta/info.json names {file!r}, which is not in the folder"
-        )
+        raise DatasetError(f"{metadata.root}: meta/info.json names {file!r}, which is not in the folder")
     return file
 
 
@@ -122,9 +116,7 @@ def read_metadata(root: Path) -> Any:
         ImportError: if lerobot is not installed.
     """
     if not (root / "meta" / "info.json").is_file():
-        raise FileNotFoundError(
-            f"{root}: no meta/info.json there, so no LeRobotDataset; check the path"
-        )
+        raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
     datasets = require("lerobot.datasets", "lerobot")
     again = "Copy or download it again, or record or convert it anew"
     for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet"):
@@ -266,9 +258,7 @@ def read_lerobot_index(
     task = task_of_env(recorded) if recorded else None
     widths = vector_widths(metadata.features)
     if "action" not in widths:
-        raise DatasetError(
-            f"{root}: there is no feature 'action' that is a vector of numbers, but {widths}"
-        )
+        raise DatasetError(f"{root}: there is no feature 'action' that is a vector of numbers, but {widths}")
     if recorded:
         _check_actions(root, metadata, recorded, task)
     columns = _columns(root, metadata.features, widths, described, task)
@@ -312,9 +302,7 @@ def read_lerobot_index(
         demos=tuple(str(row["episode_index"]) for row in episodes),
         lengths=tuple(row["length"] for row in episodes),
         observation_keys=tuple(observation_keys),
-        observation_dims=tuple(
-            columns[key][1].stop - columns[key][1].start for key in observation_keys
-        ),
+        observation_dims=tuple(columns[key][1].stop - columns[key][1].start for key in observation_keys),
         image_keys=tuple(image_keys),
         image_size=_image_size(root, metadata.features, cameras, image_keys),
         available_keys=(*columns, *cameras),
@@ -357,9 +345,7 @@ def _check_names(root: Path, feature: Mapping[str, Any], expected: list[str], wh
         )
 
 
-def _check_actions(
-    root: Path, metadata: Any, env_args: Mapping[str, Any], task: TaskSpec | None
-) -> None:
+def _check_actions(root: Path, metadata: Any, env_args: Mapping[str, Any], task: TaskSpec | None) -> None:
     """Whether the actions are those of an environment, one per control step."""
     control = env_args["env_kwargs"].get("control_freq", 20)
     if metadata.fps != control:
@@ -388,9 +374,7 @@ def _columns(
     """Where the observations are."""
     theirs = {name: width for name, width in widths.items() if name.startswith("observation.")}
     if described:
-        found = {
-            key: (name, slice(*ends)) for key, (name, *ends) in described["observations"].items()
-        }
+        found = {key: (name, slice(*ends)) for key, (name, *ends) in described["observations"].items()}
         needed = {} if task is None else task.low_dim_widths
         for key, (name, part) in found.items():
             width = needed.get(key, part.stop - part.start)
@@ -447,7 +431,5 @@ def _image_size(
             )
         sizes.add(side)
     if len(sizes) > 1:
-        raise DatasetError(
-            f"{root}: the images have several sizes, {sizes}: choose those of one size"
-        )
+        raise DatasetError(f"{root}: the images have several sizes, {sizes}: choose those of one size")
     return next(iter(sizes), 0)

@@ -74,9 +74,7 @@ def check_place(place: str | Path, option: str) -> None:
         return
     require("lerobot.datasets", "lerobot")
     if not is_remote(dataset) and not Path(dataset).expanduser().is_dir():
-        raise FileNotFoundError(
-            f"{option} {place}: no such folder, and no repository user/name of the hub"
-        )
+        raise FileNotFoundError(f"{option} {place}: no such folder, and no repository user/name of the hub")
 
 
 def name_of_place(place: str | Path) -> str:
@@ -103,9 +101,7 @@ def resolved_place(place: Path) -> str:
     return str(place) if is_remote(dataset) else f"{LEROBOT}{Path(dataset).expanduser().resolve()}"
 
 
-def open_demonstrations(
-    place: str | Path, env_args: Mapping[str, Any] | None = None
-) -> Demonstrations:
+def open_demonstrations(place: str | Path, env_args: Mapping[str, Any] | None = None) -> Demonstrations:
     """What reads the demonstrations at a place.
 
     Args:
@@ -172,9 +168,7 @@ class Demonstrations(ABC):
         """
 
     @abstractmethod
-    def with_images(
-        self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
-    ) -> Self:
+    def with_images(self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool) -> Self:
         """The same demonstrations with images of some cameras.
 
         Those that are there are compared with the simulator's; others are rendered where states are known.
@@ -224,9 +218,7 @@ class RobomimicFile(Demonstrations):
         if set(cameras) <= set(self.index(demos=demos).cameras):
             compare_images(self.path, [f"{camera}_image" for camera in cameras], fast)
             return self
-        return RobomimicFile(
-            render_demonstrations(self.path, cameras, size, demos=demos, fast=fast)
-        )
+        return RobomimicFile(render_demonstrations(self.path, cameras, size, demos=demos, fast=fast))
 
 
 class LeRobotFolder(Demonstrations):

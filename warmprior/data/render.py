@@ -211,9 +211,7 @@ class _Illustrator:
         for camera in self.cameras:
             self.renderer.render(camera, self.positions(self.index.demos[0])[0])
 
-    def compare(
-        self, state: np.ndarray, images: Mapping[str, np.ndarray], name: str, advice: str
-    ) -> None:
+    def compare(self, state: np.ndarray, images: Mapping[str, np.ndarray], name: str, advice: str) -> None:
         """Compare images of a state, by camera, with the simulator's."""
         model = self.renderer.model
         expected = 1 + model.nq + model.nv
@@ -278,9 +276,7 @@ def _rendering(file: Any) -> dict[str, Any] | None:
     return None if written is None else json.loads(written)
 
 
-def _rendered_before(
-    path: Path, index: DatasetIndex, cameras: Sequence[str], fast: bool
-) -> list[str]:
+def _rendered_before(path: Path, index: DatasetIndex, cameras: Sequence[str], fast: bool) -> list[str]:
     """Other cameras whose images are known to be of the quality that is asked for: one goes for a file."""
     with open_robomimic(path) as file:
         before = _rendering(file)

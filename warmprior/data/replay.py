@@ -180,9 +180,7 @@ def _read_absolute(
         ).numpy()
 
 
-def _fill(
-    index: DatasetIndex, data: TensorDictBase, reader: DemonstrationReader, absolute: bool
-) -> None:
+def _fill(index: DatasetIndex, data: TensorDictBase, reader: DemonstrationReader, absolute: bool) -> None:
     observation, action = data[_vector_key(index)].numpy(), data[ACTION].numpy()
     reward = data["next", "reward"].numpy()
     columns = np.cumsum([0, *index.observation_dims])
@@ -218,9 +216,7 @@ def _understanding(what: str) -> Iterator[None]:
         yield
     except Exception as error:  # whatever their unexpected structure leads to
         reason = str(error) if isinstance(error, ValueError) else repr(error)
-        raise DatasetError(
-            f"{what} describes no environment as these actions need it: {reason}"
-        ) from error
+        raise DatasetError(f"{what} describes no environment as these actions need it: {reason}") from error
 
 
 class DemonstrationReplay(TensorDictReplayBuffer):
@@ -363,14 +359,10 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         Raises:
             KeyError: if they were not read.
         """
-        first = dict(
-            zip(self.observation_keys, np.cumsum([0, *self._index.observation_dims]), strict=False)
-        )
+        first = dict(zip(self.observation_keys, np.cumsum([0, *self._index.observation_dims]), strict=False))
         columns: list[list[int]] = []
         while not columns or f"robot{len(columns)}_eef_pos" in first:
-            position, quaternion = (
-                first[f"robot{len(columns)}_eef_{end}"] for end in ("pos", "quat")
-            )
+            position, quaternion = (first[f"robot{len(columns)}_eef_{end}"] for end in ("pos", "quat"))
             columns.append([*range(position, position + 3), *range(quaternion, quaternion + 4)])
         return torch.tensor(columns)
 

@@ -106,9 +106,7 @@ class AsyncExecutor:
             raise ValueError(f"{type(actor).__name__} does not tell: give prior and action_dim")
         if latency is not None:
             if pool is not None:
-                raise ValueError(
-                    "a simulated latency computes in the calling thread: leave out pool"
-                )
+                raise ValueError("a simulated latency computes in the calling thread: leave out pool")
             delay = latency
         check_whole_numbers(window=window, observation_steps=observation_steps)
         length = prior.prediction_length
@@ -183,9 +181,7 @@ class AsyncExecutor:
             raise RuntimeError("the executor is closed")
         self._see(observation)
         self._collect()
-        if self._pending is None and (
-            self._failed or self._executed >= min(self.execute, self._left)
-        ):
+        if self._pending is None and (self._failed or self._executed >= min(self.execute, self._left)):
             self._decide()
             self._collect()
         if self._executed >= self._usable:
@@ -228,9 +224,7 @@ class AsyncExecutor:
         if isinstance(frames, TensorDictBase):
             frames.batch_size = []  # the steps belong to the entries
         delay = torch.tensor([min(self.expected_delay, self._left)])
-        data = TensorDict(
-            {keys.OBSERVATION: frames, keys.HISTORY: self._history, keys.DELAY: delay}
-        )
+        data = TensorDict({keys.OBSERVATION: frames, keys.HISTORY: self._history, keys.DELAY: delay})
         if self._pool is None:
             self._pending = Future()
             try:
@@ -250,9 +244,7 @@ class AsyncExecutor:
         chunk = self.actor(data.to(self._device)).get(self._chunk_key)
         if chunk is None or tuple(chunk.shape) != self._shape:
             found = "nothing" if chunk is None else f"shape {tuple(chunk.shape)}"
-            raise ValueError(
-                f"expected a chunk [P, d_a] = {self._shape} at {self._chunk_key}, found {found}"
-            )
+            raise ValueError(f"expected a chunk [P, d_a] = {self._shape} at {self._chunk_key}, found {found}")
         if not chunk.isfinite().all():
             raise FloatingPointError("the policy's chunk holds NaN or infinity")
         return chunk.to(self._chunk)

@@ -14,9 +14,7 @@ from warmprior.modules.prior import Source
 __all__ = ["source_coverage"]
 
 
-def source_coverage(
-    policy: WarmPriorActor, windows: TensorDictBase, *, level: float = 0.9
-) -> float:
+def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: float = 0.9) -> float:
     r"""Share of the target's coordinates inside the central interval of a Gaussian source.
 
     A calibrated source covers ``level``. One that covers less is surer of its mean than it may be; one that
@@ -57,7 +55,5 @@ def source_coverage(
     inside = (flat.target - source.loc).abs() <= z * source.scale
     executed = slice(prior.chunk_length)
     return float(
-        inside[:, executed][flat.counted[:, executed].expand_as(inside[:, executed])]
-        .double()
-        .mean()
+        inside[:, executed][flat.counted[:, executed].expand_as(inside[:, executed])].double().mean()
     )

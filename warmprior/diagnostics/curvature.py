@@ -98,9 +98,7 @@ def curvature(
     """
     check_flow(policy, max(n_steps, 2))
     if draws < 1 or split < 1 or n_steps < 2:
-        raise ValueError(
-            f"need n_steps >= 2, draws >= 1 and split >= 1, got {n_steps}, {draws} and {split}"
-        )
+        raise ValueError(f"need n_steps >= 2, draws >= 1 and split >= 1, got {n_steps}, {draws} and {split}")
     windows = flat_windows(policy, batch)
     steps = executed_positions(policy.prior, executed)
     rows = windows.repeat(draws)

@@ -52,9 +52,7 @@ class Windows:
         return Windows(self.shape, *repeated)  # type: ignore[arg-type]
 
 
-def flat_windows(
-    policy: WarmPriorActor, batch: TensorDictBase, *, target_needed: bool = False
-) -> Windows:
+def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed: bool = False) -> Windows:
     """Check a batch and bring it into shape.
 
     Raises:
@@ -117,17 +115,13 @@ def depends_on_history(policy: WarmPriorActor, windows: TensorDictBase) -> bool:
     return sees or bool(flat_windows(policy, windows).warm.any())
 
 
-def drawn(
-    policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generator | None
-) -> Tensor:
+def drawn(policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generator | None) -> Tensor:
     """Where a policy's samplers start at windows ``[N]``, ``[N, P, d_a]``."""
     inputs = rows.select(*policy.in_keys)
     return policy.sampler(inputs, generator=generator)[policy.ode.in_keys[0]]
 
 
-def encoded_windows(
-    policy: WarmPriorActor, windows: TensorDictBase, *, split: int = 256
-) -> TensorDictBase:
+def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: int = 256) -> TensorDictBase:
     """Windows with what the policy's network makes of observations that hold images.
 
     Diagnostics evaluate the network many times at the same observations, and look for near ones among them:
@@ -258,9 +252,7 @@ def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
     return allowed
 
 
-def predict(
-    policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, *, nfe: int, split: int
-) -> Tensor:
+def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, *, nfe: int, split: int) -> Tensor:
     """The chunks ``[N, P, d_a]`` that windows ``[N]`` and sources lead to, ``split`` at a time.
 
     Raises:

@@ -121,9 +121,7 @@ def mean_revision(rollout: TensorDictBase) -> float:
     """
     found = [rollout.get(key, None) for key in (keys.CHUNK, keys.LOC, keys.WARM)]
     if any(value is None for value in found):
-        raise KeyError(
-            f"the rollout lacks {keys.CHUNK}, {keys.LOC} or {keys.WARM}: let a policy write them"
-        )
+        raise KeyError(f"the rollout lacks {keys.CHUNK}, {keys.LOC} or {keys.WARM}: let a policy write them")
     chunk, loc, warm = found
     return _rms((chunk - loc)[warm.expand_as(loc)])
 

@@ -109,9 +109,7 @@ def memory_gain(
     _check_seen(policy, plain)
     if generator is None:
         generator = torch.Generator(device).manual_seed(0)
-    normal = torch.randn(
-        n, 1, flat.loc.shape[-1], generator=generator, dtype=flat.loc.dtype, device=device
-    )
+    normal = torch.randn(n, 1, flat.loc.shape[-1], generator=generator, dtype=flat.loc.dtype, device=device)
     direction = torch.nn.functional.normalize(normal, dim=-1)
     state = generator.get_state()
     history = flat.history

@@ -79,9 +79,7 @@ class SharedObservations:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def windows(
-        self, prior: Prior, offset: int = 0, *, see_history: bool = False
-    ) -> TensorDictBase:
+    def windows(self, prior: Prior, offset: int = 0, *, see_history: bool = False) -> TensorDictBase:
         """Windows with the history of the training.
 
         Args:
@@ -110,9 +108,7 @@ class SharedObservations:
         frames = (self.frames - offset).to(self.data[keys.EPISODE].device)
         return window(TensorDict({keys.FRAME: frames}, [len(frames)]))
 
-    def deployed(
-        self, policy: WarmPriorActor, *, generator: torch.Generator | None = None
-    ) -> TensorDictBase:
+    def deployed(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Windows with the history that deployment meets: from the policy's own earlier prediction.
 
         Observations with images are encoded, see :func:`encoded_windows`.
@@ -129,9 +125,7 @@ class SharedObservations:
         windows = self.windows(policy.prior, see_history=see).to(met.device).update(met)
         return encoded_windows(policy, seen_anew(policy, windows))
 
-    def met(
-        self, policy: WarmPriorActor, *, generator: torch.Generator | None = None
-    ) -> TensorDictBase:
+    def met(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Windows as decisions meet them: :meth:`deployed`, if the policy depends on the history.
 
         Args:

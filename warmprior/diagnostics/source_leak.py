@@ -227,9 +227,7 @@ def _data_spread(
     for i in range(0, len(observation), size):
         s = slice(i, i + size)
         # The faster form by matrix products loses the small distances, the ones that matter here.
-        distance = torch.cdist(
-            observation[s], observation, compute_mode="donot_use_mm_for_euclid_dist"
-        )
+        distance = torch.cdist(observation[s], observation, compute_mode="donot_use_mm_for_euclid_dist")
         taken = episodes[s, None] == episodes
         for _ in range(neighbours):
             nearest = distance.masked_fill_(taken, math.inf).argmin(1)

@@ -52,9 +52,7 @@ def success_posterior(successes: int, episodes: int) -> Any:
     return require("scipy.stats", "sim").beta(successes + 1, episodes - successes + 1)
 
 
-def probability_better(
-    successes_a: int, episodes_a: int, successes_b: int, episodes_b: int
-) -> float:
+def probability_better(successes_a: int, episodes_a: int, successes_b: int, episodes_b: int) -> float:
     r"""Posterior probability that ``a`` succeeds more often than ``b``, both under a uniform prior.
 
     With :math:`p_a \sim \mathrm{Beta}(\alpha_a, \beta_a)` and likewise :math:`p_b`, as in
@@ -84,8 +82,7 @@ def probability_better(
         0.5
     """
     (alpha_a, beta_a), (alpha_b, beta_b) = (
-        success_posterior(*counts).args
-        for counts in ((successes_a, episodes_a), (successes_b, episodes_b))
+        success_posterior(*counts).args for counts in ((successes_a, episodes_a), (successes_b, episodes_b))
     )
     better = require("scipy.stats", "sim").betanbinom(beta_a, beta_b, alpha_b)
     return min(1.0, float(better.cdf(alpha_a - 1)))

@@ -202,9 +202,7 @@ class ControlLoop(StepLoop):
         super().__init__(env, keys)
         poses = low_dim_keys(len(env.robots))
         #: Whether :meth:`look_back` gives all observations.
-        self.looks_back = type(env).__name__ in OBJECT_POSES and not {
-            *self._names.values()
-        }.difference(poses)
+        self.looks_back = type(env).__name__ in OBJECT_POSES and not {*self._names.values()}.difference(poses)
 
     def _bind(self) -> None:
         super()._bind()

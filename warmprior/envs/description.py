@@ -177,9 +177,6 @@ def _describes_robosuite(description: Any) -> bool:
         and isinstance(description["robosuite"]["env_args"], Mapping)
         and (
             "images" not in description
-            or (
-                isinstance(description["images"], Mapping)
-                and set(description["images"]) == set(_IMAGES)
-            )
+            or (isinstance(description["images"], Mapping) and set(description["images"]) == set(_IMAGES))
         )
     )

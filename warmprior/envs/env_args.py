@@ -157,9 +157,7 @@ def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     output_min = torch.as_tensor(part.get("output_min", -output_max), dtype=torch.float64).expand(6)
     limits = (part.get("input_min", -1), part.get("input_max", 1))
     if not torch.equal(output_min, -output_max) or limits != (-1, 1):
-        raise ValueError(
-            "only symmetric deltas are supported: input -1..1 and output_min = -output_max"
-        )
+        raise ValueError("only symmetric deltas are supported: input -1..1 and output_min = -output_max")
     robots = kwargs.get("robots", ["Panda"])
     arms = 1 if isinstance(robots, str) else len(robots)
     turned = arms == 2 and kwargs.get("env_configuration", "default") in ("default", "opposed")
@@ -172,9 +170,7 @@ def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
 
 def _per_arm(name: str, value: Tensor, width: int, arms: int | None = None) -> Tensor:
     if value.ndim == 0 or value.shape[-1] not in (width, 2 * width):
-        raise ValueError(
-            f"{name} must have {width} or {2 * width} columns, got {list(value.shape)}"
-        )
+        raise ValueError(f"{name} must have {width} or {2 * width} columns, got {list(value.shape)}")
     if arms is not None and value.shape[-1] != arms * width:
         raise ValueError(f"{name} has {value.shape[-1]} columns; {arms} arm(s) need {arms * width}")
     return value.double().unflatten(-1, (-1, width))

@@ -15,9 +15,7 @@ from typing import Any
 __all__ = ["find_mimicgen", "is_mimicgen", "register_mimicgen"]
 
 _TASKS = ("stack", "coffee", "threading")
-_INSTALL = (
-    "git clone https://github.com/NVlabs/mimicgen ~/mimicgen && pip install --no-deps -e ~/mimicgen"
-)
+_INSTALL = "git clone https://github.com/NVlabs/mimicgen ~/mimicgen && pip install --no-deps -e ~/mimicgen"
 _SINGLE_ARM = "robosuite.environments.manipulation.single_arm_env"
 
 
@@ -103,7 +101,5 @@ def _restore_robosuite_14() -> None:
     vars(module)["SingleArmEnv"] = SingleArmEnv
     sys.modules[_SINGLE_ARM] = module
     Robot.controller = property(
-        lambda robot: SimpleNamespace(
-            eef_name=robot.composite_controller.part_controllers["right"].ref_name
-        )
+        lambda robot: SimpleNamespace(eef_name=robot.composite_controller.part_controllers["right"].ref_name)
     )

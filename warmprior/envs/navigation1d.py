@@ -326,9 +326,7 @@ def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
     hit = navigation_collides(x.expand_as(heights), heights).any(1)
     gap = (heights[:, None] - demonstrations.to(heights.device)).abs().amin(1)
     return NavigationMetrics(
-        switch_rate=float(changes[:, boundary].sum() / at_boundary.sum())
-        if at_boundary.any()
-        else math.nan,
+        switch_rate=float(changes[:, boundary].sum() / at_boundary.sum()) if at_boundary.any() else math.nan,
         commit_rate=float((~changes.any(1)).double().mean()),
         collision_rate=float(hit.double().mean()),
         route_entropy=abs(float((taken * taken.log2()).sum())),

@@ -181,9 +181,7 @@ class CameraRenderer:
         mujoco.mj_camlight(model, data)
         self._camera.fixedcamid = number
         everything = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(
-            model, data, self._option, None, self._camera, everything, self._scene
-        )
+        mujoco.mjv_updateScene(model, data, self._option, None, self._camera, everything, self._scene)
         image = np.empty((self.height, self.width, 3), dtype=np.uint8)
         view = mujoco.MjrRect(0, 0, self.width, self.height)
         self._gl.make_current()
@@ -223,9 +221,7 @@ class EnvRenderers:
         self.env, self.fast = env, fast
         self._made: dict[tuple[int, int], CameraRenderer] = {}
 
-    def render(
-        self, camera: str, height: int, width: int, qpos: np.ndarray | None = None
-    ) -> np.ndarray:
+    def render(self, camera: str, height: int, width: int, qpos: np.ndarray | None = None) -> np.ndarray:
         """The image of a camera, see :meth:`CameraRenderer.render`.
 
         Args:

@@ -275,9 +275,7 @@ class RobosuiteWrapper(_EnvWrapper):
         out_of_time = self.horizon is not None and self._elapsed >= self.horizon
         return success, terminated, out_of_time and not terminated, terminated or out_of_time
 
-    def _tell(
-        self, flags: Sequence[_Flags], measured: Collection[dict[str, Any]]
-    ) -> list[TensorDictBase]:
+    def _tell(self, flags: Sequence[_Flags], measured: Collection[dict[str, Any]]) -> list[TensorDictBase]:
         """A result per step, of which the last ones tell what was measured."""
         # Arrays are made tensors and split, instead of one small tensor per entry and step.
         bits = np.array(flags)

@@ -132,9 +132,7 @@ TASKS: dict[str, TaskSpec] = {
             official=("ph",),
         ),
         *(
-            TaskSpec(
-                name, env_name, 1, 400, 400, width, scripted=False, official=("source", "core")
-            )
+            TaskSpec(name, env_name, 1, 400, 400, width, scripted=False, official=("source", "core"))
             for name, env_name, width in (
                 ("stack_d0", "Stack_D0", 23),
                 ("coffee_d0", "Coffee_D0", 57),

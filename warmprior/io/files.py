@@ -37,9 +37,7 @@ __all__ = [
 JSON_BYTES = 2**28  # the largest results file is a hundredth of that
 
 
-def save_file(
-    tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | None = None
-) -> None:
+def save_file(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | None = None) -> None:
     """Write a safetensors file. (Imported here: ``import warmprior`` does not need the package.)
 
     Tensors that share memory, such as tied weights, are written once each.
@@ -112,9 +110,7 @@ def read_json(path: Path) -> Any:
     """
     check_regular(path)
     if path.stat().st_size > JSON_BYTES:
-        raise ValueError(
-            f"{path} is not valid JSON of this library: it has {path.stat().st_size} bytes"
-        )
+        raise ValueError(f"{path} is not valid JSON of this library: it has {path.stat().st_size} bytes")
     try:
         return json.loads(path.read_bytes())
     except (ValueError, RecursionError) as error:  # text that is not UTF-8 included
@@ -194,9 +190,7 @@ def _remove_stale(path: Path) -> None:
         # Elsewhere only age tells: no write takes a day.
         here = node.partition(".")[2] == platform.node()
         with contextlib.suppress(OSError):
-            if (
-                here and not psutil.pid_exists(int(process))
-            ) or time.time() - old.stat().st_mtime > 86_400:
+            if (here and not psutil.pid_exists(int(process))) or time.time() - old.stat().st_mtime > 86_400:
                 old.unlink()
 
 

@@ -89,9 +89,7 @@ def check_ray(address: str | None = None) -> str | None:
 
 def reason_of(text: bytes) -> str:
     """The message at the end of what a Python process, or Ray, wrote before it ended."""
-    return re.split(r"^[\w.]+(?:Error|Exception): |^\[.*?\] ", text.decode(), flags=re.M)[
-        -1
-    ].strip()
+    return re.split(r"^[\w.]+(?:Error|Exception): |^\[.*?\] ", text.decode(), flags=re.M)[-1].strip()
 
 
 def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str) -> None:
@@ -187,9 +185,7 @@ def ray_cluster(
             ray.init(**options, logging_level="ERROR")
         with _tokens(folders) as tokens:
             nodes = [n for n in ray.nodes() if n["Alive"] and n["Resources"].get("CPU", 0) >= 1]
-            looks = [
-                _look_at(ray, node, tokens) for node in nodes
-            ]  # all at once: each takes seconds
+            looks = [_look_at(ray, node, tokens) for node in nodes]  # all at once: each takes seconds
             for node, look in zip(nodes, looks, strict=True):
                 _check_node(ray, node, look)
         yield ray

@@ -124,9 +124,7 @@ class LeRobotFlow(TensorDictModuleBase):
             raise KeyError(f"LeRobotFlow needs the keys {self.in_keys}; missing: {missing}")
         noise = tensordict.get(self.in_keys[0])
         if torch.is_grad_enabled() and noise.requires_grad:
-            raise ValueError(
-                "LeRobot's samplers compute no gradients: use no_grad or detach the source"
-            )
+            raise ValueError("LeRobot's samplers compute no gradients: use no_grad or detach the source")
         batch = noise.shape[:-2]
         a0 = noise.reshape(-1, *noise.shape[-2:])
         inputs = self._batch(network_observation(tensordict.get(self.in_keys[1]), batch))

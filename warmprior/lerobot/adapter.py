@@ -345,8 +345,6 @@ def _std(
         raise ValueError(f"sigma_unit must be 'model' or 'std', got {unit!r}")
     if unit == "model":
         if given is not None:
-            raise ValueError(
-                "action_std has no effect with sigma_unit='model': give sigma_unit='std'"
-            )
+            raise ValueError("action_std has no effect with sigma_unit='model': give sigma_unit='std'")
         return None
     return action_std(policy, stats) if given is None else torch.as_tensor(given)

@@ -71,9 +71,7 @@ class ActionMemory:
             lengths = self.prior.history_length, self.prior.prediction_length
             history = cold_history([batch_size], *lengths, self.action_dim, device=device)
         elif len(self._chunk) != batch_size:
-            raise ValueError(
-                f"{batch_size} environments follow {len(self._chunk)}: call reset() in between"
-            )
+            raise ValueError(f"{batch_size} environments follow {len(self._chunk)}: call reset() in between")
         else:
             history = advance(self._history, self._chunk, self._executed)
             # What is left of the chunk is the plan of an episode that is over.

@@ -104,9 +104,7 @@ def check_steps(nfe: int | None) -> None:
         ValueError: if it is below 1.
     """
     if nfe is not None and nfe < 1:
-        raise ValueError(
-            f"nfe is the number of integration steps: it must be at least 1, got {nfe}"
-        )
+        raise ValueError(f"nfe is the number of integration steps: it must be at least 1, got {nfe}")
 
 
 @contextmanager
@@ -194,9 +192,7 @@ class DrawnPort(FlowPort):
         self._predict(policy, batch)
 
     @contextmanager
-    def sampling(
-        self, policy: Any, source: Source, record: Record, nfe: int | None = None
-    ) -> Iterator[None]:
+    def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
         """The draw in the sampler."""
 
         def around(sample: Callable[..., Any]) -> Callable[..., Any]:
@@ -220,9 +216,7 @@ class GrootN15Port(DrawnPort):
         return "MIN_MAX"
 
     @contextmanager
-    def sampling(
-        self, policy: Any, source: Source, record: Record, nfe: int | None = None
-    ) -> Iterator[None]:
+    def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
         """The draw in the sampler; ``select_action`` executes the first actions of a chunk."""
 
         def around(predict: Callable[..., Tensor]) -> Callable[..., Tensor]:
@@ -282,9 +276,7 @@ class OpenPiPort(FlowPort):
             )
 
     @contextmanager
-    def sampling(
-        self, policy: Any, source: Source, record: Record, nfe: int | None = None
-    ) -> Iterator[None]:
+    def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
         """The sampler's argument."""
         length, width = self.length(policy), self.width(policy)
 

@@ -64,9 +64,7 @@ class RelativeActions:
         if state is None:
             raise ValueError("run the preprocessor before the policy decides: it tells the state")
         # The last of several observations.
-        return (
-            state.reshape(1, -1) if state.ndim == 1 else state[:, -1] if state.ndim == 3 else state
-        )
+        return state.reshape(1, -1) if state.ndim == 1 else state[:, -1] if state.ndim == 3 else state
 
     def reanchor(self, actions: Tensor, before: Tensor, now: Tensor) -> Tensor:
         """Actions relative to one state, as those relative to another.

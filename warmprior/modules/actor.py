@@ -103,9 +103,7 @@ class WarmPriorActor(TensorDictModuleBase):
                 f"{prior.prediction_length}"
             )
         self._nfe_was_given = nfe is not None
-        self.sampler = PriorSampler(
-            prior, start=start, observation_key=observation_key, generator=generator
-        )
+        self.sampler = PriorSampler(prior, start=start, observation_key=observation_key, generator=generator)
         self.ode = ODEActor(
             network,
             nfe=nfe,

@@ -113,9 +113,7 @@ class ChiTransformer(VelocityNetwork):
             time_modulation=time_modulation,
         )
         if embedding_dim % num_heads:
-            raise ValueError(
-                f"num_heads must divide embedding_dim, got {num_heads} and {embedding_dim}"
-            )
+            raise ValueError(f"num_heads must divide embedding_dim, got {num_heads} and {embedding_dim}")
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim),
             nn.Linear(timestep_embedding_dim, embedding_dim),
@@ -163,9 +161,7 @@ class ChiTransformer(VelocityNetwork):
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
         """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
         self.check_shapes(a, observation)
-        memory = torch.cat(
-            [self.embed_time(t)[:, None], self.embed_observation(observation)], dim=1
-        )
+        memory = torch.cat([self.embed_time(t)[:, None], self.embed_observation(observation)], dim=1)
         memory = self.encoder(memory + self.memory_position)
         tokens = self.embed_action(a) + self.action_position
         tokens = self.decoder(tokens, memory, tgt_mask=self.causal_mask, tgt_is_causal=True)

@@ -43,9 +43,7 @@ def _small(crop_size: int) -> tuple[nn.Module, int]:
         in_features=3, num_cells=[32, 64, 64], strides=2, paddings=1, activation_class=nn.ReLU
     )
     # The positions of features are kept, which a pooling network of this size would lose.
-    return nn.Sequential(
-        convolutions, nn.Linear(64 * side * side, _SMALL_FEATURES)
-    ), _SMALL_FEATURES
+    return nn.Sequential(convolutions, nn.Linear(64 * side * side, _SMALL_FEATURES)), _SMALL_FEATURES
 
 
 class ImageEncoder(nn.Module):

@@ -90,9 +90,7 @@ class VelocityMLP(VelocityNetwork):
             nn.Linear(hidden_dim, hidden_dim),
         )
         self.embed_chunk = nn.Linear(chunk, hidden_dim)
-        self.blocks = nn.ModuleList(
-            _Block(hidden_dim, timestep_embedding_dim) for _ in range(num_blocks)
-        )
+        self.blocks = nn.ModuleList(_Block(hidden_dim, timestep_embedding_dim) for _ in range(num_blocks))
         self.head = nn.Sequential(nn.LayerNorm(hidden_dim), nn.Linear(hidden_dim, chunk))
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:

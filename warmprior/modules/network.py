@@ -111,15 +111,10 @@ class VelocityNetwork(nn.Module):
         """
         self.check_chunk(a)
         expected = (self.observation_steps, self.observation_dim)
-        built = (
-            f"{type(self).__name__} was built for observations [B, To, d_o] with "
-            f"(To, d_o) = {expected}"
-        )
+        built = f"{type(self).__name__} was built for observations [B, To, d_o] with (To, d_o) = {expected}"
         if isinstance(observation, TensorDictBase):
             entries = sorted(map(str, observation.keys(True, True)))
-            raise ValueError(
-                f"{built}, got the entries {entries}: write a network that encodes them"
-            )
+            raise ValueError(f"{built}, got the entries {entries}: write a network that encodes them")
         if tuple(observation.shape[1:]) != expected:
             raise ValueError(f"{built}, got {tuple(observation.shape)}")
 
@@ -227,15 +222,11 @@ def _first_precision(module: nn.Module, kind: str) -> torch.dtype | None:
     for value in getattr(module, kind).values():
         if value is not None and value.is_floating_point():
             return value.dtype
-    found = (
-        _first_precision(child, kind) for child in module._modules.values() if child is not None
-    )
+    found = (_first_precision(child, kind) for child in module._modules.values() if child is not None)
     return next(filter(None, found), None)
 
 
-def network_observation(
-    observation: Tensor | TensorDictBase, batch: torch.Size
-) -> Tensor | TensorDictBase:
+def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size) -> Tensor | TensorDictBase:
     """The observation with the one batch dimension that a network gets.
 
     Args:

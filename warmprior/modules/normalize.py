@@ -141,13 +141,9 @@ class Normalizer(nn.Module):
         for key in self.keys:
             loc, scale = self.loc(key).clone(), self.scale(key).clone()
             if key == action_key:
-                transforms.append(
-                    ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale)
-                )
+                transforms.append(ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
             else:
-                transforms.append(
-                    ObservationNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True)
-                )
+                transforms.append(ObservationNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))
         return transforms
 
     def config(self) -> dict[str, Any]:

@@ -215,14 +215,10 @@ class ODEActor(TensorDictModuleBase):
         bounds = clip if isinstance(clip, list) else [1.0 if clip is None else clip]
         # A dimension that never varies is bounded by 0, but not all of them.
         if not (all(bound >= 0 for bound in bounds) and any(bound > 0 for bound in bounds)):
-            raise ValueError(
-                f"clip must be > 0, one such number per dimension, or None, got {clip}"
-            )
+            raise ValueError(f"clip must be > 0, one such number per dimension, or None, got {clip}")
         width = getattr(network, "action_dim", None)
         if isinstance(clip, list) and width not in (None, len(clip)):
-            raise ValueError(
-                f"clip has {len(clip)} bounds, but the network has {width} action dimensions"
-            )
+            raise ValueError(f"clip has {len(clip)} bounds, but the network has {width} action dimensions")
         if guidance is not None and max_nfe == 1:
             raise ValueError(
                 "the network's field means something at t = 0 alone, and is no flow to guide: leave the "

@@ -81,9 +81,7 @@ class SourceMoments(nn.Module):
             raise ValueError(f"all moments must have one shape [P, d_a], got {shapes}")
         if not all(bool(torch.isfinite(value).all()) for value in given):
             raise ValueError("the moments hold NaN or infinity: check the actions they come from")
-        v0, v1 = (
-            value.double().clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance)
-        )
+        v0, v1 = (value.double().clamp_min(VARIANCE_FLOOR) for value in (source_variance, target_variance))
         limit = CORRELATION_LIMIT * (v0 * v1).sqrt()
         c = covariance.double().clamp(-limit, limit)
         for name, value in {

@@ -106,9 +106,7 @@ class Prior(Registered):
     default_sigma: ClassVar[float] = 1.0
     """``sigma`` where none is given."""
 
-    def __init__(
-        self, chunk_length: int, *, sigma: float | None = None, correlation: float = 0.0
-    ) -> None:
+    def __init__(self, chunk_length: int, *, sigma: float | None = None, correlation: float = 0.0) -> None:
         if chunk_length < 1:
             raise ValueError(f"chunk_length must be at least 1, got {chunk_length}")
         sigma = self.default_sigma if sigma is None else sigma

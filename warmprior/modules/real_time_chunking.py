@@ -108,9 +108,7 @@ class RealTimeChunking:
 
     def __post_init__(self) -> None:
         if self.schedule not in SCHEDULES:
-            raise ValueError(
-                f"unknown schedule {self.schedule!r}; choose one of {', '.join(SCHEDULES)}"
-            )
+            raise ValueError(f"unknown schedule {self.schedule!r}; choose one of {', '.join(SCHEDULES)}")
         if self.horizon is not None:
             check_whole_numbers(horizon=self.horizon)
         positive = ("max_guidance_weight", "data_std")
@@ -148,9 +146,7 @@ class RealTimeChunking:
                 f"does: need horizon >= delay, or None for all {left} actions that are left"
             )
 
-    def weights(
-        self, delay: Tensor, left: Tensor, length: int, dtype: torch.dtype | None = None
-    ) -> Tensor:
+    def weights(self, delay: Tensor, left: Tensor, length: int, dtype: torch.dtype | None = None) -> Tensor:
         """:math:`W`, by position.
 
         Args:
@@ -165,9 +161,7 @@ class RealTimeChunking:
         i = torch.arange(length, device=delay.device)
         end = (left if self.horizon is None else left.clamp(max=self.horizon)).unsqueeze(-1)
         start = torch.minimum(delay.unsqueeze(-1), end)
-        linear = (
-            (start - 1 - i).to(dtype or torch.get_default_dtype()) / (end - start + 1) + 1
-        ).clamp(0, 1)
+        linear = ((start - 1 - i).to(dtype or torch.get_default_dtype()) / (end - start + 1) + 1).clamp(0, 1)
         return torch.where(i < end, SCHEDULES[self.schedule](linear), 0.0)
 
     def guidance_weight(self, t: Tensor, sigma: Tensor | float = 1.0) -> Tensor:

@@ -42,9 +42,7 @@ class Registered:
         elif not abstract:
             cls.name = name = cls.__dict__.get("name", cls.__name__)
             if not re.fullmatch(r"[\w.+-]+", name):
-                raise ValueError(
-                    f"the name of {cls.__name__} becomes that of files: {name!r} cannot"
-                )
+                raise ValueError(f"the name of {cls.__name__} becomes that of files: {name!r} cannot")
             taken = cls._classes.get(name, cls)
             # The same class once more, as when a notebook's cell runs again, replaces itself.
             if (taken.__module__, taken.__qualname__) != (cls.__module__, cls.__qualname__):
@@ -69,9 +67,7 @@ class Registered:
             elif parameter.kind is not parameter.VAR_POSITIONAL:
                 arguments[name] = value
             elif value:
-                raise TypeError(
-                    f"{cls.__name__} must name its arguments: *{name} could not be saved"
-                )
+                raise TypeError(f"{cls.__name__} must name its arguments: *{name} could not be saved")
         return self
 
     def config(self) -> dict[str, Any]:
@@ -84,9 +80,7 @@ class Registered:
             TypeError: if an argument is nothing that JSON can hold.
         """
         if "name" in self._arguments:
-            raise TypeError(
-                f"{type(self).__name__} takes an argument called name: call it otherwise"
-            )
+            raise TypeError(f"{type(self).__name__} takes an argument called name: call it otherwise")
         try:
             return json.loads(json.dumps({"name": self.name, **self._resolved()}, allow_nan=False))
         except (TypeError, ValueError) as error:
@@ -216,9 +210,7 @@ def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
 def _known[T: Registered](base: type[T], name: Any, advice: str) -> type[T]:
     if name not in base._classes:
         known = ", ".join(sorted(base._classes))
-        raise ValueError(
-            f"unknown {base.__name__.lower()} {name!r}: it is none of {known}; {advice}"
-        )
+        raise ValueError(f"unknown {base.__name__.lower()} {name!r}: it is none of {known}; {advice}")
     return base._classes[name]
 
 

@@ -70,9 +70,7 @@ class PriorSampler(TensorDictModuleBase):
         """The source of decisions or windows, ``[*B]``."""
         return self.prior.distribution(*self._inputs(tensordict))
 
-    def forward(
-        self, tensordict: TensorDictBase, generator: torch.Generator | None = None
-    ) -> TensorDictBase:
+    def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:
         """Write the mean, where it is warm, and the point from which samplers start."""
         source = self.source(tensordict)
         point = source.sample(self.generator if generator is None else generator)

@@ -241,9 +241,7 @@ class FlowMatchingLoss(LossModule):
             )
         self.interpolant = interpolant
         if not isinstance(self.interpolant, LinearInterpolant):
-            told = (
-                f"only on a straight path: use LinearInterpolant, not {type(interpolant).__name__}"
-            )
+            told = f"only on a straight path: use LinearInterpolant, not {type(interpolant).__name__}"
             if times == "start":
                 raise ValueError(f"one step from t = 0 ends at the data {told}")
             if objective != "velocity" or self_distillation:
@@ -321,9 +319,7 @@ class FlowMatchingLoss(LossModule):
         distilled = max(1, round(DISTILLED_SHARE * batch.numel()))
         errors: list[Tensor] = []
         interrupt: KeyboardInterrupt | None = None
-        with self.velocity_network_params.to_module(
-            self.velocity_network, preserve_module_state=False
-        ):
+        with self.velocity_network_params.to_module(self.velocity_network, preserve_module_state=False):
             try:
                 errors.append(self._velocity_error(a0, a1, t, observation))
                 if self.self_distillation:
@@ -347,9 +343,7 @@ class FlowMatchingLoss(LossModule):
         predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:]))
         return self._distance(predicted.reshape(a1.shape), velocity, t)
 
-    def _jump_error(
-        self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase, n: int
-    ) -> Tensor:
+    def _jump_error(self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase, n: int) -> Tensor:
         """Error of the single step from the start to the end, of the first windows, ``[n, P, d_a]``."""
         a0, a1 = (a.detach().reshape(-1, *a.shape[-2:])[:n] for a in (a0, a1))
         observation = observation[:n]

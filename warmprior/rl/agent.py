@@ -62,9 +62,7 @@ class PriorSpaceAgent:
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
         # By default what is drawn around a mean stays in the box, but not what is drawn around zero.
         drawn: ResidualDistribution | None = None if has_anchor(actor) else "clipped"
-        self.warmup = TensorDictSequential(
-            ResidualSampler(self.decoder, distribution=drawn), self.decoder
-        )
+        self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
         frozen: Any = actor.network
         sizes = {

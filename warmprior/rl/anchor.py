@@ -42,17 +42,13 @@ def has_anchor(actor: Any) -> bool:
     # A prior without a mean of the history has a source of its own, which moves.
     if actor.start is not None or type(prior).mean is Prior.mean:
         return True
-    chunk, target = (
-        torch.zeros(length, width) for length in (prior.history_length, prior.prediction_length)
-    )
+    chunk, target = (torch.zeros(length, width) for length in (prior.history_length, prior.prediction_length))
     steps = torch.tensor([prior.history_length])
     history = window_history(chunk, steps, target, prior.chunk_length)
     return bool(checked_mean(prior, history)[1].any())
 
 
-def source_anchor(
-    actor: Any, history: TensorDictBase, observation: Tensor | None
-) -> tuple[Tensor, Tensor]:
+def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
     """Where the source of decisions is centred: the mean where it is warm, or where the policy starts.
 
     Args:
@@ -188,18 +184,14 @@ class PriorAnchor(Transform):
         anchor = cold
         if self.moves:
             with torch.no_grad():
-                mean, known = source_anchor(
-                    self, history, next_tensordict.get(self.observation_key, None)
-                )
+                mean, known = source_anchor(self, history, next_tensordict.get(self.observation_key, None))
             anchor = torch.where(known, mean, cold)
         return next_tensordict.set(self.anchor_key, anchor)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return keep_resting(tensordict, self._call(next_tensordict), [self.anchor_key])
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # For all sub-environments: TorchRL keeps the rows of those that were reset.
         return self._call(tensordict_reset)
 

@@ -40,16 +40,12 @@ class BoxTanhNormal(TanhNormal):
         """The log-density of ``value`` in units of the box."""
         return super().log_prob(value) + self._change_of_units()
 
-    def rsample_and_log_prob(
-        self, sample_shape: torch.Size | tuple[int, ...] = ()
-    ) -> tuple[Tensor, Tensor]:
+    def rsample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """A draw with pathwise gradients and its log-density in units of the box."""
         sample, log_prob = super().rsample_and_log_prob(sample_shape)
         return sample, log_prob + self._change_of_units()
 
-    def sample_and_log_prob(
-        self, sample_shape: torch.Size | tuple[int, ...] = ()
-    ) -> tuple[Tensor, Tensor]:
+    def sample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
         """A draw without pathwise gradients and its log-density in units of the box."""
         sample, log_prob = super().sample_and_log_prob(sample_shape)
         return sample, log_prob + self._change_of_units()

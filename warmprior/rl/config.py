@@ -106,8 +106,7 @@ class PriorSpaceConfig:
         check_counts(**{name: getattr(self, name) for name in names})
         if self.warmup_steps > self.environment_steps:
             raise ValueError(
-                f"warmup_steps ({self.warmup_steps}) exceed environment_steps "
-                f"({self.environment_steps})"
+                f"warmup_steps ({self.warmup_steps}) exceed environment_steps ({self.environment_steps})"
             )
 
     def box(self, actor: WarmPriorActor) -> float:

@@ -251,9 +251,7 @@ class DSRLNALoss(LossModule):
                 "set_keys(chunk=...)"
             )
 
-    def make_value_estimator(
-        self, value_type: ValueEstimators | None = None, **hyperparams: Any
-    ) -> None:
+    def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> None:
         """Choose the discount: ``make_value_estimator(ValueEstimators.TD0, gamma=0.99)``.
 
         Args:
@@ -295,9 +293,7 @@ class DSRLNALoss(LossModule):
             ValueError: if ``updates < 1``.
         """
         check_counts(updates=updates)
-        return iter(
-            [self.reinforcement_loss] * updates + [self.distillation_loss] * self.noise_critic_steps
-        )
+        return iter([self.reinforcement_loss] * updates + [self.distillation_loss] * self.noise_critic_steps)
 
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """The losses of the actor, the temperature and the action critic, and the diagnostics.
@@ -329,9 +325,7 @@ class DSRLNALoss(LossModule):
     def _qvalue_loss(self, tensordict: TensorDictBase, alpha: Tensor) -> tuple[Tensor, Tensor]:
         with torch.no_grad():
             after = tensordict.get("next")
-            state = after.select(
-                *self._states(self.actor_network, self.decoder, self.qvalue_network)
-            )
+            state = after.select(*self._states(self.actor_network, self.decoder, self.qvalue_network))
             delta, log_prob = self._act(state)
             state = self.decoder(state.set(self.decoder.delta_key, delta))
             value = self._combine(self._vmap_qvalue(state, self.target_qvalue_network_params))
@@ -434,11 +428,7 @@ def _check_networks(
     if written != [decoder.delta_key]:
         raise ValueError(f"the actor writes {written}, but the decoder reads {decoder.delta_key}")
     spec = getattr(actor, "spec", None)
-    box = (
-        None
-        if spec is None or decoder.delta_key not in spec.keys(True, True)
-        else spec[decoder.delta_key]
-    )
+    box = None if spec is None or decoder.delta_key not in spec.keys(True, True) else spec[decoder.delta_key]
     high = getattr(box, "high", None)
     if high is not None and not torch.allclose(high, torch.full_like(high, decoder.delta)):
         raise ValueError(

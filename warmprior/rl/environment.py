@@ -86,9 +86,7 @@ class PriorSpace(Transform):
             next_tensordict.set(out_key, tensordict.get(key))
         return next_tensordict
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         anchor = self._anchor_of(tensordict_reset)
         for key in self.out_keys:
             tensordict_reset.set(key, torch.zeros_like(anchor))
@@ -97,9 +95,7 @@ class PriorSpace(Transform):
     def _anchor_of(self, observations: Any) -> Any:
         key = self.decoder.anchor_key
         if key not in observations.keys(True, True):
-            raise KeyError(
-                f"PriorSpace found no {key} among the observations: append it after PriorAnchor"
-            )
+            raise KeyError(f"PriorSpace found no {key} among the observations: append it after PriorAnchor")
         return observations[key]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -134,12 +134,9 @@ def ray_rounds(
 
         cores = int(ray.cluster_resources().get("CPU", 0))
         if cores < collectors:
-            raise ValueError(
-                f"--collectors {collectors} need a CPU each, and the cluster has {cores}"
-            )
+            raise ValueError(f"--collectors {collectors} need a CPU each, and the cluster has {cores}")
         makers: list[Any] = [
-            partial(_make_env, make_env, seed + EPISODES_APART * i, list(sys.path))
-            for i in range(collectors)
+            partial(_make_env, make_env, seed + EPISODES_APART * i, list(sys.path)) for i in range(collectors)
         ]
         collector = None
         try:

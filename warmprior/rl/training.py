@@ -281,9 +281,7 @@ class PriorSpaceTraining:
     def _transitions(self, data: TensorDictBase) -> TensorDictBase:
         transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
         following = transitions["next"]
-        following["reward"] = (
-            following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
-        )
+        following["reward"] = following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
         if not self.config.bootstrap_timeouts:
             following["terminated"] = following["done"].clone()
         return transitions

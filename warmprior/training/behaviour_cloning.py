@@ -225,9 +225,7 @@ class BehaviourCloning:
             chunk_key=actor.chunk_key,
         )
         self._windows = windows if apart else None
-        self._prefetch = (
-            Prefetch(self.replay_buffer.sample, windows, device=device) if prefetch else None
-        )
+        self._prefetch = Prefetch(self.replay_buffer.sample, windows, device=device) if prefetch else None
         #: The network, and the prior where it has weights as well.
         self.trained = nn.ModuleDict({"network": actor.network})
         if isinstance(actor.prior, nn.Module):
@@ -268,9 +266,7 @@ class BehaviourCloning:
         self.identity = {
             "config": asdict(config) | {"betas": list(config.betas)},
             "prior": actor.prior.config() | _fixed_identity(actor.prior),
-            "start": None
-            if actor.start is None
-            else actor.start.config() | _fixed_identity(actor.start),
+            "start": None if actor.start is None else actor.start.config() | _fixed_identity(actor.start),
             "coupling": _coupling_identity(coupling),
             "network": _network_identity(actor.network),
             "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
@@ -298,9 +294,7 @@ class BehaviourCloning:
 
     def policy_path(self, iteration: int | None = None) -> Path:
         """Where the policy kept after ``iteration`` lies, the last one by default."""
-        return policy_path(
-            self.directory, self.config.iterations if iteration is None else iteration
-        )
+        return policy_path(self.directory, self.config.iterations if iteration is None else iteration)
 
     def step(self) -> torch.Tensor:
         """One gradient step: sample, loss, backward, optimiser, schedule, averaging.
@@ -425,8 +419,7 @@ class BehaviourCloning:
             values = {
                 "train/loss": loss,
                 "train/learning_rate": self.schedule.get_last_lr()[0],
-                "train/iterations_per_second": (self.iteration - iteration)
-                / (self._logged[1] - moment),
+                "train/iterations_per_second": (self.iteration - iteration) / (self._logged[1] - moment),
             }
             for name, value in values.items():
                 self.logger.log_scalar(name, value, step=self.iteration)
@@ -574,9 +567,7 @@ def data_digest(data: TensorDictBase) -> str:
     digest = hashlib.sha256()
     for key, value in sorted(data.items(True, True), key=lambda item: str(item[0])):
         digest.update(str(key).encode())
-        rows = max(
-            1, HASHED_AT_ONCE // max(1, value[:1].nbytes)
-        )  # it may be larger than the memory
+        rows = max(1, HASHED_AT_ONCE // max(1, value[:1].nbytes))  # it may be larger than the memory
         for part in value.split(rows):
             digest.update(part.cpu().contiguous().view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()[:16]

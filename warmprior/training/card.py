@@ -44,8 +44,7 @@ def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
         row
         for row in read_lines(path)
         if "success_rate" in row
-        and f"{row['policy']}/policy_{row['checkpoint']:06d}"
-        == f"{folder.parent.name}/{folder.name}"
+        and f"{row['policy']}/policy_{row['checkpoint']:06d}" == f"{folder.parent.name}/{folder.name}"
     ]
     if not rows:
         raise ValueError(
@@ -150,9 +149,7 @@ def _success(results: Sequence[Mapping[str, Any]]) -> str:
     )
     if results[0].get("demonstrations", {}).get("source") == "scripted":
         words += " A scripted expert recorded the data: do not set these beside published numbers."
-    return (
-        f"{_table((*conditions, 'episodes', 'solved', '95% of the posterior'), shown)}\n\n{words}"
-    )
+    return f"{_table((*conditions, 'episodes', 'solved', '95% of the posterior'), shown)}\n\n{words}"
 
 
 def _use(actor: WarmPriorActor, repository: str) -> str:

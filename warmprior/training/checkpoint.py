@@ -79,8 +79,7 @@ def restoring(path: Path) -> Iterator[None]:
     except Exception as error:
         reason = str(error) if isinstance(error, ValueError) else repr(error)
         raise ValueError(
-            f"{path} is damaged, or the code has changed since: {reason}. Remove the folder to train "
-            "again."
+            f"{path} is damaged, or the code has changed since: {reason}. Remove the folder to train again."
         ) from error
 
 

@@ -95,9 +95,7 @@ class _Tally:
         return Episode(seed, self._solved, self._steps, rollout, self._values)
 
 
-def _transformed(
-    make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]
-) -> EnvBase:
+def _transformed(make_env: Callable[[], EnvBase], make_transforms: Callable[[], Compose]) -> EnvBase:
     end_with_parent()
     return TransformedEnv(make_env(), make_transforms())
 
@@ -144,9 +142,7 @@ def parallel_env(
     if num_envs < 1:
         raise ValueError(f"the number of environments must be at least 1, got {num_envs}")
     workers = [
-        partial(
-            _transformed, partial(make_env, seed_offset=i, seed_stride=num_envs), make_transforms
-        )
+        partial(_transformed, partial(make_env, seed_offset=i, seed_stride=num_envs), make_transforms)
         for i in range(num_envs)
     ]
     # Without shared buffers the parent sleeps while workers simulate; with them it polls and would
@@ -513,8 +509,7 @@ def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
         env = env.base_env
     loc, scale = normalizer.loc(keys.ACTION), normalizer.scale(keys.ACTION)
     if not any(
-        torch.equal(t.loc.cpu(), loc.cpu()) and torch.equal(t.scale.cpu(), scale.cpu())
-        for t in scalings
+        torch.equal(t.loc.cpu(), loc.cpu()) and torch.equal(t.scale.cpu(), scale.cpu()) for t in scalings
     ):
         found = "has another normaliser" if scalings else "has no normaliser"
         raise ValueError(

@@ -53,9 +53,7 @@ def play_navigation(
         torch.Size([2, 16])
     """
     generator = torch.Generator().manual_seed(seed)
-    transforms = policy_transforms(
-        actor.prior, observation_steps=1, see_history=sees_history(actor)
-    )
+    transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
     env = TransformedEnv(NavigationEnv(batch_size=[rollouts]), transforms)
     player = actor.replace(nfe=nfe, generator=generator)
     policy = HistoryShift(player, shift, generator=generator) if shift else player
@@ -63,9 +61,7 @@ def play_navigation(
         return env.rollout(1_000, policy)
 
 
-def judge_navigation(
-    actor: WarmPriorActor, seed: int, *, nfe: int, rollouts: int = 256
-) -> dict[str, Any]:
+def judge_navigation(actor: WarmPriorActor, seed: int, *, nfe: int, rollouts: int = 256) -> dict[str, Any]:
     """Play a policy on the toy and measure what it did.
 
     Args:

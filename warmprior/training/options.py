@@ -150,9 +150,7 @@ class DataOptions:
             if self.download:
                 raise ValueError("--dataset reads a file: leave out --download")
             if len(self.task) > 1 or len(self.data) > 1:
-                raise ValueError(
-                    "--dataset is of one task and style: name at most one --task and --data"
-                )
+                raise ValueError("--dataset is of one task and style: name at most one --task and --data")
             check_place(self.dataset, "--dataset")
         for task in filter(is_simulated, self.task):
             if self.generated and not get_task(task).scripted:
@@ -282,7 +280,5 @@ class NetworkOptions:
             if self.encoder == PRETRAINED:
                 load_imagenet(encoder)
             observation_dim = encoder.observation_dim
-        network = kind(
-            action_dim, observation_dim, prediction_length, self.observation_steps, **options
-        )
+        network = kind(action_dim, observation_dim, prediction_length, self.observation_steps, **options)
         return network if encoder is None else VisionNetwork(encoder, network)

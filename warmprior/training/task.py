@@ -149,14 +149,10 @@ class Task:
         """
         missing = [key for key in (OBSERVATION, ACTION, EPISODE) if key not in list(data.keys())]
         if missing:
-            raise KeyError(
-                f"the demonstrations of {name} lack {missing}: they have {list(data.keys())}"
-            )
+            raise KeyError(f"the demonstrations of {name} lack {missing}: they have {list(data.keys())}")
         for key in (OBSERVATION, ACTION):
             if data[key].ndim != 2:
-                raise ValueError(
-                    f"{key!r} of {name} has shape {tuple(data[key].shape)}, not [N, d]"
-                )
+                raise ValueError(f"{key!r} of {name} has shape {tuple(data[key].shape)}, not [N, d]")
         episode = data[EPISODE]
         if episode.ndim != 1 or episode.is_floating_point() or bool((episode < 0).any()):
             raise ValueError(
@@ -394,9 +390,7 @@ def read_like(place: Path | str, name: str, facts: Mapping[str, Any]) -> tuple[T
     """
     found = _open(place, name)
     if (theirs := _name_of(found.index())) != name:  # before images are rendered
-        raise ValueError(
-            f"{place} holds demonstrations of {theirs}, but these policies are for {name}"
-        )
+        raise ValueError(f"{place} holds demonstrations of {theirs}, but these policies are for {name}")
     images = facts.get("images")
     demos = min(facts["demonstrations"], len(found.index().demos))
     called = found.name
@@ -429,9 +423,7 @@ def navigation_task() -> Task:
     return Task("navigation", "toy", navigation_demonstrations(), NavigationEnv)
 
 
-def load_task(
-    options: DataOptions, name: str | None, style: str = "ph", observation_steps: int = 2
-) -> Task:
+def load_task(options: DataOptions, name: str | None, style: str = "ph", observation_steps: int = 2) -> Task:
     """Read, download or generate the demonstrations of one task.
 
     Args:
@@ -477,9 +469,7 @@ def load_task(
         path, source = download(str(name), style, force=options.force_download), "official"
     else:
         path, source = generate_demonstrations(str(name), style, options.count(style)), "scripted"
-    return robosuite_task(
-        path, style, source=source, observation_steps=observation_steps, options=options
-    )
+    return robosuite_task(path, style, source=source, observation_steps=observation_steps, options=options)
 
 
 def task_places(options: DataOptions) -> list[tuple[str | None, str]]:

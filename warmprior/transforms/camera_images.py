@@ -84,9 +84,7 @@ class CameraImages(Transform):
         entries = {keys.STATE: vector, **{k: v.to(vector.device) for k, v in images.items()}}
         return next_tensordict.set(keys.OBSERVATION, TensorDict(entries))
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

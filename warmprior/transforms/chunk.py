@@ -221,9 +221,7 @@ class ChunkStep(Transform):
             total = torch.add(total, reward, alpha=self.gamma**i)
         return total
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         shape = (*tensordict_reset.batch_size, 1)
         executed = torch.zeros(shape, dtype=torch.int64, device=tensordict_reset.device)
         return tensordict_reset.set(self.executed_key, executed)

@@ -156,9 +156,7 @@ class InferenceDelay(Transform):
         next_tensordict.set(keys.DELAY, torch.full_like(executed, self.delay))
         return keep_resting(tensordict, next_tensordict, [keys.DELAY])
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         shape = (*tensordict_reset.batch_size, 1)
         none = torch.zeros(shape, dtype=torch.int64, device=tensordict_reset.device)
         return tensordict_reset.set(keys.DELAY, none)
@@ -170,9 +168,7 @@ class InferenceDelay(Transform):
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the delay."""
         if keys.FORECAST not in observation_spec.keys(True, True):
-            raise KeyError(
-                f"InferenceDelay found no {keys.FORECAST}: append it after ActionHistory"
-            )
+            raise KeyError(f"InferenceDelay found no {keys.FORECAST}: append it after ActionHistory")
         check_delay(self.delay, self.execute, observation_spec[keys.FORECAST].shape[-2])
         observation_spec[keys.DELAY] = Unbounded(
             (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device

@@ -78,9 +78,7 @@ class EncodeObservation(Transform):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return self.forward(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

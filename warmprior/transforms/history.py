@@ -88,9 +88,7 @@ class ActionHistory(Transform):
         # The others' chunks were not executed.
         return keep_resting(tensordict, next_tensordict, HISTORY_KEYS)
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         # Everywhere: TorchRL merges these rows into the sub-environments that were reset only.
         chunk = self._chunk or self._check_chunk()
         return tensordict_reset.set(keys.HISTORY, self._cold(chunk, tensordict_reset))

@@ -45,9 +45,7 @@ class InnerStep:
         self.base: EnvBase = container.base_env
         self.transforms = before
         states = set(self.base.state_spec.keys(True, True))
-        self.observed = [
-            key for key in self.base.observation_spec.keys(True, True) if key not in states
-        ]
+        self.observed = [key for key in self.base.observation_spec.keys(True, True) if key not in states]
         done_spec = self.base.full_done_spec
         self._done_spec = done_spec
         self._done_shapes = [(key, spec.shape) for key, spec in done_spec.items(True, True)]

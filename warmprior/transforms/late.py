@@ -62,9 +62,7 @@ class LateTransforms:
             self._control_steps = _control_steps(step.base)
 
     @classmethod
-    def of(
-        cls, step: InnerStep, action_key: NestedKey, read: Iterable[NestedKey]
-    ) -> LateTransforms | None:
+    def of(cls, step: InnerStep, action_key: NestedKey, read: Iterable[NestedKey]) -> LateTransforms | None:
         """Such steps, or ``None`` where every transform has to run at every step.
 
         Args:
@@ -83,9 +81,7 @@ class LateTransforms:
         looked_at = [t.pose_key for t in transforms if isinstance(t, AbsoluteActions)]
         needed = _roots([action_key, *read, *looked_at, *base.state_spec.keys(True, True)])
         inverse = [(list(t.in_keys_inv), list(t.out_keys_inv)) for t in transforms]
-        if written & needed or any(
-            keys not in ([], [action_key]) for pair in inverse for keys in pair
-        ):
+        if written & needed or any(keys not in ([], [action_key]) for pair in inverse for keys in pair):
             return None
         brief = {*base.reward_keys, *base.done_keys, keys.SUCCESS}
         return cls(step, action_key, brief.issuperset(read))
@@ -124,9 +120,7 @@ class LateTransforms:
                 break
             # Without the constructor's checks: the entries come out of tensordicts of this batch size.
             entries = current | {self._action_key: action}
-            inputs = TensorDict._new_unsafe(
-                entries, batch_size=first.batch_size, device=first.device
-            )
+            inputs = TensorDict._new_unsafe(entries, batch_size=first.batch_size, device=first.device)
             for transform in reversed(self._one_by_one):
                 inputs = transform._inv_call(inputs)
             results.append(self._step.bare(inputs))
@@ -156,9 +150,7 @@ def _control_steps(base: EnvBase) -> Callable[[Tensor, int], list[TensorDictBase
     return getattr(base, "control_steps", None) if same else None
 
 
-def advance(
-    current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey
-) -> None:
+def advance(current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey) -> None:
     """As ``step_mdp``, in place and without its generality: it runs at every control step.
 
     Args:

@@ -85,13 +85,9 @@ class ObservationStack(Transform):
                 return stack
             return torch.where(expand_as_right(rows.view(next_tensordict.shape), old), stack, old)
 
-        return next_tensordict.set(
-            self.observation_key, _each(append, newest, self._stack(tensordict))
-        )
+        return next_tensordict.set(self.observation_key, _each(append, newest, self._stack(tensordict)))
 
-    def _reset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         self._check_key(tensordict_reset)
         time = tensordict_reset.ndim
         # Rows that were not reset keep their stack: TorchRL merges only the others.
@@ -121,9 +117,9 @@ class ObservationStack(Transform):
         for key, leaf in list(leaves):
             shape = (*leaf.shape[:time], self.steps, *leaf.shape[time:])
             stack = leaf.unsqueeze(time).expand(shape).clone()
-            observation_spec[
-                unravel_key((self.observation_key, key)) if key else self.observation_key
-            ] = stack
+            observation_spec[unravel_key((self.observation_key, key)) if key else self.observation_key] = (
+                stack
+            )
         return observation_spec
 
 

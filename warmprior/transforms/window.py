@@ -138,9 +138,7 @@ class ActionWindow(Transform):
         executed = action[:, :before] * (index[:, :before] >= start).unsqueeze(-1)
         history = window_history(executed, frame - start, target, self.chunk_length)
         recent = (frame + self.observation_offsets).clamp_min(start)
-        written = (
-            (key, _rows(self.get_buffer(name), recent)) for name, key in self._observations.items()
-        )
+        written = ((key, _rows(self.get_buffer(name), recent)) for name, key in self._observations.items())
         values = (target, is_pad, history)
         for key, value in (*written, *zip(self.out_keys[1:], values, strict=True)):
             tensordict.set(key, value.reshape(*batch, *value.shape[1:]))
@@ -339,9 +337,7 @@ def window_replay_buffer(
     frames = torch.arange(len(data), device=window.start.device)
     return TensorDictReplayBuffer(
         # The sampler draws on the storage's device, where the generator has to be too.
-        storage=TensorStorage(
-            TensorDict({window.frame_key: frames}, [len(data)]), device=frames.device
-        ),
+        storage=TensorStorage(TensorDict({window.frame_key: frames}, [len(data)]), device=frames.device),
         sampler=RandomSampler() if sampler is None else sampler,
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,

@@ -99,9 +99,7 @@ class WarmFlowConfig(PreTrainedConfig):
 
     def get_scheduler_preset(self) -> DiffuserSchedulerConfig:
         """The paper's warm-up and cosine."""
-        return DiffuserSchedulerConfig(
-            name=self.scheduler_name, num_warmup_steps=self.scheduler_warmup_steps
-        )
+        return DiffuserSchedulerConfig(name=self.scheduler_name, num_warmup_steps=self.scheduler_warmup_steps)
 
     @property
     def observation_delta_indices(self) -> list[int]:

@@ -93,9 +93,7 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
     told = {k: v for k, v in prior.config().items() if k not in ("name", "chunk_length")}
     config = WarmFlowConfig(
         input_features=inputs,
-        output_features={
-            "action": PolicyFeature(type=FeatureType.ACTION, shape=(network.action_dim,))
-        },
+        output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(network.action_dim,))},
         n_obs_steps=network.observation_steps,
         n_action_steps=prior.chunk_length,
         prior=",".join([prior.name, *(f"{k}={json.dumps(v)}" for k, v in told.items())]),

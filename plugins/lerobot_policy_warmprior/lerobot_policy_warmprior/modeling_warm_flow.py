@@ -93,9 +93,7 @@ class WarmFlowPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """New episodes in all environments."""
-        self._queues = {
-            name: deque(maxlen=self.config.n_obs_steps) for name in self.config.observed
-        }
+        self._queues = {name: deque(maxlen=self.config.n_obs_steps) for name in self.config.observed}
         self._queues["action"] = deque(maxlen=self.config.n_action_steps)
         prior = self.actor.prior
         self.__dict__["_memory"] = ActionMemory(prior, self.config.action_feature.shape[0])
@@ -162,9 +160,7 @@ class WarmFlowPolicy(PreTrainedPolicy):
         """The next action of every environment, ``[B, d_a]``, normalised."""
         self._remember(batch)
         if not self._queues["action"]:
-            self._queues["action"].extend(
-                self._chunk().transpose(0, 1)[: self.config.n_action_steps]
-            )
+            self._queues["action"].extend(self._chunk().transpose(0, 1)[: self.config.n_action_steps])
         self._memory.step()
         return self._queues["action"].popleft()
 

@@ -79,9 +79,7 @@ class RobosuiteEnvConfig(EnvConfig):
         make = partial(RobosuiteGymEnv, **self.gym_kwargs)
         options: dict[str, Any] = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}
         if use_async_envs and n_envs > 1:
-            batch = gymnasium.vector.AsyncVectorEnv(
-                [make] * n_envs, context="forkserver", **options
-            )
+            batch = gymnasium.vector.AsyncVectorEnv([make] * n_envs, context="forkserver", **options)
         else:
             batch = gymnasium.vector.SyncVectorEnv([make] * n_envs, **options)
         return {self.type: {0: batch}}

@@ -52,9 +52,7 @@ class RobosuiteGymEnv(gymnasium.Env):
         def box(width: int) -> gymnasium.spaces.Box:
             return gymnasium.spaces.Box(-np.inf, np.inf, (width,), np.float32)
 
-        seen: dict[str, gymnasium.Space] = {
-            "agent_pos": box(spec.observation_dim - spec.object_dim)
-        }
+        seen: dict[str, gymnasium.Space] = {"agent_pos": box(spec.observation_dim - spec.object_dim)}
         if cameras:
             image = gymnasium.spaces.Box(0, 255, (image_size, image_size, 3), np.uint8)
             seen["pixels"] = gymnasium.spaces.Dict({camera: image for camera in cameras})

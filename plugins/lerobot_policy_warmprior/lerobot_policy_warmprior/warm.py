@@ -88,9 +88,7 @@ class WarmPolicyMixin:
     def predict_action_chunk(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """A new chunk; ``executed_steps=`` tells how much of the last one was executed."""
         executed = kwargs.pop("executed_steps", None)
-        return self.warm_adapter.predict_action_chunk(
-            batch, executed, super().predict_action_chunk, **kwargs
-        )
+        return self.warm_adapter.predict_action_chunk(batch, executed, super().predict_action_chunk, **kwargs)
 
     def reset(self) -> None:
         """New episodes in all environments."""

@@ -105,9 +105,7 @@ def run_episode(loop: StepLoop, task: str, style: str, seed: int) -> Episode:
     # The first number keeps this stream apart from others that are seeded with the same integer.
     person = Demonstrator(operator, np.random.default_rng([7919, seed]))
     observations = [observe(loop.reset(seed))]
-    runners = [
-        ArmRunner(loop, arm, plan, person) for arm, plan in enumerate(PLANS[task](loop, person))
-    ]
+    runners = [ArmRunner(loop, arm, plan, person) for arm, plan in enumerate(PLANS[task](loop, person))]
     states, actions, rewards = [], [], []
     solved = 0
     for _ in range(spec.horizon(style)):
@@ -128,7 +126,5 @@ def run_episode(loop: StepLoop, task: str, style: str, seed: int) -> Episode:
         actions=np.stack(actions),
         states=np.stack(states),
         rewards=np.array(rewards),
-        observations={
-            key: np.stack([entry[key] for entry in observations]) for key in observations[0]
-        },
+        observations={key: np.stack([entry[key] for entry in observations]) for key in observations[0]},
     )

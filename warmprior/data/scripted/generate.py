@@ -110,9 +110,7 @@ def generate_demonstrations(
             return path
     path = Path(path)
     if path.exists() and not overwrite:
-        raise FileExistsError(
-            f"{path} exists: choose another file, or replace it (overwrite, --overwrite)"
-        )
+        raise FileExistsError(f"{path} exists: choose another file, or replace it (overwrite, --overwrite)")
     for module in ("h5py", "tqdm"):
         require(module, "sim")
     import_robosuite()
@@ -158,9 +156,7 @@ def _successes(
                 break
             running.append(call(_Play(following)))
         if not running:
-            raise RuntimeError(
-                f"only {n - sum(wanted)} of {n} demonstrations succeeded in {played} episodes"
-            )
+            raise RuntimeError(f"only {n - sum(wanted)} of {n} demonstrations succeeded in {played} episodes")
         episode = running.popleft().result()
         played += 1
         if episode.success and wanted[episode.operator]:

@@ -251,9 +251,7 @@ def release(loop: StepLoop, person: Demonstrator, arm: int, up: float = 0.1) -> 
     yield Waypoint(pos + np.array([0.0, 0.0, up]), mat, OPEN, tol=0.03, rtol=_ANY)
 
 
-def lower(
-    loop: StepLoop, arm: int, body: str, goal: np.ndarray, mat: np.ndarray, limit: int = 60
-) -> Plan:
+def lower(loop: StepLoop, arm: int, body: str, goal: np.ndarray, mat: np.ndarray, limit: int = 60) -> Plan:
     """Lower a held body to ``goal``, aiming only 3 cm ahead so that xy is corrected on the way."""
 
     def pose() -> tuple[np.ndarray, np.ndarray]:

@@ -130,9 +130,7 @@ def _try_square(loop: StepLoop, person: Demonstrator) -> Plan:
         if _wrist_allows(start, pos) and start < 3.0 and abs(end - start) < 4
     ]
     start, end = person.pick(pairs, lambda pair: 0.7 * abs(pair[0]) + abs(pair[1] - pair[0]))
-    handle = np.array(
-        [0.056 + person.draw(-0.004, 0.012), person.draw(-0.002, 0.002), person.draw(0, 0.006)]
-    )
+    handle = np.array([0.056 + person.draw(-0.004, 0.012), person.draw(-0.002, 0.002), person.draw(0, 0.006)])
 
     def spot() -> np.ndarray:
         nut_pos, nut_mat = loop.body(_NUT)
@@ -153,9 +151,7 @@ def _try_square(loop: StepLoop, person: Demonstrator) -> Plan:
     )
     if not is_held(loop, 0, _NUT):
         return
-    yield Waypoint(
-        hand_pos, hand_mat, CLOSED, tol=0.005, rtol=0.05, speed=0.6, noise=0.3, limit=80, dwell=2
-    )
+    yield Waypoint(hand_pos, hand_mat, CLOSED, tol=0.005, rtol=0.05, speed=0.6, noise=0.3, limit=80, dwell=2)
     if not is_held(loop, 0, _NUT):
         return
     yield from lower(loop, 0, _NUT, np.append(_PEG, person.draw(0.88, 0.93)), placed)
@@ -185,9 +181,7 @@ def _try_stack(loop: StepLoop, person: Demonstrator) -> Plan:
     goal = turn_z(now + aligned)
     top = loop.body(lower_cube)[0] + _up(person.draw(0.10, 0.14) + person.high * 0.5)
     hand_pos, hand_mat = carry(loop, 0, upper, lambda: (top, goal))
-    yield from transfer(
-        loop, person, 0, hand_pos, hand_mat(), CLOSED, lift=0.02, tol=0.03, rtol=0.3
-    )
+    yield from transfer(loop, person, 0, hand_pos, hand_mat(), CLOSED, lift=0.02, tol=0.03, rtol=0.3)
     if not is_held(loop, 0, upper):
         return
     yield Waypoint(hand_pos, hand_mat, CLOSED, tol=0.008, rtol=0.1, speed=0.6, noise=0.4, limit=60)

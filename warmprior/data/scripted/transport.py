@@ -110,9 +110,7 @@ def _take_hammer_out(loop: StepLoop, person: Demonstrator) -> Plan:
     # Centred in the bin, so that neither the head nor the end of the handle scrapes a wall.
     centre = (loop.body("transport_start_bin_root")[0] - _BALANCE * mat[:, 2])[:2]
     start = np.append(centre, pos[2] + 0.02)
-    yield Waypoint(
-        bring(loop, 0, _HAMMER, lambda: start), hand, CLOSED, tol=0.006, rtol=0.3, limit=30
-    )
+    yield Waypoint(bring(loop, 0, _HAMMER, lambda: start), hand, CLOSED, tol=0.006, rtol=0.3, limit=30)
 
     def rising() -> np.ndarray:
         return np.append(centre, min(pos[2] + 0.24, loop.body(_HAMMER)[0][2] + 0.05))
@@ -166,9 +164,7 @@ def _clear_trash(loop: StepLoop, person: Demonstrator) -> Plan:
     yield from release(loop, person, 1, up=0.12)
 
 
-def _put_hammer_down(
-    loop: StepLoop, person: Demonstrator, here: np.ndarray, hand: np.ndarray
-) -> Plan:
+def _put_hammer_down(loop: StepLoop, person: Demonstrator, here: np.ndarray, hand: np.ndarray) -> Plan:
     aside = [person.draw(-0.02, 0.02), person.draw(-0.01, 0.01)]
     goal = loop.body("transport_target_bin_root")[0][:2] + np.array(aside)
     home = down(_TAKER_YAW)
