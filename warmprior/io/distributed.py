@@ -24,8 +24,14 @@ __all__ = [
     "world_size",
 ]
 
+STEP = timedelta(minutes=10)
+"""How long the others may take to arrive where gradients are averaged."""
+
 PATIENCE = timedelta(days=2)
 """How long the first process may take to generate, render or learn what the others wait for."""
+
+_waiting: dist.ProcessGroup | None = None
+"""The group in which processes wait for each other; always of the CPU."""
 
 
 def launched() -> bool:
@@ -72,6 +78,7 @@ def joined() -> Iterator[None]:
         ...     world_size(), rank()
         (1, 0)
     """
+    global _waiting
     if not launched():
         yield
         return
@@ -79,7 +86,8 @@ def joined() -> Iterator[None]:
     if local < devices:
         torch.cuda.set_device(local)  # "cuda" is this one from here on
     stop_forking()
-    dist.init_process_group("cpu:gloo,cuda:nccl" if devices else "gloo", timeout=PATIENCE)
+    dist.init_process_group("cpu:gloo,cuda:nccl" if devices else "gloo", timeout=STEP)
+    _waiting = dist.new_group(backend="gloo", timeout=PATIENCE)
     try:
         yield
     finally:
@@ -112,7 +120,7 @@ def from_leader[T](make: Callable[[], T]) -> T:
             found.append(make())
     finally:
         parcel = [found]
-        dist.broadcast_object_list(parcel, 0)
+        dist.broadcast_object_list(parcel, 0, _waiting)
     if not parcel[0]:
         raise SystemExit(2)
     return parcel[0][0]
@@ -143,7 +151,7 @@ def leader_first() -> Iterator[None]:
             done = [True]
     finally:
         if world_size() > 1:
-            dist.broadcast_object_list(done, 0)
+            dist.broadcast_object_list(done, 0, _waiting)
     if rank():
         if not done[0]:
             raise SystemExit(2)
