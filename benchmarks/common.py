@@ -91,8 +91,8 @@ class Policy:
 
     @property
     def is_trained(self) -> bool:
-        """Whether that policy is there, and whole: its configuration is written last."""
-        return (self.path / "config.json").is_file()
+        """Whether that policy is there; its file is whole, or not there."""
+        return (self.path / "model.safetensors").is_file()
 
     @property
     def status(self) -> Path:

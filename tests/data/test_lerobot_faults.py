@@ -90,6 +90,10 @@ META = {
         info(lambda i: i.update(data_path="../{chunk_index:03d}/{file_index:03d}.parquet")),
         ["info.json names '../000/000.parquet'", "not in the folder"],
     ),
+    "an episode less": (
+        info(lambda i: i.update(total_episodes=i["total_episodes"] + 1)),
+        ["meta/info.json counts", "and meta/episodes"],
+    ),
     "no tasks": (without("meta/tasks.parquet"), ["no meta/tasks.parquet", "finalize()"]),
     "no episodes": (without(EPISODES), ["no meta/episodes/*/*.parquet", "finalize()"]),
     "cut-off episodes": (cut(EPISODES), ["LeRobot cannot read", "again"]),
@@ -192,6 +196,9 @@ def test_bad_values_stop_the_load(root, name):
 def test_steps_are_refused_as_well(root):
     with pytest.raises(DatasetError, match=r"has no vector 'observation\.side' of numbers"):
         lerobot_steps(root, ("observation.side",))
+    table(DATA, **{"observation.state": entry(3, float("nan"))})(root)
+    with pytest.raises(DatasetError, match=r"observation\.state is not finite at step 3"):
+        lerobot_steps(root)
     cut(DATA)(root)
     with pytest.raises(DatasetError, match=rf"{DATA}: damaged"):
         lerobot_steps(root)

@@ -394,3 +394,20 @@ def test_options_that_cannot_be(options, told):
     with pytest.raises(ValueError, match=told):
         AsyncExecutor(Told(8), **(usual | options))
     assert not [t for t in threading.enumerate() if t.name.startswith("warmprior-policy")]
+
+
+def test_a_decision_that_fails_while_the_loop_waits():
+    """All that the history remembers is executed by then, and a forecast is left."""
+
+    class Late(Failing):
+        def forward(self, data):
+            time.sleep(0.05 if self.decisions else 0.0)
+            return super().forward(data)
+
+    options = {"prior": PreviewPrior(4), "action_dim": 2, "execute": 2, "observation_steps": 1}
+    with (
+        AsyncExecutor(Late(8, {1}), **options, timeout=None) as executor,
+        pytest.warns(UserWarning, match="a decision failed"),
+    ):
+        found = [executor.act(torch.tensor([float(tick)]))[1].item() for tick in range(12)]
+    assert found == list(range(12))

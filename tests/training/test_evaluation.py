@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import multiprocessing
 import os
 import signal
@@ -533,6 +534,11 @@ def test_policy_and_environment_need_one_normaliser():
         TransformedEnv(TransformedEnv(SeededEnv(), transforms[1].clone()), StepCounter()),
     ):
         assert evaluate(actor, env, episodes=1, first_seed=0)[0].steps == length_of(0)
-    for wrong, said in ((None, "has no normaliser"), (other, "has another normaliser")):
+    # Of observations alone, and rounded with the policy.
+    alone = Normalizer(*({"observation": s * ones["observation"]} for s in (-1.0, 3.0)))
+    seen = TransformedEnv(SeededEnv(), Compose(*alone.env_transforms(), policy_transforms(PastPrior(H))))
+    kept = actor.replace(normalizer=copy.deepcopy(alone).to(torch.bfloat16))
+    assert evaluate(kept, seen, episodes=1, first_seed=0)[0].steps == length_of(0)
+    for wrong, said in ((None, "has none for"), (other, "has another for")):
         with pytest.raises(ValueError, match=f"{said}.*normalizer=policy.normalizer"):
             play(wrong)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import multiprocessing
 import os
 
@@ -311,3 +312,12 @@ def test_a_policy_that_is_saved_over_is_the_old_one_or_the_new_one(tmp_path):
         writer.kill()
         writer.join()
     assert seen == {0.25, 0.5}
+
+
+def test_earlier_policies_are_called_what_they_are(tmp_path):
+    saved(tmp_path)
+    config = policy_config(load_policy(tmp_path)) | {"format": 4}
+    save_file(load_state(tmp_path / "model.safetensors")[0], tmp_path / "model.safetensors")
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"config\.json has format 4, this version of warmprior reads 5"):
+        load_policy(tmp_path)

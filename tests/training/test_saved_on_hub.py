@@ -139,7 +139,7 @@ def test_a_tampered_file_is_refused(hub, actor, tmp_path):
 
 def test_something_else_is_refused_before_its_weights_are_fetched(hub, actor, tmp_path):
     put(hub, actor, tmp_path / "kept", **{"config.json": b'{"model_type": "bert"}'})
-    with pytest.raises(ValueError, match=f"{NAME} at the hub holds no policy of warmprior: .*json"):
+    with pytest.raises(ValueError, match=r"config\.json is of no policy of warmprior"):
         load_policy(NAME)
     assert not [r for r in hub.requests if r.endswith("model.safetensors")]
 

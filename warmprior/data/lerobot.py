@@ -362,8 +362,13 @@ def lerobot_steps(
     columns = _Columns(root, metadata)
 
     def vectors(keys: Sequence[str]) -> Tensor:
-        rows = [np.concatenate([columns.of(e, key) for key in keys], -1) for e in episodes]
-        return torch.from_numpy(np.concatenate(rows)).float()
+        rows = torch.from_numpy(
+            np.concatenate([np.concatenate([columns.of(e, key) for key in keys], -1) for e in episodes])
+        ).float()
+        bad = (~rows.isfinite()).nonzero()
+        if len(bad):
+            raise DatasetError(f"{dataset}: {' or '.join(keys)} is not finite at step {int(bad[0, 0])}")
+        return rows
 
     lengths = torch.tensor([episode["length"] for episode in episodes])
     steps = {

@@ -133,6 +133,12 @@ def read_metadata(root: Path) -> Any:
         ) from error
     if not metadata.total_episodes:
         raise DatasetError(f"{root}: the dataset has no episodes: record some")
+    numbers, steps = sorted(metadata.episodes["episode_index"]), sum(metadata.episodes["length"])
+    if numbers != list(range(metadata.total_episodes)) or steps != metadata.total_frames:
+        raise DatasetError(
+            f"{root}: meta/info.json counts {metadata.total_episodes} episodes of {metadata.total_frames} "
+            f"steps, and meta/episodes {len(numbers)} of {steps}. {again}."
+        )
     return metadata
 
 

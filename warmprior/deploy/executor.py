@@ -186,6 +186,9 @@ class AsyncExecutor:
             self._collect()
         if self._executed >= self._usable:
             self._wait()
+            if self._failed:  # the history remembers no more than what is executed by now
+                self._decide()
+                self._collect()
         action = self._chunk[self._executed]
         self._executed += 1
         if self._normalizer is None:

@@ -131,7 +131,10 @@ def leader_first() -> Iterator[None]:
     """Let the first process do something before the others, which find it done.
 
     Raises:
-        SystemExit: in the others, if it fails in the first, which says why.
+        FloatingPointError: in all, if that is what it led to in the first: such failures end a training, and
+            not the run.
+        ValueError: likewise.
+        SystemExit: in the others, if it failed otherwise in the first, which says why.
 
     Examples:
         >>> from pathlib import Path
@@ -144,17 +147,21 @@ def leader_first() -> Iterator[None]:
         ...     path.read_text()
         'generated'
     """
-    done = [False]
+    failure: list[BaseException | None] = [SystemExit(2)]
     try:
         if not rank():
             yield
-            done = [True]
+            failure = [None]
+    except (FloatingPointError, ValueError) as error:
+        kind = FloatingPointError if isinstance(error, FloatingPointError) else ValueError
+        failure = [kind(str(error))]
+        raise
     finally:
         if world_size() > 1:
-            dist.broadcast_object_list(done, 0, _waiting)
+            dist.broadcast_object_list(failure, 0, _waiting)
     if rank():
-        if not done[0]:
-            raise SystemExit(2)
+        if failure[0] is not None:
+            raise failure[0]
         yield
 
 

@@ -44,7 +44,8 @@ def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
         row
         for row in read_lines(path)
         if "success_rate" in row
-        and f"{row['policy']}/policy_{row['checkpoint']:06d}" == f"{folder.parent.name}/{folder.name}"
+        and row.get("policy") == folder.parent.name
+        and f"policy_{row['checkpoint']:06d}" == folder.name
     ]
     if not rows:
         raise ValueError(

@@ -17,7 +17,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
-from torchrl.envs.transforms import ActionScaling, Compose
+from torchrl.envs.transforms import ActionScaling, Compose, ObservationNorm
 from tqdm import tqdm
 
 from warmprior import keys
@@ -499,24 +499,28 @@ def _check_keys(env: EnvBase, success: NestedKey, measures: Measures) -> None:
 
 
 def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
-    """Whether the environment denormalises actions by the normaliser that the policy keeps."""
+    """Whether the environment is normalised as the normaliser that the policy keeps says."""
     normalizer = getattr(policy, "normalizer", None)
     if normalizer is None or isinstance(_base_of(env), SerialEnv | ParallelEnv):
         return  # what lies inside of workers cannot be asked
-    scalings: list[ActionScaling] = []
+    found: dict[NestedKey, Any] = {}
     while isinstance(env, TransformedEnv):
-        scalings += [t for t in env.transform.modules() if isinstance(t, ActionScaling)]
+        for part in env.transform.modules():
+            if isinstance(part, ActionScaling):
+                found[part.in_keys_inv[0]] = part
+            elif isinstance(part, ObservationNorm):
+                found[part.in_keys[0]] = part
         env = env.base_env
-    loc, scale = normalizer.loc(keys.ACTION), normalizer.scale(keys.ACTION)
-    if not any(
-        torch.equal(t.loc.cpu(), loc.cpu()) and torch.equal(t.scale.cpu(), scale.cpu()) for t in scalings
-    ):
-        found = "has another normaliser" if scalings else "has no normaliser"
-        raise ValueError(
-            f"the policy was trained in the units of its normaliser, and the environment {found}: give "
-            "policy_transforms(..., normalizer=policy.normalizer), or play policy.replace(normalizer=None) "
-            "where the environment is in these units already"
-        )
+    for key in normalizer.keys:
+        for name in ("loc", "scale"):
+            mine = getattr(normalizer, name)(key)
+            if key not in found or not torch.equal(getattr(found[key], name).to(mine), mine):
+                raise ValueError(
+                    f"the policy was trained in the units of its normaliser, and the environment has "
+                    f"{'another' if key in found else 'none'} for {key!r}: give policy_transforms(..., "
+                    "normalizer=policy.normalizer), or play policy.replace(normalizer=None) where the "
+                    "environment is in these units already"
+                )
 
 
 def _chunk_key(policy: TensorDictModuleBase, env: EnvBase) -> NestedKey:

@@ -54,13 +54,21 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         elif kept:
             reason = f"it holds the policies {', '.join(kept)}: name one of them"
         raise FileNotFoundError(f"no policy at {folder}: {reason}")
+    if (folder / CONFIG).is_file():
+        _check_format(folder / CONFIG, read_json(folder / CONFIG))  # earlier ones have no other place for it
     tensors, config = load_state(path, "policy", "Copy it again")
+    _check_format(path, config)
+    return tensors, config
+
+
+def _check_format(path: Path, config: Any) -> None:
+    if not isinstance(config, dict) or "warmprior" not in config:
+        raise ValueError(f"{path} is of no policy of warmprior")
     if config.get("format") != FORMAT:
         raise ValueError(
             f"{path} has format {config.get('format')}, this version of warmprior reads {FORMAT}: save the "
             "policy again with a matching version"
         )
-    return tensors, config
 
 
 def _folder(
@@ -82,9 +90,9 @@ def _folder(
     options: dict[str, Any] = {"token": token, "endpoint": endpoint}
     # The small file first: a repository of something else may be large.
     folder = snapshot(place, [CONFIG], revision=revision, **options)
-    config = read_json(folder / CONFIG) if (folder / CONFIG).exists() else None
-    if not isinstance(config, dict) or "warmprior" not in config:
-        raise ValueError(f"{place} at the hub holds no policy of warmprior: look at its {CONFIG}")
+    if not (folder / CONFIG).exists():
+        raise ValueError(f"{place} at the hub holds no policy of warmprior: it has no {CONFIG}")
+    _check_format(folder / CONFIG, read_json(folder / CONFIG))
     # Of the same commit, whatever happens to the branch meanwhile.
     return snapshot(place, [WEIGHTS], revision=folder.name, **options)
 
