@@ -21,14 +21,11 @@ from warmprior.io.workers import WorkerError, available_cores, stop_forking
 
 __all__ = ["check_ray", "check_versions", "ray_cluster"]
 
-PATIENCE = 15.0
-"""Seconds in which a cluster has to answer."""
+PATIENCE = 60.0
+"""Seconds in which a cluster, and each of its machines, has to answer."""
 
 CONNECT = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
 """What a process does to find out whether there is a cluster."""
-
-NODE_PATIENCE = 60.0
-"""Seconds in which each of its machines has to start a process and import the library."""
 
 
 def check_ray(address: str | None = None) -> str | None:
@@ -68,7 +65,7 @@ def check_ray(address: str | None = None) -> str | None:
             "start from one of its machines, not through ray://"
         )
     try:
-        if address != "auto":  # nobody listens: that is told at once
+        if address != "auto":  # fails at once where nobody listens
             socket.create_connection((host.strip("[]"), int(port)), PATIENCE).close()
         # In a process of its own: Ray itself goes on trying for minutes, and cannot be interrupted.
         command = [sys.executable, "-c", CONNECT, address]
@@ -202,7 +199,7 @@ def _look_at(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> An
 def _check_node(ray: Any, node: Mapping[str, Any], look: Any) -> None:
     name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
     try:
-        theirs, unseen = ray.get(look, timeout=NODE_PATIENCE)
+        theirs, unseen = ray.get(look, timeout=PATIENCE)
     except ray.exceptions.RayError as error:
         cause = getattr(error, "cause", None) or error
         raise WorkerError(f"{name} cannot start this library: {cause}") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from multiprocessing.context import get_spawning_popen
 from typing import Any
 
 import torch
@@ -29,7 +30,7 @@ class PriorSampler(TensorDictModuleBase):
             overrides :meth:`~Prior.distribution`, is given.
         noise_key: key written, ``[*B, P, d_a]``.
         generator: source of randomness; PyTorch's global generator by default. Per call:
-            ``sampler(data, generator=...)``.
+            ``sampler(data, generator=...)``. Worker processes take none, for they would all draw the same.
 
     Raises:
         KeyError: if an entry of the history is missing.
@@ -65,6 +66,15 @@ class PriorSampler(TensorDictModuleBase):
         observed = [] if self.observation_key is None else [self.observation_key]
         self.in_keys = [*((keys.HISTORY, name) for name in ENTRIES), *observed]
         self.out_keys = [keys.LOC, keys.WARM, noise_key]
+
+    def __getstate__(self) -> Any:
+        if self.generator is not None and get_spawning_popen() is not None:
+            raise RuntimeError(  # TorchRL's collectors swallow a TypeError
+                "a policy with a generator cannot go to worker processes: all of them would draw the same "
+                "noise. Build it without one (actor.replace(generator=None)), and seed the collector with "
+                "set_seed"
+            )
+        return super().__getstate__()
 
     def source(self, tensordict: TensorDictBase) -> Source:
         """The source of decisions or windows, ``[*B]``."""

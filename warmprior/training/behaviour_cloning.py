@@ -421,8 +421,12 @@ class BehaviourCloning:
                 "train/learning_rate": self.schedule.get_last_lr()[0],
                 "train/iterations_per_second": (self.iteration - iteration) / (self._logged[1] - moment),
             }
-            for name, value in values.items():
-                self.logger.log_scalar(name, value, step=self.iteration)
+            try:
+                for name, value in values.items():
+                    self.logger.log_scalar(name, value, step=self.iteration)
+            except OSError as error:  # which names no file: a full disk
+                place = getattr(self.logger, "log_dir", type(self.logger).__name__)
+                raise OSError(error.errno, f"cannot write the log: {error.strerror}", str(place)) from error
 
     def _averaged_actor(self) -> WarmPriorActor:
         averaged = cast(Any, self.ema.module)

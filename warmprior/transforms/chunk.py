@@ -10,7 +10,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs.transforms import Transform
+from torchrl.envs.transforms import Transform, VecGymEnvTransform
 
 from warmprior import keys
 from warmprior.transforms.inner_step import InnerStep, rows_where, set_aside
@@ -62,7 +62,8 @@ class ChunkStep(Transform):
         ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, or (in an environment) an
             action is not one vector.
         KeyError: (in an environment) if there is no such action.
-        RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``.
+        RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``, or is
+            a vector environment of Gymnasium.
 
     Examples:
         >>> import torch
@@ -143,6 +144,12 @@ class ChunkStep(Transform):
                     "return: have the environment write it under another key as well"
                 )
             read = (*dones, rewards[0], *self.event_keys, *self.measures)
+            if self.execute > 1 and any(isinstance(t, VecGymEnvTransform) for t in inner.transforms):
+                raise RuntimeError(
+                    "ChunkStep cannot step a vector environment of Gymnasium (num_envs): it restarts an "
+                    "episode that ends inside a chunk, and the rest of the chunk would be played in the next "
+                    "one. Use SerialEnv or ParallelEnv of single environments"
+                )
             late = LateTransforms.of(inner, self.action_key, read)
             self._inner = (parent, inner, late, rewards[0])
         return self._inner[1:]

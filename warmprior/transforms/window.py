@@ -51,6 +51,7 @@ class ActionWindow(Transform):
         KeyError: if ``data`` lacks a key.
         ValueError: if not ``1 <= chunk_length <= prediction_length, history_length``, ``data`` is empty or
             not flat, an action is not one vector, an entry holds NaN or Inf, or an episode is not contiguous.
+        IndexError: (on a call) for a step that the data do not hold.
 
     See Also:
         - :class:`~warmprior.ActionHistory`: writes the same history in an environment.
@@ -129,7 +130,13 @@ class ActionWindow(Transform):
             )
         batch, before = tensordict.batch_size, self.history_length
         frame = frame.reshape(-1, 1)
-        start, end = _rows(self.start, frame), _rows(self.end, frame)
+        try:
+            start, end = _rows(self.start, frame), _rows(self.end, frame)
+        except IndexError as error:
+            raise IndexError(
+                f"{self.frame_key!r} has steps from {int(frame.min())} to {int(frame.max())}, but the data "
+                f"hold 0 to {len(self.start) - 1}"
+            ) from error
         index = frame + self.action_offsets
         is_pad = index[:, before:] > end
         action = _rows(self.action, index.clamp(start, end))
