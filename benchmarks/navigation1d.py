@@ -51,7 +51,7 @@ def preset(width: int, **training: Any) -> NavigationOptions:
     """All sources, with a network of a width and its recipe."""
     return NavigationOptions(
         network=NetworkOptions(hidden_dim=width, observation_steps=1),
-        training=TrainingConfig(batch_size=256, checkpoints=1, cold_probability=WITHHELD, **training),
+        training=TrainingConfig(batch_size=256, weighting="velocity", cold_probability=WITHHELD, **training),
         sources=Sources(("gaussian", "regression", "history", "past", "preview"), (4,), (0.1, 0.5)),
         evaluation=Evaluation(episodes=256, nfe=(9, 1)),
     )
@@ -61,7 +61,7 @@ NAVIGATION_PRESETS = {
     # All policies in a few minutes on two cores.
     "quick": preset(128, iterations=3_000, learning_rate=2e-3, warmup_ratio=0.0, save_every=3_000),
     # The paper's network and iterations: hours on a CPU.
-    "wide": preset(1024, iterations=50_000),
+    "wide": preset(1024, iterations=50_000, learning_rate=1e-4, warmup_ratio=0.2),
 }
 
 

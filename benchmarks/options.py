@@ -28,7 +28,8 @@ from warmprior.io.script import run_script
 from warmprior.modules import imagenet_weights
 from warmprior.modules.grid import check_grid
 from warmprior.training import DataOptions, NetworkOptions, TrainingConfig
-from warmprior.training.options import GENERATED, PRETRAINED, SMALL, check_counts, is_simulated
+from warmprior.training.options import GENERATED, PRETRAINED, check_counts, is_simulated
+from warmprior.training.training_config import PAPER
 
 Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
 
@@ -209,22 +210,17 @@ def check_single(options: Options, *names: str) -> None:
 
 PRESETS: dict[str, Options] = {
     # One seed, small network: a first table within 15 minutes on two cores.
-    "quick": Options(
-        data=DataOptions(demonstrations=(GENERATED,)),
-        network=NetworkOptions(hidden_dim=384),
-        training=SMALL,
-    ),
+    "quick": Options(data=DataOptions(demonstrations=(GENERATED,))),
     # The same policies with three seeds and twice the episodes: a table with seeds.
     "cpu": Options(
         data=DataOptions(demonstrations=(150, 300)),
-        network=NetworkOptions(hidden_dim=384),
-        training=SMALL,
         evaluation=Evaluation(seeds=3, episodes=50),
     ),
     # The paper's: 20M parameters, 200k iterations.
     "paper": Options(
         data=DataOptions(demonstrations=(200, 300)),
         network=NetworkOptions(network="chi_transformer", precondition=False),
+        training=PAPER,
         evaluation=Evaluation(seeds=3, episodes=200, top_k=3),
     ),
 }

@@ -23,7 +23,6 @@ from warmprior.training import (
     train_policy,
 )
 from warmprior.training.behaviour_cloning import policy_path
-from warmprior.training.options import SMALL
 
 
 def _policy(args: argparse.Namespace) -> WarmPriorActor:
@@ -157,7 +156,7 @@ def train(args: argparse.Namespace) -> None:
         prog="python -m warmprior train",
         description=train.__doc__,
         args=args.options,
-        default=Train(DataOptions(), NetworkOptions(hidden_dim=384), SMALL),
+        default=Train(DataOptions(), NetworkOptions(), TrainingConfig()),
     )
     options.network.check(options.data)
     prior = make(Prior, options.prior, options.chunk)

@@ -39,7 +39,7 @@ def read(out, *argv):
 
 
 def test_papers_recipe(package, tmp_path, monkeypatch):
-    """Table 4 of the paper, MimicGen's column."""
+    """Table 3 of the paper, MimicGen's column."""
     monkeypatch.setattr("warmprior.training.options.require_rendering", lambda: None)
     for place in ("warmprior.training.options", "options"):
         monkeypatch.setattr(f"{place}.imagenet_weights", dict)

@@ -199,7 +199,7 @@ def test_presets_of_states_are_untouched(name):
 def test_the_papers_encoder_where_its_weights_can_be_had(monkeypatch):
     monkeypatch.setattr("options.imagenet_weights", dict)
     found = preset_of_images("paper")
-    # Table 4: 84 x 84 pixels, 76 x 76 random crop, ResNet-18 from ImageNet, batches of 256.
+    # Table 3: 84 x 84 pixels, 76 x 76 random crop, ResNet-18 from ImageNet, batches of 256.
     assert (found.data.image_size, found.network.crop_size) == (84, 76)
     assert (found.network.encoder, found.training.batch_size) == ("resnet18-imagenet", 256)
     assert not found.data.fast_rendering and not found.network.share_encoder

@@ -1,4 +1,4 @@
-"""The toy shows what the paper says it shows (Sec. 4.2, Fig. 5)."""
+"""The toy shows what the paper says it shows (Sec. 5.2, Fig. 5)."""
 
 from __future__ import annotations
 

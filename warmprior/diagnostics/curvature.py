@@ -1,4 +1,4 @@
-"""How straight a policy's flow is (Sec. 4.1, Table 2)."""
+"""How straight a policy's flow is (Sec. 5.1, Table 2)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one-dimensional navigation toy: two obstacles, six demonstrations, two modes everywhere (Sec. 4.2)."""
+"""The one-dimensional navigation toy: two obstacles, six demonstrations, two modes everywhere (Sec. 5.2)."""
 
 from __future__ import annotations
 

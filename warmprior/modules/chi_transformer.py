@@ -45,7 +45,7 @@ class ChiTransformer(VelocityNetwork):
     """Decoder transformer over action tokens that attends to time and observation tokens.
 
     The architecture of `Diffusion Policy <https://arxiv.org/abs/2303.04137>`_ (Chi et al., 2023) in the
-    paper's sizes (Table 4). Action tokens attend causally to each other and to the memory
+    paper's sizes (Table 3). Action tokens attend causally to each other and to the memory
     ``[time, o_{-To+1}, ..., o_0]``.
 
     .. note::

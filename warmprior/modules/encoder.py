@@ -49,7 +49,7 @@ def _small(crop_size: int) -> tuple[nn.Module, int]:
 class ImageEncoder(nn.Module):
     r"""Encodes an observation of images and a vector: one vector per observation step.
 
-    Every camera has a network of its own, ResNet-18 with group norm as in the paper (Table 4), whose
+    Every camera has a network of its own, ResNet-18 with group norm as in the paper (Table 3), whose
     features stand behind the vector. In training mode a random window of the image is cut out, the same
     one for all ``To`` images of a camera; otherwise the central one. Pixels are scaled by ImageNet's
     statistics.

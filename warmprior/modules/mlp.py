@@ -65,7 +65,7 @@ class VelocityMLP(VelocityNetwork):
         prediction_length: int,
         observation_steps: int = 2,
         *,
-        hidden_dim: int = 512,
+        hidden_dim: int = 384,
         num_blocks: int = 2,
         timestep_embedding_dim: int = 32,
     ) -> None:

@@ -17,7 +17,7 @@ __all__ = ["Normalizer"]
 
 
 class Normalizer(nn.Module):
-    """Maps every dimension of every key to ``[-1, 1]`` by the data's minimum and maximum (Table 4).
+    """Maps every dimension of every key to ``[-1, 1]`` by the data's minimum and maximum (Table 3).
 
     Dimensions that vary by no more than the float noise of a resting body (half a range of 1e-5, relative
     above 1) count as constant and are only shifted: blown up to [-1, 1], the noise would drown the

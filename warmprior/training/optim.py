@@ -1,4 +1,4 @@
-"""Optimiser, learning-rate schedule and weight averaging of the paper's recipe (Table 4)."""
+"""Optimiser, learning-rate schedule and weight averaging of the paper's recipe (Table 3)."""
 
 from __future__ import annotations
 

@@ -22,27 +22,13 @@ from warmprior.modules import (
     load_imagenet,
 )
 from warmprior.modules.checks import check_whole_numbers
-from warmprior.training.training_config import TrainingConfig
 
-__all__ = ["GENERATED", "PRETRAINED", "SMALL", "DataOptions", "NetworkOptions", "check_counts"]
+__all__ = ["GENERATED", "PRETRAINED", "DataOptions", "NetworkOptions", "check_counts"]
 
 GENERATED = 150
 """Scripted demonstrations, where no other number is asked for."""
 
 PRETRAINED = "resnet18-imagenet"
-
-SMALL = TrainingConfig(
-    iterations=10_000,
-    batch_size=128,
-    learning_rate=1e-3,
-    warmup_ratio=0.1,
-    checkpoints=1,
-    weighting="standardised",
-)
-"""The recipe for a small preconditioned network on a CPU.
-
-It was chosen from success against iterations on square. Half the batch at twice the iterations is as good.
-"""
 
 _NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
     "mlp": (VelocityMLP, "hidden_dim"),

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
-from contextlib import closing, nullcontext
+from contextlib import ExitStack, closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 from torchrl.record.loggers.common import Logger
 
 from warmprior import keys
-from warmprior.io.distributed import from_leader
+from warmprior.io.distributed import from_leader, world_size
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.modules.start import StartPoint
@@ -93,9 +96,9 @@ def new_policy(
 
 
 def train_policy(
-    task: Task,
+    demonstrations: Task | TensorDictBase,
     prior: Prior,
-    directory: str | Path,
+    directory: str | Path | None = None,
     *,
     network: NetworkOptions | None = None,
     training: TrainingConfig | None = None,
@@ -109,18 +112,22 @@ def train_policy(
     description: str | None = "train",
     progress: Callable[[int], object] | None = None,
 ) -> WarmPriorActor:
-    """Train a policy by behaviour cloning; an interrupted training continues from its last state.
+    """From demonstrations and a source to a trained policy, by behaviour cloning.
 
-    On a CPU it is trained by one thread: another number would give other weights.
+    The defaults are what the tables here were measured with: a :class:`VelocityMLP` that is preconditioned
+    for the source and the demonstrations, and the recipe of :class:`TrainingConfig`. On a CPU one thread
+    trains: another number would give other weights.
 
     Args:
-        task: what it is for.
+        demonstrations: contiguous steps ``[N]`` in raw units: ``"observation"`` ``[N, d_o]``, ``"action"``
+            ``[N, d_a]`` and ``"episode"``, an integer ``[N]``; or a :class:`Task`.
         prior: the source distribution.
-        directory: of the training, see :class:`BehaviourCloning`.
+        directory: where the training is saved, and continued from, see :class:`BehaviourCloning`; nowhere by
+            default, so that an interruption loses it.
 
     Keyword Args:
-        network: the velocity network; the default of :class:`NetworkOptions` by default.
-        training: the recipe; the paper's by default.
+        network: the velocity network.
+        training: the recipe; :data:`~warmprior.training.training_config.PAPER` is the paper's.
         start: see :func:`new_policy`.
         coupling: likewise.
         see_history: likewise.
@@ -132,35 +139,45 @@ def train_policy(
         progress: called with the number of iterations, at the start and after each.
 
     Returns:
-        The last policy of averaged weights, on the CPU.
+        The last policy of averaged weights, on the CPU. It has the demonstrations' normaliser, and
+        :func:`~warmprior.policy_transforms` makes the environment that it acts in.
 
     Raises:
+        KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
-        ValueError: if the folder holds another training.
+        ValueError: if the demonstrations have another form, or the folder holds another training.
 
     See Also:
         - :class:`~warmprior.training.BehaviourCloning`: the training loop.
-        - :func:`~warmprior.training.load_policy`: loads what it keeps.
+        - :func:`~warmprior.training.evaluate`: plays episodes.
+        - :func:`~warmprior.training.save_policy`: keeps the policy.
 
     Examples:
-        >>> from tempfile import TemporaryDirectory
-        >>> from warmprior import PastPrior
-        >>> from warmprior.training import navigation_task
-        >>> options = NetworkOptions(hidden_dim=8, observation_steps=1)
-        >>> recipe = TrainingConfig(iterations=2, batch_size=8, checkpoints=1)
-        >>> with TemporaryDirectory() as folder:
-        ...     actor = train_policy(
-        ...         navigation_task(), PastPrior(4), folder, network=options, training=recipe)
-        ...     sorted(path.name for path in Path(folder).iterdir())
-        ['policy_000002', 'state.safetensors']
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from warmprior import PastPrior, policy_transforms
+        >>> steps = {"observation": torch.rand(60, 3), "action": torch.rand(60, 1),
+        ...          "episode": torch.arange(60) // 20}
+        >>> recipe = TrainingConfig(iterations=2)  # 10,000 by default
+        >>> actor = train_policy(TensorDict(steps, [60]), PastPrior(4), training=recipe, description=None)
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(actor))
+        >>> env.rollout(3, actor)["vla_action", "chunk"].shape
+        torch.Size([3, 4, 1])
     """
+    task = demonstrations
+    if not isinstance(task, Task):
+        task = Task.of("demonstrations", task, _nowhere)
     network, training = network or NetworkOptions(), training or TrainingConfig()
     on_cpu = torch.device(device).type == "cpu"
-    with (
-        torch_threads(1 if on_cpu else None),
-        # A process may end without the exit handlers that some loggers write in.
-        nullcontext() if logger is None else closing(logger),  # type: ignore[type-var]
-    ):
+    if directory is None and world_size() > 1:
+        raise ValueError("processes that train together need a directory that all of them see")
+    with ExitStack() as stack:
+        stack.enter_context(torch_threads(1 if on_cpu else None))
+        if logger is not None:  # a process may end without the exit handlers that some loggers write in
+            stack.enter_context(closing(logger))  # type: ignore[type-var]
+        if directory is None:
+            directory = stack.enter_context(TemporaryDirectory())
         actor = new_policy(
             task,
             prior,
@@ -182,5 +199,9 @@ def train_policy(
             compile=compile,
         )
         cloning.run(description, progress)
-    from_leader(lambda: None)  # other processes wait until the first has written it
-    return load_policy(cloning.policy_path())
+        from_leader(lambda: None)  # other processes wait until the first has written it
+        return load_policy(cloning.policy_path())
+
+
+def _nowhere() -> EnvBase:
+    raise ValueError("these demonstrations came without an environment: give train_policy a Task")

@@ -9,6 +9,8 @@ from tensordict.utils import NestedKey
 from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.compiled import uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
@@ -21,19 +23,19 @@ __all__ = ["policy_transforms"]
 
 
 def policy_transforms(
-    prior: Prior,
+    policy: WarmPriorActor | Prior,
     *,
     normalizer: Normalizer | None = None,
     actions: Transform | None = None,
     images: Transform | None = None,
-    observation_steps: int = 2,
+    observation_steps: int | None = None,
     execute: int | None = None,
     delay: int | None = None,
     gamma: float = 1.0,
-    see_history: bool = False,
+    see_history: bool | None = None,
     observation_key: NestedKey = keys.OBSERVATION,
     action_key: NestedKey = keys.ACTION,
-    chunk_key: NestedKey = keys.CHUNK,
+    chunk_key: NestedKey | None = None,
     success: NestedKey = keys.SUCCESS,
     measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
 ) -> Compose:
@@ -46,21 +48,22 @@ def policy_transforms(
     environment, and inside or outside of batched ones (with images, inside).
 
     Args:
-        prior: the policy's source distribution, whose lengths alone are used: the environment serves every
-            prior of the same.
+        policy: the policy, which says what it needs; or its source distribution, whose lengths alone are
+            used: the environment serves every policy with a prior of the same.
 
     Keyword Args:
-        normalizer: the normaliser of the training data; none if the environment is normalised already.
+        normalizer: the normaliser of the training data; the policy's by default. None if the environment is
+            normalised already.
         actions: between the policy's actions, in raw units, and the environment's, such as
             :class:`AbsoluteActions`; a copy of it is used. None if they are the same.
         images: makes observations with images, such as :class:`CameraImages`; a copy of it is used.
-        observation_steps: ``To``.
+        observation_steps: ``To``; those of the policy's network by default, or 2.
         execute: actions executed per decision; all ``H`` by default, with a ``delay`` as many as predictions
             allow.
         delay: control steps until a chunk takes effect, see :class:`InferenceDelay`; 0 for
             :class:`~warmprior.RealTimeChunking` without one. By default none is written.
         gamma: discount per control step inside a chunk.
-        see_history: whether the network sees the last actions.
+        see_history: whether the network sees the last actions; as the policy's does by default.
         observation_key: as for :class:`~warmprior.WarmPriorActor`, also for the following.
         action_key: the single action that the environment takes.
         chunk_key: the chunk.
@@ -68,6 +71,7 @@ def policy_transforms(
         measures: see :class:`ChunkStep`.
 
     Raises:
+        TypeError: for anything else than a policy or a prior.
         ValueError: if the normaliser lacks the action, or for numbers that do not go together, see
             :class:`ChunkStep` and :class:`InferenceDelay`.
 
@@ -77,11 +81,25 @@ def policy_transforms(
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
-        >>> from warmprior import PreviewPrior
-        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(PreviewPrior(4)))
+        >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor
+        >>> actor = WarmPriorActor(VelocityMLP(1, 3, prediction_length=8), PreviewPrior(4))
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(actor))
         >>> env.reset()["observation"].shape
         torch.Size([2, 3])
     """
+    prior = policy
+    if isinstance(policy, WarmPriorActor):
+        prior = policy.prior
+        normalizer = policy.normalizer if normalizer is None else normalizer
+        chunk_key = policy.chunk_key if chunk_key is None else chunk_key
+        if see_history is None:
+            see_history = policy.in_keys[0] == keys.CONDITIONED
+        if observation_steps is None:
+            observation_steps = getattr(uncompiled(policy.network), "observation_steps", None)
+    if not isinstance(prior, Prior):
+        raise TypeError(f"policy_transforms takes a WarmPriorActor or a Prior, got {type(prior).__name__}")
+    observation_steps = 2 if observation_steps is None else observation_steps
+    chunk_key = keys.CHUNK if chunk_key is None else chunk_key
     if normalizer is not None and action_key not in normalizer.keys:
         raise ValueError(
             f"the normaliser has {normalizer.keys}, and not the environment's action {action_key!r}: "
