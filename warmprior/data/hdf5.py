@@ -325,8 +325,8 @@ def read_index(
             if image_keys:
                 sides.setdefault(image_size(path, demo, image_keys, steps), name)
     if len(sides) > 1:
-        told = ", ".join(f"{size} in data/{name}" for size, name in sides.items())
-        raise DatasetError(f"{path}: images have several sizes: {told}. Render them anew")
+        listed = ", ".join(f"{size} in data/{name}" for size, name in sides.items())
+        raise DatasetError(f"{path}: images have several sizes: {listed}. Render them anew")
     return DatasetIndex(
         path=path,
         demos=selected,

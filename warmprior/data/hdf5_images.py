@@ -55,8 +55,8 @@ def image_size(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) ->
             raise DatasetError(f"{what}; only square images can be used. Render them anew")
         sizes[key] = shape[1]
     if len(set(sizes.values())) > 1:
-        told = ", ".join(f"{key} {size}" for key, size in sizes.items())
-        raise DatasetError(f"{path}: {name} has images of several sizes: {told}. Render them anew")
+        listed = ", ".join(f"{key} {size}" for key, size in sizes.items())
+        raise DatasetError(f"{path}: {name} has images of several sizes: {listed}. Render them anew")
     return next(iter(sizes.values()))
 
 

@@ -128,5 +128,5 @@ def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advi
     if not usable.all():
         worst = int(np.argmin(usable))
         finite = np.isfinite(out[worst]).all()
-        told = f"a value beyond {LARGEST:.0e}" if finite else "NaN or infinity"
-        raise DatasetError(f"{what} has {told} in row {first + worst}. {advice}")
+        found = f"a value beyond {LARGEST:.0e}" if finite else "NaN or infinity"
+        raise DatasetError(f"{what} has {found} in row {first + worst}. {advice}")

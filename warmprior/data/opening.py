@@ -40,8 +40,8 @@ LEROBOT = "lerobot:"
 
 def _lerobot(place: str | Path) -> str | None:
     """The folder or repository behind the prefix, if there is one."""
-    told = str(place)
-    return told.removeprefix(LEROBOT) if told.startswith(LEROBOT) else None
+    text = str(place)
+    return text.removeprefix(LEROBOT) if text.startswith(LEROBOT) else None
 
 
 def check_place(place: str | Path, option: str) -> None:

@@ -112,8 +112,8 @@ def render_demonstrations(
     chosen = [] if demos is None else [demos]
     identity = digest_of(*renderer_versions(), file_digest(path), cameras, size, fast, *chosen)[:8]
     if out is None:
-        told = "-".join(cameras) if len(cameras) < 3 else f"{len(cameras)}cameras"
-        name = f"{path.stem}_{told}{size}{'fast' if fast else ''}_{identity}.hdf5"
+        names = "-".join(cameras) if len(cameras) < 3 else f"{len(cameras)}cameras"
+        name = f"{path.stem}_{names}{size}{'fast' if fast else ''}_{identity}.hdf5"
         out = cache_folder(cache_dir) / "rendered" / name
         if out.exists():
             return out
@@ -230,13 +230,13 @@ class _Illustrator:
                 "have red and blue exchanged": stored[..., ::-1],
             }
             off = {name: float(np.abs(shown - image).mean()) for name, image in views.items()}
-            (as_stored, *_), told = off.values(), min(off, key=lambda name: off[name])
+            (as_stored, *_), view = off.values(), min(off, key=lambda name: off[name])
             # Most of a scene may look alike upside down, and have little colour.
-            other = as_stored > 1 and off[told] < as_stored / 2
+            other = as_stored > 1 and off[view] < as_stored / 2
             if other or as_stored > CLEARLY:
-                told = told if other else next(iter(views))
+                view = view if other else next(iter(views))
                 raise DatasetError(
-                    f"{name}: the images of {camera} {told} ({as_stored:.0f} of 255 off on average). "
+                    f"{name}: the images of {camera} {view} ({as_stored:.0f} of 255 off on average). "
                     f"Policies would see other ones in evaluation: {advice}"
                 )
 

@@ -36,7 +36,7 @@ class AsyncExecutor:
     Every ``execute`` control steps a decision is begun with the observation of that step, in a thread of its
     own. Until its chunk is there the robot goes on with the one before; the new one then takes effect at
     the position of the step that has been reached. How many steps that took is counted, and the largest of
-    the last decisions' is what the policy is told of the next (``("rtc", "delay")``, for
+    the last decisions' is what the policy expects of the next (``("rtc", "delay")``, for
     :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) holds what was executed, and
     what is left of the chunk. All of it is what :class:`~warmprior.InferenceDelay` does in simulation: with
     ``latency`` given, the actions are the same.
@@ -144,7 +144,7 @@ class AsyncExecutor:
 
     @property
     def expected_delay(self) -> int:
-        """What the next decision is told: the largest of :attr:`delays`, or ``delay`` without any."""
+        """The delay that the next decision expects: the largest of :attr:`delays`, else ``delay``."""
         return max(self._delays, default=self._expected)
 
     def reset(self) -> None:

@@ -171,7 +171,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
 
 
 def executed_positions(prior: Prior, executed: int | None) -> int:
-    """How many positions of a prediction are executed: ``H`` unless told otherwise.
+    """How many positions of a prediction are executed: ``H`` by default.
 
     Raises:
         ValueError: if not ``1 <= executed <= P``.

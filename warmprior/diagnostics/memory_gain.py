@@ -49,7 +49,7 @@ def memory_gain(
     not a fault: the mean may know what the observation does not tell. But what demonstrations never contain,
     an action of the policy's own that was wrong, is carried on by as much.
 
-    How the source's noise lowers it can be told of an exact flow. If past and next actions are one height
+    How the source's noise lowers it follows for an exact flow. If past and next actions are one height
     that varies by :math:`s` at an observation, and :math:`V = \sigma^2 (\rho + (1 - \rho)/H)` is the variance
     of the noise's average over the chunk, with a ``correlation`` of :math:`\rho`, it is
     :math:`s^2 / (s^2 + V)` at one Euler step, a regression on the source, and :math:`s / \sqrt{s^2 + V}`,

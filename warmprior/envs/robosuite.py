@@ -343,7 +343,7 @@ class RobosuiteWrapper(_EnvWrapper):
             if flags[-1][-1]:
                 break
         if self._late is not None:
-            # One more than is told: see ControlLoop.look_back.
+            # One more than asked for: see ControlLoop.look_back.
             measured.extend(map(self._measure, self._late.look_back(states[-keep - 1 :])))
         return self._tell(flags, measured)
 

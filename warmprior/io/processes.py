@@ -55,7 +55,7 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
         def watch() -> None:
             while os.getppid() == parent:
                 time.sleep(0.2)
-            os._exit(1)  # nobody is left to be told, and a job may be in the middle of a step
+            os._exit(1)  # nobody is left to hear, and a job may be in the middle of a step
 
         threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
 

@@ -1,4 +1,4 @@
-"""Scripts: what a user can mend, and Ctrl-C, are told in one line."""
+"""Scripts: an error that a user can mend, and Ctrl-C, become one line."""
 
 from __future__ import annotations
 
@@ -89,9 +89,9 @@ def run_script(
             return 130
         if not isinstance(error, errors):
             raise
-        told = error.args[0] if isinstance(error, KeyError) and error.args else error
+        message = error.args[0] if isinstance(error, KeyError) and error.args else error
         teller = f"{name} (process {os.environ['RANK']})" if launched() else name
-        print(f"{teller}: error: {told}", file=sys.stderr, flush=True)
+        print(f"{teller}: error: {message}", file=sys.stderr, flush=True)
         return 2
     finally:
         signal.signal(signal.SIGINT, before)

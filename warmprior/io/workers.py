@@ -92,6 +92,6 @@ def end_with_parent() -> None:
     def watch() -> None:
         while os.getppid() == parent:
             time.sleep(0.5)
-        os._exit(1)  # nobody is left to be told, and the environment may be in the middle of a step
+        os._exit(1)  # nobody is left to hear, and the environment may be in the middle of a step
 
     threading.Thread(target=watch, name="end-with-parent", daemon=True).start()

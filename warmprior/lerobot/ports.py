@@ -76,7 +76,7 @@ class FlowPort(ABC):
         Args:
             policy: of the family.
             source: what takes the place of the noise.
-            record: told each chunk, with its positions and dimensions of padding.
+            record: called with each chunk, its positions and dimensions of padding.
             nfe: integration steps; the policy's own by default.
         """
 

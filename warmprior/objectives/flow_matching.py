@@ -104,7 +104,7 @@ class FlowMatchingLoss(LossModule):
     data's own path, so that the jump is never its own teacher. It replaces the velocity at the one time
     :math:`s`; at all others the network stays a flow. Idea and target are those of the self-consistency of
     One-Step Flow Policy (Li et al., 2026, arXiv:2603.12480), for the interval from the start to the end.
-    What differs: a velocity network is told no interval, so this is the only one that is learnt, and the
+    What differs: a velocity network knows no interval, so this is the only one that is learnt, and the
     teacher makes it in steps, as in progressive distillation, instead of in one that it has to learn as well
     (so no schedule contracts it, either). There is no self-guidance, and the warm start is the prior's. A
     quarter of the batch is distilled, as in shortcut models (Frans et al., 2025); a training step takes about
@@ -245,11 +245,11 @@ class FlowMatchingLoss(LossModule):
             )
         self.interpolant = interpolant
         if not isinstance(self.interpolant, LinearInterpolant):
-            told = f"only on a straight path: use LinearInterpolant, not {type(interpolant).__name__}"
+            straight = f"only on a straight path: use LinearInterpolant, not {type(interpolant).__name__}"
             if times == "start":
-                raise ValueError(f"one step from t = 0 ends at the data {told}")
+                raise ValueError(f"one step from t = 0 ends at the data {straight}")
             if objective != "velocity" or self_distillation:
-                raise ValueError(f"a velocity predicts the sample {told}")
+                raise ValueError(f"a velocity predicts the sample {straight}")
         self.reduction = reduction
         self.generator = actor_network.sampler.generator if generator is None else generator
         self.set_keys(observation=actor_network.in_keys[0], chunk=actor_network.chunk_key)

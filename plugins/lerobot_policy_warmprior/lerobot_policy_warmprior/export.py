@@ -90,13 +90,13 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
             inputs[name] = PolicyFeature(type=kind, shape=(width,))
             stats[name] = bounds(keys.OBSERVATION, slice(first, first + width))
         first += width
-    told = {k: v for k, v in prior.config().items() if k not in ("name", "chunk_length")}
+    options = {k: v for k, v in prior.config().items() if k not in ("name", "chunk_length")}
     config = WarmFlowConfig(
         input_features=inputs,
         output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(network.action_dim,))},
         n_obs_steps=network.observation_steps,
         n_action_steps=prior.chunk_length,
-        prior=",".join([prior.name, *(f"{k}={json.dumps(v)}" for k, v in told.items())]),
+        prior=",".join([prior.name, *(f"{k}={json.dumps(v)}" for k, v in options.items())]),
         nfe=actor.ode.nfe,
         network=json.dumps(network.config()),
         device="cpu",

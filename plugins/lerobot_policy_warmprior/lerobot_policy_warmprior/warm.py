@@ -78,8 +78,8 @@ class WarmPolicyMixin:
     def forward(self, batch: dict[str, Any], *args: Any, **kwargs: Any) -> Any:
         """The policy's own loss, from the prior's source."""
         forward = super().forward
-        told = inspect.signature(forward).bind(batch, *args, **kwargs).arguments
-        return self.warm_adapter.loss(told.pop("batch"), forward, **told)
+        arguments = inspect.signature(forward).bind(batch, *args, **kwargs).arguments
+        return self.warm_adapter.loss(arguments.pop("batch"), forward, **arguments)
 
     def select_action(self, batch: dict[str, Any], **kwargs: Any) -> Tensor:
         """The next action of every environment."""
