@@ -161,7 +161,7 @@ def test_info_of_a_policy_with_parts_of_ones_own(tmp_path, capsys, monkeypatch):
     save_policy(WarmPriorActor(network, PastPrior(8), start=start), tmp_path / "policy")
     del sys.modules["my_starts"], StartPoint._classes["tests.middle"]
     assert main(["info", str(tmp_path / "policy")]) == 2
-    assert "unknown startpoint 'tests.middle'" in capsys.readouterr().err
+    assert "unknown start point 'tests.middle'" in capsys.readouterr().err
     assert main(["info", str(tmp_path / "policy"), "--import", "my_starts"]) == 0
     assert "start        Middle()" in capsys.readouterr().out
     del StartPoint._classes["tests.middle"]

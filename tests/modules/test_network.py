@@ -12,11 +12,12 @@ from torch import nn
 from warmprior import ChiTransformer, VelocityMLP, VelocityNetwork
 from warmprior.modules import TimestepEmbedding
 from warmprior.modules.network import velocity_field
+from warmprior.modules.registry import from_config
 
 
 class Linear(VelocityNetwork):
     def __init__(self, action_dim, observation_dim, prediction_length, observation_steps=2, *, k=3):
-        super().__init__(action_dim, observation_dim, prediction_length, observation_steps, k=k)
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         self.position = nn.Parameter(torch.zeros(1, prediction_length, action_dim))
         self.layer = nn.Linear(action_dim, action_dim)
         self.norm = nn.LayerNorm(action_dim)
@@ -67,7 +68,7 @@ def test_a_field_is_evaluated_in_the_precision_of_the_first_parameter(frozen):
 )
 def test_config_survives_json(network):
     config = json.loads(json.dumps(network.config()))
-    again = VelocityNetwork.from_config(config)
+    again = from_config(VelocityNetwork, config)
     assert type(again) is type(network) and again.config() == network.config()
     again.load_state_dict(network.state_dict())
     inputs = torch.rand(3), torch.randn(3, 4, 2), torch.randn(3, network.observation_steps, 3)
@@ -75,8 +76,8 @@ def test_config_survives_json(network):
 
 
 def test_unknown_name():
-    with pytest.raises(ValueError, match=r"unknown network 'Nope'.*ChiTransformer.*VelocityMLP"):
-        VelocityNetwork.from_config({"name": "Nope"})
+    with pytest.raises(ValueError, match=r"unknown velocity network 'Nope'.*ChiTransformer.*VelocityMLP"):
+        from_config(VelocityNetwork, {"name": "Nope"})
 
 
 @pytest.mark.parametrize("position", range(4))

@@ -29,6 +29,7 @@ from warmprior import (
     WarmPriorActor,
     window_replay_buffer,
 )
+from warmprior.modules.registry import from_config
 from warmprior.training.saved import load_policy, save_policy
 
 PATHS = [LinearInterpolant(), TrigonometricInterpolant(), PolynomialInterpolant(3.0)]
@@ -411,8 +412,8 @@ def test_windows_of_another_prior():
 def test_config_inside_config():
     network = PreconditionedNetwork(VelocityMLP(2, 3, 4, hidden_dim=8))
     config = json.loads(json.dumps(network.config()))
-    again = VelocityNetwork.from_config(config)
+    again = from_config(VelocityNetwork, config)
     assert isinstance(again, PreconditionedNetwork) and isinstance(again.network, nn.Module)
     assert again.config() == network.config()
     with pytest.raises(ValueError, match="unknown interpolant 'bent'"):
-        VelocityNetwork.from_config(config | {"interpolant": {"name": "bent"}})
+        from_config(VelocityNetwork, config | {"interpolant": {"name": "bent"}})

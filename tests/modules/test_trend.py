@@ -23,6 +23,7 @@ from warmprior import (
 )
 from warmprior.envs import absolute_actions
 from warmprior.history import window_history, without
+from warmprior.modules.registry import from_config
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 
@@ -158,7 +159,7 @@ def test_config_and_state_bring_it_back():
     moments = SourceMoments.fit(batch, prior, trend=trend)
     mlp = VelocityMLP(D_A, D_O, P, TO, hidden_dim=8)
     network = PreconditionedNetwork(mlp, moments=moments, trend=trend)
-    again = VelocityNetwork.from_config(network.config())
+    again = from_config(VelocityNetwork, network.config())
     again.load_state_dict(network.state_dict())
     inputs = torch.rand(200), batch["vla_action", "chunk"], batch["observation"]
     assert torch.equal(network(*inputs), again(*inputs))

@@ -100,18 +100,7 @@ class ChiTransformer(VelocityNetwork):
         dropout: float = 0.1,
         time_modulation: bool = False,
     ) -> None:
-        super().__init__(
-            action_dim,
-            observation_dim,
-            prediction_length,
-            observation_steps,
-            embedding_dim=embedding_dim,
-            num_layers=num_layers,
-            num_heads=num_heads,
-            timestep_embedding_dim=timestep_embedding_dim,
-            dropout=dropout,
-            time_modulation=time_modulation,
-        )
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         if embedding_dim % num_heads:
             raise ValueError(f"num_heads must divide embedding_dim, got {num_heads} and {embedding_dim}")
         self.embed_time = nn.Sequential(

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
+
+from warmprior.modules.registry import Registered
 
 __all__ = [
     "Interpolant",
@@ -16,12 +17,12 @@ __all__ = [
 ]
 
 
-class Interpolant:
+class Interpolant(Registered):
     r"""The path :math:`a_t = \alpha(t) a_0 + \beta(t) a_1` and its velocity.
 
-    Subclasses give a ``name``, :meth:`coefficients` and, if they take arguments, :meth:`config`. The
-    coefficients must satisfy :math:`\alpha(0)=\beta(1)=1` and :math:`\alpha(1)=\beta(0)=0`, so that the flow
-    starts at the source and ends at the data.
+    Subclasses give :meth:`coefficients` and, for files, a ``name``. The coefficients must satisfy
+    :math:`\alpha(0)=\beta(1)=1` and :math:`\alpha(1)=\beta(0)=0`, so that the flow starts at the source and
+    ends at the data.
 
     See Also:
         - :class:`~warmprior.LinearInterpolant`: the default.
@@ -40,14 +41,6 @@ class Interpolant:
         (0.5, 1.571)
     """
 
-    name: ClassVar[str]
-    _registry: ClassVar[dict[str, type[Interpolant]]] = {}
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        if "name" in cls.__dict__:
-            Interpolant._registry[cls.name] = cls
-
     def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         r"""Return :math:`\alpha, \beta, \dot\alpha, \dot\beta` at times ``t`` in [0, 1], each like ``t``."""
         raise NotImplementedError
@@ -65,31 +58,6 @@ class Interpolant:
         """
         alpha, beta, d_alpha, d_beta = self.coefficients(t[..., None, None])
         return alpha * a0 + beta * a1, d_alpha * a0 + d_beta * a1
-
-    def config(self) -> dict[str, Any]:
-        """JSON-serialisable description; :meth:`from_config` reverses it."""
-        return {"name": self.name}
-
-    @staticmethod
-    def from_config(config: dict[str, Any]) -> Interpolant:
-        """Build an interpolant from :meth:`config`'s output; subclasses are found by their ``name``.
-
-        Raises:
-            ValueError: if no imported class has that name.
-
-        Examples:
-            >>> Interpolant.from_config({"name": "polynomial", "n": 3.0}).config()
-            {'name': 'polynomial', 'n': 3.0}
-        """
-        kwargs = dict(config)
-        name = kwargs.pop("name", None)
-        if name not in Interpolant._registry:
-            known = ", ".join(sorted(Interpolant._registry))
-            raise ValueError(
-                f"unknown interpolant {name!r}; known: {known}. Import the module that defines a custom "
-                "one before loading it."
-            )
-        return Interpolant._registry[name](**kwargs)
 
 
 class LinearInterpolant(Interpolant):
@@ -170,7 +138,3 @@ class PolynomialInterpolant(Interpolant):
         beta = t**self.n
         d_beta = self.n * t ** (self.n - 1)
         return 1 - beta, beta, -d_beta, d_beta
-
-    def config(self) -> dict[str, Any]:
-        """JSON-serialisable description."""
-        return {"name": self.name, "n": self.n}

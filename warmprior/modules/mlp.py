@@ -69,15 +69,7 @@ class VelocityMLP(VelocityNetwork):
         num_blocks: int = 2,
         timestep_embedding_dim: int = 32,
     ) -> None:
-        super().__init__(
-            action_dim,
-            observation_dim,
-            prediction_length,
-            observation_steps,
-            hidden_dim=hidden_dim,
-            num_blocks=num_blocks,
-            timestep_embedding_dim=timestep_embedding_dim,
-        )
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         chunk = prediction_length * action_dim
         self.embed_time = nn.Sequential(
             TimestepEmbedding(timestep_embedding_dim),

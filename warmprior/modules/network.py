@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from warmprior.modules.checks import check_whole_numbers
+from warmprior.modules.registry import Registered
+
 __all__ = ["TimestepEmbedding", "VelocityNetwork", "network_observation", "velocity_field"]
 
 
-class VelocityNetwork(nn.Module):
+class VelocityNetwork(nn.Module, Registered):
     """Base class of velocity networks ``v(t, a_t, o)`` that can be saved by name and configuration.
 
-    Subclasses pass their constructor arguments on to this class. :class:`~warmprior.ODEActor` and
-    :class:`~warmprior.FlowMatchingLoss` take any callable of the same signature; this base only adds
-    shape checks and :meth:`config`.
+    :class:`~warmprior.ODEActor` and :class:`~warmprior.FlowMatchingLoss` take any callable of the same
+    signature; this base only adds shape checks and ``config()``, the name of the class and the arguments of
+    its constructor.
 
     Args:
         action_dim: ``d_a``.
         observation_dim: ``d_o``.
         prediction_length: ``P``.
         observation_steps: ``To``.
-        kwargs: further constructor arguments of the subclass, recorded by :meth:`config`.
 
     Raises:
         ValueError: if a width or length is not positive.
@@ -53,35 +55,21 @@ class VelocityNetwork(nn.Module):
 
     encodes: bool = False
     """Whether :meth:`encode` does anything."""
-    _registry: ClassVar[dict[str, type[VelocityNetwork]]] = {}
 
     def __init__(
-        self,
-        action_dim: int,
-        observation_dim: int,
-        prediction_length: int,
-        observation_steps: int,
-        **kwargs: Any,
+        self, action_dim: int, observation_dim: int, prediction_length: int, observation_steps: int
     ) -> None:
         super().__init__()
-        sizes = {
-            "action_dim": action_dim,
-            "observation_dim": observation_dim,
-            "prediction_length": prediction_length,
-            "observation_steps": observation_steps,
-        }
-        for name, size in sizes.items():
-            if size < 1:
-                raise ValueError(f"{name} must be at least 1, got {size}")
+        check_whole_numbers(
+            action_dim=action_dim,
+            observation_dim=observation_dim,
+            prediction_length=prediction_length,
+            observation_steps=observation_steps,
+        )
         self.action_dim = action_dim
         self.observation_dim = observation_dim
         self.prediction_length = prediction_length
         self.observation_steps = observation_steps
-        self._config = {**sizes, **kwargs}
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        VelocityNetwork._registry[cls.__name__] = cls
 
     def check_chunk(self, a: Tensor) -> None:
         """Compare a chunk with what the network was built for.
@@ -127,27 +115,6 @@ class VelocityNetwork(nn.Module):
             observation: ``[B, To, d_o]``, or a tensordict ``[B]``.
         """
         return observation
-
-    def config(self) -> dict[str, Any]:
-        """JSON-serialisable class name and constructor arguments."""
-        return {"name": type(self).__name__, **self._config}
-
-    @staticmethod
-    def from_config(config: dict[str, Any]) -> VelocityNetwork:
-        """Build a network (with fresh weights) from :meth:`config`'s output.
-
-        Raises:
-            ValueError: if no imported class has that name.
-        """
-        kwargs = dict(config)
-        name = kwargs.pop("name", None)
-        if name not in VelocityNetwork._registry:
-            known = ", ".join(sorted(VelocityNetwork._registry))
-            raise ValueError(
-                f"unknown network {name!r}; known: {known}. Pass the network itself, or import the "
-                "module that defines it first."
-            )
-        return VelocityNetwork._registry[name](**kwargs)
 
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
         """Optimiser groups: decay on matrix weights, none on biases, norms and embeddings.

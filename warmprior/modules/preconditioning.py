@@ -14,6 +14,7 @@ from warmprior import keys
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.prior import Prior
+from warmprior.modules.registry import from_config
 from warmprior.modules.trend import PoseTrend
 
 __all__ = ["PreconditionedNetwork", "SourceMoments"]
@@ -240,9 +241,9 @@ class PreconditionedNetwork(VelocityNetwork):
         interpolant: Interpolant | dict[str, Any] | None = None,
     ) -> None:
         if isinstance(network, dict):
-            network = VelocityNetwork.from_config(network)
+            network = from_config(VelocityNetwork, network)
         if isinstance(interpolant, dict):
-            interpolant = Interpolant.from_config(interpolant)
+            interpolant = from_config(Interpolant, interpolant)
         super().__init__(
             network.action_dim,
             network.observation_dim,

@@ -122,7 +122,7 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
     module, colon, attribute = name.partition(":")
     if not colon:
         return _known(base, name, "name your own as package.module:Class")
-    kind = base.__name__.lower()
+    kind = _kind(base)
     try:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, TypeError, ValueError) as error:
@@ -210,8 +210,13 @@ def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
 def _known[T: Registered](base: type[T], name: Any, advice: str) -> type[T]:
     if name not in base._classes:
         known = ", ".join(sorted(base._classes))
-        raise ValueError(f"unknown {base.__name__.lower()} {name!r}: it is none of {known}; {advice}")
+        raise ValueError(f"unknown {_kind(base)} {name!r}: it is none of {known}; {advice}")
     return base._classes[name]
+
+
+def _kind(base: type) -> str:
+    """The name of a base class in words."""
+    return re.sub(r"(?<!^)(?=[A-Z])", " ", base.__name__).lower()
 
 
 def _written(arguments: Mapping[str, Any]) -> list[str]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from warmprior.modules.encoder import ImageEncoder
 from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.registry import from_config
 
 __all__ = ["VisionNetwork"]
 
@@ -53,7 +54,7 @@ class VisionNetwork(VelocityNetwork):
         if isinstance(encoder, dict):
             encoder = ImageEncoder(**encoder)
         if isinstance(network, dict):
-            network = VelocityNetwork.from_config(network)
+            network = from_config(VelocityNetwork, network)
         if network.observation_dim != encoder.observation_dim:
             raise ValueError(
                 f"the network was built for observation_dim={network.observation_dim}, but the encoder "

@@ -379,7 +379,7 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
         options["guidance"] = RealTimeChunking(**options["guidance"])
     normalizer, start = config["normalizer"], config["start"]
     actor = WarmPriorActor(
-        VelocityNetwork.from_config(config["network"]),
+        from_config(VelocityNetwork, config["network"]),
         from_config(Prior, config["prior"]),
         normalizer=None if normalizer is None else Normalizer.from_config(normalizer),
         start=None if start is None else from_config(StartPoint, start),

@@ -24,6 +24,7 @@ from warmprior import (
 )
 from warmprior.history import window_history
 from warmprior.lerobot import ActionMemory
+from warmprior.modules.registry import from_config
 
 __all__ = ["WarmFlowPolicy"]
 
@@ -62,7 +63,7 @@ class WarmFlowPolicy(PreTrainedPolicy):
                     "--policy.network is the JSON of VelocityNetwork.config(), got "
                     f"{config.network!r} ({error})"
                 ) from error
-            network = VelocityNetwork.from_config(described)
+            network = from_config(VelocityNetwork, described)
             names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
             built = tuple(getattr(network, name) for name in names)
             if built != sizes:
