@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import h5py
 import numpy as np
 import pytest
@@ -14,16 +12,9 @@ pytest.importorskip("lerobot")
 from tests.data.lerobot_parts import scene
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
 from tests.processes import apart
-from warmprior.__main__ import main
-from warmprior.data import (
-    DatasetError,
-    LeRobotExperienceReplay,
-    RobomimicExperienceReplay,
-    convert_robomimic,
-)
+from warmprior.data import DatasetError, LeRobotExperienceReplay, RobomimicExperienceReplay, convert_robomimic
 from warmprior.data.opening import open_demonstrations
 from warmprior.envs import rendering_backend
-from warmprior.io.files import file_digest, read_json
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -61,11 +52,6 @@ def converted(tmp_path_factory):
         kind: convert_robomimic(path, folder / kind, images=kind, progress=False)
         for kind in ("image", "video")
     }
-
-
-def test_a_process_is_scheduled_as_before(converted):
-    """The encoder of videos takes real-time priority where it may, which workers would inherit."""
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
 
 
 def equal(mine, theirs):
@@ -137,33 +123,6 @@ def test_lerobot_reads_what_was_converted(converted):
             assert off.max() < 1e-4 if kind == "image" else off.mean() < 8
 
 
-def test_what_lerobot_does_not_tell_is_written_down(converted):
-    path, folders = converted
-    told = read_json(folders["image"] / "meta" / "warmprior.json")
-    assert told["env_args"] == env_args_14("transport")
-    assert told["source"] == {"file": "transport.hdf5", "sha256": file_digest(path)}
-    assert told["masks"] == {"train": [0, 2], "valid": [1]}
-    with h5py.File(path) as file:
-        assert told["first_state"] == file["data/demo_0/states"][0].tolist()
-
-
-def test_part_of_a_file(converted, tmp_path):
-    path, _ = converted
-    folder = convert_robomimic(path, tmp_path / "part", demos=2, progress=False)
-    whole = RobomimicExperienceReplay(path, demos=2)
-    assert not equal(LeRobotExperienceReplay(folder).data, whole.data)
-    assert LeRobotExperienceReplay(folder, filter_key="train").episode_lengths.tolist() == [6]
-    with pytest.raises(DatasetError, match=r"unknown filter key 'test'.*train"):
-        LeRobotExperienceReplay(folder, filter_key="test")
-
-
-def test_a_target_that_exists_is_refused(converted, tmp_path):
-    (tmp_path / "link").symlink_to("nowhere")
-    for folder in (converted[1]["image"], tmp_path / "link"):
-        with pytest.raises(FileExistsError, match=f"{folder} exists: choose another folder, or"):
-            convert_robomimic(converted[0], folder)
-
-
 def test_an_interrupted_conversion_leaves_nothing(converted, tmp_path, monkeypatch):
     from lerobot.datasets import LeRobotDataset
 
@@ -212,30 +171,6 @@ def test_what_cannot_be_converted(tmp_path):
     with pytest.raises(DatasetError, match=r"control_freq is 12\.5"):
         convert_robomimic(path, folder)
     assert [p.name for p in tmp_path.iterdir()] == ["lift.hdf5"]
-
-
-def test_an_environment_of_ones_own(tmp_path):
-    path = tmp_path / "own.hdf5"
-    env_args = env_args_15("lift") | {"env_name": "Own"}
-    env_args["env_kwargs"]["control_freq"] = 10
-    write_robomimic_file(path, task="lift", lengths=(3, 2), env_args=env_args)
-    folder = convert_robomimic(path, tmp_path / "own", progress=False)
-    replay = LeRobotExperienceReplay(folder)
-    assert not equal(replay.data, RobomimicExperienceReplay(path).data)
-    assert replay.task is None and replay.env_args["env_name"] == "Own"
-    assert read_json(folder / "meta" / "info.json")["fps"] == 10
-
-
-def test_command(converted, tmp_path, capsys):
-    path, _ = converted
-    folder = tmp_path / "data"
-    argv = ["convert", str(path), str(folder), "--images", "--demonstrations", "1"]
-    assert main(argv) == 0
-    told = capsys.readouterr()
-    assert told.out.strip() == str(folder) and "convert transport: 100%" in told.err
-    assert LeRobotExperienceReplay(folder, image_keys=["agentview_image"]).num_episodes == 1
-    assert main(argv) == 2
-    assert "exists: choose another folder" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")

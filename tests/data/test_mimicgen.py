@@ -23,13 +23,6 @@ def test_files_of_robosuite_14(tmp_path, task):
     assert "lite_physics" not in data.env_args["env_kwargs"]
 
 
-def test_variants_that_are_not_in_the_table_are_read_as_well(tmp_path):
-    path = tmp_path / "file.hdf5"
-    write_robomimic_file(path, env_args=env_args_14("square") | {"env_name": "Square_D2"})
-    data = MimicGenExperienceReplay(path)
-    assert data.task is None and data.num_episodes == 3
-
-
 def test_files_of_others_are_refused(tmp_path, square_file):
     with pytest.raises(DatasetError, match=r"square\.hdf5: NutAssemblySquare is none of MimicGen's"):
         MimicGenExperienceReplay(square_file[0])
@@ -37,10 +30,3 @@ def test_files_of_others_are_refused(tmp_path, square_file):
         MimicGenExperienceReplay("stack_d0")
     with pytest.raises(ValueError, match="choose one of stack_d0, coffee_d0, threading_d0"):
         MimicGenExperienceReplay("square", download=True)
-
-
-def test_object_of_another_width_is_named(tmp_path):
-    path = tmp_path / "file.hdf5"
-    write_robomimic_file(path, env_args=env_args_14("coffee_d0"))
-    with pytest.raises(DatasetError, match=r"obs/object has shape .*Coffee_D0 has 57"):
-        MimicGenExperienceReplay(path)

@@ -13,7 +13,7 @@ from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 from torchrl.envs.transforms import RenameTransform
 
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
-from warmprior.data import DatasetError, RobomimicExperienceReplay, generate_demonstrations
+from warmprior.data import RobomimicExperienceReplay, generate_demonstrations
 from warmprior.envs import absolute_actions, absolute_to_env_action, modernize_env_args
 from warmprior.envs.tasks import TASKS
 
@@ -56,13 +56,6 @@ def test_values_equal_what_was_written(tmp_path, task, storage):
     assert replay.env_args == modernize_env_args(env_args_15(task))
 
 
-def test_mask_numbers_episodes_from_zero(square_file):
-    path, demos = square_file
-    data = RobomimicExperienceReplay(path, filter_key="train").data
-    assert data["episode"].unique().tolist() == [0, 1]
-    np.testing.assert_array_equal(data["action"][12:], demos[2]["actions"].astype(np.float32))
-
-
 def test_data_is_the_storage(square_file, tmp_path):
     path, _ = square_file
     for options in ({}, {"storage": "memmap", "scratch_dir": tmp_path / "maps"}):
@@ -71,13 +64,6 @@ def test_data_is_the_storage(square_file, tmp_path):
         replay.data["action"].fill_(0.25)
         assert (replay.sample()["action"] == 0.25).all()
     assert list((tmp_path / "maps").rglob("*.memmap"))
-
-
-def test_is_immutable(square_file):
-    path, _ = square_file
-    replay = RobomimicExperienceReplay(path)
-    with pytest.raises(RuntimeError, match="doesn't allow writing"):
-        replay.extend(replay.data)
 
 
 def test_works_with_torchrl_samplers_and_transforms(square_file):
@@ -94,13 +80,6 @@ def test_works_with_torchrl_samplers_and_transforms(square_file):
     assert (sample["frame"].diff(dim=-1) == 1).all()
     assert (sample["episode"].diff(dim=-1) == 0).all()
     assert "state" in sample.keys() and "observation" not in sample.keys()  # noqa: SIM118
-
-
-def test_observation_keys(square_file):
-    path, demos = square_file
-    replay = RobomimicExperienceReplay(path, observation_keys=["robot0_eef_pos", "object"])
-    expected = np.concatenate([demos[1]["robot0_eef_pos"], demos[1]["object"]], -1)
-    np.testing.assert_array_equal(replay.data["observation"][12:17].numpy(), expected.astype(np.float32))
 
 
 @pytest.mark.parametrize("frame", ["old", "world", "base"])
@@ -128,43 +107,6 @@ def test_absolute_actions(tmp_path, task, frame):
     assert replay.recorded_env_args == modernize_env_args(meta)
     replay.recorded_env_args["env_kwargs"].clear()
     assert replay.recorded_env_args["env_kwargs"]
-
-
-def test_absolute_actions_need_matching_robots(tmp_path):
-    path = tmp_path / "file.hdf5"
-    meta = env_args_15("transport")
-    meta["env_kwargs"]["robots"] = ["Panda"]
-    write_robomimic_file(path, task="transport", env_args=meta)
-    with pytest.raises(DatasetError, match="14 columns"):
-        RobomimicExperienceReplay(path, absolute_actions=True)
-
-
-def test_refuses_bad_options(square_file, tmp_path, monkeypatch):
-    path, _ = square_file
-    with pytest.raises(ValueError, match="'disk'"):
-        RobomimicExperienceReplay(path, storage="disk")
-    with pytest.raises(ValueError, match="memory maps live on the CPU"):
-        RobomimicExperienceReplay(path, storage="memmap", device="cuda")
-    with pytest.raises(FileNotFoundError, match="no such file"):
-        RobomimicExperienceReplay(tmp_path / "absent.hdf5")
-    with pytest.raises(ValueError, match="choose one of lift, can"):
-        RobomimicExperienceReplay("sqare", download=True)
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(FileNotFoundError, match=r"official square mh file.*download=True"):
-        RobomimicExperienceReplay("square", style="mh")
-
-
-def test_downloads_by_task_name(square_file, tmp_path, monkeypatch):
-    asked = []
-
-    def fake(task, style, *, root):
-        asked.append((task, style, root))
-        return square_file[0]
-
-    monkeypatch.setattr("warmprior.data.robomimic.download_robomimic", fake)
-    monkeypatch.chdir(tmp_path / "..")
-    replay = RobomimicExperienceReplay("square", style="mh", download=True, root="somewhere")
-    assert asked == [("square", "mh", "somewhere")] and replay.num_episodes == 3
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads Linux's /proc")

@@ -94,15 +94,6 @@ def test_bound_counts_cold_and_padded_positions():
     assert branching_bound(data, prior)["total"].tolist() == [4.25] * 2
 
 
-def test_cost_does_not_depend_on_the_split():
-    data = windows(torch.zeros(7, H, 2), torch.randn(7, H, 2))
-    results = []
-    for split in (2, 1000):
-        actor = policy(lambda t, a, o: torch.tanh(a) * t, PastPrior(H), seed=9)
-        results.append(branching_cost(actor, data, split=split)["cost"])
-    torch.testing.assert_close(*results)
-
-
 def test_bad_input_is_named():
     actor = policy(lambda t, a, o: -a)
     with pytest.raises(KeyError, match="chunk"):

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from tests.diagnostics.fields import remember
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, WarmPriorActor
+from warmprior import PastPrior, PreviewPrior, WarmPriorActor
 from warmprior.diagnostics import mean_error, mean_revision
 from warmprior.history import cold_history
 
@@ -56,11 +56,6 @@ def test_only_warm_positions_inside_the_episode_count(prior):
     assert found.target == pytest.approx(math.sqrt(sum(squares) / len(squares)))
     # What does not move predicts mean and noise.
     assert found.revision == pytest.approx(prior.sigma, rel=0.3, abs=1e-7)
-
-
-def test_without_a_mean_there_is_no_error():
-    found = mean_error(WarmPriorActor(Still(), GaussianPrior(H)), windows(GaussianPrior(H), warm=False))
-    assert math.isnan(found.target) and math.isnan(found.revision)
 
 
 def test_the_mean_is_that_of_the_source():

@@ -89,34 +89,6 @@ def test_an_episode_ends_on_the_way(monkeypatch, end):
     check(env.control_steps(actions, keep=3), expected, keep=3)
 
 
-def test_out_of_time():
-    env = RobosuiteEnv("lift", horizon=5)
-    env.reset()
-    results = env.control_steps(actions_of(env, 8), keep=1)
-    assert [bool(result["truncated"]) for result in results] == [False] * 4 + [True]
-
-
-class Shaped(RobosuiteEnv):
-    """Earns one more at every step."""
-
-    def _step(self, tensordict):
-        result = super()._step(tensordict)
-        return result.set("reward", result["reward"] + 1)
-
-
-def test_a_subclass_with_a_step_of_its_own():
-    env = TransformedEnv(Shaped("lift"), policy_transforms(PastPrior(8)))
-    data = env.reset().set(("vla_action", "chunk"), torch.zeros(8, 7))
-    assert env.step(data)["next", "reward"] == 8
-
-
-def test_nothing_to_tell():
-    env = RobosuiteEnv("lift")
-    env.reset()
-    with pytest.raises(ValueError, match="keep must be at least 1"):
-        env.control_steps(torch.zeros(2, 7), keep=0)
-
-
 class Onlooker(Transform):
     """Does nothing, but nobody can know, so that it is run at every step."""
 

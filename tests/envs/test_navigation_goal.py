@@ -70,15 +70,6 @@ def test_which_demonstrations_succeed(route):
     assert int(solved.sum()) == 3
 
 
-def test_a_collision_ends_the_episode():
-    low = torch.full((1, STEPS, 1), 0.3)  # above the axis, but inside both obstacles
-    env = GoalNavigationEnv((1, 1), batch_size=[1])
-    rewards, length, solved = play(env, low.squeeze(-1))
-    x = torch.linspace(-1, 1, STEPS)
-    first = int((x > -0.45 - 0.12).nonzero()[0])  # the first segment that reaches the obstacle
-    assert int(length) == first + 1 and not solved.any() and not rewards.any()
-
-
 def test_the_way_there_is_that_of_the_environment_without_goal():
     plain, goal = NavigationEnv(batch_size=[6]), GoalNavigationEnv((1, 1), batch_size=[6])
     a, b = plain.reset(), goal.reset()
@@ -110,9 +101,3 @@ def test_chunks_stop_at_the_end():
     before_end = (done.cumsum(1) - done) == 0
     total = (executed * before_end).sum(1)
     assert total.tolist() == [STEPS] * 3 + [first + 1] * 3
-
-
-@pytest.mark.parametrize("route", [(1,), (1, 0), (1, 1, 1), (2, -1)])
-def test_bad_routes(route):
-    with pytest.raises(ValueError, match="a route is 2 numbers 1 or -1"):
-        GoalNavigationEnv(route)

@@ -11,12 +11,7 @@ import torch
 from tests.fuzz.raw import damage
 from tests.fuzz.sandbox import Outcome
 from tests.training.cloning_parts import CONFIG, training
-from warmprior.training.checkpoint import (
-    load_state,
-    module_tensors,
-    named,
-    snapshot_optimizer,
-)
+from warmprior.training.checkpoint import load_state, module_tensors, named, snapshot_optimizer
 
 NAME = "training states"
 

@@ -6,9 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torchrl.collectors import Collector
-from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.lerobot.seen import watch
@@ -17,7 +16,6 @@ from warmprior import GaussianPrior, PastPrior, PreviewPrior, PriorAnchor, polic
 from warmprior.history import window_history
 from warmprior.lerobot import LeRobotActor
 from warmprior.rl import PriorDecoder, ResidualSampler
-from warmprior.training import evaluate
 
 
 class Arm(EnvBase):
@@ -53,17 +51,6 @@ class Arm(EnvBase):
 
     def _set_seed(self, seed):
         return seed
-
-
-class WithSuccess(Arm):
-    """It also tells that nothing was solved."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.observation_spec["success"] = Binary(1, shape=(1,), dtype=torch.bool)
-
-    def _observed(self):
-        return super()._observed().set("success", torch.zeros(1, dtype=torch.bool))
 
 
 NAMES = {"state": "observation.state", "top": CAMERA}
@@ -159,49 +146,6 @@ def test_the_rest_of_the_source_is_drawn_anew_for_actors_and_fixed_for_decoders(
     assert torch.equal(*chunks)
     with pytest.raises(ValueError, match=r"padding must be \[2, \d+, \d+\].*got \[2, 3, 4\]"):
         actor.ode(data.clone(), padding=torch.zeros(2, 3, 4))
-
-
-def test_evaluation_draws_from_its_seeds_whatever_generator_an_actor_has(policy):
-    prior = PastPrior(LENGTH)
-    env = environment(prior, WithSuccess())
-    actor = actor_of(policy("pi05"), prior)
-
-    def chunks(**options):
-        played = evaluate(actor, env, episodes=2, first_seed=0, **options)
-        return torch.cat([episode.decisions["vla_action", "chunk"] for episode in played])
-
-    first = chunks()
-    assert torch.equal(chunks(), first)
-    assert not torch.equal(chunks(policy_seed=1), first)
-
-
-def test_a_single_observation_of_a_policy_that_may_see_several(policy):
-    made, prior = policy("multi_task_dit", n_obs_steps=1), PastPrior(LENGTH, sigma=0.0)
-    actor = LeRobotActor(made, prior, names=NAMES, preprocess=preprocessed)
-    data = TensorDict(
-        {
-            "observation": {"state": torch.randn(3, 1, STATE)},
-            "history": history_of(torch.randn(3, LENGTH, ACTION)),
-        },
-        [3],
-    )
-    with watch("multi_task_dit", made) as seen:
-        chunk = actor(data)["vla_action", "chunk"]
-    assert torch.equal(seen.x[0], data["history", "actions"])
-    torch.testing.assert_close(chunk, seen.x[0] + sum(seen.out) / len(seen.out))
-
-
-def test_collectors_and_batched_environments(policy):
-    prior = PastPrior(LENGTH)
-    actor = actor_of(policy("pi05"), prior)
-    env = environment(prior, base=SerialEnv(2, lambda: Arm(12)))
-    collector = Collector(env, actor, frames_per_batch=8, total_frames=16)
-    for batch in collector:
-        assert batch["vla_action", "chunk"].shape == (2, 4, LENGTH, ACTION)
-        # A new episode starts cold.
-        first = batch["history", "steps"][..., 0] == 0
-        assert first.any() and not batch["prior", "warm"][first].any()
-    collector.shutdown()
 
 
 def test_a_frozen_policy_decodes_what_an_agent_chooses(policy):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import json
 import os
@@ -144,55 +143,6 @@ def test_losses_and_chunks_start_from_the_prior(found, name):
     assert not torch.equal(seen.x[0][..., :ACTION], sources[2])
 
 
-@pytest.mark.parametrize(
-    ("name", "given"), [("warm_smolvla", (None, None, "none")), ("warm_pi05", ("none",))]
-)
-def test_options_of_the_loss_count_by_position_too(found, name, given):
-    policy = warm(found, name).train()
-    batch = windows(name.removeprefix("warm_"), 2, LENGTH)
-    losses = []
-    for args, kwargs in ((given, {}), ((), {"reduction": "none"})):
-        torch.manual_seed(0)
-        losses.append(policy(dict(batch), *args, **kwargs)[0])
-    assert losses[0].shape == (2,) and torch.equal(*losses)
-    if name == "warm_smolvla":
-        with pytest.raises(ValueError, match="noise= is what the prior gives"):
-            policy(dict(batch), torch.zeros(2, LENGTH, 12))
-
-
-def test_sigma_in_units_of_the_dataset_is_kept(found, tmp_path):
-    stats = {
-        "action": {
-            "std": torch.ones(ACTION),
-            "q01": -4 * torch.ones(ACTION),
-            "q99": torch.ones(ACTION),
-        }
-    }
-    kind = found["warm_pi05"]
-
-    class WithStats:  # as LeRobot's factory hands them to the constructor
-        def __new__(cls, config):
-            return kind(config, dataset_stats=stats)
-
-    policy = make_pi("pi05", WithStats, kind.config_class, sigma_unit="std")
-    assert policy.config.action_std == pytest.approx([0.4] * ACTION)
-    policy.save_pretrained(tmp_path)
-    with small("warm_pi05"):
-        again = kind.from_pretrained(tmp_path)
-    assert again.config.action_std == policy.config.action_std
-    with pytest.raises(ValueError, match="needs the statistics"):
-        make_pi("pi05", kind, kind.config_class, sigma_unit="std")
-
-
-def test_options_that_do_not_fit(found):
-    with pytest.raises(ValueError, match="n_action_steps=8 of each chunk"):
-        warm(found, "warm_smolvla", prior="preview")
-    with pytest.raises(ValueError, match="unknown prior 'nothing'"):
-        warm(found, "warm_smolvla", prior="nothing")
-    with pytest.raises(ValueError, match="use_relative_actions=true needs"):
-        warm(found, "warm_pi05", use_relative_actions=True)
-
-
 def write_dataset(root, episodes=3, steps=12):
     """Of lift's widths."""
     import numpy as np
@@ -296,25 +246,6 @@ def test_the_flow_policys_loss_is_algorithm_1(found):
         policy.forward({k: v for k, v in batch.items() if k != "action_is_pad"})
 
 
-def test_a_copied_flow_policy_trains_its_own_weights(found):
-    policy = flow_policy(found)
-    policy.forward(flow_batch(8))
-    replaced = flow_policy(found)
-    replaced.forward(flow_batch(8))
-    replaced.load_state_dict(policy.state_dict(), assign=True)
-    for other in (copy.deepcopy(policy), replaced):
-        other.forward(flow_batch(8))[0].backward()
-        assert all(weight.grad is not None for weight in other.parameters())
-
-
-def test_only_the_extremes_bound_a_flow_policys_actions(found):
-    from lerobot.configs.types import NormalizationMode
-
-    assert flow_policy(found).actor.ode.clip == 1.0
-    units = {"STATE": NormalizationMode.MEAN_STD, "ACTION": NormalizationMode.MEAN_STD}
-    assert flow_policy(found, normalization_mapping=units).actor.ode.clip is None
-
-
 def test_the_flow_policy_remembers(found):
     policy = flow_policy(found, prior="past,sigma=0.0").eval()
     sources = []
@@ -333,38 +264,6 @@ def test_the_flow_policy_remembers(found):
     chunks = [policy.predict_action_chunk(dict(batch)) for _ in range(2)]
     assert not torch.equal(sources[3], actions[:, 4:8])
     assert torch.equal(sources[4], chunks[0])
-
-
-class TrainedPast(PastPrior, torch.nn.Module):
-    name = "trained-in-lerobot"
-
-    def __init__(self, chunk_length):
-        torch.nn.Module.__init__(self)
-        super().__init__(chunk_length)
-
-
-def test_flow_policies_that_lerobot_could_not_train(found):
-    from warmprior import VelocityMLP
-
-    with pytest.raises(ValueError, match="lerobot-train does not"):
-        flow_policy(found, prior="trained-in-lerobot")
-    for text, told in (
-        (
-            "past,speed=3",
-            r"PastPrior cannot be built from .*speed=3 .*takes chunk_length, sigma, corr",
-        ),
-        ("past,sigma", "written as name,option=value, got 'sigma'"),
-        ("past,sigma=1,sigma=2", "sigma is given twice"),
-    ):
-        with pytest.raises(ValueError, match=told):
-            flow_policy(found, prior=text)
-    with pytest.raises(ValueError, match=r"probability must be in \[0, 1\]"):
-        flow_policy(found, cold_probability=2.0)
-
-    network = json.dumps(VelocityMLP(2, 5, 9).config())
-    with pytest.raises(ValueError, match=r"'prediction_length': 9.*'prediction_length': 4"):
-        flow_policy(found, network=network)
-    assert flow_policy(found, network=json.dumps(VelocityMLP(2, 5, 4).config())).actor is not None
 
 
 class Halfway(StartPoint):

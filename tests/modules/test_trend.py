@@ -16,7 +16,6 @@ from warmprior import (
     PoseTrend,
     PreconditionedNetwork,
     RestingAction,
-    Source,
     SourceMoments,
     VelocityMLP,
     VelocityNetwork,
@@ -94,23 +93,6 @@ def windows(n=4000, noise=0.1, warm=False):
 def fit(batch, prior):
     generator = torch.Generator().manual_seed(0)
     return PoseTrend.fit(batch, prior, RestingAction(COLUMNS), generator=generator)
-
-
-class Seeing(GaussianPrior):
-    """A source around the grippers' position."""
-
-    name = "seeing-of-the-tests"
-
-    def distribution(self, history, observation=None):
-        source = super().distribution(history)
-        shift = RestingAction(COLUMNS)(observation[:, -1])[:, None]
-        return Source(source.loc + 0.5 * shift, 0.1 * source.scale, source.warm)
-
-
-def test_a_source_that_sees_the_observation():
-    """The source's trend is that of its draws, which depend on the observation where it sees it."""
-    trend = fit(windows(), Seeing(P))
-    torch.testing.assert_close(trend.source[:, :-1], torch.full((P, D_A - 1), 0.5), atol=0.02, rtol=0)
 
 
 def test_against_least_squares():

@@ -61,19 +61,6 @@ def test_l1_compares_predicted_samples(prior):
     torch.testing.assert_close(unreduced, errors * counted[..., None])
 
 
-def test_two_euler_steps_are_the_sampler_of_l1_flow():
-    prior = GaussianPrior(H)
-    actor, data = actor_for(prior), sample(prior, 5)
-    a0 = ends(prior, data)[0]
-
-    def predicted_sample(t, a):
-        return a + (1 - t) * actor.network(torch.full((5,), t), a, data["observation"])
-
-    half = a0 + 0.5 * (predicted_sample(0.0, a0) - a0)
-    found = actor(data, nfe=2, generator=torch.Generator().manual_seed(2))["vla_action", "chunk"]
-    torch.testing.assert_close(found, predicted_sample(0.5, half))
-
-
 @pytest.mark.parametrize("start", [None, Late()])
 @pytest.mark.parametrize("prior", PRIORS, ids=lambda prior: prior.name)
 @pytest.mark.parametrize("objective", ["velocity", "l1"])
@@ -125,38 +112,6 @@ def test_without_a_teacher_the_network_teaches_itself_and_no_gradient_flows_back
     parameters = list(actor.network.parameters())
     mine, theirs = (torch.autograd.grad(loss["loss_self_distillation"], parameters) for loss in (found, twin))
     assert all(torch.equal(a, b) for a, b in zip(mine, theirs, strict=True))
-
-
-def test_the_teacher_is_no_part_of_the_loss():
-    actor = actor_for(PastPrior(H))
-    plain = FlowMatchingLoss(actor)
-    loss = FlowMatchingLoss(actor, self_distillation=1.0, teacher=copy.deepcopy(actor.network))
-    assert loss.state_dict().keys() == plain.state_dict().keys()
-    assert len(list(loss.parameters())) == len(list(plain.parameters()))
-    assert loss.out_keys == ["loss_flow_matching", "loss_self_distillation"]
-
-
-@pytest.mark.parametrize("shape", [(), (6,), (2, 3)])
-def test_batch_shapes(shape):
-    prior = PastPrior(H)
-    actor, data = actor_for(prior), sample(prior, *shape)
-    found = losses_of(actor, data, self_distillation=1.0)["loss_self_distillation"]
-    flat = losses_of(actor, data.reshape(-1), self_distillation=1.0)["loss_self_distillation"]
-    assert found.shape == () and torch.equal(found, flat)
-
-
-def test_a_straight_flow_is_at_rest():
-    """Where every step leads to the same end, there is nothing left to distil."""
-
-    class ToTheObserved(nn.Module):
-        def forward(self, t, a, observation):
-            return (observation[:, :1, :2] - a) / (1 - t)[:, None, None]
-
-    prior = GaussianPrior(H)
-    data = sample(prior, 8)
-    data["vla_action", "chunk"] = data["observation"][:, :1, :2].expand(8, H, 2).contiguous()
-    found = losses_of(WarmPriorActor(ToTheObserved(), prior), data, self_distillation=1.0)
-    assert found["loss_flow_matching"] < 1e-10 and found["loss_self_distillation"] < 1e-10
 
 
 def test_one_step_learns_to_reach_one_of_two_modes():

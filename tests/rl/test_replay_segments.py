@@ -92,24 +92,6 @@ def test_what_was_not_committed_is_ignored_and_replaced(tmp_path):
     assert (ReplaySegments(tmp_path, again.committed).load() == batch(7)).all()
 
 
-def test_a_write_that_fails_loses_nothing(tmp_path, monkeypatch):
-    segments = ReplaySegments(tmp_path)
-    segments.append(batch(3))
-
-    def full_disk(tensors, path):
-        path.write_bytes(b"half a fi")
-        raise OSError("no space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("warmprior.rl.replay_segments.save_file", full_disk)
-        with pytest.raises(OSError, match="no space left"):
-            segments.write()
-    assert segments.committed == 0 and segments.load() is None and not list(tmp_path.iterdir())
-    segments.append(batch(1, start=3))
-    segments.write()
-    assert (segments.load() == batch(4)).all()
-
-
 @pytest.mark.parametrize("damage", ["missing", "torn"])
 def test_a_segment_that_is_gone_is_named(tmp_path, damage):
     segments = ReplaySegments(tmp_path)

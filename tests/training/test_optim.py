@@ -22,21 +22,6 @@ def test_group_values_are_the_paper_s():
     assert sum(sizes) == sum(p.numel() for p in network.parameters())
 
 
-def test_group_values_are_passed_on():
-    optimizer = make_optimizer(
-        VelocityMLP(2, 3, 4), learning_rate=0.5, weight_decay=0.25, betas=(0.1, 0.2), eps=1e-3
-    )
-    decay, rest = optimizer.param_groups
-    assert (decay["weight_decay"], rest["weight_decay"]) == (0.25, 0.0)
-    assert decay["lr"] == rest["lr"] == 0.5
-    assert decay["betas"] == (0.1, 0.2) and decay["eps"] == 1e-3
-
-
-def test_a_plain_module_decays_everything():
-    (group,) = make_optimizer(nn.Linear(2, 3), weight_decay=0.1).param_groups
-    assert group["weight_decay"] == 0.1 and len(group["params"]) == 2
-
-
 def test_first_step_of_adamw_by_hand():
     """After one step: w - lr * decay * w - lr * g / (|g| + eps)."""
     network = VelocityMLP(1, 1, 1, 1, hidden_dim=4)
@@ -90,12 +75,6 @@ def test_average_is_the_recurrence():
         torch.testing.assert_close(average.module.weight, torch.full((3, 2), expected))
     assert network.weight.requires_grad and not average.module.weight.requires_grad
     assert not average.module.training
-
-
-@pytest.mark.parametrize("rate", [-0.1, 1.0, 2.0])
-def test_bad_rate(rate):
-    with pytest.raises(ValueError, match="EMA rate"):
-        ema_of(nn.Linear(1, 1), rate)
 
 
 def test_a_compiled_network_has_the_same_groups():

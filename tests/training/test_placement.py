@@ -7,7 +7,7 @@ import threading
 import pytest
 import torch
 
-from tests.training.cloning_parts import CONFIG, actor_for, dataset, same, training, weights
+from tests.training.cloning_parts import dataset, same, training, weights
 from warmprior.training import placement
 from warmprior.training.checkpoint import load_state
 from warmprior.training.placement import Prefetch, placed
@@ -17,31 +17,6 @@ def numbers(seed=0):
     """A source of batches and its generator."""
     generator = torch.Generator().manual_seed(seed)
     return (lambda: torch.rand(3, generator=generator)), generator
-
-
-def test_batches_are_those_of_the_source():
-    sample, _ = numbers()
-    expected = [sample() for _ in range(5)]
-    batches = Prefetch(*numbers())
-    assert all(torch.equal(batches(), value) for value in expected)
-
-
-def test_the_next_batch_is_drawn_by_another_thread_meanwhile():
-    drawn, threads = threading.Event(), []
-    sample, generator = numbers()
-
-    def telling():
-        threads.append(threading.current_thread())
-        if len(threads) == 2:
-            drawn.set()
-        return sample()
-
-    batches = Prefetch(telling, generator)
-    batches()
-    assert drawn.wait(10)  # though it was not asked for
-    assert threading.main_thread() not in threads
-    batches.close()
-    assert not any(thread.is_alive() for thread in threads)
 
 
 @pytest.mark.parametrize("stop", [0, 1, 4])
@@ -92,19 +67,6 @@ def test_stopping_changes_nothing(tmp_path, stop):
     assert not [t for t in threading.enumerate() if t.name.startswith("prefetch")]
 
 
-def test_data_that_moved_to_the_device_go_on(tmp_path):
-    """And back: with other draws, but from the same weights."""
-    part = training(tmp_path, prefetch=True)
-    for _ in range(7):
-        part.step()
-    part._save()
-    plain = training(tmp_path)
-    assert plain.iteration == 7
-    plain.run(None)
-    assert "rng/windows" not in load_state(tmp_path / "state.safetensors")[0]
-    assert training(tmp_path, prefetch=True).iteration == CONFIG.iterations
-
-
 @pytest.mark.parametrize(("free", "fits"), [(4.1, True), (1.9, False)])
 def test_data_go_to_the_gpu_where_they_fit(monkeypatch, free, fits):
     """Half of what is free is left to the network."""
@@ -115,11 +77,3 @@ def test_data_go_to_the_gpu_where_they_fit(monkeypatch, free, fits):
     assert placement.DEVICE_SHARE == 0.5
     assert placed(data, "cuda") == "moved" if fits else placed(data, "cuda") is data
     assert moved == ([torch.device("cuda")] if fits else [])
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU here")
-def test_data_behind_a_network_on_the_gpu(tmp_path):
-    cloning = training(tmp_path, actor=actor_for().to("cuda"))
-    cloning.run(None)
-    assert "rng/windows" in load_state(tmp_path / "state.safetensors")[0]
-    assert all(torch.isfinite(value).all() for value in weights(cloning).values())

@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from warmprior import GaussianPrior, PastPrior
+from warmprior import PastPrior
 from warmprior.modules import PreconditionedNetwork
 from warmprior.training import (
-    BehaviourCloning,
     NetworkOptions,
     TrainingConfig,
     load_policy,
@@ -55,15 +54,6 @@ def test_an_interrupted_training_continues_to_the_same_policy(tmp_path):
     for checkpoint in (4, 8):
         paths = [policy_path(tmp_path / name, checkpoint) for name in ("whole", "cut")]
         assert equal(*map(load_policy, paths))
-
-
-def test_a_finished_training_is_found(tmp_path, monkeypatch):
-    first = train(tmp_path)
-    monkeypatch.setattr(BehaviourCloning, "step", lambda self: pytest.fail("trained again"))
-    assert equal(train(tmp_path), first)
-    for other in ({"prior": GaussianPrior(4)}, {"training": TrainingConfig(iterations=9)}):
-        with pytest.raises(ValueError, match=str(tmp_path)):
-            train(tmp_path, **other)
 
 
 def test_what_is_done_before_makes_no_difference(tmp_path):

@@ -74,15 +74,6 @@ def test_specs():
     assert spec.shape == (3, 16, 16) and spec.dtype == torch.uint8
 
 
-@pytest.mark.parametrize(
-    ("cameras", "size", "said"),
-    [((), 8, "different cameras"), (("a", "a"), 8, "different cameras"), (("a",), 0, "1 pixel")],
-)
-def test_bad_options(cameras, size, said):
-    with pytest.raises(ValueError, match=said):
-        CameraImages(cameras, size)
-
-
 @apart
 def test_environments_that_cannot_be_rendered_say_so():
     blind = TransformedEnv(RobosuiteEnv("lift"), CameraImages(["agentview"], 8))

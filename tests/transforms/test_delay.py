@@ -17,15 +17,11 @@ from warmprior import (
     InferenceDelay,
     PastPrior,
     PreviewPrior,
-    RealTimeChunking,
-    VelocityMLP,
-    WarmPriorActor,
     keys,
     policy_transforms,
 )
 from warmprior.diagnostics import executed_actions, mean_revision, smoothness
 from warmprior.history import ENTRIES
-from warmprior.training import play_episode
 from warmprior.transforms import executed_chunk
 
 PRIORS = {prior.name: prior for prior in (GaussianPrior(6), PastPrior(6), PreviewPrior(6))}
@@ -217,35 +213,6 @@ def test_specs_and_jumps_where_chunks_take_effect():
     assert mean_revision(rollout) == pytest.approx(float(expected), rel=1e-5)
 
 
-class Judged(CountingEnv):
-    def __init__(self, length):
-        super().__init__(length)
-        flag = self.full_done_spec["done"].clone()
-        self.observation_spec["success"] = flag
-
-    def _reset(self, tensordict=None, **kwargs):
-        return super()._reset().set("success", torch.zeros(1, dtype=torch.bool))
-
-    def _step(self, tensordict):
-        return super()._step(tensordict).set("success", torch.ones(1, dtype=torch.bool))
-
-
-def test_episodes_keep_what_was_executed():
-    torch.manual_seed(0)
-    prior = PRIORS["past"]
-    network = VelocityMLP(ACTION_DIM, 4, 6, observation_steps=1, hidden_dim=8)
-    actor = WarmPriorActor(network, prior, nfe=2, guidance=RealTimeChunking())
-    env = TransformedEnv(Judged(17), policy_transforms(prior, observation_steps=1, execute=4, delay=2))
-    episode = play_episode(actor, env, seed=3)
-    decisions = episode.decisions
-    assert episode.steps == 17 and decisions["next", "executed_steps"].sum() == 17
-    assert decisions["rtc", "delay"].flatten().tolist() == [0, 2, 2, 2, 2]
-    played = executed_chunk(decisions)
-    for d in range(1, len(decisions)):
-        assert torch.equal(decisions[keys.FORECAST][d, :2], played[d - 1, 4:])
-        assert torch.equal(played[d, :2], played[d - 1, 4:])
-
-
 def test_numbers_that_do_not_go_together():
     with pytest.raises(ValueError, match=r"delay of 4.*3 actions.*0 <= delay <= execute"):
         InferenceDelay(4, execute=3)
@@ -272,10 +239,3 @@ def test_numbers_that_do_not_go_together():
     )
     with pytest.raises(RuntimeError, match=r"executed 6 actions.*execute=4"):
         wrong.rollout(2)
-
-
-def test_a_delay_alone_chooses_how_many_are_executed():
-    env = TransformedEnv(CountingEnv(30), policy_transforms(PRIORS["past"], observation_steps=1, delay=2))
-    assert env.rollout(3, told(6))["next", "executed_steps"].flatten().tolist() == [4, 4, 4]
-    env = TransformedEnv(CountingEnv(30), policy_transforms(PRIORS["preview"], observation_steps=1, delay=2))
-    assert env.rollout(3, told(12))["next", "executed_steps"].flatten().tolist() == [6, 6, 6]
