@@ -76,15 +76,6 @@ def content(tmp_path_factory) -> bytes:
     return path.read_bytes()
 
 
-@pytest.mark.parametrize("missing", ["RepoNotFound", "EntryNotFound"])
-def test_mirror_when_the_first_has_nothing(hub, content, tmp_path, missing):
-    hub.missing = missing
-    hub.put(MIRROR, content)
-    path = download_robomimic("square", root=tmp_path, endpoint=hub.address)
-    assert path.read_bytes() == content
-    assert hub.requests["GET", MIRROR] == 1
-
-
 def test_is_fetched_once(hub, content, tmp_path):
     hub.put(FIRST, content)
     options = {"root": tmp_path, "endpoint": hub.address}

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-
 import numpy as np
 import pytest
 import torch
@@ -19,7 +17,6 @@ from tests.data.synthetic import env_args_15
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.data import LeRobotExperienceReplay
 from warmprior.data.lerobot_index import action_names, state_names
-from warmprior.data.opening import open_demonstrations
 from warmprior.envs.tasks import TASKS
 
 H, TO = 4, 3
@@ -155,42 +152,3 @@ def test_observations_of_a_task_are_found_by_their_widths(tmp_path, layout):
     expected = np.concatenate([values[name] for name in LAYOUTS[layout]], -1)
     np.testing.assert_array_equal(replay.data["observation"].numpy(), expected)
     assert replay.observation_keys == TASKS["lift"].low_dim_keys
-
-
-def test_of_a_repository_only_what_is_read_is_fetched(written, tmp_path, monkeypatch):
-    source, asked = written[0], []
-
-    def snapshot_download(repository, **options):
-        asked.append((repository, options["revision"], options["allow_patterns"]))
-        target = tmp_path / "snapshot"
-        for pattern in options["allow_patterns"]:
-            files = source.glob("meta/**/*") if pattern == "meta/*" else source.glob(pattern)
-            for file in files:
-                if file.is_file():
-                    to = target / file.relative_to(source)
-                    to.parent.mkdir(parents=True, exist_ok=True)
-                    shutil.copy(file, to)
-        return str(target)
-
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
-    monkeypatch.chdir(tmp_path)
-    replay = LeRobotExperienceReplay("user/lift", image_keys=["agentview_image"], demos=1)
-    assert asked == [
-        ("user/lift", "v3.0", ["meta/*"]),
-        ("user/lift", "v3.0", ["data/chunk-000/file-000.parquet"]),
-    ]
-    expected = LeRobotExperienceReplay(source, image_keys=["agentview_image"], demos=1)
-    assert (replay.data == expected.data).all()
-    LeRobotExperienceReplay("user/lift", demos=1, revision="main")
-    assert asked[2:] == [("user/lift", "main", ["meta/*"])]  # the rest is there
-    # Digest and checks of a part need no more than that part.
-    found = open_demonstrations("lerobot:user/lift")
-    assert len(found.index().demos) == 3 and found.name == "lerobot:lift"
-    whole = open_demonstrations(f"lerobot:{source}")
-    assert found.digest(demos=1) == whole.digest(demos=1) != whole.digest()
-    assert [files for *_, files in asked[3:]] == [["meta/*"]] * 2
-    del asked[3:]
-    # What was recorded here is taken from where LeRobot keeps it.
-    local = shutil.copytree(source, tmp_path / "home" / "user" / "mine")
-    assert LeRobotExperienceReplay("user/mine").path == local and len(asked) == 3

@@ -3,14 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -21,19 +16,12 @@ pytest.importorskip("h5py")
 
 import h5py
 
-from tests.processes import ended
 from warmprior.data.scripted import generate as generate_module
 from warmprior.data.scripted import generate_demonstrations
 from warmprior.data.scripted.episode import Episode, expert_loop, operator_of, run_episode
 from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs.simulator import make_simulator
 from warmprior.envs.tasks import TASKS
-
-
-@pytest.fixture(scope="module")
-def lift_file(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("cache")
-    return generate_demonstrations("lift", n=3, cache_dir=folder, workers=1, progress=False)
 
 
 def contents(path):
@@ -50,18 +38,18 @@ def contents(path):
     return found
 
 
-def test_the_number_of_workers_does_not_matter(lift_file, tmp_path):
+def test_the_number_of_workers_does_not_matter(lift_demonstrations, tmp_path):
     other = generate_demonstrations(
         "lift", n=3, path=tmp_path / "deep" / "two.hdf5", workers=2, progress=False
     )
-    first, second = contents(lift_file), contents(other)
+    first, second = contents(lift_demonstrations), contents(other)
     assert first.keys() == second.keys()
     for name, value in first.items():
         np.testing.assert_array_equal(value, second[name], err_msg=name)
 
 
-def test_layout_is_robomimics(lift_file):
-    with h5py.File(lift_file) as file:
+def test_layout_is_robomimics(lift_demonstrations):
+    with h5py.File(lift_demonstrations) as file:
         data = file["data"]
         demos = sorted(data, key=lambda name: int(name[5:]))
         assert demos == ["demo_0", "demo_1", "demo_2"]
@@ -98,9 +86,9 @@ def test_layout_is_robomimics(lift_file):
     assert not {"better", "okay", "worse"} & masks.keys()
 
 
-def test_recorded_states_and_actions_replay(lift_file):
+def test_recorded_states_and_actions_replay(lift_demonstrations):
     """The stored observations are those of the simulator that the file itself describes."""
-    with h5py.File(lift_file) as file:
+    with h5py.File(lift_demonstrations) as file:
         env_args = json.loads(file["data"].attrs["env_args"])
         demo = file["data/demo_1"]
         states, actions = demo["states"][()], demo["actions"][()]
@@ -224,44 +212,3 @@ def test_success_rate(task, style, count, least):
     loop = expert_loop(task)
     successes = sum(run_episode(loop, task, style, seed).success for seed in range(count))
     assert successes / count >= least
-
-
-GENERATING = """
-import multiprocessing, sys, threading, time
-from unittest.mock import MagicMock
-from warmprior.data.scripted import generate
-generate.expert_loop = MagicMock()
-generate.run_episode = lambda *args: time.sleep(300)
-def tell():
-    while len(multiprocessing.active_children()) < 2:
-        time.sleep(0.05)
-    print(*(process.pid for process in multiprocessing.active_children()), flush=True)
-threading.Thread(target=tell, daemon=True).start()
-generate.generate_demonstrations("lift", n=4, path=sys.argv[1], workers=2, progress=False)
-"""
-
-
-SLOWLY = [pytest.param(s, marks=pytest.mark.slow) for s in (signal.SIGTERM, signal.SIGINT)]
-
-
-@pytest.mark.parametrize("sent", [signal.SIGKILL, *SLOWLY])
-def test_workers_end_with_whoever_generates(sent, tmp_path):
-    process = subprocess.Popen(
-        [sys.executable, "-c", GENERATING, str(tmp_path / "out.hdf5")],
-        cwd=Path(__file__).parents[2],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    pids = [int(word) for word in process.stdout.readline().split()]
-    time.sleep(1.0)
-    process.send_signal(sent)
-    started = time.monotonic()
-    process.wait(30)
-    while not all(ended(pid) for pid in pids) and time.monotonic() < started + 10:
-        time.sleep(0.05)
-    survivors = [pid for pid in pids if not ended(pid)]
-    for pid in survivors:
-        os.kill(pid, signal.SIGKILL)
-    assert len(pids) == 2 and not survivors
-    assert time.monotonic() - started < 20  # and not the 300 of an episode

@@ -90,21 +90,6 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
         assert torch.isfinite(curvature(policy(lazy, prior), data.exclude("vla_action"))["kappa"]).all()
 
 
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        (lambda d: d.exclude("observation"), KeyError, "observation"),
-        (lambda d: d.exclude(("history", "steps")), KeyError, "steps"),
-        (lambda d: d[:0], ValueError, "no observation"),
-        (lambda d: d.update({"observation": d["observation"] * torch.nan}), ValueError, "NaN"),
-        (lambda d: batch(length=H + 1), ValueError, "forecasts of 3"),
-    ],
-)
-def test_bad_batches_are_named(change, error, message):
-    with pytest.raises(error, match=message):
-        curvature(policy(lambda t, a, o: -a), change(batch()))
-
-
 def test_bad_options_and_policies_are_named():
     field = policy(lambda t, a, o: -a)
     with pytest.raises(ValueError, match="n_steps >= 2"):

@@ -81,12 +81,3 @@ def test_a_revision_counts_warm_positions():
     assert mean_revision(decided) == pytest.approx(float(expected))
     decided["prior", "warm"][:] = False
     assert math.isnan(mean_revision(decided))
-
-
-def test_bad_input_is_named():
-    for key in ("chunk", "loc"):
-        with pytest.raises(KeyError, match=key):
-            mean_revision(TensorDict({}, [3]))
-    with pytest.raises(KeyError, match="chunk"):
-        batch = windows(PastPrior(H)).exclude(("vla_action", "chunk"))
-        mean_error(WarmPriorActor(Still(), PastPrior(H)), batch)

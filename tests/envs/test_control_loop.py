@@ -35,7 +35,7 @@ def lift_env():
     return make_simulator(task_env_args("lift"))
 
 
-@pytest.mark.parametrize("task", ["lift", "can", "square", "stack", "transport"])
+@pytest.mark.parametrize("task", ["lift", "square", "transport"])
 def test_agrees_with_env_step(task):
     env = make_simulator(task_env_args(task))
     actions = random_actions(TASKS[task].action_dim)

@@ -18,9 +18,7 @@ from warmprior.envs import RobosuiteEnv
 
 RESULT = ["reward", "success", "done", "terminated", "truncated"]
 KINDS = {
-    "one arm": {"task": "square"},
     "two arms": {"task": "transport"},
-    "objects that touch": {"task": "tool_hang"},
     "robosuite's own loop": {"task": "lift", "control_loop": "robosuite"},
     "other observations": {"task": "lift", "low_dim_keys": ("object", "robot0_joint_vel")},
     "state and poses": {"task": "lift", "sim_state": True, "eef_pose": True},
@@ -71,7 +69,7 @@ def test_in_one_go(options):
             first += number
 
 
-@pytest.mark.parametrize("end", [1, 2, 3, 6])
+@pytest.mark.parametrize("end", [1, 3, 6])
 def test_an_episode_ends_on_the_way(monkeypatch, end):
     env = RobosuiteEnv("stack")
     actions, simulator, asked = actions_of(env, 8), env.loop.env, []
@@ -93,7 +91,7 @@ class Onlooker(Transform):
     """Does nothing, but nobody can know, so that it is run at every step."""
 
 
-@pytest.mark.parametrize("steps", [1, 2, 4])
+@pytest.mark.parametrize("steps", [1, 3])
 def test_chunks(steps):
     prior, found = PastPrior(8), []
     for before in ([], [Onlooker()]):

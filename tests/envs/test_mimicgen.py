@@ -32,7 +32,7 @@ def path(tmp_path, monkeypatch):
             del sys.modules[name]
 
 
-@pytest.mark.parametrize("task", ["stack_d0", "coffee_d0", "threading_d0"])
+@pytest.mark.parametrize("task", ["stack_d0", "coffee_d0"])
 def test_tasks_play_in_either_loop(path, capsys, task):
     write_mimicgen(path)
     rollouts = []

@@ -110,17 +110,3 @@ def test_metrics_of_known_paths():
     assert navigation_metrics(routes, 4).route_entropy == pytest.approx(2.0)
     assert navigation_metrics(routes[:2], 4).route_entropy == pytest.approx(1.0)
     assert navigation_metrics(above[None] + 0.01, 4).distance == pytest.approx(0.01, rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("heights", "chunk", "message"),
-    [
-        (torch.zeros(2, 63), 4, "64"),
-        (torch.zeros(0, 64), 4, "n > 0"),
-        (torch.full((2, 64), math.nan), 4, "NaN"),
-        (torch.zeros(2, 64), 64, "chunk_length"),
-    ],
-)
-def test_bad_heights_are_named(heights, chunk, message):
-    with pytest.raises(ValueError, match=message):
-        navigation_metrics(heights, chunk)

@@ -6,11 +6,8 @@ import itertools
 
 import pytest
 import torch
-from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import ChunkPolicy
-from warmprior import PastPrior, policy_transforms
 from warmprior.envs import GoalNavigationEnv, NavigationEnv, navigation_heights
 
 ROUTES = list(itertools.product((1, -1), repeat=2))
@@ -78,26 +75,3 @@ def test_the_way_there_is_that_of_the_environment_without_goal():
         a = plain.step(a.set("action", action))["next"].exclude("reward")
         b = goal.step(b.set("action", action))["next"].exclude("reward")
         assert all(torch.equal(a[key], b[key]) for key in ("observation", "height", "step_index"))
-
-
-def test_chunks_stop_at_the_end():
-    """An episode that ends inside a chunk executes no more of it."""
-    env = TransformedEnv(
-        GoalNavigationEnv((1, 1), batch_size=[6]),
-        policy_transforms(PastPrior(4), observation_steps=1),
-    )
-    chunks = navigation_heights().unflatten(1, (-1, 4)).unsqueeze(-1)
-    count = itertools.count()
-    rollout = env.rollout(
-        16,
-        ChunkPolicy(lambda data: chunks[:, min(next(count), 15)].clone()),
-        break_when_any_done=False,
-        auto_reset=True,
-        break_when_all_done=True,
-    )
-    first = int((torch.linspace(-1, 1, STEPS) + 0.45).abs().argmin())
-    executed = rollout["next", "executed_steps"].squeeze(-1)
-    done = rollout["next", "done"].squeeze(-1).long()
-    before_end = (done.cumsum(1) - done) == 0
-    total = (executed * before_end).sum(1)
-    assert total.tolist() == [STEPS] * 3 + [first + 1] * 3

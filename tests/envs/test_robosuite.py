@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from functools import partial
 
 import numpy as np
@@ -19,7 +18,6 @@ from warmprior.data.scripted.episode import PLANS
 from warmprior.data.scripted.motion import ArmRunner
 from warmprior.data.scripted.operators import SKILLED, Demonstrator
 from warmprior.envs import RobosuiteEnv, rendering_backend
-from warmprior.envs.simulator import task_env_args
 from warmprior.envs.tasks import TASKS
 
 make_lift = partial(RobosuiteEnv, "lift", horizon=15)
@@ -173,18 +171,6 @@ def test_built_from_the_env_args_of_a_file(lift):
     assert set(rollout["next", "reward"].unique().tolist()) <= {0.0, 1.0}
 
 
-def test_environment_outside_the_table_has_the_files_time_limit():
-    """Without one an evaluation would wait for a success that may never come."""
-    env_args = task_env_args("lift")
-    env_args["env_name"] = "Door"
-    env_args["env_kwargs"]["horizon"] = 3
-    assert RobosuiteEnv(env_args=env_args).rollout(10).shape == (3,)
-    assert RobosuiteEnv(env_args=env_args, horizon=2).rollout(10).shape == (2,)
-    env_args["env_kwargs"]["horizon"] = "long"
-    with pytest.raises(ValueError, match="horizon must be a number of steps, got 'long'"):
-        RobosuiteEnv(env_args=env_args)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -198,12 +184,6 @@ def test_environment_outside_the_table_has_the_files_time_limit():
 def test_bad_options(options, message):
     with pytest.raises(ValueError, match=message):
         RobosuiteEnv(**options)
-
-
-def test_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ImportError, match=r"warmprior\[sim\]"):
-        RobosuiteEnv("lift")
 
 
 @apart

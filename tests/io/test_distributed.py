@@ -31,19 +31,6 @@ def test_alone(monkeypatch):
     assert not launched()
 
 
-@pytest.mark.parametrize(
-    ("device", "said"),
-    [
-        ("cuda:7", "--device cuda:7 does not work here"),
-        ("meta", "--device meta does not work here"),
-        ("nothing", "--device nothing does not work here"),
-    ],
-)
-def test_a_device_that_is_not_there(two_gpus, device, said):
-    with pytest.raises(ValueError, match=said):
-        check_device(device)
-
-
 def test_several_processes_share_no_gpu(under_torchrun, two_gpus):
     with pytest.raises(ValueError, match="3 processes on a machine with 2 CUDA device"):
         check_device("cuda")

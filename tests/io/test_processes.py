@@ -142,6 +142,7 @@ print(ours.recv(), ours.recv() if ours.poll(60) else None)
 """
 
 
+@pytest.mark.slow
 def test_forked_workers_compute_gradients_after_something_was_compiled():
     # In a process of its own: autograd counts devices once.
     done = subprocess.run([sys.executable, "-c", FAKED], capture_output=True, text=True)

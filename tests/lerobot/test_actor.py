@@ -82,7 +82,7 @@ def environment(prior, base=None):
     return TransformedEnv(Arm() if base is None else base, policy_transforms(prior, observation_steps=1))
 
 
-@pytest.mark.parametrize("family", ["smolvla", "pi05", "xvla"])
+@pytest.mark.parametrize("family", ["smolvla", "xvla"])
 @pytest.mark.parametrize("prior", [PastPrior(LENGTH, sigma=0.0), PreviewPrior(LENGTH // 2, sigma=0.0)])
 def test_rollouts_start_from_the_mean(policy, family, prior):
     made = policy(family)

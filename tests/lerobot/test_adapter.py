@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from tests.lerobot.seen import at_times, watch
 from tests.lerobot.tiny import ACTION, LENGTH, observations, windows
 from tests.toy_env import Momentum
-from warmprior import ActionWindow, GaussianPrior, PastPrior, PreviewPrior
+from warmprior import ActionWindow, PastPrior, PreviewPrior
 from warmprior.history import window_history
 from warmprior.lerobot import RelativeActions, WarmPriorAdapter, action_std
 
@@ -204,15 +204,6 @@ def test_the_standard_deviation_in_a_policys_units(policy):
         WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit="data")
 
 
-class Looking(GaussianPrior):
-    """It sees the observation."""
-
-    name = "looking-in-lerobot"
-
-    def distribution(self, history, observation=None):
-        return super().distribution(history) if observation.any() else None
-
-
 def pipelines(made, stats):
     """The steps of pi0's own, which need the hub's tokenizer besides."""
     from lerobot.processor import (
@@ -259,22 +250,6 @@ def test_relative_actions_follow_the_state(built):
     absolute = first * std + mean + states[0][:, None]
     expected = (absolute - states[1][:, None] - mean) / std
     torch.testing.assert_close(seen.x[0][..., :ACTION], expected, rtol=1e-4, atol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("prior", "told"),
-    [
-        (PreviewPrior(5), "predicts 10 actions, .* have 8 .* chunk_length <= 4"),
-        (
-            PreviewPrior(4),
-            "n_action_steps=8 of each chunk, .* chunk_length=4: set n_action_steps to 4",
-        ),
-        (Looking(8), "Looking.* cannot be the source .* history and no observation: 'NoneType'"),
-    ],
-)
-def test_priors_that_do_not_fit(policy, prior, told):
-    with pytest.raises(ValueError, match=told):
-        WarmPriorAdapter(policy("pi05"), prior)
 
 
 def test_batches_that_do_not_fit(policy):

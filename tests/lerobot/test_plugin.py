@@ -166,6 +166,7 @@ TRAIN = """--policy.type=warm_flow --policy.embedding_dim=24 --policy.num_layers
 --policy.push_to_hub=false --steps=2 --batch_size=4 --num_workers=0 --save_freq=2"""
 
 
+@pytest.mark.slow
 def test_lerobot_trains_and_evaluates_it(found, tmp_path, monkeypatch):
     """The commands of the documentation, offline."""
     pytest.importorskip("robosuite")

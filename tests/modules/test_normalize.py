@@ -55,6 +55,11 @@ def test_constant_dimension():
     out = normalizer.normalize(raw)
     assert (out["observation"][:, 1] == 0).all()
     assert (normalizer.denormalize(out)["observation"][:, 1] == 7.5).all()
+    # Noise counts by the size of what it is on: of a body far from the origin it is larger.
+    for middle, noise in ((0.0, 1e-6), (1000.0, 1e-3)):
+        resting = raw.clone()
+        resting["observation"][:, 1] = middle + noise * torch.linspace(-1, 1, 40)
+        assert Normalizer.fit(resting).scale("observation")[1] == 1.0
     moved = raw.clone()
     moved["observation"][:, 1] += 0.25  # a value that the data never showed stays finite
     assert torch.allclose(normalizer.normalize(moved)["observation"][:, 1], torch.tensor(0.25))

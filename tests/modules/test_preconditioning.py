@@ -129,8 +129,6 @@ def test_coefficients_are_gaussian_conditioning(path, t, means, v0, v1, rho, a):
     [
         (GaussianPrior(3), 0.0, 0.0),
         (PastPrior(1), 0.9, 0.0),
-        (PastPrior(2), 0.0, 0.0),
-        (PreviewPrior(2), 0.0, 0.0),
         (PreviewPrior(2, sigma=0.3), 0.0, 0.5),
         (GaussianPrior(1), 0.9, 0.0),
     ],

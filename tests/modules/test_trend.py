@@ -147,15 +147,3 @@ def test_config_and_state_bring_it_back():
     without = PreconditionedNetwork(mlp, moments=moments)
     assert "trend" not in without.config()
     assert not torch.equal(network(*inputs), without(*inputs))
-
-
-def test_refusals():
-    rest, one = RestingAction(COLUMNS), torch.ones(P, D_A)
-    with pytest.raises(ValueError, match=r"\[arms, 7\], got \[1, 6\]"):
-        RestingAction(COLUMNS[:, :6])
-    with pytest.raises(ValueError, match=r"10 actions needs .*got the shapes"):
-        PoseTrend(rest, one[0], one, one[:, :7])
-    with pytest.raises(ValueError, match="target holds NaN"):
-        PoseTrend(rest, one[0], one, one * math.nan)
-    with pytest.raises(ValueError, match=r"trend is of chunks \(P, d_a\) = \(5, 10\)"):
-        PreconditionedNetwork(VelocityMLP(D_A, D_O, P), trend=PoseTrend.zero(1, 5))

@@ -132,24 +132,9 @@ def test_gradient_of_the_residual_by_finite_differences():
         assert not decode(delta).requires_grad
 
 
-@pytest.mark.parametrize("delta", [0.0, -0.5, float("nan"), float("inf")])
-def test_no_box(delta):
-    with pytest.raises(ValueError, match="delta must be a finite number > 0"):
-        PriorDecoder(make_actor(PastPrior(H)), delta=delta)
-
-
 def test_regression_has_no_source_space():
     with pytest.raises(ValueError, match=r"trained at t = 0 alone.* no source space to act in"):
         PriorDecoder(make_actor(GaussianPrior(H), max_nfe=1), delta=0.5)
-
-
-@pytest.mark.parametrize("missing", ["observation", ("prior", "anchor"), ("prior", "delta")])
-def test_missing_key(missing):
-    prior = PastPrior(H)
-    data = batch(prior, 4)
-    del data[missing]
-    with pytest.raises(KeyError, match=missing[-1] if isinstance(missing, tuple) else missing):
-        PriorDecoder(make_actor(prior), delta=0.5)(data)
 
 
 def test_shapes_of_another_policy():

@@ -125,16 +125,6 @@ def test_buffer_of_another_wiring(missing):
     assert f"missing: [{missing!r}]" in error.value.args[0]
 
 
-def test_priority_weights():
-    """All weight on a row leaves that row's losses. Nothing random enters: it ended, nothing is distilled."""
-    data = batch().set("priority_weight", torch.tensor([2.0, 0, 0, 0, 0, 0]))
-    loss = build()
-    weighted = loss.reinforcement_loss(data)["loss_qvalue"]
-    alone = loss.reinforcement_loss(batch()[:1])["loss_qvalue"]
-    torch.testing.assert_close(weighted, alone)
-    assert not torch.isclose(weighted, loss.reinforcement_loss(batch())["loss_qvalue"])
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 def test_divergence_is_named(value):
     data = batch()

@@ -15,7 +15,6 @@ from warmprior import (
     ResidualSampler,
     VelocityMLP,
     WarmPriorActor,
-    make_prior_space_actor,
     make_prior_space_critic,
 )
 
@@ -73,21 +72,6 @@ def test_critics_see_residuals_in_units_of_the_box():
     value = small(data.clone())["state_action_value"]
     data["prior", "delta"] = 3 * data["prior", "delta"]
     torch.testing.assert_close(large(data)["state_action_value"], value)
-
-
-@pytest.mark.parametrize("make", [make_prior_space_actor, make_prior_space_critic])
-def test_bad_sizes(make):
-    with pytest.raises(ValueError, match="delta must be a finite number > 0"):
-        make(D_A, D_O, P, delta=0.0)
-    with pytest.raises(ValueError, match="hidden_dim must be at least 1"):
-        make(D_A, D_O, P, delta=1.0, hidden_dim=0)
-    with pytest.raises(ValueError, match="in_keys is empty"):
-        make(D_A, D_O, P, delta=1.0, in_keys=[])
-    network = make(D_A, D_O, P, TO, delta=1.0)
-    data = batch(4)
-    data["observation"] = torch.randn(4, TO, D_O + 1)
-    with pytest.raises(ValueError, match=r"built for .* inputs, got the shapes \[\(4, 2, 6\)"):
-        network(data)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ class Recorded(PriorSpaceTraining):
 
 @pytest.mark.parametrize(
     ("offset", "truncate", "bootstrap"),
-    [(1.0, True, False), (0.0, True, True), (0.25, False, True)],
+    [(1.0, True, False), (0.25, True, True)],
 )
 def test_transitions_are_those_of_a_rollout_by_hand(tmp_path, offset, truncate, bootstrap):
     training = make_training(
@@ -57,14 +57,13 @@ def test_the_warm_up_draws_from_the_prior_and_learns_nothing(tmp_path):
     assert not all(torch.equal(fresh[name], state[name]) for name in fresh)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize(
-    ("prior", "see_history"),
+    ("algorithm", "prior", "see_history"),
     [
-        (GaussianPrior(H), False),
-        (GaussianPrior(H), True),
-        (PastPrior(H), False),
-        (PreviewPrior(H), False),
+        ("dsrl-na", GaussianPrior(H), True),
+        ("dsrl-na", PastPrior(H), False),
+        ("dsrl-sac", GaussianPrior(H), False),
+        ("dsrl-sac", PreviewPrior(H), False),
     ],
 )
 def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, prior, see_history):
@@ -100,27 +99,9 @@ def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, 
         assert row["episodes"] == 2 and row["success_rate"] == row["successes"] / 2
 
 
-def test_both_algorithms_want_the_same_entropy(tmp_path):
-    """In units of the box."""
-    losses = {}
-    for algorithm in ALGORITHMS:
-        options = {"alpha_init": 3.0, "target_entropy": -2.5, "delta": 0.7}
-        training = make_training(tmp_path / algorithm, algorithm=algorithm, environment_steps=30, **options)
-        if algorithm == "dsrl-na":
-            training.run()
-            data, weights = training.buffer[:], training.agent.loss.actor_network_params
-        loss = training.agent.loss
-        loss.actor_network_params.data.copy_(weights.data)
-        torch.manual_seed(0)
-        losses[algorithm] = loss(data.clone())["loss_alpha"].item()
-    # In other units they would be 2.4 apart; TorchRL inverts the squashing numerically.
-    assert losses["dsrl-sac"] == pytest.approx(losses["dsrl-na"], abs=0.05)
-
-
-@pytest.mark.parametrize("delta", [0.5, 1.5])
-def test_the_targets_of_sac_by_hand(tmp_path, delta):
+def test_the_targets_of_sac_by_hand(tmp_path):
     """Squared errors to rewards and soft values, with entropies that do not depend on the box."""
-    options = {"algorithm": "dsrl-sac", "alpha_init": 0.7, "delta": delta, "gamma": 0.9}
+    options = {"algorithm": "dsrl-sac", "alpha_init": 0.7, "delta": 1.5, "gamma": 0.9}
     training = make_training(tmp_path, environment_steps=30, **options)
     training.run()
     loss, data = training.agent.loss, training.buffer[:]

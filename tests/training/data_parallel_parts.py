@@ -13,7 +13,6 @@ from torch import nn
 from tests.training.cloning_parts import CONFIG, actor_for, mlp, training, weights
 from warmprior import PastPrior, PreconditionedNetwork, SourceMoments
 from warmprior.io.distributed import rank
-from warmprior.objectives import OTCoupling
 
 STEPS = dataclasses.replace(
     CONFIG,
@@ -48,15 +47,7 @@ def standardised():
 CASES = {
     "plain": ({}, {}, lambda: actor_for(PastPrior(4), mlp())),
     "dropout, withheld": ({"cold_probability": 0.5}, {}, actor_for),
-    "prefetched": ({}, {"prefetch": True}, lambda: actor_for(PastPrior(4), mlp())),
-    "coupled": ({}, {"coupling": OTCoupling()}, lambda: actor_for(PastPrior(4), mlp())),
     "learning prior": ({}, {}, lambda: actor_for(LearningPrior(4), mlp())),
-    "distilled, standardised": (
-        {"self_distillation": 0.5, "weighting": "standardised"},
-        {},
-        lambda: actor_for(PastPrior(4), standardised()),
-    ),
-    "bf16": ({"precision": "bf16"}, {}, lambda: actor_for(PastPrior(4), mlp())),
 }
 """Recipes, options and policies."""
 

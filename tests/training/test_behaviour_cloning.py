@@ -57,7 +57,7 @@ def test_the_loop_by_hand(tmp_path):
     assert cloning.losses[1][1] == pytest.approx(sum(losses[10:]) / 2, rel=1e-4)
 
 
-@pytest.mark.parametrize("stop", [1, 6, 7, 8, 20, 23, 39])
+@pytest.mark.parametrize("stop", [6, 7, 23])
 def test_stopping_anywhere_changes_nothing(tmp_path, stop):
     """Without a kill: an exception in the middle of the loop, then a new object."""
     whole = training(tmp_path / "whole")

@@ -15,36 +15,30 @@ from warmprior.training import load_policy
 from warmprior.training.checkpoint import load_state
 
 
-@pytest.mark.parametrize(
-    ("part", "change"),
-    [
-        ("config", {"config": dataclasses.replace(CONFIG, learning_rate=2e-2)}),
-        ("config", {"config": dataclasses.replace(CONFIG, seed=1)}),
-        ("config", {"config": dataclasses.replace(CONFIG, iterations=80)}),
-        ("prior", {"actor": lambda: actor_for(PastPrior(4, sigma=0.1))}),
-        ("prior", {"actor": lambda: actor_for(PreviewPrior(4))}),
-        ("network", {"actor": lambda: actor_for(network=mlp())}),
-        ("data", {"data": lambda: dataset().set("action", torch.zeros(120, 2))}),
-    ],
-)
-def test_a_state_of_another_run(tmp_path, part, change):
+def test_a_state_of_another_run(tmp_path):
     training(tmp_path).run()
     before = (tmp_path / "state.safetensors").read_bytes()
-    change = {k: v() if callable(v) else v for k, v in change.items()}
-    with pytest.raises(ValueError, match=rf"belongs to another {part}: .*(folder|resume)"):
-        training(tmp_path, **change)
-    assert (tmp_path / "state.safetensors").read_bytes() == before
+    for part, change in (
+        ("config", {"config": dataclasses.replace(CONFIG, learning_rate=2e-2)}),
+        ("config", {"config": dataclasses.replace(CONFIG, seed=1)}),
+        ("prior", {"actor": actor_for(PastPrior(4, sigma=0.1))}),
+        ("prior", {"actor": actor_for(PreviewPrior(4))}),
+        ("network", {"actor": actor_for(network=mlp())}),
+        ("data", {"data": dataset().set("action", torch.zeros(120, 2))}),
+    ):
+        with pytest.raises(ValueError, match=rf"belongs to another {part}: .*(folder|resume)"):
+            training(tmp_path, **change)
+        assert (tmp_path / "state.safetensors").read_bytes() == before
 
 
-@pytest.mark.parametrize("moment", [1, 2, 5])
-def test_a_full_disk(tmp_path, monkeypatch, moment):
+def test_a_full_disk(tmp_path, monkeypatch):
     cloning = training(tmp_path)
     replace, calls = os.replace, 0
 
     def failing(*args):
         nonlocal calls
         calls += 1
-        if calls >= moment:
+        if calls >= 2:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return replace(*args)
 
@@ -60,7 +54,7 @@ def test_a_full_disk(tmp_path, monkeypatch, moment):
     assert same(weights(again), weights(whole))
 
 
-@pytest.mark.parametrize("bad", [8, 10, 13, 15, 21])
+@pytest.mark.parametrize("bad", [8, 15])
 def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
     """Wherever it appears between two logs or two saves, no NaN reaches the disk."""
     cloning = training(tmp_path)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
-import os
 import shutil
 
 import pytest
@@ -50,23 +48,6 @@ def test_a_lost_policy_is_rebuilt_and_not_trained_again(folder, damage):
     again.step = lambda: pytest.fail("trains again")
     again.run()
     assert {path.name: path.read_bytes() for path in policy.iterdir()} == before
-
-
-def test_a_folder_in_use_is_left_alone(folder, tmp_path):
-    cloning = training(tmp_path / "new")
-    (tmp_path / "new").mkdir()
-    other = os.open(tmp_path / "new", os.O_RDONLY)
-    fcntl.flock(other, fcntl.LOCK_EX)
-    with pytest.raises(BlockingIOError, match=rf"{tmp_path}/new is in use by another process"):
-        cloning.run()
-    assert not list((tmp_path / "new").iterdir())
-    os.close(other)  # as at the death of its process
-    cloning.run()
-    # Whoever only wants the finished policies needs nobody's leave.
-    other = os.open(folder, os.O_RDONLY)
-    fcntl.flock(other, fcntl.LOCK_EX)
-    training(folder).run()
-    os.close(other)
 
 
 # --------------------------------------------------------------------------- users' own parts

@@ -81,14 +81,3 @@ def test_what_is_not_known_is_said():
     assert "license" not in card and "Not measured" in card and "| environment | not known |" in card
     assert 'load_policy("me/it")' in card and "environment_of" not in card
     assert warmprior.__version__ in card
-
-
-def test_results_of_something_else_are_refused(run, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"has no results\.jsonl"):
-        policy_results(tmp_path, at(run))
-    for policy in (tmp_path / "elsewhere" / "policy_000020", at(run).with_name("state")):
-        with pytest.raises(ValueError, match=r"no row of .*name the run"):
-            policy_results(run, policy)
-    (run / "results.jsonl").write_text("{broken")
-    with pytest.raises(ValueError, match=r"results\.jsonl"):
-        policy_results(run, at(run))

@@ -105,11 +105,11 @@ def actor_for(prior=None):
     return WarmPriorActor(Recorder(), prior, nfe=2)
 
 
-@pytest.mark.parametrize("num_envs", [1, 2, 3])
+@pytest.mark.parametrize("num_envs", [1, 3])
 def test_every_episode_once(num_envs):
     env = environments(num_envs)
     try:
-        for episodes in range(1, 8):
+        for episodes in (1, 3, 7):
             actor = actor_for()
             result = evaluate(actor, env, episodes=episodes, first_seed=100)
             assert result == expected(100, episodes)
@@ -308,8 +308,7 @@ def batched(kind, make_env, num_envs, transforms_inside=False):
     return TransformedEnv(kind(num_envs, make_env, **options), policy_transforms(prior))
 
 
-@pytest.mark.parametrize("inside", [False, True])
-@pytest.mark.parametrize("kind", [SerialEnv, ParallelEnv])
+@pytest.mark.parametrize(("kind", "inside"), [(SerialEnv, False), (ParallelEnv, True)])
 def test_any_batched_environment_plays_every_seed_once(kind, inside, tmp_path):
     log = tmp_path / "resets"
     env = batched(kind, partial(PlainEnv, log=log), 3, inside)

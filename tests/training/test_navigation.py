@@ -60,7 +60,7 @@ def trained(tmp_path_factory):
     return train
 
 
-@pytest.mark.parametrize("name", ["gaussian", "regression", "history", "preview"])
+@pytest.mark.parametrize("name", ["regression", "preview"])
 def test_judgements_are_reproducible_and_of_what_was_played(trained, name):
     actor, nfe = trained(name, 5), 1 if name == "regression" else 9
     row = judge_navigation(actor, 1, nfe=nfe, rollouts=8)
@@ -92,8 +92,8 @@ def bent(actor, seed):
 
 
 def test_warm_sources_stop_mode_switching(trained):
-    """A third of the benchmark's budget, one seed: the contrast is far larger than what that costs."""
-    base, past = trained("gaussian", 1_000, 0), trained("past", 1_000, 0)
+    """A sixth of the benchmark's budget, one seed: the contrast is far larger than what that costs."""
+    base, past = trained("gaussian", 500, 0), trained("past", 500, 0)
     of_base, of_past = (judge_navigation(actor, 0, nfe=9) for actor in (base, past))
     assert of_base["switch_rate"] > 0.4 and of_base["collision_rate"] > 0.8
     assert of_past["switch_rate"] < 0.05 and of_past["collision_rate"] < 0.3

@@ -95,14 +95,6 @@ def test_a_folder_is_a_folder(hub, actor, tmp_path):
     assert not hub.requests
 
 
-def test_a_private_repository_needs_a_token(hub, actor):
-    push_policy(actor, NAME, token=TOKEN, private=True)
-    assert hub.repositories[NAME].private
-    with pytest.raises(OSError, match=NAME):
-        load_policy(NAME)
-    assert torch.equal(chunk(load_policy(NAME, token=TOKEN)), chunk(actor))
-
-
 def test_what_is_to_be_private_is_not_published(hub, actor):
     hub.repositories[NAME] = Repository(private=False)
     with pytest.raises(ValueError, match=f"{NAME} is there already, and public"):

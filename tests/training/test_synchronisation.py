@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, training
-from warmprior import ImageEncoder, PastPrior, PreviewPrior, VelocityMLP, VisionNetwork, WarmPriorActor
+from warmprior import ImageEncoder, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
 from warmprior.training import precondition
 
 READS = ("_local_scalar_dense", "nonzero", "is_nonzero", "equal", "masked_select", "lift_fresh")
@@ -58,12 +58,6 @@ CASES = {
         dataclasses.replace(CONFIG, weighting="standardised", times="u-shaped", self_distillation=1.0),
         dataset(),
         preconditioned(PastPrior(4, correlation=0.5)),
-    ),
-    "bf16": lambda: (dataclasses.replace(CONFIG, precision="bf16"), dataset(), actor_for()),
-    "l1": lambda: (
-        dataclasses.replace(CONFIG, objective="l1", times="logit-normal"),
-        dataset(),
-        preconditioned(PreviewPrior(2)),
     ),
     "learned": lambda: (
         CONFIG,

@@ -12,7 +12,6 @@ from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
     HistoryObservation,
-    PastPrior,
     VelocityMLP,
     WarmPriorActor,
     keys,
@@ -73,17 +72,6 @@ def test_stopping_with_a_teacher_changes_nothing(tmp_path):
     plain = training(tmp_path / "plain", replace(config, self_distillation=0.0))
     plain.run()
     assert not same(weights(plain), weights(whole))
-
-
-def test_regression_needs_a_policy_of_one_evaluation_before_training(tmp_path):
-    config = replace(CONFIG, times="start")
-    with pytest.raises(ValueError, match="build the policy with max_nfe=1"):
-        training(tmp_path, config, actor=WarmPriorActor(mlp(), PastPrior(4)))
-    assert not list(tmp_path.iterdir())
-    actor = WarmPriorActor(mlp(), GaussianPrior(4), max_nfe=1)
-    cloning = training(tmp_path, replace(config, iterations=2, checkpoints=1), actor=actor)
-    cloning.run(None)
-    assert load_policy(cloning.policy_path()).ode.max_nfe == 1
 
 
 def test_a_network_that_sees_the_last_actions(tmp_path):

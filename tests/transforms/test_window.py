@@ -161,35 +161,6 @@ def test_a_prior_may_need_more_than_a_chunk():
     del Prior._classes[Longer.name]
 
 
-@pytest.mark.parametrize("key", ["observation", "action", "episode"])
-def test_missing_entry(key):
-    data = steps([3, 4])
-    del data[key]
-    with pytest.raises(KeyError, match=f"the data lack '{key}'"):
-        ActionWindow(data, 2)
-
-
-def test_episodes_in_pieces():
-    data = steps([3, 4])
-    data["episode"] = torch.tensor([0, 0, 1, 1, 0, 2, 2])
-    with pytest.raises(ValueError, match="steps of episode 0 are not contiguous"):
-        ActionWindow(data, 2)
-
-
-def test_empty_or_batched_data():
-    data = steps([3, 4])
-    with pytest.raises(ValueError, match=r"flat steps \[N\] with N > 0"):
-        ActionWindow(data[:0], 2)
-    with pytest.raises(ValueError, match="flat steps"):
-        ActionWindow(steps([3, 3]).reshape(2, 3), 2)
-
-
-def test_no_frame():
-    window = ActionWindow(steps([3, 4]), 2)
-    with pytest.raises(KeyError, match="index of each sampled step under 'frame'"):
-        window(TensorDict({"other": torch.arange(3)}, [3]))
-
-
 @pytest.mark.parametrize(
     ("options", "told"),
     [
