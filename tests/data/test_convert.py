@@ -183,17 +183,17 @@ def test_images_are_compared_with_the_simulators(tmp_path_factory):
     path = generate_demonstrations("lift", n=1, path=tmp_path / "lift.hdf5", progress=False)
     options = {"fast": True, "progress": False, "workers": 1}
     render_demonstrations(path, ["agentview"], 32, out=path, **options)
-    told = {"demos": None, "fast": True}
+    asked = {"demos": None, "fast": True}
     for kind in ("image", "video"):
         folder = convert_robomimic(path, tmp_path / kind, images=kind, progress=False)
-        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **told)
+        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **asked)
     with pytest.raises(DatasetError, match=r"rendered fast, and in evaluation.*add --fast-rendering"):
         open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, demos=None, fast=False)
     with pytest.raises(DatasetError, match="no images 'sideview_image'"):
-        open_demonstrations(f"lerobot:{folder}").with_images(["sideview"], 32, **told)
+        open_demonstrations(f"lerobot:{folder}").with_images(["sideview"], 32, **asked)
     with h5py.File(path, "a") as file:
         for demo in file["data"].values():
             demo["obs/agentview_image"][...] = demo["obs/agentview_image"][()][:, ::-1]
     folder = convert_robomimic(path, tmp_path / "flipped", images="image", progress=False)
     with pytest.raises(DatasetError, match=r"images of agentview are upside down.*convert it again"):
-        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **told)
+        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **asked)

@@ -227,9 +227,9 @@ def test_images_upside_down_are_refused(picture):
     }
     with h5py.File(picture) as file:
         before = file[key][()]
-    for told, change in changes.items():
+    for message, change in changes.items():
         replaced(picture, lambda images, change=change: change(before), key)
-        with pytest.raises(DatasetError, match=f"images of agentview {told}"):
+        with pytest.raises(DatasetError, match=f"images of agentview {message}"):
             compare_images(picture, IMAGES, fast=True)
 
 

@@ -141,8 +141,8 @@ def test_measured_delays_on_a_fake_clock():
     assert [int(data["observation"]) for data in policy.given] == [0, 4, 8, 12, 17, 21, 25, 29]
     assert executor.delays == (1, 1, 1)
     # What was expected: 1 until there was a measurement, then the largest of the last three.
-    told = [int(data["rtc", "delay"]) for data in policy.given]
-    assert told == [0, 1, 2, 2, 5, 5, 5, 1]
+    delays = [int(data["rtc", "delay"]) for data in policy.given]
+    assert delays == [0, 1, 2, 2, 5, 5, 5, 1]
     for data in policy.given[1:]:
         step, left = float(data["observation"]), int(data["history", "forecast_steps"])
         expected = step + torch.arange(float(left))
@@ -338,7 +338,7 @@ def test_chunks_that_no_robot_should_get():
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "said"),
     [
         ({"execute": 6, "delay": 3}, r"8 actions do not reach 6.*delay of 3.*at most 5"),
         ({"latency": 5}, r"delay of 5.*too long for predictions of 8 actions.*at most 4"),
@@ -347,9 +347,9 @@ def test_chunks_that_no_robot_should_get():
         ({"prior": None}, "Told does not tell: give prior and action_dim"),
     ],
 )
-def test_options_that_cannot_be(options, told):
+def test_options_that_cannot_be(options, said):
     usual = {"prior": GaussianPrior(8), "action_dim": 2}
-    with pytest.raises(ValueError, match=told):
+    with pytest.raises(ValueError, match=said):
         AsyncExecutor(Told(8), **(usual | options))
     assert not [t for t in threading.enumerate() if t.name.startswith("warmprior-policy")]
 

@@ -8,7 +8,6 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
 
 from tests.diagnostics.fields import D_A, H, batch, policy, remember
 from warmprior import GaussianPrior, HistoryObservation, PastPrior, PreviewPrior, keys
@@ -179,21 +178,13 @@ def test_a_network_that_sees_the_history():
 
 def test_bad_input_is_named():
     actor, data = policy(passing(0.5)), windows(5)
-    for key in ("observation", ("vla_action", "chunk"), ("history", "actions")):
-        with pytest.raises(KeyError, match=key if isinstance(key, str) else key[1]):
-            source_leak(actor, data.exclude(key))
+    with pytest.raises(KeyError, match="chunk"):
+        source_leak(actor, data.exclude(("vla_action", "chunk")))
     with pytest.raises(ValueError, match="4 other episode"):
         source_leak(actor, data[:4], neighbours=4)
     with pytest.raises(ValueError, match="each of the 5 windows"):
         source_leak(actor, data, episodes=torch.zeros(4))
-    for option in ({"draws": 1}, {"neighbours": 0}, {"split": 0}):
-        with pytest.raises(ValueError, match="need draws"):
-            source_leak(actor, data, **option)
-    with pytest.raises(ValueError, match="network evaluations"):
-        source_leak(actor, data, nfes=(0, 1))
-    with pytest.raises(ValueError, match="has none"):
-        source_leak(actor, data, nfes=())
+    with pytest.raises(ValueError, match="need draws"):
+        source_leak(actor, data, draws=1)
     with pytest.raises(FloatingPointError, match="NFE 9"):
         source_leak(policy(lambda t, a, o: a / (t < 0.5)), data)
-    with pytest.raises(ValueError, match="no observation"):
-        source_leak(actor, TensorDict(data[:0], [0]))

@@ -91,12 +91,13 @@ class Onlooker(Transform):
     """Does nothing, but nobody can know, so that it is run at every step."""
 
 
-@pytest.mark.parametrize("steps", [1, 3])
-def test_chunks(steps):
+@pytest.mark.parametrize(("steps", "last"), [(1, 5), (3, 1)])
+def test_chunks(steps, last):
+    """Also where a chunk's first action is the episode's last."""
     prior, found = PastPrior(8), []
     for before in ([], [Onlooker()]):
         transforms = [*before, *policy_transforms(prior, observation_steps=steps)]
-        env = TransformedEnv(RobosuiteEnv("can", horizon=29))
+        env = TransformedEnv(RobosuiteEnv("can", horizon=24 + last))
         for transform in transforms:
             env.append_transform(transform.clone())
         env.set_seed(2)
@@ -107,6 +108,6 @@ def test_chunks(steps):
             rows.append(data["next"])
             data = env.step_mdp(data)
         assert rows[-1]["truncated"]
-        assert rows[-1]["executed_steps"] == 5
+        assert rows[-1]["executed_steps"] == last
         found.append(torch.stack(rows))
     assert (found[0] == found[1]).all()

@@ -31,14 +31,14 @@ def executing(prior, count, first=1):
 
 def test_a_history_moves_by_what_was_executed():
     memory = executing(PreviewPrior(3), 2)
-    told = {
+    expected = {
         "actions": [0, 1, 2],
         "steps": [2],
         "forecast": [3, 4, 5, 6, 0, 0],
         "forecast_steps": [4],
     }
-    assert row(memory.decide(2)) == told
-    assert row(memory.decide(2)) == told  # a decision without a chunk does not count
+    assert row(memory.decide(2)) == expected
+    assert row(memory.decide(2)) == expected  # a decision without a chunk does not count
     memory.record(chunk(11, 6))
     memory.executed(torch.tensor([3, 0]))
     history = memory.decide(2)

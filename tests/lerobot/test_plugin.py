@@ -191,8 +191,8 @@ def test_lerobot_trains_and_evaluates_it(found, tmp_path, monkeypatch):
     episodes = ["--eval.n_episodes=1", "--eval.batch_size=1", "--policy.device=cpu"]
     out = f"--output_dir={tmp_path / 'evaluation'}"
     run("lerobot-eval", f"--policy.path={policy}", *environment, *episodes, out)
-    told = json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())
-    assert told["overall"]["n_episodes"] == 1
+    results = json.loads((tmp_path / "evaluation" / "eval_info.json").read_text())
+    assert results["overall"]["n_episodes"] == 1
 
 
 def flow_policy(found, **options):

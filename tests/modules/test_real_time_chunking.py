@@ -205,7 +205,7 @@ def test_trust_region_bounds_what_is_perpendicular_to_the_velocity():
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "said"),
     [
         ({"schedule": "cosine"}, "unknown schedule 'cosine'.*exp, linear, ones, zeros"),
         ({"horizon": 0}, "horizon must be a whole number"),
@@ -213,8 +213,8 @@ def test_trust_region_bounds_what_is_perpendicular_to_the_velocity():
         ({"sigma": -0.1}, "sigma must be >= 0"),
     ],
 )
-def test_options_that_cannot_be(options, told):
-    with pytest.raises(ValueError, match=told):
+def test_options_that_cannot_be(options, said):
+    with pytest.raises(ValueError, match=said):
         RealTimeChunking(**options)
 
 

@@ -83,8 +83,8 @@ def test_what_cannot_be_paired():
     couple, chunk = OTCoupling(), torch.zeros(2, H, 1)
     with pytest.raises(ValueError, match="at least 2"):
         couple(chunk[:1], chunk[:1], torch.zeros(1, 1, 3))
-    for told, seen in (("none", None), ("nested", TensorDict({"pose": torch.zeros(2, 3)}, [2]))):
-        with pytest.raises(ValueError, match=f"compares .*{told}.*observation_weight=0"):
+    for said, seen in (("none", None), ("nested", TensorDict({"pose": torch.zeros(2, 3)}, [2]))):
+        with pytest.raises(ValueError, match=f"compares .*{said}.*observation_weight=0"):
             couple(chunk, chunk, seen)
         OTCoupling(0.0)(chunk, chunk, seen)
     for weight in (-1.0, float("inf"), float("nan"), True, "abc"):

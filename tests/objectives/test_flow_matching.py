@@ -207,7 +207,7 @@ def test_missing_key(missing):
 
 
 @pytest.mark.parametrize(
-    ("made_for", "told"),
+    ("made_for", "said"),
     [
         (
             PreviewPrior(H),
@@ -216,8 +216,8 @@ def test_missing_key(missing):
         (PastPrior(H - 1), r"has 2 positions, but PastPrior.* predicts 3: make the windows"),
     ],
 )
-def test_windows_of_other_lengths(made_for, told):
-    with pytest.raises(ValueError, match=told):
+def test_windows_of_other_lengths(made_for, said):
+    with pytest.raises(ValueError, match=said):
         loss_of(actor_for(PastPrior(H)), sample(made_for, 6))
     data = sample(PastPrior(H), 6)
     data["history"] = sample(made_for, 6)["history"]

@@ -202,8 +202,8 @@ def test_grippers_go_where_they_are_told(env):
             if steps[row] == H:
                 np.testing.assert_allclose(reached[row], ends[row], atol=2e-5)
             else:
-                told = chunks[row][int(steps[row]) - 1]
-                np.testing.assert_allclose(reached[row][:, 3], told[:3], atol=2e-5)
+                goal = chunks[row][int(steps[row]) - 1]
+                np.testing.assert_allclose(reached[row][:, 3], goal[:3], atol=2e-5)
         td = following
     assert steps.max() <= H
 

@@ -85,6 +85,14 @@ def test_partial_reset_and_step():
     assert stepped["executed_steps"].flatten().tolist() == [0, 3]
 
 
+def test_rows_that_rest_count_for_no_measure():
+    env = TransformedEnv(SerialEnv(2, partial(CountingEnv, 9)), ChunkStep(3, measures={"observation": "sum"}))
+    data = env.step_mdp(env.step(ones(3)(env.reset())))
+    assert data["observation"][:, 0].tolist() == [1 + 2 + 3] * 2
+    stepped = env.step(ones(3)(data).set("_step", torch.tensor([False, True])))["next"]
+    assert stepped["observation"][:, 0].tolist() == [0, 4 + 5 + 6]
+
+
 @pytest.mark.parametrize("prediction", [3, 6])
 def test_specs(prediction):
     env = TransformedEnv(SerialEnv(2, partial(CountingEnv, 5)), ChunkStep(3, prediction_length=prediction))

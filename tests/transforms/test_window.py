@@ -162,7 +162,7 @@ def test_a_prior_may_need_more_than_a_chunk():
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"observation_steps": 0}, "observation_steps must be at least 1, got 0"),
         ({"chunk_length": 0}, r"need 1 <= chunk_length <= .*chunk_length=0"),
@@ -170,9 +170,22 @@ def test_a_prior_may_need_more_than_a_chunk():
         ({"history_length": 1}, "history_length=1"),
     ],
 )
-def test_lengths_that_cannot_be(options, told):
-    with pytest.raises(ValueError, match=told):
+def test_lengths_that_cannot_be(options, message):
+    with pytest.raises(ValueError, match=message):
         ActionWindow(steps([3]), **({"chunk_length": 2} | options))
+
+
+def test_data_that_cannot_be():
+    data, folded = steps([3, 4]), steps([3, 3]).reshape(2, 3)
+    pieces = data.clone().set("episode", torch.tensor([0, 0, 1, 1, 0, 2, 2]))
+    for wrong, error, said in (
+        (data.exclude("action"), KeyError, "the data lack 'action'"),
+        (pieces, ValueError, "steps of episode 0 are not contiguous"),
+        (data[:0], ValueError, r"flat steps \[N\] with N > 0"),
+        (folded, ValueError, "flat steps"),
+    ):
+        with pytest.raises(error, match=said):
+            ActionWindow(wrong, 2)
 
 
 @pytest.mark.parametrize("bad", [0, 777, 1999])
