@@ -11,10 +11,7 @@ pytest.importorskip("lerobot")
 
 from tests.data.lerobot_parts import scene
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
-from tests.processes import apart
 from warmprior.data import DatasetError, LeRobotExperienceReplay, RobomimicExperienceReplay, convert_robomimic
-from warmprior.data.opening import open_demonstrations
-from warmprior.envs import rendering_backend
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -171,29 +168,3 @@ def test_what_cannot_be_converted(tmp_path):
     with pytest.raises(DatasetError, match=r"control_freq is 12\.5"):
         convert_robomimic(path, folder)
     assert [p.name for p in tmp_path.iterdir()] == ["lift.hdf5"]
-
-
-@pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
-@pytest.mark.slow
-@apart
-def test_images_are_compared_with_the_simulators(tmp_path_factory):
-    from warmprior.data import generate_demonstrations, render_demonstrations
-
-    tmp_path = tmp_path_factory.mktemp("rendered")
-    path = generate_demonstrations("lift", n=1, path=tmp_path / "lift.hdf5", progress=False)
-    options = {"fast": True, "progress": False, "workers": 1}
-    render_demonstrations(path, ["agentview"], 32, out=path, **options)
-    asked = {"demos": None, "fast": True}
-    for kind in ("image", "video"):
-        folder = convert_robomimic(path, tmp_path / kind, images=kind, progress=False)
-        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **asked)
-    with pytest.raises(DatasetError, match=r"rendered fast, and in evaluation.*add --fast-rendering"):
-        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, demos=None, fast=False)
-    with pytest.raises(DatasetError, match="no images 'sideview_image'"):
-        open_demonstrations(f"lerobot:{folder}").with_images(["sideview"], 32, **asked)
-    with h5py.File(path, "a") as file:
-        for demo in file["data"].values():
-            demo["obs/agentview_image"][...] = demo["obs/agentview_image"][()][:, ::-1]
-    folder = convert_robomimic(path, tmp_path / "flipped", images="image", progress=False)
-    with pytest.raises(DatasetError, match=r"images of agentview are upside down.*convert it again"):
-        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **asked)

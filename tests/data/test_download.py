@@ -130,8 +130,6 @@ def test_a_server_that_never_ends_is_left(hub, content, tmp_path, monkeypatch):
     ("download", "args", "said"),
     [
         (download_robomimic, ["stack"], "choose one of lift, can, square, transport, tool_hang"),
-        (download_robomimic, ["stack"], r"task 'stack' here \(download_mimicgen has stack_d0\)"),
-        (download_mimicgen, ["stack"], "task 'stack' here; choose one of stack_d0"),
         (download_robomimic, ["lift", "mg"], "'mg' data; it has: ph, mh"),
         (
             download_mimicgen,

@@ -13,8 +13,8 @@ from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 from torchrl.envs.transforms import RenameTransform
 
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
-from warmprior.data import RobomimicExperienceReplay, generate_demonstrations
-from warmprior.envs import absolute_actions, absolute_to_env_action, modernize_env_args
+from warmprior.data import RobomimicExperienceReplay
+from warmprior.envs import absolute_actions, modernize_env_args
 from warmprior.envs.tasks import TASKS
 
 
@@ -144,31 +144,3 @@ def test_peak_memory(tmp_path, options):
     ratio, size = map(float, result.stdout.split())
     assert size > 5e7
     assert 0.7 < ratio < 1.3  # below, the measurement itself would be broken
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("absolute", [False, True])
-def test_recorded_actions_replay_in_the_described_environment(tmp_path, absolute):
-    """Actions and ``env_args`` belong together: replayed open loop, they solve the task again."""
-    suite = pytest.importorskip("robosuite")
-    import h5py
-
-    path = generate_demonstrations("square", n=2, path=tmp_path / "square.hdf5", progress=False)
-    replay = RobomimicExperienceReplay(path, absolute_actions=absolute)
-    env = suite.make(replay.env_args["env_name"], **replay.env_args["env_kwargs"])
-    try:
-        for episode in range(replay.num_episodes):
-            actions = replay.data["action"][replay.data["episode"] == episode]
-            if absolute:
-                actions = absolute_to_env_action(actions)
-            env.reset()
-            with h5py.File(path) as file:
-                env.sim.set_state_from_flattened(file[f"data/demo_{episode}/states"][0])
-            env.sim.forward()
-            success = False
-            for action in actions.double().numpy():
-                env.step(action)
-                success = success or bool(env._check_success())
-            assert success
-    finally:
-        env.close()

@@ -7,9 +7,8 @@ import math
 import pytest
 import torch
 from learned_sources import ForecastPrior, ForecastStart
-from tensordict import TensorDict
 
-from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember, seeing_network
+from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
 from warmprior import (
     GaussianPrior,
     HistoryObservation,
@@ -17,9 +16,8 @@ from warmprior import (
     PreviewPrior,
     RealTimeChunking,
     WarmPriorActor,
-    keys,
 )
-from warmprior.diagnostics import encoded_windows, memory_gain
+from warmprior.diagnostics import memory_gain
 
 N = 20_000
 
@@ -117,32 +115,6 @@ def test_noise_lowers_the_gain_by_what_averaging_over_the_chunk_leaves(sigma, co
     found = memory_gain(field, windows(prior), nfes=(1, 300))
     assert found[1] == pytest.approx(spread**2 / (spread**2 + kept), rel=1e-3)
     assert found[300] == pytest.approx(spread / math.sqrt(spread**2 + kept), rel=5e-3)
-
-
-def test_a_network_that_sees_images_and_the_mean():
-    """Against the same policy without its diagnostics: observations made anew on both sides."""
-    prior, n = GaussianPrior(H), 8
-    width = 4 + HistoryObservation.width(H, D_A)
-    network = seeing_network(D_A, width, H)
-    actor = WarmPriorActor(network, prior, nfe=1, observation_key=keys.CONDITIONED).eval()
-    data = windows(GaussianPrior(H), n)
-    images = torch.randint(0, 255, (n, 2, 3, 16, 16), dtype=torch.uint8)
-    states = torch.randn(n, 2, 4)
-    data["observation"] = TensorDict({"state": states, "cam_image": images}, [n])
-    whole = HistoryObservation()(data.clone())
-    found = memory_gain(actor, whole, nfes=(1,), shift=0.5)[1]
-    with pytest.raises(ValueError, match="images as they are, not encoded"):
-        memory_gain(actor, encoded_windows(actor, whole))
-    with pytest.raises(ValueError, match="holds no observation"):
-        memory_gain(actor, whole[:0])
-
-    def act(moved, generator):
-        a0 = torch.randn(n, H, D_A, generator=generator)
-        said = HistoryObservation()(moved)["prior", "observation"]
-        return a0 + network(torch.zeros(n), a0, said)
-
-    assert abs(found) > 1e-4
-    assert found == pytest.approx(by_hand(act, data, shift=0.5), rel=1e-3)
 
 
 def test_a_learned_source_is_asked_with_the_shifted_history():

@@ -13,6 +13,7 @@ pytest.importorskip("robosuite")
 from torchrl.envs import ParallelEnv, SerialEnv
 from torchrl.envs.utils import check_env_specs
 
+from tests.data.synthetic import env_args_14
 from tests.processes import apart
 from warmprior.data.scripted.episode import PLANS
 from warmprior.data.scripted.motion import ArmRunner
@@ -137,32 +138,8 @@ def test_robosuite_loop_agrees(lift):
 
 
 def test_built_from_the_env_args_of_a_file(lift):
-    legacy = {
-        "env_name": "Lift",
-        "env_version": "1.4.1",
-        "type": 1,
-        "env_kwargs": {
-            "has_renderer": False,
-            "has_offscreen_renderer": True,
-            "use_camera_obs": True,
-            "camera_names": ["agentview"],
-            "control_freq": 20,
-            "robots": ["Panda"],
-            "reward_shaping": True,
-            "controller_configs": {
-                "type": "OSC_POSE",
-                "input_max": 1,
-                "input_min": -1,
-                "output_max": [0.05, 0.05, 0.05, 0.5, 0.5, 0.5],
-                "output_min": [-0.05, -0.05, -0.05, -0.5, -0.5, -0.5],
-                "kp": 150,
-                "damping": 1,
-                "impedance_mode": "fixed",
-                "control_delta": True,
-                "interpolation": None,
-            },
-        },
-    }
+    legacy = env_args_14("lift")
+    legacy["env_kwargs"] |= {"reward_shaping": True, "use_camera_obs": True, "camera_names": ["agentview"]}
     env = RobosuiteEnv(env_args=legacy)
     assert env.horizon == TASKS["lift"].horizon_ph
     actions = torch.rand(8, 7, generator=torch.manual_seed(0)) * 2 - 1

@@ -187,23 +187,3 @@ def test_residuals_around_its_means(policy, prior):
     assert torch.equal(rollout["prior", "noise"], anchor + rollout["prior", "delta"])
     assert torch.equal(executed[1:], rollout["vla_action", "chunk"][:-1])
     assert torch.equal(anchor[1:], executed[1:] if prior.name == "past" else torch.zeros_like(executed[1:]))
-
-
-def test_what_cannot_be_done_is_said(policy):
-    prior = PastPrior(LENGTH)
-    actor = actor_of(policy("pi05"), prior)
-    data = TensorDict(
-        {
-            "observation": {"state": torch.zeros(1, STATE)},
-            "history": history_of(torch.zeros(LENGTH, ACTION)),
-        },
-        [],
-    )
-    with pytest.raises(KeyError, match=r'needs the history; missing: .*"actions"'):
-        actor(data.select("observation"))
-    with pytest.raises(ValueError, match=r"what are speed of the observation"):
-        actor(data.clone().set(("observation", "speed"), torch.zeros(1, 2)))
-    with pytest.raises(ValueError, match="compute no gradients"):
-        actor.ode(data.clone().set(("prior", "noise"), torch.zeros(LENGTH, ACTION, requires_grad=True)))
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        actor(data.clone(), nfe=0)

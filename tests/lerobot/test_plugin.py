@@ -16,7 +16,6 @@ from tensordict import TensorDict
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import (
     ACTION,
-    CAMERA,
     LENGTH,
     make_pi,
     make_smolvla,
@@ -26,8 +25,7 @@ from tests.lerobot.tiny import (
     windows,
 )
 from warmprior import HistoryObservation, PastPrior, RealTimeChunking, StartPoint, keys
-from warmprior.history import cold_history, window_history
-from warmprior.lerobot import LeRobotActor, WarmPriorAdapter
+from warmprior.history import cold_history
 
 pytest.importorskip("lerobot")
 pytest.importorskip("lerobot_policy_warmprior")
@@ -82,36 +80,6 @@ def test_a_base_checkpoint_becomes_a_warm_policy(found, name, built, tmp_path):
         again = found[name].from_pretrained(tmp_path / "warm")
     assert again.config.prior == "past,sigma=0.0"
     assert all(map(torch.equal, again.state_dict().values(), policy.state_dict().values()))
-
-
-@pytest.mark.parametrize("name", ["warm_smolvla", "warm_pi05"])
-def test_a_warm_policy_acts_in_torchrl(found, name):
-    family = name.removeprefix("warm_")
-    policy = warm(found, name, prior="past,sigma=0.0").eval()
-    prior = policy.warm_adapter.prior
-    seen_by = observations(family, 2)
-    actor = LeRobotActor(
-        policy,
-        prior,
-        names={"state": "observation.state", "top": CAMERA},
-        preprocess=lambda batch: {**seen_by, **batch},
-    )
-    loc = torch.randn(2, LENGTH, ACTION)
-    data = TensorDict(
-        {
-            "observation": {
-                "state": seen_by["observation.state"][:, None],
-                "top": seen_by[CAMERA][:, None],
-            },
-            "history": window_history(loc, torch.full((2, 1), LENGTH), loc, LENGTH),
-        },
-        [2],
-    )
-    with watch(family, policy) as seen:
-        chunk = actor(data)["vla_action", "chunk"]
-    assert torch.equal(seen.x[0][..., :ACTION], loc) and chunk.shape == loc.shape
-    with pytest.raises(ValueError, match=r"starts from .* by itself"):
-        WarmPriorAdapter(policy, prior)
 
 
 @pytest.mark.parametrize("name", ["warm_smolvla", "warm_pi05"])
@@ -308,7 +276,6 @@ def test_a_policy_of_this_library_is_one_of_lerobot(found, tmp_path):
     pytest.importorskip("robosuite")
     from lerobot.policies.factory import make_pre_post_processors
     from lerobot_policy_warmprior.export import export_policy, main
-    from tensordict import TensorDict
 
     actor = saved_policy(tmp_path / "ours")
     out = export_policy(tmp_path / "ours", tmp_path / "theirs")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 
 from tests.toy_env import random_history
 from warmprior import (
@@ -15,7 +14,6 @@ from warmprior import (
     PastPrior,
     PolynomialInterpolant,
     PreviewPrior,
-    Prior,
     TrigonometricInterpolant,
     VelocityMLP,
     WarmPriorActor,
@@ -223,32 +221,6 @@ def test_windows_of_other_lengths(made_for, said):
     data["history"] = sample(made_for, 6)["history"]
     with pytest.raises(ValueError, match=r"PastPrior.* needs 3 remembered .* of 3, but .* has "):
         loss_of(actor_for(PastPrior(H)), data)
-
-
-def test_any_callable_module_and_any_prior():
-    """A learned or heuristic source needs nothing but a subclass of Prior."""
-
-    class Double(Prior):
-        name = "double-for-this-test"
-        prediction_chunks = 2
-
-        def mean(self, history):
-            loc = history["forecast"]
-            return 2 * loc, torch.ones_like(loc[..., :1], dtype=torch.bool)
-
-    class Exact(nn.Module):
-        """The true velocity of the flow from 2a to a, -a = -a_t / (2 - t), and for what is unknown none."""
-
-        def forward(self, t, a, observation):
-            known = torch.arange(2 * H)[:, None] < H
-            return torch.where(known, -a / (2 - t)[:, None, None], 0.0)
-
-    prior = Double(H, sigma=0.0)
-    batch = window_replay_buffer(dataset(), prior, batch_size=32).sample()
-    loss = FlowMatchingLoss(WarmPriorActor(Exact(), prior), reduction="none")
-    error = loss(batch)["loss_flow_matching"]
-    del Prior._classes["double-for-this-test"]
-    assert error[:, :H].max() < 1e-10 and error[:, H:].max() > 0.1  # the second half is not told
 
 
 def test_ctrl_c_in_the_network_is_one():

@@ -4,106 +4,16 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import TransformedEnv
-from torchrl.objectives import HardUpdate, SoftUpdate
 
 from tests.rl.dsrl_parts import D_A, D_O, TO, H, batch, build, make_decoder
 from warmprior import (
     DSRLNALoss,
-    GaussianPrior,
-    Normalizer,
     PastPrior,
-    PreviewPrior,
-    PriorAnchor,
-    PriorDecoder,
-    PriorSpace,
-    ResidualSampler,
-    VelocityMLP,
-    WarmPriorActor,
     keys,
     make_prior_space_actor,
     make_prior_space_critic,
-    policy_transforms,
 )
-from warmprior.envs import NavigationEnv
-
-
-def rollout(policy, decoder, inside, frames=40):
-    transforms = policy_transforms(decoder.prior, observation_steps=1)
-    transforms.append(PriorAnchor(policy))
-    if inside:
-        transforms.append(PriorSpace(decoder))
-    env = TransformedEnv(NavigationEnv(batch_size=[4]), transforms)
-    env.set_seed(0)
-    torch.manual_seed(0)
-    sampler = ResidualSampler(decoder)
-    acting = sampler if inside else TensorDictSequential(sampler, decoder)
-    return env.rollout(frames, acting, break_when_any_done=False)
-
-
-def navigation_loss(prior):
-    """And the policy in it."""
-    torch.manual_seed(0)
-    network = VelocityMLP(1, 9, prior.prediction_length, 1, hidden_dim=8)
-    data = TensorDict({"observation": torch.randn(9, 9), "action": torch.randn(9, 1)}, [9])
-    actor = WarmPriorActor(network, prior, nfe=1, normalizer=Normalizer.fit(data))
-    decoder = PriorDecoder(actor, delta=0.5)
-    sizes = (1, 9, prior.prediction_length, 1)
-    loss = DSRLNALoss(
-        make_prior_space_actor(*sizes, delta=0.5, hidden_dim=8),
-        make_prior_space_critic(*sizes, in_keys=(keys.OBSERVATION, keys.CHUNK), hidden_dim=8),
-        make_prior_space_critic(*sizes, delta=0.5, hidden_dim=8),
-        decoder,
-        generator=torch.Generator().manual_seed(0),
-    )
-    return loss, actor
-
-
-@pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
-def test_either_wiring_gives_the_same_losses(prior_class):
-    results = []
-    for inside in (False, True):
-        loss, policy = navigation_loss(prior_class(4))
-        SoftUpdate(loss, tau=0.1)
-        if inside:
-            loss.set_keys(chunk=("next", *keys.DECODED_CHUNK))
-        data = rollout(policy, loss.decoder, inside).reshape(-1)
-        torch.manual_seed(2)
-        results.append(loss(data.select(*loss.in_keys)))
-    assert all(torch.equal(results[0][key], results[1][key]) for key in results[0].keys())  # noqa: SIM118
-
-
-@pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
-def test_frozen_through_training(prior_class):
-    """Collect, store, sample, optimise, update targets, save, move: the decoder does not change."""
-    loss, policy = navigation_loss(prior_class(4))
-    decoder = loss.decoder
-    before = {name: tensor.clone() for name, tensor in decoder.state_dict().items()}
-    assert any("normalizer" in name for name in before)
-    start = [p.detach().clone() for p in loss.parameters()]
-    loss.train().requires_grad_(True)
-    updater = HardUpdate(loss, value_network_update_interval=1)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-2, weight_decay=0.1)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(200), batch_size=16)
-    buffer.extend(rollout(policy, decoder, inside=False).reshape(-1).select(*loss.in_keys))
-    for compute in loss.schedule(updates=3):
-        losses = compute(buffer.sample())
-        optimizer.zero_grad()
-        sum(v for k, v in losses.items() if k.startswith("loss_")).backward()
-        optimizer.step()
-        updater.step()
-    loss.reset_parameters_recursive()
-    loss.load_state_dict(loss.state_dict())
-    assert any(not torch.equal(p, q) for p, q in zip(loss.parameters(), start, strict=True))
-    ids = {tensor.data_ptr() for tensor in decoder.state_dict().values() if tensor.numel()}
-    assert not ids & {p.data_ptr() for p in loss.parameters()}
-    after = decoder.state_dict()
-    assert before.keys() == after.keys()
-    assert all(torch.equal(before[name], after[name]) for name in before)
-    assert not any(module.training for module in decoder.modules())
 
 
 @pytest.mark.parametrize(

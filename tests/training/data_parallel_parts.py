@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import signal
@@ -10,7 +9,7 @@ import signal
 import torch
 from torch import nn
 
-from tests.training.cloning_parts import CONFIG, actor_for, mlp, training, weights
+from tests.training.cloning_parts import CONFIG, actor_for, mlp, run_until, training, weights
 from warmprior import PastPrior, PreconditionedNetwork, SourceMoments
 from warmprior.io.distributed import rank
 
@@ -83,25 +82,10 @@ def whole(folder):
     for case in CASES:
         trained(folder, case)
     for name in ("one", "two"):  # the same from the same state
-        stopped_at(folder / name, 12)
+        run_until(cloning(folder / name / "plain", "plain"), 12)
         trained(folder / name, "plain")
     diverges(folder)
     refuses(folder)
-
-
-def stopped_at(folder, iteration):
-    """End in the middle, as if killed after a step."""
-    part = cloning(folder / "plain", "plain")
-    step = part.step
-
-    def stopping():
-        if part.iteration == iteration:
-            raise KeyboardInterrupt
-        return step()
-
-    part.step = stopping
-    with contextlib.suppress(KeyboardInterrupt):
-        part.run(None)
 
 
 def dies(folder):

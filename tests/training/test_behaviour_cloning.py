@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.training.cloning_parts import CONFIG, actor_for, dataset, same, training, weights
+from tests.training.cloning_parts import CONFIG, actor_for, dataset, run_until, same, training, weights
 from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
 from warmprior.training import TrainingConfig, load_policy, make_optimizer
 from warmprior.training.checkpoint import load_state
@@ -63,18 +63,7 @@ def test_stopping_anywhere_changes_nothing(tmp_path, stop):
     whole = training(tmp_path / "whole")
     whole.run()
     part = training(tmp_path / "part")
-    take, calls = part.step, 0
-
-    def step():
-        nonlocal calls
-        calls += 1
-        if calls > stop:
-            raise KeyboardInterrupt
-        return take()
-
-    part.step = step
-    with pytest.raises(KeyboardInterrupt):
-        part.run()
+    run_until(part, stop)
     torch.rand(100)  # whatever else uses the global generator in between
     again = training(tmp_path / "part")
     assert again.iteration == max(i for i in (0, 7, 14, 20, 21, 28, 35) if i <= stop)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import nn
 
-from tests.training.cloning_parts import CONFIG, actor_for, same, training, weights
+from tests.training.cloning_parts import CONFIG, actor_for, run_until, same, training, weights
 from warmprior import PastPrior, VelocityMLP
 from warmprior.training import load_policy
 
@@ -110,16 +110,7 @@ def test_users_networks_are_saved_resumed_and_loaded(tmp_path, network):
     whole = training(tmp_path / "whole", actor=build())
     whole.run()
     part = training(tmp_path / "part", actor=build())
-    step = part.step
-
-    def stop():
-        if part.iteration == 25:
-            raise KeyboardInterrupt
-        return step()
-
-    part.step = stop
-    with pytest.raises(KeyboardInterrupt):
-        part.run()
+    run_until(part, 25)
     again = training(tmp_path / "part", actor=build())
     assert again.iteration == 21
     again.run()

@@ -7,7 +7,7 @@ import threading
 import pytest
 import torch
 
-from tests.training.cloning_parts import same, training, weights
+from tests.training.cloning_parts import run_until, same, training, weights
 from warmprior.training.checkpoint import load_state
 from warmprior.training.placement import Prefetch
 
@@ -47,16 +47,7 @@ def test_stopping_changes_nothing(tmp_path, stop):
     whole = training(tmp_path / "whole", prefetch=True)
     whole.run(None)
     part = training(tmp_path / "part", prefetch=True)
-    take = part.step
-
-    def step():
-        if part.iteration == stop:
-            raise KeyboardInterrupt
-        return take()
-
-    part.step = step
-    with pytest.raises(KeyboardInterrupt):
-        part.run(None)
+    run_until(part, stop)
     again = training(tmp_path / "part", prefetch=True)
     assert again.iteration == stop // 7 * 7
     again.run(None)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, same, training, weights
+from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, run_until, same, training, weights
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
@@ -55,16 +55,7 @@ def test_stopping_with_a_teacher_changes_nothing(tmp_path):
     whole = training(tmp_path / "whole", config)
     whole.run()
     part = training(tmp_path / "part", config)
-    take = part.step
-
-    def step():
-        if part.iteration == 16:
-            raise KeyboardInterrupt
-        return take()
-
-    part.step = step
-    with pytest.raises(KeyboardInterrupt):
-        part.run()
+    run_until(part, 16)
     again = training(tmp_path / "part", config)
     assert again.iteration == 14
     again.run()
