@@ -49,10 +49,6 @@ class NoWarm(Prior):
         return history["actions"]
 
 
-class Impostor(PastPrior):
-    name = "step"
-
-
 def network():
     return VelocityMLP(D_A, D_O, H, observation_steps=1, hidden_dim=8)
 
@@ -80,25 +76,6 @@ def cloning(folder, data, **options):
     actor = WarmPriorActor(network(), GaussianPrior(H), start=options.pop("start", None))
     config = TrainingConfig(iterations=4, batch_size=8, checkpoints=1, save_every=2)
     return BehaviourCloning(actor, data, config, folder, observation_steps=1, **options)
-
-
-def test_a_prior_with_the_name_of_another_method_is_refused():
-    with pytest.raises(ValueError, match="Impostor has the name of the method 'step'"):
-        Method(f"{__name__}:Impostor", H)
-
-
-BASES = {
-    "Prior": "warmprior.modules.prior",
-    "LearnedPrior": "learned_sources",
-}
-
-
-@pytest.mark.parametrize("base", BASES)
-def test_a_base_class_is_no_method(base):
-    with pytest.raises(ValueError, match=f"unknown prior '{base}'"):
-        Method(base, H)
-    with pytest.raises(ValueError, match="is no prior that can be built"):
-        Method(f"{BASES[base]}:{base}", H)
 
 
 def test_agents_search_around_a_source_that_has_no_mean_of_the_history():

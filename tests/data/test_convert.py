@@ -84,15 +84,6 @@ def test_both_buffers_hold_the_same(converted, options):
     assert torch.equal(mine.episode_lengths, theirs.episode_lengths)
 
 
-def test_absolute_actions_agree_to_rounding(converted):
-    path, folders = converted
-    theirs = RobomimicExperienceReplay(path, absolute_actions=True)
-    mine = LeRobotExperienceReplay(folders["image"], absolute_actions=True)
-    torch.testing.assert_close(mine.data["action"], theirs.data["action"], rtol=0, atol=1e-6)
-    assert torch.equal(mine.pose_columns, theirs.pose_columns)
-    assert mine.env_args == theirs.env_args
-
-
 def test_lerobot_reads_what_was_converted(converted):
     from lerobot.datasets import LeRobotDataset
 

@@ -68,20 +68,6 @@ def test_against_loops(rows, decisions, horizon, seed):
     assert result.switch_rate == pytest.approx(mean(switches))
 
 
-def test_actions_without_a_mode_do_not_switch():
-    chunks = torch.tensor([[[0.01]], [[1.0]], [[-1.0]], [[0.0]]])
-    rollout = rollout_of(chunks, [1, 1, 1, 1])
-    assert smoothness(rollout, mode=0).switch_rate == pytest.approx(0.5)
-
-    def clear(actions):
-        height = actions[..., 0]
-        return torch.where(height.abs() > 0.1, height, 0.0)
-
-    assert smoothness(rollout, mode=clear).switch_rate == 1.0
-    assert math.isnan(smoothness(rollout_of(0 * chunks, [1] * 4), mode=0).switch_rate)
-    assert math.isnan(smoothness(rollout).switch_rate)
-
-
 def test_bad_rollouts_are_named():
     chunks = torch.zeros(3, 2, 1)
     with pytest.raises(KeyError, match="ChunkStep"):

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.diagnostics.fields import D_A, H, batch, policy, remember
-from warmprior import GaussianPrior, HistoryObservation, PastPrior, PreviewPrior, keys
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import source_leak
 
 
@@ -157,23 +157,6 @@ def test_padded_positions_do_not_count():
     assert source_leak(policy(passing(0.3)), noisy) == expected
     first = data["vla_action", "chunk"][:, :2].diff(dim=1).norm(dim=-1).mean()
     assert expected[1].data_inner_step == pytest.approx(float(first))
-
-
-def test_a_network_that_sees_the_history():
-    """What was done moves the chunk, the source around it does not spread by it."""
-    data = windows(100)
-    data = HistoryObservation()(remember(data, torch.randn(100, H, D_A)))
-
-    def field(t, a, o):
-        assert o.shape[-1] == 4 + HistoryObservation.width(H, D_A)
-        return goal(o[..., 4:]) + (0.2 - 1) * a
-
-    actor = policy(field, observation_key=keys.CONDITIONED)
-    result = source_leak(actor, data, draws=16)[1]
-    assert result.spread == pytest.approx(0.2, rel=0.03)
-    # Neighbours in what the policy alone is shown would be others.
-    gaussian = source_leak(policy(passing(0.2)), data)[1]
-    assert result.data_spread == gaussian.data_spread
 
 
 def test_bad_input_is_named():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from warmprior.envs import GoalNavigationEnv, NavigationEnv, navigation_heights
+from warmprior.envs import GoalNavigationEnv, navigation_heights
 
 ROUTES = list(itertools.product((1, -1), repeat=2))
 STEPS = 64
@@ -65,13 +65,3 @@ def test_which_demonstrations_succeed(route):
     # Three of the six demonstrations if the goal keeps to one side, none of them if it crosses.
     assert int(solved[:6].sum()) == (3 if route[0] == route[1] else 0)
     assert int(solved.sum()) == 3
-
-
-def test_the_way_there_is_that_of_the_environment_without_goal():
-    plain, goal = NavigationEnv(batch_size=[6]), GoalNavigationEnv((1, 1), batch_size=[6])
-    a, b = plain.reset(), goal.reset()
-    for step in range(10):
-        action = navigation_heights()[:, step, None]
-        a = plain.step(a.set("action", action))["next"].exclude("reward")
-        b = goal.step(b.set("action", action))["next"].exclude("reward")
-        assert all(torch.equal(a[key], b[key]) for key in ("observation", "height", "step_index"))

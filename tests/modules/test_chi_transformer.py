@@ -47,18 +47,6 @@ def test_training_mode_is_causal_too():
         assert (gradient[0, : position + 1].abs().sum(-1) > 0).all()
 
 
-def test_only_matrices_decay():
-    network = tiny()
-    decay, rest = network.parameter_groups(0.1)
-    names = {id(p): name for name, p in network.named_parameters()}
-    decayed = {names[id(p)] for p in decay["params"]}
-    kept = {names[id(p)] for p in rest["params"]}
-    assert all(name.endswith("weight") for name in decayed)
-    assert not any("norm" in name for name in decayed)
-    assert {"action_position", "memory_position", "head.0.weight", "head.1.bias"} <= kept
-    assert "decoder.layers.0.self_attn.in_proj_weight" in decayed
-
-
 @pytest.mark.parametrize("training", [False, True])
 def test_modulation_starts_as_the_paper_s_network(training):
     """With the same weights it is the same function, until the modulation learns."""

@@ -155,19 +155,6 @@ def test_a_learned_prior_trains_saves_resumes_and_freezes(tmp_path):
     assert not torch.equal(decoder.prior.shift, averaged)
 
 
-def test_a_training_with_other_buffers_is_another(tmp_path):
-    def training(value):
-        prior = Learned(H)
-        prior.offset.fill_(value)
-        config = TrainingConfig(iterations=4, batch_size=8, checkpoints=1, save_every=2)
-        return BehaviourCloning(actor_for(prior), data(), config, tmp_path, observation_steps=TO)
-
-    training(1.0).run(None)
-    training(1.0).run(None)
-    with pytest.raises(ValueError, match="another prior"):
-        training(9.0).run(None)
-
-
 # ------------------------------------------------------------------------------------ what users type
 
 

@@ -46,15 +46,6 @@ def test_distribution_and_moments(name):
         assert (t**power).mean() == pytest.approx(float((mass * centres**power).sum()), abs=3e-3)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", RANDOM)
-def test_shape_type_and_generator(name, dtype):
-    t = draw(name, 2, 3, dtype=dtype)
-    assert t.shape == (2, 3) and t.dtype == dtype
-    assert torch.equal(t, draw(name, 2, 3, dtype=dtype)) and not torch.equal(t, draw(name, 2, 3, seed=1))
-    assert draw(name).shape == ()
-
-
 def test_the_loss_is_given_them():
     prior = PastPrior(3)
     actor, data = actor_for(prior), sample(prior, 6)

@@ -291,15 +291,6 @@ def test_any_policy_that_writes_chunks():
     assert not torch.isclose(chunks_of(other)[:3], chunks_of(one)[:3]).any()
 
 
-class LateFailure(PlainEnv):
-    """Solved at the second step of every third seed, but not at those after it; and goes on."""
-
-    def _step(self, tensordict):
-        out = super()._step(tensordict)
-        solved = (self.t == 2) & (self.seed_ % 3 == 0)
-        return out.set("success", torch.tensor([solved]))
-
-
 def batched(kind, make_env, num_envs, transforms_inside=False):
     prior = PastPrior(H)
     options = {"mp_start_method": "fork"} if kind is ParallelEnv else {}
@@ -344,14 +335,6 @@ def test_environments_that_cannot_be_judged():
         evaluate(actor_for(), single(CountingEnv), episodes=1, first_seed=0)
     with pytest.raises(KeyError, match="give it the policy's transforms"):
         evaluate(actor_for(), PlainEnv(), episodes=1, first_seed=0)
-
-
-@pytest.mark.parametrize("place", ["single", "outside", "inside"])
-def test_a_success_counts_at_any_step(place):
-    """Where episodes go on after a success, it may be lost before their end, even inside a chunk."""
-    inside = place == "inside"
-    env = single(LateFailure) if place == "single" else batched(SerialEnv, LateFailure, 2, inside)
-    assert evaluate(actor_for(), env, episodes=6, first_seed=0) == expected(0, 6)
 
 
 def test_policy_and_environment_need_one_normaliser():

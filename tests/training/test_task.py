@@ -149,19 +149,6 @@ def test_further_demonstrations_are_read_as_a_policy_sees_them(path, tmp_path):
         assert called == "the TRAINING demonstrations (not held out)"
 
 
-def test_another_task_is_refused_before_anything_is_rendered(path, monkeypatch):
-    from warmprior.data import render
-
-    monkeypatch.setattr(render, "render_demonstrations", lambda *_, **__: pytest.fail("rendered"))
-    asked = DataOptions(task=("stack",), dataset=path, obs="image")
-    with pytest.raises(ValueError, match="holds demonstrations of lift, not of stack"):
-        load_task(asked, "stack")
-    facts = {"source": "file", "demonstrations": 2, "sha256": ""}
-    facts["images"] = {"cameras": ["agentview"], "size": 16, "fast_rendering": True}
-    with pytest.raises(ValueError, match=r"of lift, but these .* are for stack"):
-        read_like(path, "stack", facts)
-
-
 def test_a_lerobot_dataset_is_the_task_of_its_file(path, tmp_path):
     pytest.importorskip("lerobot")
     from warmprior.data import convert_robomimic
