@@ -8,7 +8,7 @@ import pytest
 
 from tests.data.synthetic import write_robomimic_file
 from tests.io.hub_server import Loopback, reachable
-from warmprior.data.download import MIMICGEN_REPOSITORY, REPOSITORIES, download_mimicgen, download_robomimic
+from warmprior.data.download import REPOSITORIES, download_mimicgen, download_robomimic
 
 pytest.importorskip("huggingface_hub")
 
@@ -143,20 +143,3 @@ def test_unknown_task_or_style_asks_nobody(hub, download, args, said):
     with pytest.raises(ValueError, match=said):
         download(*args, endpoint=hub.address)
     assert not hub.requests
-
-
-@pytest.mark.parametrize(
-    ("task", "style", "name"),
-    [
-        ("stack_d0", "source", "source/stack.hdf5"),
-        ("coffee_d0", "source", "source/coffee.hdf5"),
-        ("threading_d0", "core", "core/threading_d0.hdf5"),
-        ("tool_hang", "ph", "v1.5/tool_hang/ph/low_dim_v15.hdf5"),
-        ("lift", "mh", "v1.5/lift/mh/low_dim_v15.hdf5"),
-    ],
-)
-def test_files_have_their_addresses(hub, content, tmp_path, task, style, name):
-    mimicgen = task.endswith("_d0")
-    download = download_mimicgen if mimicgen else download_robomimic
-    hub.files[MIMICGEN_REPOSITORY if mimicgen else FIRST, name] = (len(content), content)
-    assert download(task, style, root=tmp_path, endpoint=hub.address) == tmp_path / name

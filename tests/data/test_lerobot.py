@@ -9,8 +9,6 @@ import torch
 pytest.importorskip("pyarrow")
 pytest.importorskip("lerobot")
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from tests.data.lerobot_parts import WIDTHS, numbers, scene, write_lerobot
 from tests.data.synthetic import env_args_15
@@ -104,21 +102,6 @@ def test_images_are_decoded_as_lerobot_does(written):
     assert torch.equal(observation["agentview_image"][15], upright)
     off = observation["robot0_eye_in_hand_image"][15].float() - upright
     assert off.abs().mean() < 8  # a video is lossy
-
-
-def test_other_writers_of_the_same_format(tmp_path):
-    """One row group for everything, and lists without a fixed length, as converters by pandas write."""
-    values = write_lerobot(tmp_path / "data")
-    (path,) = (tmp_path / "data").glob("data/*/*.parquet")
-    table = pq.read_table(path)
-    for name in WIDTHS:
-        place = table.schema.get_field_index(name)
-        column = pa.array(table[name].to_pylist(), pa.list_(pa.float32()))
-        table = table.set_column(place, name, column)
-    pq.write_table(table, path, row_group_size=5)
-    data = LeRobotExperienceReplay(tmp_path / "data").data
-    np.testing.assert_array_equal(data["action"].numpy(), values["action"])
-    np.testing.assert_array_equal(data["observation"][:, 10:], values["observation.state"])
 
 
 @pytest.mark.parametrize("kind", ["reward", "success"])

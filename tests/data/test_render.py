@@ -41,7 +41,11 @@ def recorded(lift_demonstrations, tmp_path_factory):
     path = tmp_path_factory.mktemp("recorded") / "lift.hdf5"
     shutil.copy(lift_demonstrations, path)
     with h5py.File(path, "a") as file:
-        del file["data/demo_2"], file["mask"]
+        del file["data/demo_2"]
+        for name, names in list(file["mask"].items()):
+            kept = [demo for demo in names[()] if demo != b"demo_2"]
+            del file["mask"][name]
+            file["mask"][name] = np.array(kept, dtype="S8")
         for demo in file["data"].values():
             demo.attrs["num_samples"] = STEPS
             demo.pop("next_obs", None)
@@ -177,7 +181,7 @@ def not_a_number(file):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (not_a_number, r"data/demo_0/states has NaN or infinity in row 2"),
+        pytest.param(not_a_number, "states has NaN or infinity in row 2", marks=pytest.mark.slow),
         (of_another_environment, r"states has shape \(4, 45\).*Lift has \(4, 32\)"),
     ],
 )

@@ -109,14 +109,8 @@ def test_absolute_actions(tmp_path, task, frame):
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="reads Linux's /proc")
-@pytest.mark.parametrize(
-    "options",
-    [
-        "",
-        pytest.param("absolute_actions=True", marks=pytest.mark.slow),
-        pytest.param("storage='memmap'", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("options", ["", "absolute_actions=True", "storage='memmap'"])
 def test_peak_memory(tmp_path, options):
     small, large = tmp_path / "small.hdf5", tmp_path / "large.hdf5"
     write_robomimic_file(small)

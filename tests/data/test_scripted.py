@@ -38,6 +38,7 @@ def contents(path):
     return found
 
 
+@pytest.mark.slow
 def test_the_number_of_workers_does_not_matter(lift_demonstrations, tmp_path):
     other = generate_demonstrations(
         "lift", n=3, path=tmp_path / "deep" / "two.hdf5", workers=2, progress=False

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from tests.diagnostics.fields import D_A, H, batch, policy, remember
-from warmprior import PastPrior, PreviewPrior, VelocityMLP
+from warmprior import PastPrior, PreviewPrior
 from warmprior.diagnostics import curvature
-from warmprior.modules import WarmPriorActor
 
 
 @pytest.mark.parametrize("n_steps", [10, 100])
@@ -47,23 +46,6 @@ def test_executed_positions_and_padding_count_separately():
     out = curvature(policy(lambda t, a, o: weights.expand_as(a), prior), data, executed=1)
     assert out["speed"].tolist() == pytest.approx([D_A * 5.0] + [D_A * 91.0] * 4)
     assert out["speed_executed"].tolist() == pytest.approx([D_A * 1.0] * 5)
-
-
-def network_policy(prior=None, width=4, **options):
-    prior = PastPrior(H) if prior is None else prior
-    torch.manual_seed(0)
-    network = VelocityMLP(D_A, width, prior.prediction_length, 1, hidden_dim=8)
-    return WarmPriorActor(network, prior, generator=torch.Generator().manual_seed(0), **options)
-
-
-def test_the_split_changes_nothing():
-    data, results = batch(7), []
-    for split in (1, 3, 10_000):
-        generator = torch.Generator().manual_seed(3)
-        results.append(curvature(network_policy(), data, 20, draws=3, split=split, generator=generator))
-    for other in results[1:]:
-        for key, value in results[0].items():
-            torch.testing.assert_close(other[key], value, rtol=1e-4, atol=1e-6)
 
 
 def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():

@@ -135,16 +135,6 @@ def test_modernize_old_description():
     assert "render_gpu_device_id" not in new
 
 
-def test_modernize_fills_in_the_default_frame_and_flattens_arms():
-    meta = env_args_15("lift")
-    parts = meta["env_kwargs"]["controller_configs"]["body_parts"]
-    del parts["right"]["input_ref_frame"]
-    meta["env_kwargs"]["controller_configs"]["body_parts"] = {"arms": parts, "base": {"type": "X"}}
-    new = modernize_env_args(meta)["env_kwargs"]["controller_configs"]["body_parts"]
-    assert new["right"]["input_ref_frame"] == "base" and new["base"] == {"type": "X"}
-    assert "arms" not in new
-
-
 def test_delta_conventions_read_the_controller():
     meta = env_args_14("square")
     meta["env_kwargs"]["controller_configs"] |= {

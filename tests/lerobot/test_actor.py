@@ -5,17 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, PriorAnchor, policy_transforms
+from warmprior import PastPrior, PreviewPrior, policy_transforms
 from warmprior.history import window_history
 from warmprior.lerobot import LeRobotActor
-from warmprior.rl import PriorDecoder, ResidualSampler
+from warmprior.rl import PriorDecoder
 
 
 class Arm(EnvBase):
@@ -173,17 +172,3 @@ def test_a_frozen_policy_decodes_what_an_agent_chooses(policy):
     # A function of the source alone, whatever else is in the batch.
     assert torch.equal(decoder(data.clone())["vla_action", "chunk"], chunk)
     torch.testing.assert_close(decoder(data[1:].clone())["vla_action", "chunk"], chunk[1:])
-
-
-@pytest.mark.parametrize("prior", [PastPrior(LENGTH), GaussianPrior(LENGTH)])
-def test_residuals_around_its_means(policy, prior):
-    """As around those of the library's own policies."""
-    actor = actor_of(policy("pi05"), prior, nfe=1)
-    decoder = PriorDecoder(actor, delta=0.5)
-    env = environment(prior)
-    env.append_transform(PriorAnchor(actor))
-    rollout = env.rollout(3, TensorDictSequential(ResidualSampler(decoder), decoder))
-    anchor, executed = rollout["prior", "anchor"], rollout["history", "actions"]
-    assert torch.equal(rollout["prior", "noise"], anchor + rollout["prior", "delta"])
-    assert torch.equal(executed[1:], rollout["vla_action", "chunk"][:-1])
-    assert torch.equal(anchor[1:], executed[1:] if prior.name == "past" else torch.zeros_like(executed[1:]))

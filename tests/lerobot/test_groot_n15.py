@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tests.lerobot.seen import at_times, watch
-from tests.lerobot.tiny import ACTION, LENGTH, N15, STATE, STEPS, observations, windows
+from tests.lerobot.tiny import ACTION, LENGTH, N15, STATE, STEPS, observations
 from warmprior import PastPrior, PreviewPrior
 from warmprior.lerobot import WarmPriorAdapter
 
@@ -41,16 +41,6 @@ def test_the_first_actions_of_a_chunk_are_executed(built):
         torch.testing.assert_close(actions, chunks[-1][:, :every])
     torch.testing.assert_close(seen.x[0][:, :half, :ACTION], chunks[0][:, every : every + half])
     assert adapter.predict_action_chunk(dict(batch)).shape == (2, LENGTH, ACTION)
-
-
-def test_a_batch_that_the_head_repeats_is_refused(built):
-    made = built("groot", n_action_steps=2).train()
-    made._groot_model.action_head.config.expand_batch = 2
-    with pytest.raises(ValueError, match=r"repeats each batch 2 times .*set it to None"):
-        WarmPriorAdapter(made, PastPrior(LENGTH))
-    made._groot_model.action_head.config.expand_batch = 1
-    loss, _ = WarmPriorAdapter(made, PastPrior(LENGTH)).loss(windows("groot", 2, LENGTH))
-    assert loss.isfinite()
 
 
 @pytest.fixture

@@ -53,19 +53,6 @@ def test_order_of_convergence(solver):
     assert slope == pytest.approx(ORDERS[solver], abs=0.15)
 
 
-def test_nine_euler_steps_are_the_paper_s_sampler():
-    a0 = torch.randn(3, 4, 2)
-    weight = torch.randn(2, 2)
-
-    def velocity(t, a):
-        return torch.tanh(a @ weight) * (1 + t)[:, None, None]
-
-    a = a0.clone()
-    for i in range(9):
-        a = a + velocity(torch.full((3,), i / 9), a) / 9
-    torch.testing.assert_close(integrate(velocity, a0, nfe=9), a)
-
-
 @pytest.mark.parametrize("solver", ORDERS)
 def test_nfe_is_the_number_of_network_calls(solver):
     network = Counting()

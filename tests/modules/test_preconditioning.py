@@ -280,16 +280,6 @@ def test_another_path_than_that_of_the_loss_is_refused():
         FlowMatchingLoss(actor, interpolant=LinearInterpolant())
 
 
-def test_bad_moments():
-    one = torch.ones(2, 3)
-    with pytest.raises(ValueError, match=r"one shape \[P, d_a\]"):
-        SourceMoments(one, one, one, one, torch.ones(3, 2))
-    with pytest.raises(ValueError, match="NaN or infinity"):
-        SourceMoments(one, one, one, one * math.nan, one)
-    with pytest.raises(ValueError, match=r"\(2, 3\), but the network was built for \(4, 3\)"):
-        PreconditionedNetwork(Nothing(3, 5, 4), moments=SourceMoments(one, one, one, one, 0 * one))
-
-
 def test_windows_of_another_prior():
     windows = buffer_of(gaussian_steps(episodes=2), PastPrior(2), 8).sample()
     with pytest.raises(ValueError, match=r"2 positions, but PreviewPrior.* predicts 4"):

@@ -7,7 +7,6 @@ import torch
 
 from tests.toy_env import random_history
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
-from warmprior.history import window_history
 from warmprior.modules.registry import find, from_config
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
@@ -90,12 +89,3 @@ def test_config_round_trip(prior_class):
     assert type(again) is prior_class and again.config() == prior.config()
     assert repr(again) == repr(prior)
     assert find(Prior, prior.name) is prior_class
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_width_has_the_precision_of_the_history(dtype):
-    history = window_history(
-        torch.zeros(1, 2, 1, dtype=dtype), torch.tensor([[2]]), torch.zeros(1, 2, 1, dtype=dtype), 2
-    )
-    scale = PastPrior(2, sigma=0.1).distribution(history).scale
-    assert torch.equal(scale.flatten(), torch.tensor([0.1, 0.1], dtype=dtype))

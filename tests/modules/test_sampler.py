@@ -56,11 +56,3 @@ def test_the_observation_is_an_input_where_it_is_read(part):
     assert "state" not in unread.in_keys
     actor = WarmPriorActor(VelocityMLP(2, 2, 4, 1), prior, start=start, observation_key="state")
     assert actor.in_keys == ["state", *((keys.HISTORY, name) for name in ENTRIES)]
-
-
-@pytest.mark.parametrize("missing", [*ENTRIES, "history"])
-def test_missing_key_is_named(missing):
-    data = TensorDict({"history": random_history(PastPrior(4), 3)}, [3])
-    del data["history" if missing == "history" else ("history", missing)]
-    with pytest.raises(KeyError, match=rf"PastPrior.*missing: .*{missing}.*ActionHistory writes"):
-        PriorSampler(PastPrior(4))(data)

@@ -85,7 +85,6 @@ def whole(folder):
         run_until(cloning(folder / name / "plain", "plain"), 12)
         trained(folder / name, "plain")
     diverges(folder)
-    refuses(folder)
 
 
 def dies(folder):
@@ -112,11 +111,3 @@ def diverges(folder):
         part.run(None)
     except FloatingPointError as error:
         (folder / f"diverged {rank()}").write_text(str(error))
-
-
-def refuses(folder):
-    """A batch that several processes cannot share."""
-    try:
-        cloning(folder / "odd", "plain", batch_size=15)
-    except ValueError as error:
-        (folder / f"refused {rank()}").write_text(str(error))

@@ -73,16 +73,6 @@ def test_judgements_are_reproducible_and_of_what_was_played(trained, name):
     assert row["distance"] == pytest.approx(metrics.distance, nan_ok=True)
 
 
-def test_a_shift_touches_only_policies_with_a_memory(trained):
-    def heights(name, shift):
-        played = play_navigation(trained(name, 5), 3, nfe=1, rollouts=8, shift=shift)
-        return executed_actions(played)[0]
-
-    assert torch.equal(heights("gaussian", 0.0), heights("gaussian", 0.0))
-    assert torch.equal(heights("history", 0.0), heights("history", 0.0))
-    assert not torch.isclose(heights("history", 0.0), heights("history", 5.0)).all()
-
-
 def bent(actor, seed):
     """Curvature and branching bound on demonstrated observations."""
     batch = SharedObservations(navigation_task().data, 4).windows(actor.prior)

@@ -11,13 +11,9 @@ from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, run_un
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
-    HistoryObservation,
-    VelocityMLP,
-    WarmPriorActor,
-    keys,
     window_replay_buffer,
 )
-from warmprior.training import ema_of, load_policy, make_optimizer
+from warmprior.training import ema_of, make_optimizer
 
 LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}
 
@@ -63,14 +59,3 @@ def test_stopping_with_a_teacher_changes_nothing(tmp_path):
     plain = training(tmp_path / "plain", replace(config, self_distillation=0.0))
     plain.run()
     assert not same(weights(plain), weights(whole))
-
-
-def test_a_network_that_sees_the_last_actions(tmp_path):
-    """The windows are made with them, of the data's own observation."""
-    width = 3 + HistoryObservation.width(4, 2)
-    network = VelocityMLP(2, width, 4, hidden_dim=8)
-    actor = WarmPriorActor(network, GaussianPrior(4), observation_key=keys.CONDITIONED)
-    cloning = training(tmp_path, replace(CONFIG, iterations=2, checkpoints=1), actor=actor)
-    assert cloning.replay_buffer.sample()[keys.CONDITIONED].shape == (16, 2, width)
-    cloning.run(None)
-    assert load_policy(cloning.policy_path()).in_keys[0] == keys.CONDITIONED

@@ -17,8 +17,6 @@ from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
     PastPrior,
-    PreconditionedNetwork,
-    VelocityMLP,
     VelocityNetwork,
     WarmPriorActor,
     policy_transforms,
@@ -155,15 +153,6 @@ def test_a_decision_in_the_environment_is_a_window_of_its_recording(place, layou
         loss.generator.manual_seed(1)
         row["action_is_pad"] = windows["action_is_pad"]
         assert torch.equal(loss(row)["loss_flow_matching"], first)
-
-
-@pytest.mark.parametrize("preconditioned", [False, True])
-def test_networks_of_vectors_say_so(preconditioned):
-    network = VelocityMLP(ACTION_DIM, 4, H, TO, hidden_dim=8)
-    network = PreconditionedNetwork(network) if preconditioned else network
-    env = build("single", "nested", PastPrior(H))
-    with pytest.raises(ValueError, match=r"\[B, To, d_o\].*got the entries \['pixels', 'state'\]"):
-        env.rollout(1, WarmPriorActor(network, PastPrior(H)))
 
 
 @pytest.mark.parametrize("place", ["single", "serial-inside", "parallel-outside"])

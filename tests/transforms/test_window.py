@@ -13,7 +13,6 @@ from warmprior import (
     ActionWindow,
     PastPrior,
     PreviewPrior,
-    Prior,
     WithheldHistory,
     window_replay_buffer,
 )
@@ -84,18 +83,6 @@ def test_random_episodes(lengths, horizon, further, longer, observation_steps, n
     check(window(every_step(data)), data, window)
 
 
-@pytest.mark.parametrize("shape", [(), (6,), (6, 1), (2, 3)])
-def test_shapes_of_the_sample(shape):
-    data = steps([4, 5])
-    frame, window = torch.randint(0, 9, shape), ActionWindow(data, 2, prediction_length=3)
-    batch_size = shape[:1] if shape == (6, 1) else shape
-    out = window(TensorDict({"frame": frame}, batch_size))
-    assert out["vla_action", "chunk"].shape == (*batch_size, 3, 2)
-    assert out["observation"].shape == (*batch_size, 2, 3)
-    assert out["history"].batch_size == batch_size
-    check(out.reshape(-1), data, window)
-
-
 def test_generator_fixes_steps_and_what_is_withheld():
     data = steps([20, 30])
 
@@ -146,19 +133,6 @@ def test_a_share_that_is_none_and_a_history_that_is_missing():
             WithheldHistory(wrong)
     with pytest.raises(KeyError, match="append it after ActionWindow"):
         WithheldHistory(0.5)(TensorDict({}, [3]))
-
-
-def test_a_prior_may_need_more_than_a_chunk():
-    class Longer(PastPrior):
-        name = "longer-of-the-windows"
-        history_length = 7
-
-    prior, data = Longer(2), steps([20])
-    batch = window_replay_buffer(data, prior, batch_size=9).sample()
-    assert batch["history", "actions"].shape == (9, 7, 2)
-    check(batch, data, ActionWindow(data, 2, history_length=7))
-    prior.distribution(batch["history"])
-    del Prior._classes[Longer.name]
 
 
 @pytest.mark.parametrize(
