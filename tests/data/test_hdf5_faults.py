@@ -138,6 +138,18 @@ def test_an_index_of_chunks_that_is_damaged(square_file, damage):
         RobomimicExperienceReplay(path)
 
 
+def test_values_whose_storage_ends_before_they_do(square_file):
+    """By one number: HDF5 makes zeros of what is missing."""
+    path, _ = square_file
+    with h5py.File(path) as file:
+        place = file["data/demo_1/actions"].id.get_offset()
+    content, before = path.read_bytes(), struct.pack("<2Q", place, 5 * 7 * 8)
+    assert content.count(before) == 1
+    path.write_bytes(content.replace(before, struct.pack("<2Q", place, 5 * 7 * 8 - 8)))
+    with pytest.raises(DatasetError, match=r"square\.hdf5: data/demo_1/actions .* never written"):
+        RobomimicExperienceReplay(path)
+
+
 @pytest.mark.parametrize(
     ("mask", "said"),
     [
