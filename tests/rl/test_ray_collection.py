@@ -29,6 +29,7 @@ def test_a_buffer_says_which_policy_acts():
         assert torch.equal(*found)
 
 
+@pytest.mark.slow
 @apart
 def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp_path):
     actor = make_actor(PastPrior(H, sigma=0.01))
