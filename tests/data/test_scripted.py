@@ -6,6 +6,7 @@ import json
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -19,6 +20,7 @@ import h5py
 from warmprior.data.scripted import generate as generate_module
 from warmprior.data.scripted import generate_demonstrations
 from warmprior.data.scripted.episode import Episode, expert_loop, operator_of, run_episode
+from warmprior.data.scripted.motion import CLOSED, transfer
 from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs.simulator import make_simulator
 from warmprior.envs.tasks import TASKS
@@ -107,6 +109,16 @@ def test_recorded_states_and_actions_replay(lift_demonstrations):
     assert env.timestep > 10
     # env.step reports poses from the start of its last 2 ms.
     np.testing.assert_allclose(observations["robot0_eef_pos"], positions[env.timestep - 1], atol=3e-3)
+
+
+def test_a_transfer_passes_over_what_lies_between():
+    """By a waypoint in the middle, to the left by the arc and higher by the lift."""
+    places = {"robot0_base": (np.array([-0.5, 0.0, 0.9]), np.eye(3))}
+    loop = SimpleNamespace(eef=lambda arm: (np.array([0.0, -0.1, 1.0]), np.eye(3)), body=places.get)
+    person = SimpleNamespace(axiswise=False, arc=0.03)
+    way, last = transfer(loop, person, 0, np.array([0.0, 0.1, 1.0]), np.eye(3), CLOSED, lift=0.2)
+    np.testing.assert_allclose(way.pos, [-0.03, 0.0, 1.2], atol=1e-5)
+    assert last.pos.tolist() == [0.0, 0.1, 1.0] and last.grip == CLOSED
 
 
 @contextmanager
