@@ -31,6 +31,22 @@ def renders_apart():
     assert start_method() == before, "let what renders run in tests.processes.apart"
 
 
+@pytest.fixture(scope="session")
+def lift_demonstrations(tmp_path_factory):
+    """Three scripted demonstrations of lift, generated once for all processes of a run; not to be changed."""
+    pytest.importorskip("robosuite")
+    from filelock import FileLock
+
+    from warmprior.data import generate_demonstrations
+
+    folder = tmp_path_factory.getbasetemp()
+    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+    with FileLock(folder / "demonstrations.lock"):
+        return generate_demonstrations(
+            "lift", n=3, cache_dir=folder / "demonstrations", workers=1, progress=False
+        )
+
+
 CLUSTER = """
 import ray
 options = dict(num_cpus=2, include_dashboard=False, logging_level="ERROR")

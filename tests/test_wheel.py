@@ -87,8 +87,8 @@ def test_the_sdist_builds_the_same_wheel(built, tmp_path):
 
 
 def test_the_wheel_runs_in_an_empty_environment(python, tmp_path):
-    told = run(python, "-m", "warmprior", "--version", cwd=tmp_path)
-    assert told == f"warmprior {PROJECT['version']}\n"
+    printed = run(python, "-m", "warmprior", "--version", cwd=tmp_path)
+    assert printed == f"warmprior {PROJECT['version']}\n"
     where = run(python, "-c", "import warmprior; print(warmprior.__file__)", cwd=tmp_path)
     assert Path(where.strip()).is_relative_to(python.parents[1])
 
@@ -98,11 +98,11 @@ def test_the_quickstart_runs_from_the_wheel(python, tmp_path):
     text = (ROOT / "docs" / "quickstart.md").read_text()
     (code,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     (tmp_path / "quickstart.py").write_text(code)
-    told = run(python, "quickstart.py", cwd=tmp_path)
-    assert [float(line) < 0 for line in told.split()] == [True, True]
-    told = run(python, "-m", "warmprior", "info", "policy", cwd=tmp_path)
-    assert "PastPrior(chunk_length=8" in told
-    assert f"warmprior {PROJECT['version']}, format 5" in told
+    printed = run(python, "quickstart.py", cwd=tmp_path)
+    assert [float(line) < 0 for line in printed.split()] == [True, True]
+    printed = run(python, "-m", "warmprior", "info", "policy", cwd=tmp_path)
+    assert "PastPrior(chunk_length=8" in printed
+    assert f"warmprior {PROJECT['version']}, format 5" in printed
 
 
 def test_the_plugin_and_the_citation_have_the_same_version():

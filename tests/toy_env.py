@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
+from warmprior import Prior, StartPoint
 from warmprior.history import advance, cold_history, without
 
 ACTION_DIM = 2
@@ -75,3 +79,49 @@ def random_history(prior, *batch, action_dim: int = ACTION_DIM, seed: int = 0, c
     executed = torch.full((*batch, 1), prior.chunk_length)
     history = advance(cold_history(batch, *shape), chunk, executed)
     return without(history, torch.rand(batch, generator=generator) < cold)
+
+
+PLACES = ("single", "serial-outside", "serial-inside", "parallel-outside", "parallel-inside")
+
+
+def placed(place, make_transforms, lengths, make_env=CountingEnv):
+    """Environments of these lengths, with transforms inside of workers or common ones outside."""
+
+    def one(length):
+        return TransformedEnv(make_env(length), make_transforms())
+
+    if place == "single":
+        return one(lengths[0])
+    batched = SerialEnv if "serial" in place else partial(ParallelEnv, mp_start_method="fork")
+    if place.endswith("inside"):
+        return batched(len(lengths), [partial(one, n) for n in lengths])
+    return TransformedEnv(batched(len(lengths), [partial(make_env, n) for n in lengths]), make_transforms())
+
+
+class Momentum(Prior):
+    """Goes on as the last two actions did."""
+
+    name = "momentum-of-the-tests"
+
+    def mean(self, history):
+        before, last = history["actions"][..., -2:-1, :], history["actions"][..., -1:, :]
+        ahead = torch.arange(1, self.prediction_length + 1).view(-1, 1)
+        warm = (history["steps"] >= 2).unsqueeze(-1)
+        return last + ahead * (last - before), warm.expand_as(history["forecast"][..., :1])
+
+
+class Halfway(StartPoint):
+    """Enters the flow at the time 0.5, with half of the noise around the last action and a weight."""
+
+    name = "halfway-of-the-tests"
+    time = noise_share = 0.5
+
+    def __init__(self, shift=0.0):
+        nn.Module.__init__(self)
+        self.shift = nn.Parameter(torch.full((), shift))
+
+    def centre(self, history, observation):
+        return history["actions"][..., -1:, :].expand_as(history["forecast"]) + self.shift
+
+    def forward(self, noise, history, observation):
+        return self.centre(history, observation) + self.noise_share * noise

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import h5py
 import numpy as np
 import pytest
@@ -13,17 +11,7 @@ pytest.importorskip("lerobot")
 
 from tests.data.lerobot_parts import scene
 from tests.data.synthetic import env_args_14, env_args_15, write_robomimic_file
-from tests.processes import apart
-from warmprior.__main__ import main
-from warmprior.data import (
-    DatasetError,
-    LeRobotExperienceReplay,
-    RobomimicExperienceReplay,
-    convert_robomimic,
-)
-from warmprior.data.opening import open_demonstrations
-from warmprior.envs import rendering_backend
-from warmprior.io.files import file_digest, read_json
+from warmprior.data import DatasetError, LeRobotExperienceReplay, RobomimicExperienceReplay, convert_robomimic
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -63,11 +51,6 @@ def converted(tmp_path_factory):
     }
 
 
-def test_a_process_is_scheduled_as_before(converted):
-    """The encoder of videos takes real-time priority where it may, which workers would inherit."""
-    assert os.sched_getscheduler(0) == os.SCHED_OTHER
-
-
 def equal(mine, theirs):
     keys = set(mine.keys(True, True))
     assert keys == set(theirs.keys(True, True))
@@ -101,15 +84,6 @@ def test_both_buffers_hold_the_same(converted, options):
     assert torch.equal(mine.episode_lengths, theirs.episode_lengths)
 
 
-def test_absolute_actions_agree_to_rounding(converted):
-    path, folders = converted
-    theirs = RobomimicExperienceReplay(path, absolute_actions=True)
-    mine = LeRobotExperienceReplay(folders["image"], absolute_actions=True)
-    torch.testing.assert_close(mine.data["action"], theirs.data["action"], rtol=0, atol=1e-6)
-    assert torch.equal(mine.pose_columns, theirs.pose_columns)
-    assert mine.env_args == theirs.env_args
-
-
 def test_lerobot_reads_what_was_converted(converted):
     from lerobot.datasets import LeRobotDataset
 
@@ -135,33 +109,6 @@ def test_lerobot_reads_what_was_converted(converted):
             shown = item["observation.images.agentview"].permute(1, 2, 0) * 255
             off = (shown - torch.from_numpy(images[i])).abs()
             assert off.max() < 1e-4 if kind == "image" else off.mean() < 8
-
-
-def test_what_lerobot_does_not_tell_is_written_down(converted):
-    path, folders = converted
-    told = read_json(folders["image"] / "meta" / "warmprior.json")
-    assert told["env_args"] == env_args_14("transport")
-    assert told["source"] == {"file": "transport.hdf5", "sha256": file_digest(path)}
-    assert told["masks"] == {"train": [0, 2], "valid": [1]}
-    with h5py.File(path) as file:
-        assert told["first_state"] == file["data/demo_0/states"][0].tolist()
-
-
-def test_part_of_a_file(converted, tmp_path):
-    path, _ = converted
-    folder = convert_robomimic(path, tmp_path / "part", demos=2, progress=False)
-    whole = RobomimicExperienceReplay(path, demos=2)
-    assert not equal(LeRobotExperienceReplay(folder).data, whole.data)
-    assert LeRobotExperienceReplay(folder, filter_key="train").episode_lengths.tolist() == [6]
-    with pytest.raises(DatasetError, match=r"unknown filter key 'test'.*train"):
-        LeRobotExperienceReplay(folder, filter_key="test")
-
-
-def test_a_target_that_exists_is_refused(converted, tmp_path):
-    (tmp_path / "link").symlink_to("nowhere")
-    for folder in (converted[1]["image"], tmp_path / "link"):
-        with pytest.raises(FileExistsError, match=f"{folder} exists: choose another folder, or"):
-            convert_robomimic(converted[0], folder)
 
 
 def test_an_interrupted_conversion_leaves_nothing(converted, tmp_path, monkeypatch):
@@ -212,53 +159,3 @@ def test_what_cannot_be_converted(tmp_path):
     with pytest.raises(DatasetError, match=r"control_freq is 12\.5"):
         convert_robomimic(path, folder)
     assert [p.name for p in tmp_path.iterdir()] == ["lift.hdf5"]
-
-
-def test_an_environment_of_ones_own(tmp_path):
-    path = tmp_path / "own.hdf5"
-    env_args = env_args_15("lift") | {"env_name": "Own"}
-    env_args["env_kwargs"]["control_freq"] = 10
-    write_robomimic_file(path, task="lift", lengths=(3, 2), env_args=env_args)
-    folder = convert_robomimic(path, tmp_path / "own", progress=False)
-    replay = LeRobotExperienceReplay(folder)
-    assert not equal(replay.data, RobomimicExperienceReplay(path).data)
-    assert replay.task is None and replay.env_args["env_name"] == "Own"
-    assert read_json(folder / "meta" / "info.json")["fps"] == 10
-
-
-def test_command(converted, tmp_path, capsys):
-    path, _ = converted
-    folder = tmp_path / "data"
-    argv = ["convert", str(path), str(folder), "--images", "--demonstrations", "1"]
-    assert main(argv) == 0
-    told = capsys.readouterr()
-    assert told.out.strip() == str(folder) and "convert transport: 100%" in told.err
-    assert LeRobotExperienceReplay(folder, image_keys=["agentview_image"]).num_episodes == 1
-    assert main(argv) == 2
-    assert "exists: choose another folder" in capsys.readouterr().err
-
-
-@pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
-@pytest.mark.slow
-@apart
-def test_images_are_compared_with_the_simulators(tmp_path_factory):
-    from warmprior.data import generate_demonstrations, render_demonstrations
-
-    tmp_path = tmp_path_factory.mktemp("rendered")
-    path = generate_demonstrations("lift", n=1, path=tmp_path / "lift.hdf5", progress=False)
-    options = {"fast": True, "progress": False, "workers": 1}
-    render_demonstrations(path, ["agentview"], 32, out=path, **options)
-    told = {"demos": None, "fast": True}
-    for kind in ("image", "video"):
-        folder = convert_robomimic(path, tmp_path / kind, images=kind, progress=False)
-        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **told)
-    with pytest.raises(DatasetError, match=r"rendered fast, and in evaluation.*add --fast-rendering"):
-        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, demos=None, fast=False)
-    with pytest.raises(DatasetError, match="no images 'sideview_image'"):
-        open_demonstrations(f"lerobot:{folder}").with_images(["sideview"], 32, **told)
-    with h5py.File(path, "a") as file:
-        for demo in file["data"].values():
-            demo["obs/agentview_image"][...] = demo["obs/agentview_image"][()][:, ::-1]
-    folder = convert_robomimic(path, tmp_path / "flipped", images="image", progress=False)
-    with pytest.raises(DatasetError, match=r"images of agentview are upside down.*convert it again"):
-        open_demonstrations(f"lerobot:{folder}").with_images(["agentview"], 32, **told)

@@ -4,20 +4,11 @@ import hashlib
 import time
 from collections import Counter
 
-import numpy as np
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
 from tests.io.hub_server import Loopback, reachable
-from warmprior.data.download import (
-    MIMICGEN_REPOSITORY,
-    REPOSITORIES,
-    download_mimicgen,
-    download_robomimic,
-)
-from warmprior.data.mimicgen import MimicGenExperienceReplay
-from warmprior.data.robomimic import RobomimicExperienceReplay
-from warmprior.envs.tasks import TASKS
+from warmprior.data.download import REPOSITORIES, download_mimicgen, download_robomimic
 
 pytest.importorskip("huggingface_hub")
 
@@ -85,23 +76,6 @@ def content(tmp_path_factory) -> bytes:
     return path.read_bytes()
 
 
-def test_first_repository(hub, content, tmp_path):
-    hub.put(FIRST, content)
-    path = download_robomimic("square", root=tmp_path, endpoint=hub.address)
-    assert path == tmp_path / FILE and path.read_bytes() == content
-    assert {repository for _, repository in hub.requests} == {FIRST}
-    assert RobomimicExperienceReplay(path).num_episodes == 3
-
-
-@pytest.mark.parametrize("missing", ["RepoNotFound", "EntryNotFound"])
-def test_mirror_when_the_first_has_nothing(hub, content, tmp_path, missing):
-    hub.missing = missing
-    hub.put(MIRROR, content)
-    path = download_robomimic("square", root=tmp_path, endpoint=hub.address)
-    assert path.read_bytes() == content
-    assert hub.requests["GET", MIRROR] == 1
-
-
 def test_is_fetched_once(hub, content, tmp_path):
     hub.put(FIRST, content)
     options = {"root": tmp_path, "endpoint": hub.address}
@@ -112,18 +86,6 @@ def test_is_fetched_once(hub, content, tmp_path):
     assert hub.requests["GET", FIRST] == 2
     hub.close()  # what is there serves without a connection
     assert download_robomimic("square", **options) == path
-
-
-@pytest.mark.parametrize("missing", ["RepoNotFound", "EntryNotFound"])
-def test_names_every_attempt(hub, tmp_path, missing):
-    hub.missing = missing
-    with pytest.raises(OSError, match="could not download") as caught:
-        download_robomimic("square", root=tmp_path, endpoint=hub.address)
-    message = str(caught.value)
-    kind = "RepositoryNotFoundError" if missing == "RepoNotFound" else "EntryNotFoundError"
-    assert FILE in message and message.count(kind) == 2
-    assert all(f"- {repository}: " in message for repository in REPOSITORIES)
-    assert caught.value.__cause__ is not None
 
 
 BROKEN = {
@@ -164,26 +126,10 @@ def test_a_server_that_never_ends_is_left(hub, content, tmp_path, monkeypatch):
     assert time.monotonic() - started < 6
 
 
-def test_mirror_when_the_first_is_broken(hub, content, tmp_path):
-    hub.put(FIRST, b"<html>maintenance</html>")
-    hub.put(MIRROR, content)
-    path = download_robomimic("square", root=tmp_path, endpoint=hub.address)
-    assert path.read_bytes() == content
-
-
-def test_default_cache(hub, content, tmp_path, monkeypatch):
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "cache"))
-    hub.put(FIRST, content)
-    path = download_robomimic("square", endpoint=hub.address)
-    assert path.is_relative_to(tmp_path / "cache") and path.read_bytes() == content
-
-
 @pytest.mark.parametrize(
     ("download", "args", "said"),
     [
         (download_robomimic, ["stack"], "choose one of lift, can, square, transport, tool_hang"),
-        (download_robomimic, ["stack"], r"task 'stack' here \(download_mimicgen has stack_d0\)"),
-        (download_mimicgen, ["stack"], "task 'stack' here; choose one of stack_d0"),
         (download_robomimic, ["lift", "mg"], "'mg' data; it has: ph, mh"),
         (
             download_mimicgen,
@@ -197,37 +143,3 @@ def test_unknown_task_or_style_asks_nobody(hub, download, args, said):
     with pytest.raises(ValueError, match=said):
         download(*args, endpoint=hub.address)
     assert not hub.requests
-
-
-@pytest.mark.parametrize(
-    ("task", "style", "name"),
-    [
-        ("stack_d0", "source", "source/stack.hdf5"),
-        ("coffee_d0", "source", "source/coffee.hdf5"),
-        ("threading_d0", "core", "core/threading_d0.hdf5"),
-        ("tool_hang", "ph", "v1.5/tool_hang/ph/low_dim_v15.hdf5"),
-        ("lift", "mh", "v1.5/lift/mh/low_dim_v15.hdf5"),
-    ],
-)
-def test_files_have_their_addresses(hub, content, tmp_path, task, style, name):
-    mimicgen = task.endswith("_d0")
-    download = download_mimicgen if mimicgen else download_robomimic
-    hub.files[MIMICGEN_REPOSITORY if mimicgen else FIRST, name] = (len(content), content)
-    assert download(task, style, root=tmp_path, endpoint=hub.address) == tmp_path / name
-
-
-def test_mimicgens_buffer_fetches_its_file(hub, tmp_path, monkeypatch):
-    monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", hub.address)
-    monkeypatch.setattr(
-        "huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE",
-        hub.address + "/{repo_id}/resolve/{revision}/{filename}",
-    )
-    file = tmp_path / "coffee.hdf5"
-    demos = write_robomimic_file(file, lengths=(4, 3, 5), task="coffee_d0")
-    content = file.read_bytes()
-    hub.files[MIMICGEN_REPOSITORY, "source/coffee.hdf5"] = (len(content), content)
-    data = MimicGenExperienceReplay("coffee_d0", download=True, root=tmp_path / "hub", demos=2)
-    assert data.path == tmp_path / "hub" / "source" / "coffee.hdf5"
-    assert data.task is TASKS["coffee_d0"] and data.episode_lengths.tolist() == [4, 3]
-    assert data.data["observation"].shape == (7, 66)
-    np.testing.assert_allclose(data.data["action"][4:], demos[1]["actions"], rtol=1e-6)

@@ -46,12 +46,6 @@ def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):
     np.testing.assert_array_equal(part, demo["actions"][20:29].astype(np.float32))
 
 
-def test_demos_are_ordered_by_number(tmp_path):
-    path = tmp_path / "file.hdf5"
-    write_robomimic_file(path, lengths=range(1, 13))
-    assert read_index(path).lengths == tuple(range(1, 13))
-
-
 def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
     path = tmp_path / "file.hdf5"
     write_robomimic_file(path, lengths=range(1, 13), masks={"late": [11, 3, 10]})
@@ -61,18 +55,6 @@ def test_the_first_demos_are_those_of_the_smallest_numbers(tmp_path):
         read_index(path, demos=13)
     with pytest.raises(ValueError, match="demos must be at least 1, got 0"):
         read_index(path, demos=0)
-
-
-def test_masks_select(square_file):
-    path, _ = square_file
-    assert read_index(path, filter_key="train").demos == ("demo_0", "demo_2")
-    assert read_index(path, filter_key="valid").lengths == (5,)
-
-
-def test_observation_keys_select_and_order(square_file):
-    path, _ = square_file
-    index = read_index(path, observation_keys=["robot0_gripper_qpos", "object"])
-    assert index.observation_dims == (2, 14)
 
 
 def test_unknown_environment_uses_what_it_finds(tmp_path):
@@ -104,41 +86,6 @@ def test_truncated_file(square_file, keep):
     path.write_bytes(b"<html>please log in" if keep is None else content[: int(keep * len(content))])
     with pytest.raises(DatasetError, match=r"square\.hdf5: not a readable HDF5.*download it again"):
         read_index(path)
-
-
-def test_images_are_not_part_of_a_state(square_file):
-    path, _ = square_file
-    with pytest.raises(DatasetError, match=r"agentview_image has shape \(12, 4, 4, 3\)"):
-        read_index(path, observation_keys=["object", "agentview_image"])
-
-
-def test_observation_keys_must_exist(square_file):
-    path, _ = square_file
-    with pytest.raises(DatasetError, match=r"demo_0 has no 'obs/nothing'.*robot0_eef_pos"):
-        read_index(path, observation_keys=["nothing"])
-    with pytest.raises(DatasetError, match="empty"):
-        read_index(path, observation_keys=[])
-
-
-def test_poses_must_exist(square_file):
-    path, _ = square_file
-    with h5py.File(path, "a") as file:
-        del file["data/demo_2/obs/robot0_eef_quat"]
-    read_index(path, observation_keys=["object"])
-    with pytest.raises(DatasetError, match="demo_2 has no 'obs/robot0_eef_quat'"):
-        read_index(path, observation_keys=["object"], poses=True)
-
-
-def test_unknown_environment_without_known_keys(tmp_path):
-    path = tmp_path / "file.hdf5"
-    write_robomimic_file(path, env_args=env_args_15("lift") | {"env_name": "Own"})
-    with h5py.File(path, "a") as file:
-        for demo in file["data"].values():
-            del demo["obs"]
-            demo["obs/position"] = np.zeros((len(demo["actions"]), 2))
-    with pytest.raises(DatasetError, match="observation_keys"):
-        read_index(path)
-    assert read_index(path, observation_keys=["position"]).observation_dims == (2,)
 
 
 def test_filter_keys(square_file, tmp_path):

@@ -2,29 +2,19 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
-from torchrl.data import SliceSampler
 
 pytest.importorskip("pyarrow")
 pytest.importorskip("lerobot")
 
-import pyarrow as pa
-import pyarrow.parquet as pq
 
-from tests.data.lerobot_parts import WIDTHS, edit_json, numbers, scene, write_lerobot
+from tests.data.lerobot_parts import WIDTHS, numbers, scene, write_lerobot
 from tests.data.synthetic import env_args_15
 from warmprior import PastPrior, window_replay_buffer
-from warmprior.data import LeRobotExperienceReplay, lerobot, lerobot_steps
-from warmprior.data.download import download_lerobot
-from warmprior.data.lerobot_index import action_names, read_lerobot_index, state_names
-from warmprior.data.opening import open_demonstrations
+from warmprior.data import LeRobotExperienceReplay
+from warmprior.data.lerobot_index import action_names, state_names
 from warmprior.envs.tasks import TASKS
 
 H, TO = 4, 3
@@ -94,28 +84,6 @@ def test_entries_are_those_of_robomimics_buffer(written, tmp_path):
         assert replay.pose_columns.tolist() == [list(range(10, 17))]
 
 
-def test_steps_are_the_vectors_themselves(written):
-    root, values = written
-    names = ("observation.state", "observation.environment_state")
-    steps = lerobot_steps(root, names)
-    np.testing.assert_array_equal(steps["observation"], np.concatenate([values[n] for n in names], -1))
-    np.testing.assert_array_equal(steps["action"], values["action"])
-    assert steps["episode"].tolist() == [0] * 6 + [1] + [2] * 9
-
-
-def test_samplers_and_part_of_a_dataset(written):
-    root, values = written
-    replay = LeRobotExperienceReplay(
-        root, demos=1, batch_size=8, sampler=SliceSampler(slice_len=4, traj_key="episode")
-    )
-    assert (replay.sample()["frame"].reshape(2, 4).diff(dim=-1) == 1).all()
-    np.testing.assert_array_equal(replay.data["action"].numpy(), values["action"][:6])
-    # Not described, and so all features whole.
-    assert replay.observation_keys == ("observation.environment_state", "observation.state")
-    with pytest.raises(ValueError, match="does not say which environment"):
-        _ = replay.env_args
-
-
 def test_images_are_decoded_as_lerobot_does(written):
     from lerobot.datasets import LeRobotDataset
 
@@ -134,35 +102,6 @@ def test_images_are_decoded_as_lerobot_does(written):
     assert torch.equal(observation["agentview_image"][15], upright)
     off = observation["robot0_eye_in_hand_image"][15].float() - upright
     assert off.abs().mean() < 8  # a video is lossy
-
-
-def test_only_what_is_asked_for_is_opened(written, tmp_path, monkeypatch):
-    root = shutil.copytree(written[0], tmp_path / "copy")
-    shutil.rmtree(root / "videos")
-
-    def never(*args, **options):
-        raise AssertionError("was decoded")
-
-    monkeypatch.setattr("lerobot.datasets.video_utils.decode_video_frames", never)
-    assert len(LeRobotExperienceReplay(root)) == 16
-    assert LeRobotExperienceReplay(root, image_keys=["agentview_image"], demos=2).image_size == 32
-    with pytest.raises(ValueError, match=r"file-000\.mp4: damaged"):
-        LeRobotExperienceReplay(root, image_keys=["robot0_eye_in_hand_image"])
-
-
-def test_other_writers_of_the_same_format(tmp_path):
-    """One row group for everything, and lists without a fixed length, as converters by pandas write."""
-    values = write_lerobot(tmp_path / "data")
-    (path,) = (tmp_path / "data").glob("data/*/*.parquet")
-    table = pq.read_table(path)
-    for name in WIDTHS:
-        place = table.schema.get_field_index(name)
-        column = pa.array(table[name].to_pylist(), pa.list_(pa.float32()))
-        table = table.set_column(place, name, column)
-    pq.write_table(table, path, row_group_size=5)
-    data = LeRobotExperienceReplay(tmp_path / "data").data
-    np.testing.assert_array_equal(data["action"].numpy(), values["action"])
-    np.testing.assert_array_equal(data["observation"][:, 10:], values["observation.state"])
 
 
 @pytest.mark.parametrize("kind", ["reward", "success"])
@@ -196,89 +135,3 @@ def test_observations_of_a_task_are_found_by_their_widths(tmp_path, layout):
     expected = np.concatenate([values[name] for name in LAYOUTS[layout]], -1)
     np.testing.assert_array_equal(replay.data["observation"].numpy(), expected)
     assert replay.observation_keys == TASKS["lift"].low_dim_keys
-
-
-def test_digest_is_that_of_what_is_read(written, tmp_path):
-    root = shutil.copytree(written[0], tmp_path / "copy")
-
-    def digest(image_keys=()):
-        return read_lerobot_index(root, image_keys=image_keys).digest()
-
-    before, seen = digest(), digest(["robot0_eye_in_hand_image"])
-    assert before == read_lerobot_index(written[0]).digest() != seen
-    (root / "README.md").write_text("a card")
-    (video,) = root.glob("videos/*/*/*.mp4")
-    video.write_bytes(video.read_bytes() + b"\0")
-    assert digest() == before
-    assert digest(["robot0_eye_in_hand_image"]) != seen
-    edit_json(root / "meta" / "info.json", lambda info: info.update(robot_type="other"))
-    assert digest() != before
-
-
-def test_of_a_repository_only_what_is_read_is_fetched(written, tmp_path, monkeypatch):
-    source, asked = written[0], []
-
-    def snapshot_download(repository, **options):
-        asked.append((repository, options["revision"], options["allow_patterns"]))
-        target = tmp_path / "snapshot"
-        for pattern in options["allow_patterns"]:
-            files = source.glob("meta/**/*") if pattern == "meta/*" else source.glob(pattern)
-            for file in files:
-                if file.is_file():
-                    to = target / file.relative_to(source)
-                    to.parent.mkdir(parents=True, exist_ok=True)
-                    shutil.copy(file, to)
-        return str(target)
-
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path / "home"))
-    monkeypatch.setattr("huggingface_hub.snapshot_download", snapshot_download)
-    monkeypatch.chdir(tmp_path)
-    replay = LeRobotExperienceReplay("user/lift", image_keys=["agentview_image"], demos=1)
-    assert asked == [
-        ("user/lift", "v3.0", ["meta/*"]),
-        ("user/lift", "v3.0", ["data/chunk-000/file-000.parquet"]),
-    ]
-    expected = LeRobotExperienceReplay(source, image_keys=["agentview_image"], demos=1)
-    assert (replay.data == expected.data).all()
-    LeRobotExperienceReplay("user/lift", demos=1, revision="main")
-    assert asked[2:] == [("user/lift", "main", ["meta/*"])]  # the rest is there
-    # Digest and checks of a part need no more than that part.
-    found = open_demonstrations("lerobot:user/lift")
-    assert len(found.index().demos) == 3 and found.name == "lerobot:lift"
-    whole = open_demonstrations(f"lerobot:{source}")
-    assert found.digest(demos=1) == whole.digest(demos=1) != whole.digest()
-    assert [files for *_, files in asked[3:]] == [["meta/*"]] * 2
-    del asked[3:]
-    # What was recorded here is taken from where LeRobot keeps it.
-    local = shutil.copytree(source, tmp_path / "home" / "user" / "mine")
-    assert LeRobotExperienceReplay("user/mine").path == local and len(asked) == 3
-
-
-def test_a_repository_that_cannot_be_had_is_named(tmp_path, monkeypatch):
-    monkeypatch.setenv("HF_LEROBOT_HOME", str(tmp_path))
-    with pytest.raises(OSError, match=r"could not download user/nothing at v3\.0: (?s:.*)convert"):
-        download_lerobot("user/nothing")
-
-
-def test_a_process_that_has_done_nothing_else_asks_the_hub(tmp_path):
-    """The client loads its parts when they are asked for."""
-    code = """
-from warmprior.data.download import download_lerobot
-try:
-    download_lerobot("user/none")
-except OSError as error:
-    print(error)
-"""
-    env = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path)}
-    env.pop("HF_LEROBOT_HOME", None)
-    call = [sys.executable, "-c", code]
-    told = subprocess.run(call, env=env, capture_output=True, text=True, check=True).stdout
-    assert "could not download user/none" in told
-
-
-def test_names_of_repositories(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert lerobot.is_remote("user/name")
-    os.makedirs("user/name")
-    for name in ("user/name", "name", "./name", "a/b/c", "/user/name", "~/name"):
-        assert not lerobot.is_remote(name)

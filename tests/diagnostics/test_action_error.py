@@ -67,21 +67,6 @@ def test_clips_as_the_policy_does_and_skips_what_the_policy_refuses():
     assert action_error(policy, batch, nfes=(1, 9)) == {1: pytest.approx(1.0)}
 
 
-def test_same_noise_for_every_call_and_the_global_generator_untouched():
-    class Still(Towards):
-        def forward(self, t, a, observation):
-            return torch.zeros_like(a)
-
-    batch = windows(GaussianPrior(H))
-    before = torch.get_rng_state()
-    policy = WarmPriorActor(Still(), GaussianPrior(H)).train()
-    found = action_error(policy, batch, nfes=(1, 9))
-    assert found[1] == found[9] == action_error(policy, batch)[1]
-    assert torch.equal(before, torch.get_rng_state()) and policy.training
-    other = action_error(policy, batch, generator=torch.Generator().manual_seed(9))
-    assert other[1] != found[1]
-
-
 def test_what_cannot_be_measured_is_refused():
     policy = WarmPriorActor(Towards(), GaussianPrior(H), max_nfe=1)
     with pytest.raises(ValueError, match="has none: add NFE 1"):

@@ -8,10 +8,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from learned_sources import CVAEPrior
 
 from tests.diagnostics.fields import H, batch, policy, remember
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior import PastPrior, PreviewPrior
 from warmprior.diagnostics import branching_bound, branching_cost
 
 
@@ -92,30 +91,3 @@ def test_bound_counts_cold_and_padded_positions():
     assert bound["total_executed"].tolist() == [H * 4.25] * 2
     data["action_is_pad"] = torch.arange(2 * H).expand(2, -1) >= 1
     assert branching_bound(data, prior)["total"].tolist() == [4.25] * 2
-
-
-def test_cost_does_not_depend_on_the_split():
-    data = windows(torch.zeros(7, H, 2), torch.randn(7, H, 2))
-    results = []
-    for split in (2, 1000):
-        actor = policy(lambda t, a, o: torch.tanh(a) * t, PastPrior(H), seed=9)
-        results.append(branching_cost(actor, data, split=split)["cost"])
-    torch.testing.assert_close(*results)
-
-
-def test_bad_input_is_named():
-    actor = policy(lambda t, a, o: -a)
-    with pytest.raises(KeyError, match="chunk"):
-        branching_cost(actor, batch())
-    with pytest.raises(KeyError, match="chunk"):
-        branching_bound(batch(), GaussianPrior(H))
-    data = windows(torch.zeros(5, H, 2), torch.zeros(5, H, 2))
-    with pytest.raises(ValueError, match="no window"):
-        branching_bound(data[:0], GaussianPrior(H))
-    decoded = CVAEPrior(H, widths=[2, 4, 1])
-    with pytest.raises(ValueError, match="of a Gaussian source"):
-        branching_bound(data, decoded)
-    with pytest.raises(ValueError, match="no path of 2 steps"):
-        branching_cost(policy(lambda t, a, o: -a, max_nfe=1), data)
-    with pytest.raises(ValueError, match="draws"):
-        branching_cost(actor, data, draws=0)

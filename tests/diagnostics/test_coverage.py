@@ -10,13 +10,7 @@ from learned_sources import CVAEPrior
 from tensordict import TensorDict
 
 from tests.diagnostics.fields import remember
-from warmprior import (
-    GaussianPrior,
-    PastPrior,
-    PreviewPrior,
-    VelocityMLP,
-    WarmPriorActor,
-)
+from warmprior import PastPrior, PreviewPrior, VelocityMLP, WarmPriorActor
 from warmprior.diagnostics import source_coverage
 from warmprior.history import cold_history
 
@@ -62,12 +56,6 @@ def test_only_executed_positions_inside_the_episode_count():
     assert source_coverage(actor(prior), data) == pytest.approx(2 / 3)
     data["action_is_pad"][:, 0] = True
     assert source_coverage(actor(prior), data) == 1.0
-
-
-def test_cold_sources_are_standard_normal():
-    prior = GaussianPrior(H)
-    found = source_coverage(actor(prior), windows(prior, 1.0, warm=False))
-    assert found == pytest.approx(0.9, abs=0.01)
 
 
 def test_what_is_no_gaussian_has_none():

@@ -8,16 +8,8 @@ import pytest
 import torch
 
 from tests.diagnostics.fields import D_A, H, batch, policy, remember
-from warmprior import GaussianPrior, HistoryObservation, PastPrior, PreviewPrior, VelocityMLP, keys
+from warmprior import PastPrior, PreviewPrior
 from warmprior.diagnostics import curvature
-from warmprior.modules import WarmPriorActor
-
-
-def test_a_constant_field_is_straight():
-    out = curvature(policy(lambda t, a, o: torch.full_like(a, 2.0)), batch())
-    assert out["kappa"].abs().max() < 1e-9
-    torch.testing.assert_close(out["speed"], torch.full((5,), 4.0 * H * D_A))
-    assert out["one_step_error"].max() < 1e-4
 
 
 @pytest.mark.parametrize("n_steps", [10, 100])
@@ -40,14 +32,6 @@ def test_a_linear_field_has_the_closed_form(n_steps):
     )
 
 
-def test_a_quarter_turn_in_time_has_the_integral():
-    """v = cos(pi t / 2) on every coordinate: kappa = 1/2 - (2 / pi)^2 each, up to the grid."""
-    field = policy(lambda t, a, o: torch.cos(torch.pi / 2 * t) + torch.zeros_like(a))
-    out = curvature(field, batch(), 2000)
-    expected = torch.full((5,), H * D_A * (0.5 - (2 / torch.pi) ** 2))
-    torch.testing.assert_close(out["kappa"], expected, rtol=1e-2, atol=0)
-
-
 def test_executed_positions_and_padding_count_separately():
     """Speed p at position p: sums over the counted positions only."""
     prior = PreviewPrior(H)
@@ -62,51 +46,6 @@ def test_executed_positions_and_padding_count_separately():
     out = curvature(policy(lambda t, a, o: weights.expand_as(a), prior), data, executed=1)
     assert out["speed"].tolist() == pytest.approx([D_A * 5.0] + [D_A * 91.0] * 4)
     assert out["speed_executed"].tolist() == pytest.approx([D_A * 1.0] * 5)
-
-
-def network_policy(prior=None, width=4, **options):
-    prior = PastPrior(H) if prior is None else prior
-    torch.manual_seed(0)
-    network = VelocityMLP(D_A, width, prior.prediction_length, 1, hidden_dim=8)
-    return WarmPriorActor(network, prior, generator=torch.Generator().manual_seed(0), **options)
-
-
-def test_the_split_changes_nothing():
-    data, results = batch(7), []
-    for split in (1, 3, 10_000):
-        generator = torch.Generator().manual_seed(3)
-        results.append(curvature(network_policy(), data, 20, draws=3, split=split, generator=generator))
-    for other in results[1:]:
-        for key, value in results[0].items():
-            torch.testing.assert_close(other[key], value, rtol=1e-4, atol=1e-6)
-
-
-def test_draws_average_independent_sources():
-    generator = torch.Generator().manual_seed(3)
-    data = batch(8)  # 48 numbers: torch draws them in blocks of 16
-    both = curvature(network_policy(), data, 20, draws=2, generator=generator)
-    generator = torch.Generator().manual_seed(3)
-    singles = [curvature(network_policy(), data, 20, generator=generator) for _ in range(2)]
-    expected = (singles[0]["kappa"] + singles[1]["kappa"]) / 2
-    torch.testing.assert_close(both["kappa"], expected)
-
-
-def test_batch_shape_mode_and_generator_are_respected():
-    width = 4 + HistoryObservation.width(H, D_A)
-    actor = network_policy(GaussianPrior(H), width, observation_key=keys.CONDITIONED).train()
-    data = HistoryObservation()(batch(6))
-    flat = curvature(actor, data, 10, generator=torch.Generator().manual_seed(0))
-    shaped = curvature(actor, data.reshape(2, 3), 10, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(shaped["kappa"].flatten(), flat["kappa"])
-    assert actor.training and actor.network.training
-    assert not flat["kappa"].requires_grad
-
-
-def test_a_field_at_rest_is_flagged():
-    with pytest.warns(UserWarning, match="5 of 5 paths do not move"):
-        out = curvature(policy(lambda t, a, o: 0 * a), batch())
-    assert out["kappa"].isnan().all() and out["relative"].isnan().all()
-    assert (out["speed"] == 0).all()
 
 
 def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
@@ -131,21 +70,6 @@ def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
         prediction = data.clone().set(("prior", "noise"), target)  # as in a rollout: no target
         assert torch.isfinite(curvature(policy(lazy, prior), prediction)["kappa_executed"]).all()
         assert torch.isfinite(curvature(policy(lazy, prior), data.exclude("vla_action"))["kappa"]).all()
-
-
-@pytest.mark.parametrize(
-    ("change", "error", "message"),
-    [
-        (lambda d: d.exclude("observation"), KeyError, "observation"),
-        (lambda d: d.exclude(("history", "steps")), KeyError, "steps"),
-        (lambda d: d[:0], ValueError, "no observation"),
-        (lambda d: d.update({"observation": d["observation"] * torch.nan}), ValueError, "NaN"),
-        (lambda d: batch(length=H + 1), ValueError, "forecasts of 3"),
-    ],
-)
-def test_bad_batches_are_named(change, error, message):
-    with pytest.raises(error, match=message):
-        curvature(policy(lambda t, a, o: -a), change(batch()))
 
 
 def test_bad_options_and_policies_are_named():

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from tests.diagnostics.fields import remember
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, WarmPriorActor
+from warmprior import PastPrior, PreviewPrior, WarmPriorActor
 from warmprior.diagnostics import mean_error, mean_revision
 from warmprior.history import cold_history
 
@@ -58,11 +58,6 @@ def test_only_warm_positions_inside_the_episode_count(prior):
     assert found.revision == pytest.approx(prior.sigma, rel=0.3, abs=1e-7)
 
 
-def test_without_a_mean_there_is_no_error():
-    found = mean_error(WarmPriorActor(Still(), GaussianPrior(H)), windows(GaussianPrior(H), warm=False))
-    assert math.isnan(found.target) and math.isnan(found.revision)
-
-
 def test_the_mean_is_that_of_the_source():
     """Of a learned one wherever it is, and none where it is no Gaussian."""
     prior = ForecastPrior(H, widths=[D_A, 1, 1])
@@ -86,12 +81,3 @@ def test_a_revision_counts_warm_positions():
     assert mean_revision(decided) == pytest.approx(float(expected))
     decided["prior", "warm"][:] = False
     assert math.isnan(mean_revision(decided))
-
-
-def test_bad_input_is_named():
-    for key in ("chunk", "loc"):
-        with pytest.raises(KeyError, match=key):
-            mean_revision(TensorDict({}, [3]))
-    with pytest.raises(KeyError, match="chunk"):
-        batch = windows(PastPrior(H)).exclude(("vla_action", "chunk"))
-        mean_error(WarmPriorActor(Still(), PastPrior(H)), batch)

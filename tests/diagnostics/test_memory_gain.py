@@ -7,9 +7,8 @@ import math
 import pytest
 import torch
 from learned_sources import ForecastPrior, ForecastStart
-from tensordict import TensorDict
 
-from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember, seeing_network
+from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
 from warmprior import (
     GaussianPrior,
     HistoryObservation,
@@ -17,9 +16,8 @@ from warmprior import (
     PreviewPrior,
     RealTimeChunking,
     WarmPriorActor,
-    keys,
 )
-from warmprior.diagnostics import HistoryShift, encoded_windows, memory_gain
+from warmprior.diagnostics import memory_gain
 
 N = 20_000
 
@@ -28,11 +26,6 @@ def windows(prior, n=50, warm=True, **extra):
     length = prior.prediction_length
     loc = torch.rand(n, length, D_A, generator=torch.Generator().manual_seed(2))
     return HistoryObservation()(remember(batch(n, length), loc, warm).update(extra))
-
-
-def seen_mean(observation):
-    """The mean in what a network is said of it."""
-    return observation[:, -1, 4 : 4 + H * D_A].unflatten(-1, (H, D_A))
 
 
 def by_hand(act, data, shift=0.05):
@@ -63,13 +56,6 @@ def test_the_gain_is_the_share_that_is_repeated(prior, share):
     assert found == {1: pytest.approx(share, abs=1e-5)}
 
 
-@pytest.mark.parametrize("nfe", [1, 3, 9])
-def test_euler_steps_multiply(nfe):
-    prior = PastPrior(H)
-    found = memory_gain(policy(lambda t, a, o: 0.7 * a, prior), windows(prior), nfes=(nfe,))
-    assert found[nfe] == pytest.approx((1 + 0.7 / nfe) ** nfe, rel=1e-4)
-
-
 def test_the_gain_is_the_mean_slope_over_dimensions():
     """What of a dimension appears in another one is none, and what turns round counts against it."""
     prior, matrix = PastPrior(H), torch.tensor([[1.0, 2.0], [0.0, -0.5]])
@@ -90,15 +76,6 @@ def test_a_flow_that_branches_has_the_slope_of_its_mean(shift):
     found = memory_gain(field, data, nfes=(1,), shift=shift)[1]
     along = shift / math.sqrt(D_A)  # per dimension, as good as linear
     assert found == pytest.approx(math.erf(along / 0.5 / math.sqrt(2)) / along, rel=0.05)
-
-
-def test_any_shift_gives_the_slope_between_both_sides():
-    prior = PastPrior(H, sigma=0.0)
-    data = windows(prior)
-    data["history", "actions"].zero_()
-    field = policy(lambda t, a, o: torch.where(a > 0, a, 0.0), prior)  # slopes 2 and 1
-    for shift in (0.01, 1.0):
-        assert memory_gain(field, data, nfes=(1,), shift=shift)[1] == pytest.approx(1.5, rel=1e-4)
 
 
 def test_a_cold_source_has_no_memory():
@@ -140,39 +117,6 @@ def test_noise_lowers_the_gain_by_what_averaging_over_the_chunk_leaves(sigma, co
     assert found[300] == pytest.approx(spread / math.sqrt(spread**2 + kept), rel=5e-3)
 
 
-def test_a_network_that_sees_the_mean_follows_it_as_well():
-    prior = GaussianPrior(H)
-    field = policy(lambda t, a, o: 0.4 * seen_mean(o) - a, observation_key=keys.CONDITIONED)
-    found = memory_gain(field, windows(prior), nfes=(1,))
-    assert found[1] == pytest.approx(0.4, rel=1e-4)
-
-
-def test_a_network_that_sees_images_and_the_mean():
-    """Against the same policy without its diagnostics: observations made anew on both sides."""
-    prior, n = GaussianPrior(H), 8
-    width = 4 + HistoryObservation.width(H, D_A)
-    network = seeing_network(D_A, width, H)
-    actor = WarmPriorActor(network, prior, nfe=1, observation_key=keys.CONDITIONED).eval()
-    data = windows(GaussianPrior(H), n)
-    images = torch.randint(0, 255, (n, 2, 3, 16, 16), dtype=torch.uint8)
-    states = torch.randn(n, 2, 4)
-    data["observation"] = TensorDict({"state": states, "cam_image": images}, [n])
-    whole = HistoryObservation()(data.clone())
-    found = memory_gain(actor, whole, nfes=(1,), shift=0.5)[1]
-    with pytest.raises(ValueError, match="images as they are, not encoded"):
-        memory_gain(actor, encoded_windows(actor, whole))
-    with pytest.raises(ValueError, match="holds no observation"):
-        memory_gain(actor, whole[:0])
-
-    def act(moved, generator):
-        a0 = torch.randn(n, H, D_A, generator=generator)
-        said = HistoryObservation()(moved)["prior", "observation"]
-        return a0 + network(torch.zeros(n), a0, said)
-
-    assert abs(found) > 1e-4
-    assert found == pytest.approx(by_hand(act, data, shift=0.5), rel=1e-3)
-
-
 def test_a_learned_source_is_asked_with_the_shifted_history():
     torch.manual_seed(0)
     prior = ForecastPrior(H, widths=[D_A, 4, 1])
@@ -199,61 +143,6 @@ def test_it_measures_where_samplers_start():
     assert found == pytest.approx(expected, rel=1e-3) and abs(found) > 1e-4
 
 
-def test_dropout_is_off():
-    class Dropping(Field):
-        def forward(self, t, a, observation):
-            return torch.nn.functional.dropout(-0.5 * a, training=self.training)
-
-    prior = PastPrior(H)
-    dropping = WarmPriorActor(Dropping(None), prior).train()
-    found = memory_gain(dropping, windows(prior), nfes=(1,))
-    assert found[1] == pytest.approx(0.5, rel=1e-4)
-
-
-def test_nfes_are_those_of_the_prior_in_order_and_batches_may_have_any_shape():
-    field = policy(lambda t, a, o: 0.7 * a, PastPrior(H))
-    data = windows(PastPrior(H), 48)
-    found = memory_gain(field, data, nfes=(9, 1, 3))
-    assert list(found) == [1, 3, 9]
-    assert memory_gain(field, data.reshape(4, 12), nfes=(1, 3, 9)) == found
-    regression = policy(repeats(0.7), max_nfe=1)
-    assert list(memory_gain(regression, windows(GaussianPrior(H)))) == [1]
-
-
-def test_a_generator_draws_directions_and_noise():
-    data = windows(PastPrior(H))
-    field = policy(lambda t, a, o: a.sin(), PastPrior(H))
-
-    def found(seed):
-        return memory_gain(field, data, nfes=(1,), generator=torch.Generator().manual_seed(seed))
-
-    assert found(0) == memory_gain(field, data, nfes=(1,))
-    assert found(1) == found(1) != found(0)
-
-
-def test_a_disturbed_memory_tells_a_network_of_it():
-    field = Field(lambda t, a, o: seen_mean(o) - a)
-    actor = WarmPriorActor(field, GaussianPrior(H), nfe=1, observation_key=keys.CONDITIONED)
-    data = windows(GaussianPrior(H)).to("cpu")  # on the policy's device already
-    before = data.clone()
-    disturbed = HistoryShift(actor, 0.3, generator=torch.Generator().manual_seed(3))
-    found = disturbed(data)[actor.chunk_key]
-    data = data.select(*before.keys(True, True))
-    assert (data == before).all()
-    moved = (found - data["history", "actions"]) / 0.3
-    assert 0.8 < float(moved.std()) < 1.2
-    assert memory_gain(actor, data, nfes=(1,))[1] == pytest.approx(1.0, rel=1e-4)
-    assert (data == before).all()
-    with pytest.raises(KeyError, match="observation"):
-        disturbed(data.exclude(("prior", "observation")))
-
-
-def test_windows_without_a_history_do_not_count():
-    prior, warm = PastPrior(H), torch.arange(50)[:, None] % 2 == 0
-    found = memory_gain(policy(repeats(0.6), prior), windows(prior, warm=warm), nfes=(1,))
-    assert found[1] == pytest.approx(0.6, rel=1e-4)
-
-
 def test_a_guided_policy_is_measured_as_it_acts():
     """Against the policy itself, on both sides by hand; its guidance takes the source's own sigma."""
     prior = PastPrior(H, sigma=0.5)
@@ -268,29 +157,6 @@ def test_a_guided_policy_is_measured_as_it_acts():
         return guided(moved, generator=generator)[guided.chunk_key]
 
     assert found == pytest.approx(by_hand(act, data), rel=1e-3)
-
-
-def test_what_a_network_is_told_has_to_be_of_the_windows_mean():
-    data = windows(GaussianPrior(H))
-    data["prior", "observation"] = data["prior", "observation"] + 1
-    with pytest.raises(ValueError, match="does not end in the windows' last actions"):
-        memory_gain(policy(repeats(1.0), observation_key=keys.CONDITIONED), data)
-
-
-def test_empty_windows_are_refused():
-    with pytest.raises(ValueError, match="holds no observation"):
-        memory_gain(policy(repeats(1.0), PastPrior(H)), windows(PastPrior(H))[:0])
-
-
-def test_a_split_that_cannot_be_is_refused():
-    with pytest.raises(ValueError, match="split must be at least 1, got 0"):
-        memory_gain(policy(repeats(1.0), PastPrior(H)), windows(PastPrior(H)), split=0)
-
-
-@pytest.mark.parametrize("shift", [0.0, -1.0, math.nan, math.inf])
-def test_a_shift_that_cannot_be_is_refused(shift):
-    with pytest.raises(ValueError, match="shift must be a finite number > 0"):
-        memory_gain(policy(repeats(1.0), PastPrior(H)), windows(PastPrior(H)), shift=shift)
 
 
 def test_it_is_repeatable_and_leaves_the_policy_as_it_is():

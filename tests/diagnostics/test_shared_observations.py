@@ -61,23 +61,6 @@ def test_windows_hold_the_same_observations_and_each_priors_own_history():
     assert torch.equal(part.episodes, data["episode"][frames[[1, 4]]])
 
 
-def test_episode_numbers_may_have_a_dimension_of_their_own():
-    data = steps([10, 3, 8])
-    flat = SharedObservations(data, H)
-    data["episode"] = data["episode"].unsqueeze(-1)
-    column = SharedObservations(data, H)
-    assert torch.equal(column.frames, flat.frames)
-    assert torch.equal(column.episodes, flat.episodes)
-
-
-def test_the_draw_depends_on_the_seed_alone():
-    def drawn(seed):
-        generator = torch.Generator().manual_seed(seed)
-        return SharedObservations(steps([50]), H, count=10, generator=generator).frames.tolist()
-
-    assert drawn(1) == drawn(1) != drawn(2)
-
-
 def test_the_deployed_mean_is_the_policys_own_prediction():
     """A field that carries every source to the number of the observation's step plus 0, 1, 2, ..."""
     prior = PreviewPrior(H)

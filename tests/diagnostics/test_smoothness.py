@@ -11,18 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.envs import GymEnv, StepCounter, TransformedEnv
-from torchrl.envs.transforms import Compose
 
-from warmprior import (
-    ChunkStep,
-    GaussianPrior,
-    HistoryObservation,
-    PastPrior,
-    VelocityMLP,
-    WarmPriorActor,
-    keys,
-)
+from warmprior import GaussianPrior, HistoryObservation, PastPrior, VelocityMLP, WarmPriorActor, keys
 from warmprior.diagnostics import HistoryShift, compare_smoothness, executed_actions, smoothness
 from warmprior.history import cold_history
 
@@ -78,31 +68,6 @@ def test_against_loops(rows, decisions, horizon, seed):
     assert result.switch_rate == pytest.approx(mean(switches))
 
 
-def test_actions_without_a_mode_do_not_switch():
-    chunks = torch.tensor([[[0.01]], [[1.0]], [[-1.0]], [[0.0]]])
-    rollout = rollout_of(chunks, [1, 1, 1, 1])
-    assert smoothness(rollout, mode=0).switch_rate == pytest.approx(0.5)
-
-    def clear(actions):
-        height = actions[..., 0]
-        return torch.where(height.abs() > 0.1, height, 0.0)
-
-    assert smoothness(rollout, mode=clear).switch_rate == 1.0
-    assert math.isnan(smoothness(rollout_of(0 * chunks, [1] * 4), mode=0).switch_rate)
-    assert math.isnan(smoothness(rollout).switch_rate)
-
-
-def test_rollout_of_an_environment_that_ends_inside_a_chunk():
-    env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(StepCounter(max_steps=10), ChunkStep(4)))
-    env.set_seed(0)
-    rollout = env.rollout(5)
-    actions, decision, episode = executed_actions(rollout)
-    chunk = rollout["vla_action", "chunk"]
-    assert torch.equal(actions, torch.cat([chunk[0], chunk[1], chunk[2, :2]]))
-    assert decision.tolist() == [0] * 4 + [1] * 4 + [2] * 2 and not episode.any()
-    assert smoothness(rollout).boundaries == 2
-
-
 def test_bad_rollouts_are_named():
     chunks = torch.zeros(3, 2, 1)
     with pytest.raises(KeyError, match="ChunkStep"):
@@ -117,11 +82,6 @@ def test_bad_rollouts_are_named():
         executed_actions(rollout_of(chunks[:0], torch.zeros(0, dtype=torch.int64)))
     with pytest.raises(ValueError, match="executed actions only"):
         compare_smoothness({"a": rollout_of(chunks, [2] * 3), "b": rollout_of(chunks, [1] * 3)})
-
-
-def test_what_is_not_executed_may_be_anything():
-    chunks = torch.tensor([[[1.0], [math.nan]], [[2.0], [math.nan]]])
-    assert smoothness(rollout_of(chunks, [1, 1])).boundary_jump == 1.0
 
 
 @pytest.mark.parametrize("see_history", [False, True])

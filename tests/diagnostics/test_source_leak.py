@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 import math
-import sys
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
-from torch import nn
 
-from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
-from warmprior import (
-    GaussianPrior,
-    HistoryObservation,
-    PastPrior,
-    PreviewPrior,
-    WarmPriorActor,
-    keys,
-)
-from warmprior.diagnostics import SourceLeak, source_leak
+from tests.diagnostics.fields import D_A, H, batch, policy, remember
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior.diagnostics import source_leak
 
 
 def windows(n=400, length=H, d_a=D_A, seed=2):
@@ -57,31 +47,6 @@ def test_spread_is_the_share_of_the_source_that_passes(share, sigma):
     assert result[1].ratio_to_last == pytest.approx(ratio, rel=1e-3)
     assert result[9].ratio_to_last == 1.0
     assert result[1].leak == pytest.approx(result[1].spread / result[1].data_spread)
-
-
-def test_spread_and_steps_against_separate_draws():
-    data = windows(30)
-    actor = policy(lambda t, a, o: torch.tanh(2 * a) - goal(o) * t)
-    generator = torch.Generator().manual_seed(5)
-    result = source_leak(actor, data, draws=3, generator=generator, split=7)
-    generator = torch.Generator().manual_seed(5)
-    sources = [torch.randn(30, H, D_A, generator=generator) for _ in range(3)]
-    for nfe in (1, 9):
-        chunks = torch.stack(
-            [
-                actor.ode(data.clone().set(("prior", "noise"), a0), nfe=nfe)["vla_action", "chunk"]
-                for a0 in sources
-            ]
-        )
-        deviation = chunks.std(0)
-        assert result[nfe].spread == pytest.approx(float(deviation.square().mean().sqrt()), rel=1e-5)
-        steps = [
-            math.dist(chunks[d, i, p].tolist(), chunks[d, i, p + 1].tolist())
-            for d in range(3)
-            for i in range(30)
-            for p in range(H - 1)
-        ]
-        assert result[nfe].inner_step == pytest.approx(sum(steps) / len(steps), rel=1e-5)
 
 
 @pytest.mark.parametrize("s", [0.1, 0.7])
@@ -157,17 +122,6 @@ def test_data_spread_against_loops(data):
     assert result[1].data_spread == pytest.approx(expected, rel=1e-4)
 
 
-def test_data_spread_in_parts(monkeypatch):
-    data, episodes = windows(50), torch.arange(50) // 4
-    whole = source_leak(policy(passing(0.5)), data, neighbours=3, episodes=episodes)
-    # The function has the same name as its module.
-    monkeypatch.setattr(sys.modules["warmprior.diagnostics.source_leak"], "DISTANCES", 160)
-    parts = source_leak(policy(passing(0.5)), data, neighbours=3, episodes=episodes, split=9)
-    for nfe in (1, 9):
-        assert parts[nfe].data_spread == pytest.approx(whole[nfe].data_spread, rel=1e-5)
-        assert parts[nfe].spread == pytest.approx(whole[nfe].spread, rel=1e-5)
-
-
 def test_neighbours_come_from_other_episodes():
     """Four episodes of slow observations, each with an action of its own: +1 or -1."""
     episodes = torch.arange(4).repeat_interleave(20)
@@ -205,111 +159,15 @@ def test_padded_positions_do_not_count():
     assert expected[1].data_inner_step == pytest.approx(float(first))
 
 
-def test_single_actions_have_no_inner_step():
-    result = source_leak(policy(passing(0.5), GaussianPrior(1)), windows(20, 1))[1]
-    assert math.isnan(result.inner_step)
-    assert math.isnan(result.data_inner_step)
-    assert math.isnan(result.inner_step_ratio)
-    assert result.spread > 0.4
-
-
-def test_the_warning_names_what_exceeds_its_bound():
-    assert SourceLeak(1, 1.0, 1.0, 1.0, 1.3, 1.0).warning is None
-    assert SourceLeak(1, 1.0, 0.0, math.nan, math.nan, math.nan).warning is None
-    spread = SourceLeak(3, 1.1, 1.0, 1.0, 1.0, 1.0).warning
-    assert "NFE 3" in spread and "spread is 1.10 times" in spread and "inside" not in spread
-    steps = SourceLeak(1, 0.5, 1.0, 1.0, 1.4, 1.0).warning
-    assert "chunks are 1.40 times" in steps and "spread" not in steps
-
-
-def test_a_network_that_sees_the_history():
-    """What was done moves the chunk, the source around it does not spread by it."""
-    data = windows(100)
-    data = HistoryObservation()(remember(data, torch.randn(100, H, D_A)))
-
-    def field(t, a, o):
-        assert o.shape[-1] == 4 + HistoryObservation.width(H, D_A)
-        return goal(o[..., 4:]) + (0.2 - 1) * a
-
-    actor = policy(field, observation_key=keys.CONDITIONED)
-    result = source_leak(actor, data, draws=16)[1]
-    assert result.spread == pytest.approx(0.2, rel=0.03)
-    # Neighbours in what the policy alone is shown would be others.
-    gaussian = source_leak(policy(passing(0.2)), data)[1]
-    assert result.data_spread == gaussian.data_spread
-
-
-def test_a_policy_of_one_evaluation_is_measured_at_that():
-    result = source_leak(policy(lambda t, a, o: goal(o) - a, max_nfe=1), windows(30))
-    assert list(result) == [1]
-    assert result[1].spread < 1e-6
-    with pytest.raises(ValueError, match="has none"):
-        source_leak(policy(passing(0.5), max_nfe=1), windows(30), nfes=(3, 9))
-
-
-class Dropping(Field):
-    """Loses inputs in training mode."""
-
-    def __init__(self):
-        super().__init__(passing(0.5))
-        self.dropout = nn.Dropout(0.5)
-
-    def forward(self, t, a, observation):
-        return super().forward(t, self.dropout(a), observation)
-
-
-def test_nothing_changes_but_the_generator_given():
-    own = torch.Generator().manual_seed(3)
-    actor = WarmPriorActor(Dropping(), GaussianPrior(H), generator=own)
-    actor.network.eval()
-    actor.network.dropout.train()
-    modes = [module.training for module in actor.modules()]
-    data = windows(20).to("cpu")  # on the policy's device: nothing needs to be copied there
-    before, states = data.clone(), (own.get_state(), torch.get_rng_state())
-    given_one = torch.Generator().manual_seed(4)
-    runs = [
-        source_leak(actor, data),
-        source_leak(actor, data),
-        source_leak(actor, data, generator=given_one),
-        source_leak(actor, data, generator=given_one),
-        source_leak(actor, data, generator=torch.Generator().manual_seed(4)),
-    ]
-    assert runs[0] == runs[1]
-    assert runs[2] != runs[3]
-    assert runs[2] == runs[4]
-    assert [module.training for module in actor.modules()] == modes
-    assert actor.sampler.generator is own
-    assert torch.equal(own.get_state(), states[0])
-    assert torch.equal(torch.get_rng_state(), states[1])
-    assert (data == before).all()
-    assert set(data.keys(True)) == set(before.keys(True))
-    assert torch.is_grad_enabled()
-
-
-def test_windows_of_any_batch_shape():
-    data, actor = windows(24), policy(passing(0.5))
-    episodes = torch.arange(24) // 3
-    expected = source_leak(actor, data, episodes=episodes)
-    assert source_leak(actor, data.reshape(4, 6), episodes=episodes.reshape(4, 6)) == expected
-
-
 def test_bad_input_is_named():
     actor, data = policy(passing(0.5)), windows(5)
-    for key in ("observation", ("vla_action", "chunk"), ("history", "actions")):
-        with pytest.raises(KeyError, match=key if isinstance(key, str) else key[1]):
-            source_leak(actor, data.exclude(key))
+    with pytest.raises(KeyError, match="chunk"):
+        source_leak(actor, data.exclude(("vla_action", "chunk")))
     with pytest.raises(ValueError, match="4 other episode"):
         source_leak(actor, data[:4], neighbours=4)
     with pytest.raises(ValueError, match="each of the 5 windows"):
         source_leak(actor, data, episodes=torch.zeros(4))
-    for option in ({"draws": 1}, {"neighbours": 0}, {"split": 0}):
-        with pytest.raises(ValueError, match="need draws"):
-            source_leak(actor, data, **option)
-    with pytest.raises(ValueError, match="network evaluations"):
-        source_leak(actor, data, nfes=(0, 1))
-    with pytest.raises(ValueError, match="has none"):
-        source_leak(actor, data, nfes=())
+    with pytest.raises(ValueError, match="need draws"):
+        source_leak(actor, data, draws=1)
     with pytest.raises(FloatingPointError, match="NFE 9"):
         source_leak(policy(lambda t, a, o: a / (t < 0.5)), data)
-    with pytest.raises(ValueError, match="no observation"):
-        source_leak(actor, TensorDict(data[:0], [0]))

@@ -35,7 +35,7 @@ def lift_env():
     return make_simulator(task_env_args("lift"))
 
 
-@pytest.mark.parametrize("task", ["lift", "can", "square", "stack", "transport"])
+@pytest.mark.parametrize("task", ["lift", "square", "transport"])
 def test_agrees_with_env_step(task):
     env = make_simulator(task_env_args(task))
     actions = random_actions(TASKS[task].action_dim)
@@ -62,18 +62,6 @@ def test_agrees_for_other_inputs(changes):
     np.testing.assert_allclose(
         joint_path(ControlLoop(env), actions), joint_path(StepLoop(env), actions), atol=TOLERANCE
     )
-
-
-def test_env_step_may_follow_lean_steps(lift_env):
-    actions = random_actions(7)
-    expected = joint_path(StepLoop(lift_env), actions)
-    loop = ControlLoop(lift_env)
-    loop.reset(3)
-    for action in actions[:5]:
-        loop.step(action)
-    for action in actions[5:]:
-        lift_env.step(action)
-    np.testing.assert_allclose(lift_env.sim.data.qpos[:7], expected[-1], atol=TOLERANCE)
 
 
 def test_same_seed_and_actions_are_bit_identical(lift_env):
@@ -127,26 +115,9 @@ def test_state_round_trip(lift_env):
         loop.set_state(np.zeros(3))
 
 
-def test_computes_only_what_is_asked_for():
-    env = make_simulator(task_env_args("lift"))
-    keys = ("object", "robot0_eef_pos")
-    loop = ControlLoop(env, keys)
-    assert tuple(sorted(loop.reset(0))) == keys
-    assert not env._observables["robot0_joint_vel"].is_enabled()
-    with pytest.raises(ValueError, match="no observation robot1_eef_pos"):
-        ControlLoop(env, ("robot1_eef_pos",))
-
-
 def test_refuses_what_it_does_not_implement():
     env_args = task_env_args("lift")
     part = env_args["env_kwargs"]["controller_configs"]["body_parts"]["right"]
     part["impedance_mode"] = "variable"
     with pytest.raises(ValueError, match="control_loop='robosuite'"):
         ControlLoop(make_simulator(env_args))
-
-
-def test_refuses_an_action_of_another_width(lift_env):
-    loop = ControlLoop(lift_env)
-    loop.reset(0)
-    with pytest.raises(ValueError, match="width 7, got 14"):
-        loop.step(np.zeros(14))

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 
 pytest.importorskip("robosuite")
 
-from torchrl.envs import ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import TransformedEnv
 from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
 from warmprior import PastPrior, RealTimeChunking, VelocityMLP, WarmPriorActor
-from warmprior.data import RobomimicExperienceReplay, generate_demonstrations
+from warmprior.data import RobomimicExperienceReplay
 from warmprior.envs import RobosuiteEnv, environment_description, environment_of
-from warmprior.envs.description import environment_name, environment_parts, robosuite_parts
+from warmprior.envs.description import environment_name, robosuite_parts
 from warmprior.envs.simulator import task_env_args
 from warmprior.training.saved import load_policy, save_policy
 
@@ -29,11 +27,6 @@ def actor(tmp_path, actions="absolute"):
     policy = WarmPriorActor(network, PastPrior(4), nfe=1, environment=environment)
     save_policy(policy, tmp_path)
     return load_policy(tmp_path)
-
-
-def test_recorded_actions_need_no_words():
-    description = environment_description(task_env_args("lift"), "ph", 2)
-    assert set(description) == {"robosuite", "observation_steps"}
 
 
 @pytest.mark.parametrize("actions", ["delta", "absolute"])
@@ -56,16 +49,6 @@ def test_a_guided_policy_is_told_what_is_left_of_its_chunks(tmp_path):
     assert not rollout["history", "forecast_steps"].any()
 
 
-@pytest.mark.parametrize("batched", [SerialEnv, partial(ParallelEnv, mp_start_method="fork")])
-def test_batched(tmp_path, batched):
-    make_env, make_transforms = environment_parts(actor(tmp_path))
-    env = TransformedEnv(batched(2, partial(make_env, horizon=6)), make_transforms())
-    try:
-        check_env_specs(env)
-    finally:
-        env.close(raise_if_closed=False)
-
-
 @pytest.mark.parametrize("task", ["lift", "transport"])
 def test_the_pose_is_that_of_the_controller(task):
     env = RobosuiteEnv(task, eef_pose=True)
@@ -79,13 +62,6 @@ def test_the_pose_is_that_of_the_controller(task):
         hand = Rotation.from_quat(raw[f"robot{arm}_eef_quat"])
         site = hand * Rotation.from_euler("z", -90, degrees=True)
         np.testing.assert_allclose(pose[arm, :, :3], site.as_matrix(), atol=1e-5)
-
-
-def test_unknown_spaces_are_refused(tmp_path):
-    policy = actor(tmp_path)
-    policy.environment = {**policy.environment, "actions": "velocity"}
-    with pytest.raises(ValueError, match="keeps no description"):
-        environment_of(policy)
 
 
 def solved(path, actions):
@@ -110,7 +86,6 @@ def solved(path, actions):
     return outcomes
 
 
-@pytest.mark.parametrize("task", ["lift", pytest.param("square", marks=pytest.mark.slow)])
-def test_demonstrations_replay_in_both_spaces(tmp_path, task):
-    path = generate_demonstrations(task, n=3, path=tmp_path / "file.hdf5", progress=False)
-    assert solved(path, "absolute") == solved(path, "delta") == [True] * 3
+def test_demonstrations_replay_in_both_spaces(lift_demonstrations):
+    found = [solved(lift_demonstrations, actions) for actions in ("absolute", "delta")]
+    assert found == [[True] * 3] * 2

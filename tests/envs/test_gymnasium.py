@@ -82,17 +82,3 @@ def test_every_seed_is_one_reset_and_later_episodes_are_others():
     again = env.reset()["observation"]
     assert base.resets[before:] == [3, None] and again.tolist() != first[0][0]
     assert played(env, 3) == first  # whatever was played before
-
-
-def test_dictionaries_are_concatenated_in_the_order_that_is_asked_for():
-    for keys, width in (((), 3), (("turns", "dial"), 3), (("dial",), 2)):
-        env = gym_env(Dial(nested=True), observation_keys=keys)
-        env.set_seed(0)
-        data = env.step(env.reset().set("action", torch.zeros(1)))["next"]
-        seen = data["observation"]
-        assert seen.shape == (width,) and seen.dtype == torch.float32
-        assert env.observation_spec["observation"].shape == (width,)
-        turns = {(): 2, ("turns", "dial"): 0}.get(keys)
-        assert turns is None or seen[turns] == 1.0
-    with pytest.raises(KeyError, match=r"no observations \['hand'\]: it has \['dial', 'turns'\]"):
-        gym_env(Dial(nested=True), observation_keys=["hand"])

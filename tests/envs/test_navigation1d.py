@@ -91,16 +91,6 @@ def test_episode_executes_the_heights_and_reports_collisions(chunk):
     torch.testing.assert_close(seen, navigation_positions()[::chunk].expand_as(seen))
 
 
-def test_some_agents_can_start_over():
-    env = NavigationEnv(batch_size=[3])
-    data = env.reset()
-    for _ in range(3):
-        data = env.step_mdp(env.step(data.set("action", torch.ones(3, 1))))
-    again = env.reset(data.set("_reset", torch.tensor([[True], [False], [False]])))
-    assert again["step_index"].flatten().tolist() == [0, 3, 3]
-    assert again["height"].flatten().tolist() == [0.0, 1.0, 1.0]
-
-
 def test_metrics_of_known_paths():
     above, below = navigation_heights()[1], navigation_heights()[4]
     switching = torch.where(torch.arange(64) // 4 % 2 == 0, above, below)
@@ -120,22 +110,3 @@ def test_metrics_of_known_paths():
     assert navigation_metrics(routes, 4).route_entropy == pytest.approx(2.0)
     assert navigation_metrics(routes[:2], 4).route_entropy == pytest.approx(1.0)
     assert navigation_metrics(above[None] + 0.01, 4).distance == pytest.approx(0.01, rel=1e-3)
-
-
-def test_heights_without_a_side_have_no_switch_rate():
-    metrics = navigation_metrics(0.01 * torch.randn(8, 64), 4)
-    assert math.isnan(metrics.switch_rate) and metrics.collision_rate == 1.0
-
-
-@pytest.mark.parametrize(
-    ("heights", "chunk", "message"),
-    [
-        (torch.zeros(2, 63), 4, "64"),
-        (torch.zeros(0, 64), 4, "n > 0"),
-        (torch.full((2, 64), math.nan), 4, "NaN"),
-        (torch.zeros(2, 64), 64, "chunk_length"),
-    ],
-)
-def test_bad_heights_are_named(heights, chunk, message):
-    with pytest.raises(ValueError, match=message):
-        navigation_metrics(heights, chunk)

@@ -6,12 +6,9 @@ import itertools
 
 import pytest
 import torch
-from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import ChunkPolicy
-from warmprior import PastPrior, policy_transforms
-from warmprior.envs import GoalNavigationEnv, NavigationEnv, navigation_heights
+from warmprior.envs import GoalNavigationEnv, navigation_heights
 
 ROUTES = list(itertools.product((1, -1), repeat=2))
 STEPS = 64
@@ -68,51 +65,3 @@ def test_which_demonstrations_succeed(route):
     # Three of the six demonstrations if the goal keeps to one side, none of them if it crosses.
     assert int(solved[:6].sum()) == (3 if route[0] == route[1] else 0)
     assert int(solved.sum()) == 3
-
-
-def test_a_collision_ends_the_episode():
-    low = torch.full((1, STEPS, 1), 0.3)  # above the axis, but inside both obstacles
-    env = GoalNavigationEnv((1, 1), batch_size=[1])
-    rewards, length, solved = play(env, low.squeeze(-1))
-    x = torch.linspace(-1, 1, STEPS)
-    first = int((x > -0.45 - 0.12).nonzero()[0])  # the first segment that reaches the obstacle
-    assert int(length) == first + 1 and not solved.any() and not rewards.any()
-
-
-def test_the_way_there_is_that_of_the_environment_without_goal():
-    plain, goal = NavigationEnv(batch_size=[6]), GoalNavigationEnv((1, 1), batch_size=[6])
-    a, b = plain.reset(), goal.reset()
-    for step in range(10):
-        action = navigation_heights()[:, step, None]
-        a = plain.step(a.set("action", action))["next"].exclude("reward")
-        b = goal.step(b.set("action", action))["next"].exclude("reward")
-        assert all(torch.equal(a[key], b[key]) for key in ("observation", "height", "step_index"))
-
-
-def test_chunks_stop_at_the_end():
-    """An episode that ends inside a chunk executes no more of it."""
-    env = TransformedEnv(
-        GoalNavigationEnv((1, 1), batch_size=[6]),
-        policy_transforms(PastPrior(4), observation_steps=1),
-    )
-    chunks = navigation_heights().unflatten(1, (-1, 4)).unsqueeze(-1)
-    count = itertools.count()
-    rollout = env.rollout(
-        16,
-        ChunkPolicy(lambda data: chunks[:, min(next(count), 15)].clone()),
-        break_when_any_done=False,
-        auto_reset=True,
-        break_when_all_done=True,
-    )
-    first = int((torch.linspace(-1, 1, STEPS) + 0.45).abs().argmin())
-    executed = rollout["next", "executed_steps"].squeeze(-1)
-    done = rollout["next", "done"].squeeze(-1).long()
-    before_end = (done.cumsum(1) - done) == 0
-    total = (executed * before_end).sum(1)
-    assert total.tolist() == [STEPS] * 3 + [first + 1] * 3
-
-
-@pytest.mark.parametrize("route", [(1,), (1, 0), (1, 1, 1), (2, -1)])
-def test_bad_routes(route):
-    with pytest.raises(ValueError, match="a route is 2 numbers 1 or -1"):
-        GoalNavigationEnv(route)

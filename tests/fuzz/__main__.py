@@ -18,10 +18,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from tests.fuzz import demonstrations, policies, states
+from tests.fuzz.generators import SUBJECTS
 from tests.fuzz.sandbox import LIMIT_BYTES, LIMIT_SECONDS, attempt
-
-SUBJECTS = (demonstrations, policies, states)
 
 
 def main() -> int:
@@ -44,11 +42,11 @@ def main() -> int:
                 counts["failures" if outcome.failed else outcome.kind] += 1
                 if outcome.failed:
                     print(
-                        f"{subject.NAME}, seed {seed} ({how}): {outcome.kind}: {outcome.detail}",
+                        f"{subject.name}, seed {seed} ({how}): {outcome.kind}: {outcome.detail}",
                         file=sys.stderr,
                     )
         cells = [counts[kind] for kind in ("equal", "as stored", "refused", "failures")]
-        row = [subject.NAME, args.cases, *cells, f"{time.monotonic() - started:.0f}"]
+        row = [subject.name, args.cases, *cells, f"{time.monotonic() - started:.0f}"]
         print("| " + " | ".join(map(str, row)) + " |", flush=True)
         failures += counts["failures"]
     print(f"\nNo case may take {LIMIT_SECONDS:.0f} s or {LIMIT_BYTES / 2**30:.0f} GiB.")

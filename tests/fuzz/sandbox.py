@@ -61,8 +61,8 @@ def attempt(load: Callable[[], Outcome], names: str) -> Outcome:
         return Outcome("hang", f"no answer within {LIMIT_SECONDS:.0f} s")
     if not answer:
         return Outcome("crash", f"ended with status {status}")
-    inherited, *told = pickle.loads(answer)
-    outcome = Outcome(*told)
+    inherited, *found = pickle.loads(answer)
+    outcome = Outcome(*found)
     taken = 1024 * usage.ru_maxrss - inherited
     if taken > LIMIT_BYTES:
         return Outcome("memory", f"{taken / 2**30:.1f} GiB, then {outcome}")

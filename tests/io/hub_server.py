@@ -122,7 +122,7 @@ class ModelHub(Loopback):
         if what == "preupload":
             files = json.loads(body)["files"]
             mode = {True: "lfs", False: "regular"}
-            told = [
+            modes = [
                 {
                     "path": f["path"],
                     "uploadMode": mode[f["path"].endswith(".safetensors")],
@@ -130,7 +130,7 @@ class ModelHub(Loopback):
                 }
                 for f in files
             ]
-            return 200, {}, {"files": told}
+            return 200, {}, {"files": modes}
         if what == "info" and rest.startswith("lfs"):
             objects = [
                 o | {"actions": {"upload": {"href": f"{self.address}/objects/{o['oid']}"}}}

@@ -8,14 +8,7 @@ import pytest
 import torch
 
 from tests.together import together
-from warmprior.io.distributed import (
-    check_device,
-    launched,
-    leader_first,
-    rank,
-    world_size,
-)
-from warmprior.io.script import run_script
+from warmprior.io.distributed import check_device, launched, leader_first, rank, world_size
 
 
 @pytest.fixture
@@ -36,34 +29,6 @@ def test_alone(monkeypatch):
     assert not launched() and (rank(), world_size()) == (0, 1)
     monkeypatch.setenv("WORLD_SIZE", "4")  # as a cluster's scheduler may leave it, without the rest
     assert not launched()
-
-
-def test_torchrun_with_one_process_is_none(under_torchrun, monkeypatch):
-    assert launched()
-    monkeypatch.setenv("WORLD_SIZE", "1")
-    assert not launched()
-
-
-def test_other_scripts_are_not_run_twice(under_torchrun, capsys):
-    def never():
-        raise AssertionError("it was run")
-
-    assert run_script(never, "prior_space_rl.py") == 2
-    said = capsys.readouterr().err
-    assert "process 1" in said and "trains with one process; start it without torchrun" in said
-
-
-@pytest.mark.parametrize(
-    ("device", "said"),
-    [
-        ("cuda:7", "--device cuda:7 does not work here"),
-        ("meta", "--device meta does not work here"),
-        ("nothing", "--device nothing does not work here"),
-    ],
-)
-def test_a_device_that_is_not_there(two_gpus, device, said):
-    with pytest.raises(ValueError, match=said):
-        check_device(device)
 
 
 def test_several_processes_share_no_gpu(under_torchrun, two_gpus):

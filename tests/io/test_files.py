@@ -16,12 +16,6 @@ from warmprior.io.files import check_writable, exclusive, read_json, write_atomi
 FORK = multiprocessing.get_context("fork")
 
 
-def test_many_may_check_one_folder_at_once(tmp_path):
-    with ThreadPoolExecutor(16) as threads:
-        list(threads.map(lambda _: check_writable(tmp_path / "out"), range(300)))
-    assert not list((tmp_path / "out").iterdir())
-
-
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=rf"cannot write to {tmp_path}/file"):
@@ -69,16 +63,6 @@ def test_what_a_killed_process_left_is_removed_by_the_next(tmp_path):
     assert len(list(tmp_path.iterdir())) == 2
     write_atomic(other, lambda temporary: temporary.write_text("whole"))
     assert sorted(tmp_path.iterdir()) == [path, other]
-
-
-def test_only_what_is_old_is_removed_of_another_machine(tmp_path):
-    path = tmp_path / "file"
-    young, old = (tmp_path / f".file.1.{name}.elsewhere.org.tmp" for name in ("a", "b"))
-    young.write_text("")
-    old.write_text("")
-    os.utime(old, (time.time() - 100_000,) * 2)
-    write_atomic(path, lambda temporary: temporary.write_text("whole"))
-    assert sorted(tmp_path.iterdir()) == sorted([young, path])
 
 
 def test_a_folder_belongs_to_one_process_until_it_ends(tmp_path):

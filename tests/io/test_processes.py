@@ -9,7 +9,6 @@ import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from operator import add
 from pathlib import Path
 
 import pytest
@@ -17,7 +16,7 @@ import pytest
 pytest.importorskip("loky")
 
 from tests.processes import ended
-from warmprior.io.processes import fresh_processes, working
+from warmprior.io.processes import working
 from warmprior.io.workers import WorkerError
 
 ROOT = Path(__file__).parents[2]
@@ -71,12 +70,6 @@ def test_every_process_has_one_thread_and_a_state_of_its_own():
     wait_for(lambda: ended(pid))
 
 
-def test_a_process_has_the_environment_that_it_is_given():
-    with fresh_processes(1, env={"CUDA_VISIBLE_DEVICES": "7"}) as executor:
-        assert executor.submit(os.getenv, "CUDA_VISIBLE_DEVICES").result() == "7"
-        assert executor.submit(signal.getsignal, signal.SIGINT).result() == signal.SIG_IGN
-
-
 @pytest.mark.parametrize(
     ("job", "error", "said"),
     [
@@ -91,21 +84,6 @@ def test_an_error_and_a_dead_process_end_all_others(tmp_path, job, error, said):
         call(job).result()
     assert job is fail or isinstance(raised.value.__cause__, BrokenProcessPool)
     wait_for(lambda: all(map(ended, pids)), 20)
-
-
-def test_an_error_of_ones_own_ends_the_processes(tmp_path):
-    with pytest.raises(KeyboardInterrupt), working(2, None) as call:
-        for _ in range(2):
-            call(partial(sleep, tmp_path / "x"))
-        pids = sleepers(tmp_path, 2)
-        raise KeyboardInterrupt
-    wait_for(lambda: all(map(ended, pids)), 20)
-
-
-def test_results_are_those_of_the_jobs():
-    with working(2, 10) as call:
-        futures = [call(partial(add, i)) for i in range(20)]
-        assert [future.result() for future in futures] == list(range(10, 30))
 
 
 HELD = """
@@ -164,6 +142,7 @@ print(ours.recv(), ours.recv() if ours.poll(60) else None)
 """
 
 
+@pytest.mark.slow
 def test_forked_workers_compute_gradients_after_something_was_compiled():
     # In a process of its own: autograd counts devices once.
     done = subprocess.run([sys.executable, "-c", FAKED], capture_output=True, text=True)

@@ -5,19 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictSequential
-from torchrl.collectors import Collector
-from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import ACTION, CAMERA, LENGTH, STATE
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, PriorAnchor, policy_transforms
+from warmprior import PastPrior, PreviewPrior, policy_transforms
 from warmprior.history import window_history
 from warmprior.lerobot import LeRobotActor
-from warmprior.rl import PriorDecoder, ResidualSampler
-from warmprior.training import evaluate
+from warmprior.rl import PriorDecoder
 
 
 class Arm(EnvBase):
@@ -55,17 +52,6 @@ class Arm(EnvBase):
         return seed
 
 
-class WithSuccess(Arm):
-    """It also tells that nothing was solved."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.observation_spec["success"] = Binary(1, shape=(1,), dtype=torch.bool)
-
-    def _observed(self):
-        return super()._observed().set("success", torch.zeros(1, dtype=torch.bool))
-
-
 NAMES = {"state": "observation.state", "top": CAMERA}
 
 
@@ -95,7 +81,7 @@ def environment(prior, base=None):
     return TransformedEnv(Arm() if base is None else base, policy_transforms(prior, observation_steps=1))
 
 
-@pytest.mark.parametrize("family", ["smolvla", "pi05", "xvla"])
+@pytest.mark.parametrize("family", ["smolvla", "xvla"])
 @pytest.mark.parametrize("prior", [PastPrior(LENGTH, sigma=0.0), PreviewPrior(LENGTH // 2, sigma=0.0)])
 def test_rollouts_start_from_the_mean(policy, family, prior):
     made = policy(family)
@@ -161,49 +147,6 @@ def test_the_rest_of_the_source_is_drawn_anew_for_actors_and_fixed_for_decoders(
         actor.ode(data.clone(), padding=torch.zeros(2, 3, 4))
 
 
-def test_evaluation_draws_from_its_seeds_whatever_generator_an_actor_has(policy):
-    prior = PastPrior(LENGTH)
-    env = environment(prior, WithSuccess())
-    actor = actor_of(policy("pi05"), prior)
-
-    def chunks(**options):
-        played = evaluate(actor, env, episodes=2, first_seed=0, **options)
-        return torch.cat([episode.decisions["vla_action", "chunk"] for episode in played])
-
-    first = chunks()
-    assert torch.equal(chunks(), first)
-    assert not torch.equal(chunks(policy_seed=1), first)
-
-
-def test_a_single_observation_of_a_policy_that_may_see_several(policy):
-    made, prior = policy("multi_task_dit", n_obs_steps=1), PastPrior(LENGTH, sigma=0.0)
-    actor = LeRobotActor(made, prior, names=NAMES, preprocess=preprocessed)
-    data = TensorDict(
-        {
-            "observation": {"state": torch.randn(3, 1, STATE)},
-            "history": history_of(torch.randn(3, LENGTH, ACTION)),
-        },
-        [3],
-    )
-    with watch("multi_task_dit", made) as seen:
-        chunk = actor(data)["vla_action", "chunk"]
-    assert torch.equal(seen.x[0], data["history", "actions"])
-    torch.testing.assert_close(chunk, seen.x[0] + sum(seen.out) / len(seen.out))
-
-
-def test_collectors_and_batched_environments(policy):
-    prior = PastPrior(LENGTH)
-    actor = actor_of(policy("pi05"), prior)
-    env = environment(prior, base=SerialEnv(2, lambda: Arm(12)))
-    collector = Collector(env, actor, frames_per_batch=8, total_frames=16)
-    for batch in collector:
-        assert batch["vla_action", "chunk"].shape == (2, 4, LENGTH, ACTION)
-        # A new episode starts cold.
-        first = batch["history", "steps"][..., 0] == 0
-        assert first.any() and not batch["prior", "warm"][first].any()
-    collector.shutdown()
-
-
 def test_a_frozen_policy_decodes_what_an_agent_chooses(policy):
     made, prior = policy("pi05"), PastPrior(LENGTH)
     actor = actor_of(made, prior, nfe=1)
@@ -229,37 +172,3 @@ def test_a_frozen_policy_decodes_what_an_agent_chooses(policy):
     # A function of the source alone, whatever else is in the batch.
     assert torch.equal(decoder(data.clone())["vla_action", "chunk"], chunk)
     torch.testing.assert_close(decoder(data[1:].clone())["vla_action", "chunk"], chunk[1:])
-
-
-@pytest.mark.parametrize("prior", [PastPrior(LENGTH), GaussianPrior(LENGTH)])
-def test_residuals_around_its_means(policy, prior):
-    """As around those of the library's own policies."""
-    actor = actor_of(policy("pi05"), prior, nfe=1)
-    decoder = PriorDecoder(actor, delta=0.5)
-    env = environment(prior)
-    env.append_transform(PriorAnchor(actor))
-    rollout = env.rollout(3, TensorDictSequential(ResidualSampler(decoder), decoder))
-    anchor, executed = rollout["prior", "anchor"], rollout["history", "actions"]
-    assert torch.equal(rollout["prior", "noise"], anchor + rollout["prior", "delta"])
-    assert torch.equal(executed[1:], rollout["vla_action", "chunk"][:-1])
-    assert torch.equal(anchor[1:], executed[1:] if prior.name == "past" else torch.zeros_like(executed[1:]))
-
-
-def test_what_cannot_be_done_is_said(policy):
-    prior = PastPrior(LENGTH)
-    actor = actor_of(policy("pi05"), prior)
-    data = TensorDict(
-        {
-            "observation": {"state": torch.zeros(1, STATE)},
-            "history": history_of(torch.zeros(LENGTH, ACTION)),
-        },
-        [],
-    )
-    with pytest.raises(KeyError, match=r'needs the history; missing: .*"actions"'):
-        actor(data.select("observation"))
-    with pytest.raises(ValueError, match=r"what are speed of the observation"):
-        actor(data.clone().set(("observation", "speed"), torch.zeros(1, 2)))
-    with pytest.raises(ValueError, match="compute no gradients"):
-        actor.ode(data.clone().set(("prior", "noise"), torch.zeros(LENGTH, ACTION, requires_grad=True)))
-    with pytest.raises(ValueError, match="at least 1, got 0"):
-        actor(data.clone(), nfe=0)

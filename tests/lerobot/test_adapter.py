@@ -8,9 +8,10 @@ from tensordict import TensorDict
 
 from tests.lerobot.seen import at_times, watch
 from tests.lerobot.tiny import ACTION, LENGTH, observations, windows
-from warmprior import ActionWindow, GaussianPrior, PastPrior, PreviewPrior, Prior
+from tests.toy_env import Momentum
+from warmprior import ActionWindow, PastPrior, PreviewPrior
 from warmprior.history import window_history
-from warmprior.lerobot import RelativeActions, WarmPriorAdapter, action_std, history_indices
+from warmprior.lerobot import RelativeActions, WarmPriorAdapter, action_std
 
 
 def generator(seed=0):
@@ -57,22 +58,6 @@ def test_the_preview_is_the_last_forecast(built):
         assert abs(source[:, half:].std() - 1) < 0.6
 
 
-def test_as_many_as_were_executed(policy):
-    made = policy("pi0")
-    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
-    batch = observations("pi0", 2)
-    first = adapter.predict_action_chunk(dict(batch))
-    second = adapter.predict_action_chunk(dict(batch), executed_steps=LENGTH)
-    with watch("pi0", made) as seen:
-        adapter.predict_action_chunk(dict(batch), executed_steps=torch.tensor([2, 5]))
-    source = seen.x[0][..., :ACTION]
-    for row, count in enumerate((2, 5)):
-        expected = torch.cat([first[row], second[row, :count]])[-LENGTH:]
-        assert torch.equal(source[row], expected)
-    with pytest.raises(ValueError, match="from 0 to chunk_length=8"):
-        adapter.predict_action_chunk(dict(batch), executed_steps=LENGTH + 1)
-
-
 def test_an_environment_that_is_reset_starts_cold(policy):
     made = policy("pi05")
     adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
@@ -87,37 +72,6 @@ def test_an_environment_that_is_reset_starts_cold(policy):
     adapter.reset()
     _, (source,) = started(adapter, "pi05", made, batch, LENGTH)
     assert abs(source.std() - 1) < 0.3
-
-
-def test_a_reset_within_a_chunk(built):
-    """The rest of the chunk is executed as the beginning of the new episode."""
-    every = LENGTH // 2
-    made = built("pi05", n_action_steps=every)
-    adapter = WarmPriorAdapter(made, PastPrior(every, sigma=0.0), generator=generator())
-    batch = observations("pi05", 2)
-    before, _ = started(adapter, "pi05", made, batch, every + 1)
-    adapter.reset(torch.tensor([True, False]))
-    rest, _ = started(adapter, "pi05", made, batch, every - 1)
-    later, (source,) = started(adapter, "pi05", made, batch, every)
-    assert not torch.equal(source[0, 1:every], rest[0])  # too few steps in this episode
-    assert torch.equal(source[1, :every], torch.cat([before, rest], 1)[1, -every:])
-    _, (source,) = started(adapter, "pi05", made, batch, every)
-    assert torch.equal(source[:, :every], later)
-
-
-def test_what_was_executed_instead(policy):
-    made = policy("pi05")
-    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
-    batch = observations("pi05", 2)
-    with pytest.raises(ValueError, match="nothing to correct"):
-        adapter.record_executed(torch.zeros(2, ACTION))
-    clipped = []
-    for _ in range(LENGTH):
-        clipped.append(adapter.select_action(dict(batch)).clamp(-0.1, 0.1))
-        adapter.record_executed(clipped[-1])
-    with watch("pi05", made) as seen:
-        adapter.select_action(dict(batch))
-    assert torch.equal(seen.x[0][..., :ACTION], torch.stack(clipped, 1))
 
 
 def test_the_history_before_an_episode_does_not_leak(policy):
@@ -137,27 +91,6 @@ def test_the_history_before_an_episode_does_not_leak(policy):
     adapter = WarmPriorAdapter(made, PastPrior(LENGTH), generator=generator())
     changed, _ = adapter.loss(batch, reduction="none")
     assert (changed != losses[0]).tolist() == [False, True, False]
-
-
-def test_one_seed_gives_one_result(policy):
-    made, results = policy("smolvla"), []
-    for seed in (0, 0, 1):
-        adapter = WarmPriorAdapter(made, PastPrior(LENGTH), generator=generator(seed))
-        adapter.reset()
-        results.append(adapter.predict_action_chunk(observations("smolvla", 2)))
-    assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
-
-
-class Momentum(Prior):
-    """Goes on as the last two actions did."""
-
-    name = "momentum-in-lerobot"
-
-    def mean(self, history):
-        before, last = history["actions"][..., -2:-1, :], history["actions"][..., -1:, :]
-        steps = torch.arange(1, self.prediction_length + 1).view(-1, 1)
-        warm = (history["steps"] >= 2).unsqueeze(-1)
-        return last + steps * (last - before), warm.expand_as(history["forecast"][..., :1])
 
 
 def test_a_users_prior_has_the_mean_of_its_training_windows(built):
@@ -182,30 +115,6 @@ def test_a_users_prior_has_the_mean_of_its_training_windows(built):
     assert adapter.loss(windows("pi0", 2, 4))[0].isfinite()
 
 
-def test_a_prior_that_remembers_more_than_a_chunk(built):
-    class Lagged(Prior):
-        """What was executed two chunks ago."""
-
-        name = "lagged-in-lerobot"
-
-        @property
-        def history_length(self):
-            return 2 * self.chunk_length
-
-        def mean(self, history):
-            warm = (history["steps"] >= self.history_length).unsqueeze(-1)
-            return history["actions"][..., : self.chunk_length, :], warm.expand(-1, 4, -1)
-
-    made = built("pi05", n_action_steps=3)
-    adapter = WarmPriorAdapter(made, Lagged(4, sigma=0.0), generator=generator())
-    actions, sources = started(adapter, "pi05", made, observations("pi05", 2), 12)
-    assert torch.equal(sources[3][:, :4], actions[:, 1:5])
-    made.train()
-    assert adapter.loss(windows("pi05", 2, 8))[0].isfinite()
-    with pytest.raises(ValueError, match=r"\[12\] actions, expected \[16\]: 8 before"):
-        adapter.loss(windows("pi05", 2, 4))
-
-
 def test_withheld_histories_start_cold(policy):
     made = policy("pi05").train()
     batch, t = windows("pi05", 64, LENGTH), torch.ones(64)  # at the source
@@ -224,30 +133,6 @@ def test_withheld_histories_start_cold(policy):
         assert found == cold if cold is not None else 16 < found < 48
     with pytest.raises(ValueError, match=r"cold_probability must be in \[0, 1\], got 1.5"):
         WarmPriorAdapter(made, PastPrior(LENGTH), cold_probability=1.5)
-
-
-def test_sources_and_targets_are_coupled_in_the_models_units(policy):
-    made = policy("pi05").train()
-    batch, std, seen = windows("pi05", 4, LENGTH), torch.linspace(0.1, 3.0, ACTION), []
-    batch["action_is_pad"][1, :2] = True  # a cold source moves with its window's partner
-
-    def flipped(a0, a1, observation):
-        assert observation is None
-        seen.append((a0, a1))
-        return a0.flip(0), a1 + 1.0
-
-    source = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.5), sigma_unit="std", action_std=std).source
-    before, target = batch["action"].split(LENGTH, 1)
-    valid = ~batch["action_is_pad"][:, :LENGTH]
-    plain, same = source.learn(before, valid, target, generator())
-    assert same is target
-    a0, a1 = source.learn(before, valid, target, generator(), coupling=flipped)
-    assert torch.equal(seen[0][0], plain[..., :ACTION]) and torch.equal(seen[0][1], target)
-    assert torch.equal(a0[..., :ACTION], plain[..., :ACTION].flip(0))
-    assert torch.equal(a1, target + 1.0)
-    adapter = WarmPriorAdapter(made, PastPrior(LENGTH), coupling=flipped)
-    adapter.loss(dict(batch))
-    assert len(seen) == 2
 
 
 def test_sigma_in_units_of_the_data(policy):
@@ -285,15 +170,6 @@ def test_the_standard_deviation_in_a_policys_units(policy):
         action_std(policy("xvla"), stats)
     with pytest.raises(ValueError, match="'model' or 'std'"):
         WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit="data")
-
-
-class Looking(GaussianPrior):
-    """It sees the observation."""
-
-    name = "looking-in-lerobot"
-
-    def distribution(self, history, observation=None):
-        return super().distribution(history) if observation.any() else None
 
 
 def pipelines(made, stats):
@@ -344,115 +220,18 @@ def test_relative_actions_follow_the_state(built):
     torch.testing.assert_close(seen.x[0][..., :ACTION], expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("prior", "told"),
-    [
-        (PreviewPrior(5), "predicts 10 actions, .* have 8 .* chunk_length <= 4"),
-        (
-            PreviewPrior(4),
-            "n_action_steps=8 of each chunk, .* chunk_length=4: set n_action_steps to 4",
-        ),
-        (Looking(8), "Looking.* cannot be the source .* history and no observation: 'NoneType'"),
-    ],
-)
-def test_priors_that_do_not_fit(policy, prior, told):
-    with pytest.raises(ValueError, match=told):
-        WarmPriorAdapter(policy("pi05"), prior)
-
-
 def test_batches_that_do_not_fit(policy):
     adapter = WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH))
     batch = windows("pi05", 2, LENGTH)
-    for name in ("action", "action_is_pad"):
-        short = {key: value for key, value in batch.items() if key != name}
-        with pytest.raises(KeyError, match=f"lacks {name}"):
-            adapter.loss(short)
+    with pytest.raises(KeyError, match="lacks action_is_pad"):
+        adapter.loss({key: value for key, value in batch.items() if key != "action_is_pad"})
+    short = {name: batch[name][:, LENGTH:] for name in ("action", "action_is_pad")}
     with pytest.raises(
         ValueError, match=r"windows of \[8\] actions, expected \[16\].*adapter.action_indices"
     ):
-        adapter.loss(
-            {
-                **batch,
-                "action": batch["action"][:, 8:],
-                "action_is_pad": batch["action_is_pad"][:, 8:],
-            }
-        )
-    groot = windows("groot", 2, LENGTH)
-    del groot["action_history_is_pad"]
-    with pytest.raises(KeyError, match="not action_history_is_pad"):
-        WarmPriorAdapter(policy("groot"), PastPrior(LENGTH)).loss(groot)
+        adapter.loss({**batch, **short})
     adapter.predict_action_chunk(observations("pi05", 2))
     with pytest.raises(ValueError, match="3 environments follow 2: call reset"):
         adapter.predict_action_chunk(observations("pi05", 3))
-    with pytest.raises(ValueError, match="nfe is the number of integration steps"):
-        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), nfe=0)
     with pytest.raises(ValueError, match="noise= is what the prior gives"):
         adapter.predict_action_chunk(observations("pi05", 2), noise=torch.zeros(2, LENGTH, 12))
-
-
-def test_masks_that_do_not_fit(policy):
-    """One of the chunk alone would declare the history valid wherever the target is."""
-    adapter = WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH))
-    batch = windows("pi05", 2, LENGTH)
-    short = {**batch, "action_is_pad": batch["action_is_pad"][:, LENGTH:]}
-    with pytest.raises(ValueError, match=r"action_is_pad has shape .*, expected \(2, 16\)"):
-        adapter.loss(short)
-    groot = windows("groot", 2, LENGTH)
-    groot["action_history_is_pad"] = groot["action_history_is_pad"][:, 1:]
-    with pytest.raises(ValueError, match=r"action_history_is_pad .* \(2, 7\), expected \(2, 8\)"):
-        WarmPriorAdapter(policy("groot"), PastPrior(LENGTH)).loss(groot)
-    with pytest.raises(ValueError, match="noise= is what the prior gives"):
-        WarmPriorAdapter(policy("smolvla"), PastPrior(LENGTH)).loss(
-            windows("smolvla", 2, LENGTH), noise=torch.zeros(2, LENGTH, 12)
-        )
-    adapter.predict_action_chunk(observations("pi05", 2))
-    for mask in ([[True], [False]], [True]):
-        with pytest.raises(ValueError, match=r"mask of environments .* expected \(2,\)"):
-            adapter.reset(torch.tensor(mask))
-
-
-def test_actions_that_never_vary_have_no_unit(policy):
-    zeros, ones = torch.zeros(ACTION), torch.ones(ACTION)
-    still = {"std": ones, "q01": zeros, "q99": torch.cat([zeros[:1], ones[1:]])}
-    with pytest.raises(ValueError, match=r"dimensions \[0\] have std \[1.0\] between q01 \[0.0\]"):
-        action_std(policy("pi05"), {"action": still})
-    constant = {"std": zeros, "min": ones, "max": ones}
-    with pytest.raises(ValueError, match=r"dimensions \[0, 1, 2, 3, 4, 5, 6\] have std"):
-        action_std(policy("multi_task_dit"), {"action": constant})
-    for given, unit, told in (
-        (ones / 0, "std", "finite numbers > 0"),
-        (ones, "model", "no effect with sigma_unit='model'"),
-    ):
-        with pytest.raises(ValueError, match=told):
-            WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit=unit, action_std=given)
-
-
-def test_the_standard_source_is_lerobots(policy):
-    """With nothing ever warm, what is left is the policy with its own noise."""
-    made = policy("smolvla")
-    adapter = WarmPriorAdapter(made, GaussianPrior(LENGTH), generator=generator())
-    batch = observations("smolvla", 2)
-    with watch("smolvla", made) as seen:
-        chunk = adapter.predict_action_chunk(dict(batch))
-    assert torch.equal(chunk, made.predict_action_chunk(dict(batch), noise=seen.x[0]))
-
-
-def test_a_decision_that_failed_does_not_count(built):
-    """Its source is drawn again around the same mean."""
-    made = built("pi05", n_action_steps=4)
-    adapter = WarmPriorAdapter(made, PreviewPrior(4, sigma=0.0), generator=generator())
-    batch = observations("pi05", 2)
-    chunk = adapter.predict_action_chunk(dict(batch))
-    vars(made.model)["embed_prefix"] = lambda *args: 1 / 0  # once the source is drawn
-    with pytest.raises(ZeroDivisionError):
-        adapter.predict_action_chunk(dict(batch))
-    del vars(made.model)["embed_prefix"]
-    with watch("pi05", made) as seen:
-        adapter.predict_action_chunk(dict(batch))
-    assert torch.equal(seen.x[0][:, :4, :ACTION], chunk[:, 4:8])
-
-
-def test_the_steps_of_windows():
-    assert history_indices(3, 2) == [-3, -2, -1, 0, 1]
-    assert history_indices(3, 4, 1) == [-3, -2, -1, 0, 1, 2]
-    assert history_indices(1, 4, 2) == [-2, -1, 0, 1]

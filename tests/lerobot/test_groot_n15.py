@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from unittest import mock
-
 import pytest
 import torch
-from tensordict import TensorDict
 
 from tests.lerobot.seen import at_times, watch
-from tests.lerobot.tiny import ACTION, LENGTH, N15, STATE, STEPS, observations, windows
+from tests.lerobot.tiny import ACTION, LENGTH, N15, STATE, STEPS, observations
 from warmprior import PastPrior, PreviewPrior
-from warmprior.history import window_history
-from warmprior.lerobot import LeRobotActor, WarmPriorAdapter, action_std
+from warmprior.lerobot import WarmPriorAdapter
 
 if not N15:
     pytest.skip("needs lerobot 0.5.1: make test-groot-n15", allow_module_level=True)
@@ -45,33 +41,6 @@ def test_the_first_actions_of_a_chunk_are_executed(built):
         torch.testing.assert_close(actions, chunks[-1][:, :every])
     torch.testing.assert_close(seen.x[0][:, :half, :ACTION], chunks[0][:, every : every + half])
     assert adapter.predict_action_chunk(dict(batch)).shape == (2, LENGTH, ACTION)
-
-
-def test_a_batch_that_the_head_repeats_is_refused(built):
-    made = built("groot", n_action_steps=2).train()
-    made._groot_model.action_head.config.expand_batch = 2
-    with pytest.raises(ValueError, match=r"repeats each batch 2 times .*set it to None"):
-        WarmPriorAdapter(made, PastPrior(LENGTH))
-    made._groot_model.action_head.config.expand_batch = 1
-    loss, _ = WarmPriorAdapter(made, PastPrior(LENGTH)).loss(windows("groot", 2, LENGTH))
-    assert loss.isfinite()
-
-
-def test_half_precision(built):
-    """The head draws what its inputs are: half precision by default."""
-    made = built("groot", use_bf16=True).train()
-    batch = windows("groot", 2, LENGTH)
-    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
-    with watch("groot", made) as seen, at_times("groot", made, torch.zeros(2).bfloat16()):
-        adapter.loss(batch)
-    (x,) = seen.x
-    assert x.dtype == torch.bfloat16
-    assert torch.equal(x[..., :ACTION], batch["action_history"].bfloat16())
-    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.0), generator=generator())
-    first = adapter.predict_action_chunk(observations("groot", 2))
-    with watch("groot", made) as seen:
-        adapter.predict_action_chunk(observations("groot", 2))
-    assert torch.equal(seen.x[0][..., :ACTION], first.to(seen.x[0]))
 
 
 @pytest.fixture
@@ -115,45 +84,3 @@ def test_history_through_the_preprocessor(policy, preprocessed):
     cut = {**observations("groot", 3), **preprocess(raw), "action_is_pad": is_pad}
     with pytest.raises(ValueError, match=r"windows of \[8\] actions, expected \[16\]"):
         adapter.loss(cut)
-
-
-def test_the_standard_deviation_in_its_units(policy, preprocessed):
-    actions, stats, preprocess = preprocessed
-    halves = [preprocess(half)["action"] for half in actions.split(LENGTH, dim=1)]
-    by_hand = torch.cat(halves)[..., :ACTION].flatten(0, 1).std(0)
-    torch.testing.assert_close(action_std(policy("groot"), stats), by_hand)
-
-
-def test_it_acts_in_torchrl(policy):
-    made, prior = policy("groot"), PastPrior(LENGTH, sigma=0.0)
-
-    def preprocess(batch):
-        state = torch.nn.functional.pad(batch["observation.state"], (0, 8 - STATE))
-        return {**observations("groot", len(state)), "state": state[:, None]}
-
-    actor = LeRobotActor(made, prior, preprocess=preprocess)
-    executed = torch.randn(2, LENGTH, ACTION)
-    history = window_history(executed, torch.full((2, 1), LENGTH), executed, LENGTH)
-    data = TensorDict({"observation": torch.randn(2, 1, STATE), "history": history}, [2])
-    with watch("groot", made) as seen:
-        chunk = actor(data)["vla_action", "chunk"]
-    assert torch.equal(seen.x[0][..., :ACTION], executed)
-    torch.testing.assert_close(chunk, integrated(seen))
-
-
-def test_weights_are_loaded_into_a_model_that_is_built(policy, tmp_path):
-    """LeRobot's own loader fails: its head draws times of the meta device, and its model lacks post_init."""
-    from lerobot.policies.groot import groot_n1
-    from safetensors.torch import load_file
-
-    made = policy("groot")._groot_model
-    made.save_pretrained(tmp_path)
-    with mock.patch.object(groot_n1, "EagleBackbone", type(made.backbone)):
-        # Which comes first depends on whether distributions check their arguments.
-        with pytest.raises((RuntimeError, AttributeError), match=r"meta tensors|all_tied_weights"):
-            groot_n1.GR00TN15.from_pretrained(str(tmp_path))
-        sizes = groot_n1.GR00TN15Config.from_pretrained(tmp_path)
-        loaded = groot_n1.GR00TN15(sizes, local_model_path=str(tmp_path))
-    loaded.load_state_dict(load_file(tmp_path / "model.safetensors"))
-    for name, value in made.state_dict().items():
-        assert torch.equal(loaded.state_dict()[name], value), name

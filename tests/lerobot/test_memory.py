@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior
+from warmprior import PreviewPrior
 from warmprior.history import ENTRIES
 from warmprior.lerobot import ActionMemory
 
@@ -32,14 +31,14 @@ def executing(prior, count, first=1):
 
 def test_a_history_moves_by_what_was_executed():
     memory = executing(PreviewPrior(3), 2)
-    told = {
+    expected = {
         "actions": [0, 1, 2],
         "steps": [2],
         "forecast": [3, 4, 5, 6, 0, 0],
         "forecast_steps": [4],
     }
-    assert row(memory.decide(2)) == told
-    assert row(memory.decide(2)) == told  # a decision without a chunk does not count
+    assert row(memory.decide(2)) == expected
+    assert row(memory.decide(2)) == expected  # a decision without a chunk does not count
     memory.record(chunk(11, 6))
     memory.executed(torch.tensor([3, 0]))
     history = memory.decide(2)
@@ -96,30 +95,6 @@ def test_an_episode_that_begins_inside_a_chunk():
     }
 
 
-def test_two_episodes_that_begin_inside_one_chunk():
-    memory = executing(PastPrior(4), 1)
-    for rows in ([True, False], [True, True]):
-        memory.forget(torch.tensor(rows))
-        memory.step()
-    history = memory.decide(2)
-    assert [row(history, i)["actions"] for i in range(2)] == [[0, 0, 0, 3], [0, 0, 0, 103]]
-    assert history["steps"].flatten().tolist() == [1, 1]
-    assert not history["forecast"].any() and not history["forecast_steps"].any()
-
-
-def test_a_number_of_executed_actions_is_not_that_of_a_new_episode():
-    """It is counted from the chunk's beginning, where that of a new episode is not known."""
-    for told, steps in ((4, [0, 4]), (torch.tensor([2, 4]), [2, 4])):
-        memory = executing(PastPrior(4), 0)
-        memory.forget(torch.tensor([True, False]))
-        assert memory.waits
-        memory.executed(told)
-        assert memory.decide(2)["steps"].flatten().tolist() == steps
-    for wrong in (5, torch.tensor([-1, 0])):
-        with pytest.raises(ValueError, match="from 0 to chunk_length=4"):
-            memory.executed(wrong)
-
-
 def test_actions_are_expressed_at_the_present_state_and_nothing_becomes_one():
     memory = executing(PreviewPrior(3), 2)
     history = memory.decide(2, move=lambda actions: actions.double() - 0.5)
@@ -137,15 +112,3 @@ def test_actions_are_expressed_at_the_present_state_and_nothing_becomes_one():
     memory.forget(torch.tensor([True, True]))
     history = memory.decide(2, move=lambda actions: actions - 1.0)
     assert not any(history[name].any() for name in ENTRIES)
-
-
-def test_precisions_stay_those_of_the_history():
-    memory = ActionMemory(GaussianPrior(2), 1)
-    memory.decide(2)
-    given = chunk(1, 2).bfloat16()
-    memory.record(given)
-    given.zero_()  # it has a copy
-    memory.step()
-    history = memory.decide(2)
-    assert history["actions"].dtype == torch.float32 and history["steps"].dtype == torch.int64
-    assert row(history)["actions"] == [0, 1]

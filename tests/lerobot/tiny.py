@@ -403,14 +403,14 @@ def observations(family: str, size: int, seed: int = 0) -> dict[str, torch.Tenso
             "state": normal(size, 1, 8),
             "embodiment_id": torch.zeros(size, dtype=torch.long),
         }
-    told = {
+    language = {
         "observation.language.tokens": tokens,
         "observation.language.attention_mask": torch.ones_like(tokens, dtype=torch.bool),
     }
     if family == "multi_task_dit":
-        return {"observation.state": normal(size, 2, STATE), **told}
+        return {"observation.state": normal(size, 2, STATE), **language}
     images = torch.rand(size, 3, 64, 64, generator=generator)
-    return {"observation.state": normal(size, STATE), CAMERA: images, **told}
+    return {"observation.state": normal(size, STATE), CAMERA: images, **language}
 
 
 def windows(family: str, size: int, history: int, lead: int = 0, seed: int = 0) -> dict[str, Any]:

@@ -6,9 +6,8 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torch.utils._python_dispatch import TorchDispatchMode
 
-from tests.toy_env import random_history
+from tests.toy_env import Halfway, random_history
 from warmprior import (
     GaussianPrior,
     PastPrior,
@@ -19,7 +18,6 @@ from warmprior import (
     keys,
 )
 from warmprior.history import ENTRIES, advance, cold_history
-from warmprior.modules import StartPoint
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 H, D_A, D_O, TO = 3, 2, 5, 2
@@ -87,52 +85,6 @@ def test_same_generator_same_chunks():
     assert torch.equal(results[0], results[1]) and not torch.equal(results[0], results[2])
 
 
-def test_nested_observation_key():
-    prior = PastPrior(H)
-    data = batch(prior, 4)
-    data["state", "low"] = data.pop("observation")
-    actor = actor_for(prior, observation_key=("state", "low"))
-    assert actor(data)["vla_action", "chunk"].shape == (4, H, D_A)
-
-
-def test_any_module_can_be_the_network():
-    class Zero(nn.Module):
-        def forward(self, t, a, observation):
-            return torch.zeros_like(a)
-
-    prior = PastPrior(H)
-    out = WarmPriorActor(Zero(), prior)(batch(prior, 4))
-    assert torch.equal(out["vla_action", "chunk"], out["prior", "noise"])
-
-
-def test_network_of_another_length():
-    with pytest.raises(ValueError, match=r"prediction_length=3, but PreviewPrior.* needs 6"):
-        WarmPriorActor(actor_for(PastPrior(H)).network, PreviewPrior(H))
-
-
-@pytest.mark.parametrize("missing", ["observation", *((keys.HISTORY, name) for name in ENTRIES)])
-def test_missing_key(missing):
-    prior = PastPrior(H)
-    data = batch(prior, 4)
-    del data[missing]
-    with pytest.raises(KeyError, match=missing[-1] if isinstance(missing, tuple) else missing):
-        actor_for(prior)(data)
-
-
-class Halfway(StartPoint):
-    """Enters the flow at the time 0.5, at half of the noise around the last action."""
-
-    name = "halfway-of-the-actor"
-    time = noise_share = 0.5
-
-    def centre(self, history, observation):
-        return history["actions"][..., -1:, :].expand_as(history["forecast"])
-
-    def forward(self, noise, history, observation):
-        assert observation.shape == (4, TO, D_O)
-        return self.centre(history, observation) + self.noise_share * noise
-
-
 def test_a_start_point_enters_the_flow_on_the_way():
     prior = GaussianPrior(H)
     actor = actor_for(prior, start=Halfway(), nfe=2)
@@ -172,29 +124,6 @@ def test_what_is_replaced_and_what_stays():
     with pytest.raises(ValueError, match="at most 1 network evaluation"):
         four.replace(max_nfe=1, nfe=4)
     assert actor.replace(nfe=4).replace(prior=GaussianPrior(H)).ode.nfe == 4
-
-
-class Operations(TorchDispatchMode):
-    """Counts what torch computes."""
-
-    count = 0
-
-    def __torch_dispatch__(self, function, types, args=(), kwargs=None):
-        self.count += 1
-        return function(*args, **(kwargs or {}))
-
-
-def test_a_decision_costs_few_operations_beside_the_network():
-    """At batch 1 each takes as long as a layer of a small network."""
-
-    class Still(nn.Module):
-        def forward(self, t, a, observation):
-            return a
-
-    actor, data = WarmPriorActor(Still(), PastPrior(H), nfe=1), batch(PastPrior(H), 1)
-    with torch.no_grad(), Operations() as operations:
-        actor(data)
-    assert operations.count <= 16
 
 
 class Chunks(nn.Module):

@@ -46,21 +46,6 @@ def test_trigonometric_keeps_the_variance():
     torch.testing.assert_close(alpha**2 + beta**2, torch.ones(11))
 
 
-def test_power_one_is_the_straight_line():
-    a0, a1, t = torch.randn(6, 4, 2), torch.randn(6, 4, 2), torch.rand(6)
-    linear, power = LinearInterpolant(), PolynomialInterpolant(1.0)
-    for one, other in zip(linear(a0, a1, t), power(a0, a1, t), strict=True):
-        torch.testing.assert_close(one, other)
-
-
-@BY_NAME
-@pytest.mark.parametrize("batch", [(), (5,), (2, 5)])
-def test_any_batch_shape(interpolant, batch):
-    a = torch.randn(*batch, 4, 2)
-    a_t, velocity = interpolant(a, a, torch.rand(batch))
-    assert a_t.shape == velocity.shape == a.shape
-
-
 @pytest.mark.parametrize("power", [0.0, -1.0])
 def test_bad_power(power):
     with pytest.raises(ValueError, match="power"):

@@ -38,16 +38,6 @@ def test_closed_form():
     assert torch.equal(out["episode"], raw["episode"])
 
 
-def test_round_trip_and_inputs_untouched():
-    raw = data()
-    before = raw.clone()
-    normalizer = Normalizer.fit(raw)
-    again = normalizer.denormalize(normalizer.normalize(raw))
-    for key in ("observation", "action"):
-        torch.testing.assert_close(again[key], before[key])
-        assert torch.equal(raw[key], before[key])
-
-
 def test_constant_dimension():
     raw = data()
     raw["observation"][:, 1] = 7.5
@@ -55,24 +45,14 @@ def test_constant_dimension():
     out = normalizer.normalize(raw)
     assert (out["observation"][:, 1] == 0).all()
     assert (normalizer.denormalize(out)["observation"][:, 1] == 7.5).all()
+    # Noise counts by the size of what it is on: of a body far from the origin it is larger.
+    for middle, noise in ((0.0, 1e-6), (1000.0, 1e-3)):
+        resting = raw.clone()
+        resting["observation"][:, 1] = middle + noise * torch.linspace(-1, 1, 40)
+        assert Normalizer.fit(resting).scale("observation")[1] == 1.0
     moved = raw.clone()
     moved["observation"][:, 1] += 0.25  # a value that the data never showed stays finite
     assert torch.allclose(normalizer.normalize(moved)["observation"][:, 1], torch.tensor(0.25))
-
-
-def test_missing_keys_are_skipped():
-    normalizer = Normalizer.fit(data())
-    out = normalizer.normalize(TensorDict({"action": torch.zeros(3, 2)}, [3]))
-    assert list(out.keys()) == ["action"]
-
-
-def test_refitting_data_does_not_move_the_statistics():
-    """The buffers are copies: the data may be changed or freed afterwards."""
-    raw = data()
-    normalizer = Normalizer.fit(raw)
-    before = normalizer.loc("observation").clone()
-    raw["observation"].fill_(99.0)
-    assert torch.equal(normalizer.loc("observation"), before)
 
 
 @pytest.mark.parametrize("batched", [False, True])
@@ -103,24 +83,6 @@ def test_environment_side_equals_data_side(batched):
         normalizer.denormalize(data_)["observation"].reshape(-1, 4)[0, 2:],
         normalizer.denormalize(normalized)["action"],
     )
-
-
-def test_action_spec_lives_in_the_normalised_space():
-    normalizer = Normalizer.fit(data())
-    env = TransformedEnv(CountingEnv(5), Compose(*normalizer.env_transforms()))
-    space = env.action_spec.space
-    loc, scale = normalizer.loc("action"), normalizer.scale("action")
-    torch.testing.assert_close(space.low, (-1 - loc) / scale)
-    torch.testing.assert_close(space.high, (1 - loc) / scale)
-
-
-def test_state_dict_and_config():
-    normalizer = Normalizer.fit(data())
-    again = Normalizer.from_config(normalizer.config())
-    again.load_state_dict(normalizer.state_dict())
-    raw = data()
-    for key in ("observation", "action"):
-        assert torch.equal(again.normalize(raw)[key], normalizer.normalize(raw)[key])
 
 
 def test_errors():

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
-from warmprior import ODEActor, VelocityMLP, integrate
+from warmprior import ODEActor, integrate
 
 STAGES = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
 ORDERS = {"euler": 1, "midpoint": 2, "heun": 2, "rk4": 4}
@@ -53,25 +53,6 @@ def test_order_of_convergence(solver):
     assert slope == pytest.approx(ORDERS[solver], abs=0.15)
 
 
-def test_nine_euler_steps_are_the_paper_s_sampler():
-    a0 = torch.randn(3, 4, 2)
-    weight = torch.randn(2, 2)
-
-    def velocity(t, a):
-        return torch.tanh(a @ weight) * (1 + t)[:, None, None]
-
-    a = a0.clone()
-    for i in range(9):
-        a = a + velocity(torch.full((3,), i / 9), a) / 9
-    torch.testing.assert_close(integrate(velocity, a0, nfe=9), a)
-
-
-def test_one_step_evaluates_the_source_only():
-    a0 = torch.randn(3, 4, 2)
-    out = integrate(lambda t, a: a * 2 + t[:, None, None], a0, nfe=1)
-    torch.testing.assert_close(out, a0 + 2 * a0)
-
-
 @pytest.mark.parametrize("solver", ORDERS)
 def test_nfe_is_the_number_of_network_calls(solver):
     network = Counting()
@@ -80,17 +61,6 @@ def test_nfe_is_the_number_of_network_calls(solver):
         ODEActor(network, nfe=steps * STAGES[solver], solver=solver)(batch(5))
         assert network.calls == steps * STAGES[solver]
         assert min(network.times) == 0.0 and max(network.times) <= 1.0
-
-
-def test_nfe_per_call_does_not_stick():
-    network = Counting()
-    actor = ODEActor(network, nfe=3)
-    data = batch(5)
-    one = actor(data.clone(), nfe=1)["vla_action", "chunk"]
-    assert network.calls == 1
-    actor(data.clone())
-    assert network.calls == 4
-    assert torch.equal(one, ODEActor(network, nfe=1)(data.clone())["vla_action", "chunk"])
 
 
 @pytest.mark.parametrize("shape", [(), (3,), (2, 3)])
@@ -109,23 +79,6 @@ def test_path(shape, solver):
     assert "path" not in plain and actor.out_keys == [("vla_action", "chunk"), "path"]
 
 
-def test_batch_shapes_agree():
-    data = batch(2, 3)
-    actor = ODEActor(Counting(), nfe=3)
-    whole = actor(data.clone())["vla_action", "chunk"]
-    flat = actor(data.reshape(6).clone())["vla_action", "chunk"]
-    torch.testing.assert_close(whole.reshape(6, 4, 2), flat)
-    for i in range(2):
-        for j in range(3):
-            single = actor(data[i, j].clone())["vla_action", "chunk"]
-            torch.testing.assert_close(whole[i, j], single)
-
-
-def test_bounds_for_another_number_of_dimensions_are_refused():
-    with pytest.raises(ValueError, match="clip has 3 bounds, but the network has 2"):
-        ODEActor(VelocityMLP(2, 3, 4), clip=(1.0, 1.0, 1.0))
-
-
 def test_clip_applies_to_the_chunk_and_not_to_the_path():
     data = batch(50)
     out = ODEActor(Counting(), nfe=2, clip=0.5, path_key="path")(data.clone())
@@ -142,42 +95,19 @@ def test_every_dimension_may_have_a_bound_of_its_own():
     assert torch.equal(chunk, free.clamp(-bound, bound)) and chunk.abs().max() == 0.5
 
 
-def test_renamed_keys():
-    data = TensorDict({"n": torch.randn(3, 4, 2), "o": {"s": torch.randn(3, 2, 3)}}, [3])
-    actor = ODEActor(Counting(), nfe=1, noise_key="n", observation_key=("o", "s"), chunk_key=("x", "y"))
-    assert actor.in_keys == ["n", ("o", "s")]
-    assert actor(data)["x", "y"].shape == (3, 4, 2)
-
-
-def test_gradients_flow_through_the_whole_flow():
-    data = batch(3)
-    data["prior", "noise"].requires_grad_()
-    ODEActor(Counting(), nfe=3)(data)["vla_action", "chunk"].sum().backward()
-    assert data["prior", "noise"].grad.abs().min() > 0
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"solver": "dopri5"}, "unknown solver 'dopri5'.*euler.*rk4"),
         ({"nfe": 0}, "positive multiple of 1"),
-        ({"nfe": -2}, "positive multiple"),
         ({"nfe": 3, "solver": "heun"}, "multiple of 2 for the heun solver, got 3"),
-        ({"nfe": 6, "solver": "rk4"}, "multiple of 4 for the rk4 solver, got 6"),
         ({"clip": 0.0}, "clip"),
-        ({"clip": -1.0}, "clip"),
         ({"clip": (1.0, -1.0)}, "clip"),
-        ({"clip": (0.0, 0.0)}, "clip"),
     ],
 )
 def test_bad_options(options, message):
     with pytest.raises(ValueError, match=message):
         ODEActor(Counting(), **options)
-
-
-def test_bad_nfe_per_call():
-    with pytest.raises(ValueError, match="multiple of 4"):
-        ODEActor(Counting(), nfe=4, solver="rk4")(batch(3), nfe=1)
 
 
 @pytest.mark.parametrize("missing", [("prior", "noise"), "observation"])

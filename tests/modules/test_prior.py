@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
 from tests.toy_env import random_history
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
-from warmprior.history import window_history
+from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
 from warmprior.modules.registry import find, from_config
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 PAPER_SIGMA = {GaussianPrior: 1.0, PastPrior: 0.5, PreviewPrior: 1.0}
-
-
-def test_a_source_is_few_things():
-    assert len([name for name in dir(PastPrior(4)) if not name.startswith("_")]) <= 12
 
 
 @pytest.mark.parametrize("prior_class", PRIORS)
@@ -55,24 +48,6 @@ def test_the_gaussian_source_is_the_usual_one():
     assert torch.equal(a0, torch.randn(5, 3, 2, generator=torch.Generator().manual_seed(0)))
 
 
-def test_sigma_zero_is_deterministic_where_warm():
-    prior = PastPrior(3, sigma=0.0)
-    history = random_history(prior, 4, cold=0.0)
-    assert torch.equal(prior.sample(history), history["actions"])
-
-
-def test_sample_moments():
-    warm = (torch.arange(40_000) % 2 == 0).view(-1, 1, 1)
-    source = Source(torch.where(warm, 5.0, 0.0), torch.where(warm, 0.3, 1.0), warm)
-    a0 = source.sample(torch.Generator().manual_seed(0))
-    hot, cold = a0[::2], a0[1::2]
-    # Five standard errors.
-    assert abs(hot.mean() - 5.0) < 5 * 0.3 / math.sqrt(20_000)
-    assert abs(hot.std() - 0.3) < 5 * 0.3 / math.sqrt(40_000)
-    assert abs(cold.mean()) < 5 / math.sqrt(20_000)
-    assert abs(cold.std() - 1.0) < 5 / math.sqrt(40_000)
-
-
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 1.0])
 def test_correlated_noise_shares_its_variance_over_the_warm_positions(correlation):
     """Variance ``sigma^2``; covariance ``c sigma^2`` between warm positions of one dimension alone."""
@@ -94,16 +69,10 @@ def test_correlated_noise_shares_its_variance_over_the_warm_positions(correlatio
     ("arguments", "options", "message"),
     [
         ((0,), {}, "chunk_length"),
-        ((-3,), {}, "chunk_length"),
         ((4,), {"sigma": -0.1}, "sigma"),
         ((4,), {"sigma": float("nan")}, "sigma"),
-        ((4,), {"sigma": float("inf")}, "sigma"),
-        ((4,), {"sigma": True}, "sigma"),
         ((4,), {"correlation": 1.1}, "correlation"),
-        ((4,), {"correlation": -0.1}, "correlation"),
-        ((4,), {"correlation": True}, "correlation"),
         ((4,), {"correlation": "abc"}, "correlation must be a finite number, got 'abc'"),
-        ((4,), {"correlation": None}, "correlation"),
     ],
 )
 @pytest.mark.parametrize("prior_class", PRIORS)
@@ -120,17 +89,3 @@ def test_config_round_trip(prior_class):
     assert type(again) is prior_class and again.config() == prior.config()
     assert repr(again) == repr(prior)
     assert find(Prior, prior.name) is prior_class
-
-
-def test_unknown_name_lists_the_known_ones():
-    with pytest.raises(ValueError, match=r"unknown prior 'nope'.*gaussian.*past.*preview"):
-        from_config(Prior, {"name": "nope", "chunk_length": 2})
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_width_has_the_precision_of_the_history(dtype):
-    history = window_history(
-        torch.zeros(1, 2, 1, dtype=dtype), torch.tensor([[2]]), torch.zeros(1, 2, 1, dtype=dtype), 2
-    )
-    scale = PastPrior(2, sigma=0.1).distribution(history).scale
-    assert torch.equal(scale.flatten(), torch.tensor([0.1, 0.1], dtype=dtype))

@@ -8,18 +8,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from warmprior import (
-    GaussianPrior,
-    PastPrior,
-    PreviewPrior,
-    PriorDecoder,
-    RealTimeChunking,
-    VelocityMLP,
-    WarmPriorActor,
-)
+from warmprior import PastPrior, PreviewPrior, PriorDecoder, RealTimeChunking, VelocityMLP, WarmPriorActor
 from warmprior.history import advance, cold_history, without
 from warmprior.modules import with_leftover
-from warmprior.training.saved import load_policy, policy_config, save_policy
 
 B, P, D = 3, 10, 4
 
@@ -45,19 +36,6 @@ def test_weights_of_every_delay_and_horizon(schedule):
         [reference_weight(schedule, i, start, end) for i in range(P)] for start, end in pairs.tolist()
     ]
     torch.testing.assert_close(found, torch.tensor(expected))
-
-
-@pytest.mark.parametrize("schedule", ["exp", "linear", "ones", "zeros"])
-def test_weights_are_lerobots(schedule):
-    rtc = pytest.importorskip("lerobot.policies.rtc")
-    from lerobot.configs import RTCAttentionSchedule
-
-    config = rtc.RTCConfig(prefix_attention_schedule=RTCAttentionSchedule[schedule.upper()])
-    theirs = rtc.RTCProcessor(config)
-    ours = RealTimeChunking(schedule=schedule, horizon=7)
-    for delay in range(8):
-        found = ours.weights(torch.tensor(delay), torch.tensor(P), P)
-        torch.testing.assert_close(found, theirs.get_prefix_weights(delay, 7, P))
 
 
 def network():
@@ -227,19 +205,16 @@ def test_trust_region_bounds_what_is_perpendicular_to_the_velocity():
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "said"),
     [
         ({"schedule": "cosine"}, "unknown schedule 'cosine'.*exp, linear, ones, zeros"),
         ({"horizon": 0}, "horizon must be a whole number"),
         ({"max_guidance_weight": 0.0}, "max_guidance_weight must be > 0"),
-        ({"max_guidance_weight": math.inf}, "max_guidance_weight must be a finite number"),
-        ({"data_std": -1.0}, "data_std must be > 0"),
         ({"sigma": -0.1}, "sigma must be >= 0"),
-        ({"trust_region": math.nan}, "trust_region must be a finite number"),
     ],
 )
-def test_options_that_cannot_be(options, told):
-    with pytest.raises(ValueError, match=told):
+def test_options_that_cannot_be(options, said):
+    with pytest.raises(ValueError, match=said):
         RealTimeChunking(**options)
 
 
@@ -305,43 +280,6 @@ def test_the_actor_knows_the_sigma_of_its_source():
         for i in range(4):
             a = a + guided(torch.full((5,), i / 4), a) / 4
     torch.testing.assert_close(found["vla_action", "chunk"], a)
-
-
-def test_guidance_brings_the_chunk_to_the_leftover():
-    data = decision(GaussianPrior(4), 64)
-    distances = []
-    for rtc in (None, RealTimeChunking()):
-        policy = actor(GaussianPrior(4), guidance=rtc)
-        with torch.no_grad():
-            chunk = policy(data.clone(), nfe=16, generator=torch.Generator().manual_seed(7))[
-                "vla_action", "chunk"
-            ]
-        distances.append((chunk - data["history", "forecast"])[:, :2].abs().mean())
-    assert distances[1] < 0.2 * distances[0]
-
-
-def test_one_environment_and_a_batch_of_none():
-    policy = actor(PastPrior(4), guidance=RealTimeChunking())
-    assert policy(decision(PastPrior(4)))["vla_action", "chunk"].shape == (4, 2)
-
-
-def test_it_is_saved_with_the_policy(tmp_path):
-    rtc = RealTimeChunking(horizon=3, schedule="ones", jacobian=False, sigma=1.0, trust_region=0.5)
-    policy = actor(PastPrior(4), guidance=rtc)
-    save_policy(policy, tmp_path)
-    again = load_policy(tmp_path)
-    assert again.ode.guidance == rtc
-    data = decision(PastPrior(4), 2)
-    one, two = (
-        p(data.clone(), generator=torch.Generator().manual_seed(0))["vla_action", "chunk"]
-        for p in (policy.eval(), again)
-    )
-    assert torch.equal(one, two)
-    plain = policy.replace(guidance=None)
-    assert plain.ode.guidance is None and policy_config(plain)["actor"]["guidance"] is None
-    assert policy.replace(nfe=1).ode.guidance == rtc
-    config = policy_config(again)
-    assert config["actor"]["guidance"]["schedule"] == "ones"
 
 
 def test_missing_keys_and_agents():

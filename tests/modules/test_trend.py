@@ -16,7 +16,6 @@ from warmprior import (
     PoseTrend,
     PreconditionedNetwork,
     RestingAction,
-    Source,
     SourceMoments,
     VelocityMLP,
     VelocityNetwork,
@@ -97,23 +96,6 @@ def fit(batch, prior):
     return PoseTrend.fit(batch, prior, RestingAction(COLUMNS), generator=generator)
 
 
-class Seeing(GaussianPrior):
-    """A source around the grippers' position."""
-
-    name = "seeing-of-the-tests"
-
-    def distribution(self, history, observation=None):
-        source = super().distribution(history)
-        shift = RestingAction(COLUMNS)(observation[:, -1])[:, None]
-        return Source(source.loc + 0.5 * shift, 0.1 * source.scale, source.warm)
-
-
-def test_a_source_that_sees_the_observation():
-    """The source's trend is that of its draws, which depend on the observation where it sees it."""
-    trend = fit(windows(), Seeing(P))
-    torch.testing.assert_close(trend.source[:, :-1], torch.full((P, D_A - 1), 0.5), atol=0.02, rtol=0)
-
-
 def test_against_least_squares():
     batch = windows()
     trend = fit(batch, GaussianPrior(P))
@@ -166,15 +148,3 @@ def test_config_and_state_bring_it_back():
     without = PreconditionedNetwork(mlp, moments=moments)
     assert "trend" not in without.config()
     assert not torch.equal(network(*inputs), without(*inputs))
-
-
-def test_refusals():
-    rest, one = RestingAction(COLUMNS), torch.ones(P, D_A)
-    with pytest.raises(ValueError, match=r"\[arms, 7\], got \[1, 6\]"):
-        RestingAction(COLUMNS[:, :6])
-    with pytest.raises(ValueError, match=r"10 actions needs .*got the shapes"):
-        PoseTrend(rest, one[0], one, one[:, :7])
-    with pytest.raises(ValueError, match="target holds NaN"):
-        PoseTrend(rest, one[0], one, one * math.nan)
-    with pytest.raises(ValueError, match=r"trend is of chunks \(P, d_a\) = \(5, 10\)"):
-        PreconditionedNetwork(VelocityMLP(D_A, D_O, P), trend=PoseTrend.zero(1, 5))

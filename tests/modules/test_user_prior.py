@@ -2,28 +2,17 @@
 
 from __future__ import annotations
 
-import copy
 import json
-import pickle
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
-from tests.toy_env import random_history
-from warmprior import (
-    GaussianPrior,
-    PastPrior,
-    PreviewPrior,
-    Prior,
-    PriorDecoder,
-    VelocityMLP,
-    WarmPriorActor,
-)
+from warmprior import GaussianPrior, PastPrior, Prior, PriorDecoder, VelocityMLP, WarmPriorActor
 from warmprior.modules.registry import find, from_config, make, options_of
 from warmprior.training import BehaviourCloning, TrainingConfig
-from warmprior.training.saved import load_policy, save_policy
+from warmprior.training.saved import load_policy
 
 D_A, D_O, H, TO = 2, 3, 4, 2
 
@@ -91,29 +80,9 @@ def test_arguments_of_its_own_are_part_of_its_configuration():
     assert repr(again) == f"Anchor(chunk_length={H}, gain=0.5, offsets=[1.0, 2.0], sigma=0.3)"
 
 
-def test_arguments_are_told_as_given():
-    class Halved(PastPrior):
-        def __init__(self, chunk_length, *, sigma=1.0):
-            super().__init__(chunk_length, sigma=sigma / 2)
-
-    prior = Halved(H, sigma=0.8)
-    assert prior.sigma == from_config(Prior, prior.config()).sigma == 0.4
-    del Prior._classes["Halved"]
-
-
 def test_the_same_prior_has_one_configuration():
     assert PastPrior(H).config() == PastPrior(H, sigma=0.5, correlation=0).config()
     assert json.dumps(PastPrior(H, sigma=1).config()) == json.dumps(PastPrior(H, sigma=1.0).config())
-
-
-@pytest.mark.parametrize("twin", [copy.copy, copy.deepcopy, lambda p: pickle.loads(pickle.dumps(p))])
-@pytest.mark.parametrize("prior", [Anchor(H, gain=2.0), Learned(H), PreviewPrior(H, sigma=0.1)])
-def test_copies_keep_everything(twin, prior):
-    other = twin(prior)
-    assert type(other) is type(prior) and other.config() == prior.config()
-    history = random_history(prior, 3)
-    draws = [p.sample(history, generator=torch.Generator().manual_seed(2)) for p in (prior, other)]
-    assert torch.equal(*draws)
 
 
 def test_what_cannot_be_saved_is_told_before_anything_is_trained(tmp_path):
@@ -136,26 +105,6 @@ def test_a_taken_name_is_refused():
 def test_a_name_that_no_file_can_have_is_refused(name):
     with pytest.raises(ValueError, match="becomes that of files"):
         type("Unnamed", (PastPrior,), {"name": name})
-
-
-def test_a_class_without_a_name_has_its_own_and_not_its_parent_s(tmp_path):
-    class Unnamed(PastPrior):
-        pass
-
-    assert find(Prior, "Unnamed") is Unnamed and find(Prior, "past") is PastPrior
-    save_policy(actor_for(Unnamed(H)), tmp_path)
-    assert type(load_policy(tmp_path).prior) is Unnamed
-    del Prior._classes["Unnamed"]
-
-
-def test_arguments_without_names_are_refused():
-    class Starred(PastPrior):
-        def __init__(self, chunk_length, *numbers):
-            super().__init__(chunk_length)
-
-    with pytest.raises(TypeError, match=r"Starred must name its arguments: \*numbers"):
-        Starred(H, 1, 2)
-    del Prior._classes["Starred"]
 
 
 def test_found_by_name_or_place():
@@ -206,19 +155,6 @@ def test_a_learned_prior_trains_saves_resumes_and_freezes(tmp_path):
     assert not torch.equal(decoder.prior.shift, averaged)
 
 
-def test_a_training_with_other_buffers_is_another(tmp_path):
-    def training(value):
-        prior = Learned(H)
-        prior.offset.fill_(value)
-        config = TrainingConfig(iterations=4, batch_size=8, checkpoints=1, save_every=2)
-        return BehaviourCloning(actor_for(prior), data(), config, tmp_path, observation_steps=TO)
-
-    training(1.0).run(None)
-    training(1.0).run(None)
-    with pytest.raises(ValueError, match="another prior"):
-        training(9.0).run(None)
-
-
 # ------------------------------------------------------------------------------------ what users type
 
 
@@ -226,16 +162,11 @@ def test_a_training_with_other_buffers_is_another(tmp_path):
     ("text", "message"),
     [
         ("past,correlation", "name,option=value, got 'correlation'"),
-        ("past,=1", "name,option=value"),
         ("past,age=3", r"PastPrior cannot be built.*age=3.*it takes chunk_length, sigma, corr"),
         ("past,correlation=2", r"correlation must be in \[0, 1\], got 2"),
         ("nope,age=3", "unknown prior 'nope'"),
         ("past,correlation=abc", "PastPrior cannot be built.*correlation='abc'.*it takes"),
-        ("past,correlation=null", "PastPrior cannot be built.*correlation must be"),
-        ("past,correlation=true", "PastPrior cannot be built.*correlation must be"),
         ("past,correlation=0.5,correlation=0.2", "correlation is given twice"),
-        ("past,chunk_length=3", "PastPrior cannot be built.*chunk_length"),
-        ("gaussian,sigma=0.3", r"GaussianPrior cannot be built.*sigma.*it takes chunk_length$"),
         (f"{__name__}:Anchor", r"Anchor cannot be built from 4 \(.*gain.*it takes"),
     ],
 )
@@ -253,17 +184,3 @@ def test_options_behind_a_name():
     assert options_of(text) == {"gain": 0.5, "offsets": [1.0, 2.0], "correlation": 0.25}
     prior = make(Prior, text, H)
     assert prior.config()["offsets"] == [1.0, 2.0] and prior.correlation == 0.25
-
-
-@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
-def test_a_decoder_has_the_actor_s_precision(dtype):
-    decoder = PriorDecoder(actor_for(PastPrior(H), nfe=1), delta=0.5)
-    chunk = torch.zeros(2, H, D_A, dtype=dtype)
-    batch = TensorDict(
-        {
-            "observation": torch.randn(2, TO, D_O, dtype=dtype),
-            "prior": {"anchor": chunk, "delta": chunk.clone()},
-        },
-        [2],
-    )
-    assert decoder(batch)["vla_action", "chunk"].dtype == dtype

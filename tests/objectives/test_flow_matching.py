@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 
 from tests.toy_env import random_history
 from warmprior import (
@@ -15,7 +14,6 @@ from warmprior import (
     PastPrior,
     PolynomialInterpolant,
     PreviewPrior,
-    Prior,
     TrigonometricInterpolant,
     VelocityMLP,
     WarmPriorActor,
@@ -136,26 +134,10 @@ def loss_of(actor, data, **options):
     return FlowMatchingLoss(actor, **options)(data)["loss_flow_matching"]
 
 
-@pytest.mark.parametrize("shape", [(), (6,), (2, 3)])
-def test_batch_shapes(shape):
-    prior = PastPrior(H)
-    actor, data = actor_for(prior), sample(prior, *shape)
-    assert loss_of(actor, data).shape == ()
-    assert loss_of(actor, data, reduction="none").shape == (*shape, H, D_A)
-
-
 def test_batch_shapes_agree():
     prior = PastPrior(H)
     actor, data = actor_for(prior), sample(prior, 2, 3)
     torch.testing.assert_close(loss_of(actor, data), loss_of(actor, data.reshape(6)))
-
-
-def test_padding_does_not_reach_the_loss():
-    prior = PreviewPrior(H)
-    actor, data = actor_for(prior), sample(prior, 6)
-    pad = data["action_is_pad"]
-    out = loss_of(actor, data, reduction="none")
-    assert (out[pad] == 0).all() and (out[~pad] > 0).all()
 
 
 def test_no_pad_mask_counts_everything():
@@ -176,28 +158,6 @@ def test_only_padding_is_zero_and_not_nan(reduction):
     assert (loss == 0).all()
     loss.sum().backward()
     assert all((p.grad == 0).all() for p in actor.network.parameters())
-
-
-def test_gradients_reach_every_parameter_of_the_actor_s_network():
-    prior = PastPrior(H)
-    actor = actor_for(prior)
-    with torch.no_grad():  # modulation starts at zero, which would hide the time embedding
-        for block in actor.network.blocks:
-            block.scale.weight.normal_(std=0.1)
-    loss_of(actor, sample(prior, 64)).backward()
-    assert all(p.grad is not None and p.grad.any() for p in actor.network.parameters())
-
-
-def test_the_loss_trains_the_actor_itself():
-    prior = PastPrior(H)
-    actor = actor_for(prior)
-    loss = FlowMatchingLoss(actor)
-    assert {p.data_ptr() for p in loss.parameters()} == {p.data_ptr() for p in actor.network.parameters()}
-    optimizer = torch.optim.SGD(loss.parameters(), 0.1)
-    before = actor.network.embed_chunk.weight.clone()
-    loss(sample(prior, 8))["loss_flow_matching"].backward()
-    optimizer.step()
-    assert not torch.equal(before, actor.network.embed_chunk.weight)
 
 
 def test_generator_repeats_and_defaults_to_the_actor_s():
@@ -234,22 +194,6 @@ def test_set_keys(nested):
     assert torch.equal(loss(renamed)["loss_flow_matching"], expected)
 
 
-def test_in_keys_follow_set_keys_after_they_were_read():
-    loss = FlowMatchingLoss(actor_for(PastPrior(H)))
-    assert "history" in loss.in_keys
-    loss.set_keys(history="elsewhere")
-    assert "elsewhere" in loss.in_keys and "history" not in loss.in_keys
-    assert loss.out_keys == ["loss_flow_matching"]
-
-
-def test_observation_key_of_the_actor():
-    prior = PastPrior(H)
-    data = sample(prior, 6)
-    expected = loss_of(actor_for(prior), data)
-    data["state", "low"] = data.pop("observation")
-    assert torch.equal(loss_of(actor_for(prior, observation_key=("state", "low")), data), expected)
-
-
 @pytest.mark.parametrize("missing", [("vla_action", "chunk"), "history", ("history", "steps"), "observation"])
 def test_missing_key(missing):
     prior = PastPrior(H)
@@ -261,7 +205,7 @@ def test_missing_key(missing):
 
 
 @pytest.mark.parametrize(
-    ("made_for", "told"),
+    ("made_for", "said"),
     [
         (
             PreviewPrior(H),
@@ -270,44 +214,13 @@ def test_missing_key(missing):
         (PastPrior(H - 1), r"has 2 positions, but PastPrior.* predicts 3: make the windows"),
     ],
 )
-def test_windows_of_other_lengths(made_for, told):
-    with pytest.raises(ValueError, match=told):
+def test_windows_of_other_lengths(made_for, said):
+    with pytest.raises(ValueError, match=said):
         loss_of(actor_for(PastPrior(H)), sample(made_for, 6))
     data = sample(PastPrior(H), 6)
     data["history"] = sample(made_for, 6)["history"]
     with pytest.raises(ValueError, match=r"PastPrior.* needs 3 remembered .* of 3, but .* has "):
         loss_of(actor_for(PastPrior(H)), data)
-
-
-def test_unknown_reduction():
-    with pytest.raises(ValueError, match="reduction must be 'none', 'mean' or 'sum', got 'avg'"):
-        FlowMatchingLoss(actor_for(PastPrior(H)), reduction="avg")
-
-
-def test_any_callable_module_and_any_prior():
-    """A learned or heuristic source needs nothing but a subclass of Prior."""
-
-    class Double(Prior):
-        name = "double-for-this-test"
-        prediction_chunks = 2
-
-        def mean(self, history):
-            loc = history["forecast"]
-            return 2 * loc, torch.ones_like(loc[..., :1], dtype=torch.bool)
-
-    class Exact(nn.Module):
-        """The true velocity of the flow from 2a to a, -a = -a_t / (2 - t), and for what is unknown none."""
-
-        def forward(self, t, a, observation):
-            known = torch.arange(2 * H)[:, None] < H
-            return torch.where(known, -a / (2 - t)[:, None, None], 0.0)
-
-    prior = Double(H, sigma=0.0)
-    batch = window_replay_buffer(dataset(), prior, batch_size=32).sample()
-    loss = FlowMatchingLoss(WarmPriorActor(Exact(), prior), reduction="none")
-    error = loss(batch)["loss_flow_matching"]
-    del Prior._classes["double-for-this-test"]
-    assert error[:, :H].max() < 1e-10 and error[:, H:].max() > 0.1  # the second half is not told
 
 
 def test_ctrl_c_in_the_network_is_one():

@@ -46,46 +46,6 @@ def test_distribution_and_moments(name):
         assert (t**power).mean() == pytest.approx(float((mass * centres**power).sum()), abs=3e-3)
 
 
-def test_shapes_of_the_densities():
-    shares = {
-        name: torch.histc(draw(name, N), bins=5, min=0.0, max=1.0) / N
-        for name in ("u-shaped", "logit-normal")
-    }
-    u, middle = shares["u-shaped"], shares["logit-normal"]
-    assert u[0] > 1.5 * u[1] > 1.5 * u[2] and middle[2] > 1.5 * middle[0]
-    for share in shares.values():  # symmetric
-        torch.testing.assert_close(share, share.flip(0), atol=5e-3, rtol=0.0)
-
-
-def test_uniform_is_the_draw_that_it_was():
-    generator = torch.Generator().manual_seed(3)
-    expected = torch.rand((4, 5), generator=generator, device=CPU, dtype=torch.float32)
-    assert torch.equal(draw("uniform", 4, 5, seed=3, dtype=torch.float32), expected)
-
-
-def test_the_start_is_no_draw():
-    state = torch.get_rng_state()
-    assert torch.equal(draw("start", 2, 3), torch.zeros(2, 3, dtype=torch.float64))
-    assert torch.equal(torch.get_rng_state(), state)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("name", RANDOM)
-def test_shape_type_and_generator(name, dtype):
-    t = draw(name, 2, 3, dtype=dtype)
-    assert t.shape == (2, 3) and t.dtype == dtype
-    assert torch.equal(t, draw(name, 2, 3, dtype=dtype)) and not torch.equal(t, draw(name, 2, 3, seed=1))
-    assert draw(name).shape == ()
-
-
-def test_rounding_stays_in_the_interval(monkeypatch):
-    ends = torch.tensor([0.0, 1 - 2**-24, 0.5])
-    monkeypatch.setattr(torch, "rand", lambda *args, **options: ends)
-    t = draw("u-shaped", 3, dtype=torch.float32)
-    assert t.tolist() == pytest.approx([0.0, 1.0, 0.5], abs=1e-6)
-    assert t.min() >= 0 and t.max() <= 1
-
-
 def test_the_loss_is_given_them():
     prior = PastPrior(3)
     actor, data = actor_for(prior), sample(prior, 6)

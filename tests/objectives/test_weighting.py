@@ -24,11 +24,11 @@ from warmprior.modules.network import VelocityNetwork
 H, D_A, N = 2, 1, 40_000
 
 
-class Nothing(VelocityNetwork):
+class Still(VelocityNetwork):
     """Has learnt nothing."""
 
-    def __init__(self, *args):
-        super().__init__(*args)
+    def __init__(self, action_dim, observation_dim, prediction_length, observation_steps):
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         self.weight = nn.Parameter(torch.zeros(1))
 
     def forward(self, t, a, observation):
@@ -53,7 +53,7 @@ def batch(n=N, seed=0):
     )
 
 
-def policy(prior, interpolant=None, network=Nothing):
+def policy(prior, interpolant=None, network=Still):
     windows = batch()
     moments = SourceMoments.fit(windows, prior, generator=torch.Generator().manual_seed(1))
     inside = network(D_A, 1, H, 1)
@@ -122,26 +122,6 @@ def test_errors_are_divided_coordinate_by_coordinate():
     plain, weighed = (errors(self_distillation=2.0, weighting=w) for w in ("velocity", "standardised"))
     key, start = "loss_self_distillation", actor.network.remainder(torch.zeros(1))
     torch.testing.assert_close(weighed[key], plain[key] / start.square())
-
-
-def test_the_best_field_is_the_same():
-    """On data that the network can fit exactly, both weightings lead to the same velocities."""
-    prior = GaussianPrior(H)
-    found = []
-    for weighting in ("velocity", "standardised"):
-        torch.manual_seed(0)
-        actor = policy(prior)  # a linear network on jointly Gaussian data: F = 0 is best
-        actor.network.network.weight.data.fill_(0.5)
-        generator = torch.Generator().manual_seed(0)
-        module = FlowMatchingLoss(actor, weighting=weighting, generator=generator)
-        optimizer = torch.optim.Adam(module.parameters(), lr=0.02)
-        for i in range(150):
-            loss = module(batch(2000, seed=i))["loss_flow_matching"]
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-        found.append(float(actor.network.network.weight))
-    assert found == pytest.approx([0.0, 0.0], abs=0.03)
 
 
 def test_networks_without_a_unit_are_refused():

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import copy
-
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
-from torch import nn
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.modules.models.utils import _reset_parameters_recursive
 
-from tests.toy_env import ACTION_DIM, CountingEnv, random_history
+from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
     ActionHistory,
     ChiTransformer,
     ChunkStep,
     GaussianPrior,
-    HistoryObservation,
     Normalizer,
     PastPrior,
     PreviewPrior,
@@ -26,7 +22,6 @@ from warmprior import (
     PriorDecoder,
     VelocityMLP,
     WarmPriorActor,
-    keys,
     make_prior_space_actor,
 )
 
@@ -71,34 +66,6 @@ def test_euler_from_anchor_plus_delta(prior_class, shape):
     expected = a.clamp(-0.5, 0.5).reshape(expected_noise.shape)
     torch.testing.assert_close(out["vla_action", "chunk"], expected)
     assert (a.abs() > 0.5).any() and (a.abs() < 0.5).any()  # the clip matters
-
-
-def test_another_number_of_evaluations():
-    prior = PastPrior(H)
-    actor = make_actor(prior, nfe=3)
-    data = batch(prior, 4)
-    one = PriorDecoder(actor, delta=0.5, nfe=1)(data.clone())
-    a0, o = one["prior", "noise"], data["observation"]
-    with torch.no_grad():
-        expected = a0 + actor.network(torch.zeros(4), a0, o)
-    torch.testing.assert_close(one["vla_action", "chunk"], expected)
-    with pytest.raises(ValueError, match="positive multiple of 2 for the heun"):
-        PriorDecoder(make_actor(prior, nfe=4, solver="heun"), delta=0.5, nfe=3)
-
-
-def test_a_policy_that_sees_its_last_actions():
-    prior = GaussianPrior(H)
-    width = D_O + HistoryObservation.width(H, D_A)
-    actor = make_actor(prior, width, nfe=2, observation_key=keys.CONDITIONED)
-    data = batch(prior, 4).set("history", random_history(prior, 4))
-    data = HistoryObservation()(data)
-    data["prior", "anchor"] = torch.zeros_like(data["prior", "anchor"])
-    decoder = PriorDecoder(actor, delta=1.5)
-    assert keys.CONDITIONED in decoder.in_keys
-    out = decoder(data.clone())
-    with torch.no_grad():
-        reference = actor.ode(data.set(("prior", "noise"), data["prior", "delta"]))
-    assert torch.equal(out["vla_action", "chunk"], reference["vla_action", "chunk"])
 
 
 def fingerprint(module):
@@ -151,46 +118,6 @@ def test_nothing_can_change_the_decoder(network):
     assert torch.equal(first, decoder(fixed.clone())["vla_action", "chunk"])
 
 
-def test_the_policy_is_left_alone():
-    actor = make_actor(PastPrior(H)).train()
-    names = [name for name, _ in actor.named_parameters()]
-    PriorDecoder(actor, delta=0.5)
-    assert actor.training and [name for name, _ in actor.named_parameters()] == names
-    assert all(parameter.requires_grad for parameter in actor.parameters())
-
-
-def test_tied_parameters_stay_tied():
-    class Tied(nn.Module):
-        def __init__(self):
-            super().__init__()
-            self.a = nn.Linear(D_A, D_A)
-            self.b = nn.Linear(D_A, D_A)
-            self.b.weight = self.a.weight
-
-        def forward(self, t, a, observation):
-            return self.b(self.a(a))
-
-    decoder = PriorDecoder(WarmPriorActor(Tied(), PastPrior(H)), delta=0.5)
-    network = decoder.ode.network
-    assert network.a.weight is network.b.weight
-    network.to(torch.float64)
-    assert network.a.weight.dtype == network.b.weight.dtype == torch.float64
-
-
-def test_copies_and_devices():
-    decoder = PriorDecoder(make_actor(PastPrior(H), nfe=1), delta=0.5)
-    data = batch(PastPrior(H), 4)
-    again = copy.deepcopy(decoder)
-    assert torch.equal(
-        decoder(data.clone())["vla_action", "chunk"], again(data.clone())["vla_action", "chunk"]
-    )
-    moved = TensorDictSequential(again.double()).to("meta").state_dict()
-    assert moved.keys() == {f"module.0.{key}" for key in decoder.state_dict()}
-    assert all(value.device.type == "meta" for value in moved.values())
-    assert {value.dtype for value in moved.values()} == {torch.float64}
-    assert {value.dtype for value in decoder.state_dict().values()} == {torch.float32}
-
-
 def test_gradient_of_the_residual_by_finite_differences():
     prior = PastPrior(H)
     decoder = PriorDecoder(make_actor(prior, nfe=2), delta=0.5, differentiable=True).double()
@@ -205,24 +132,9 @@ def test_gradient_of_the_residual_by_finite_differences():
         assert not decode(delta).requires_grad
 
 
-@pytest.mark.parametrize("delta", [0.0, -0.5, float("nan"), float("inf")])
-def test_no_box(delta):
-    with pytest.raises(ValueError, match="delta must be a finite number > 0"):
-        PriorDecoder(make_actor(PastPrior(H)), delta=delta)
-
-
 def test_regression_has_no_source_space():
     with pytest.raises(ValueError, match=r"trained at t = 0 alone.* no source space to act in"):
         PriorDecoder(make_actor(GaussianPrior(H), max_nfe=1), delta=0.5)
-
-
-@pytest.mark.parametrize("missing", ["observation", ("prior", "anchor"), ("prior", "delta")])
-def test_missing_key(missing):
-    prior = PastPrior(H)
-    data = batch(prior, 4)
-    del data[missing]
-    with pytest.raises(KeyError, match=missing[-1] if isinstance(missing, tuple) else missing):
-        PriorDecoder(make_actor(prior), delta=0.5)(data)
 
 
 def test_shapes_of_another_policy():

@@ -11,15 +11,7 @@ from tensordict.nn import TensorDictSequential
 from torch import nn
 
 from tests.rl.dsrl_parts import GAMMA, H, N, batch, build
-from warmprior import (
-    GaussianPrior,
-    PastPrior,
-    PreviewPrior,
-    PriorDecoder,
-    ResidualSampler,
-    WarmPriorActor,
-    keys,
-)
+from warmprior import PastPrior, PreviewPrior, PriorDecoder, ResidualSampler, WarmPriorActor, keys
 
 
 def networks(loss):
@@ -228,14 +220,3 @@ def test_schedule():
     assert [c.__name__ for c in build().schedule(20)].count("distillation_loss") == 10
     with pytest.raises(ValueError, match="updates must be at least 1"):
         loss.schedule(0)
-
-
-def test_official_defaults():
-    loss = build(GaussianPrior(H), delta=1.5)
-    assert (loss.backup, loss.bootstrap_timeouts, loss.noise_critic_steps) == ("min", False, 10)
-    assert loss.distillation.distribution == "normal" and loss.distillation.sigma == 1.0
-    assert float(loss.log_alpha) == 0.0 and float(loss.target_entropy) == 0.0
-    assert len(loss.qvalue_network_params["module", "net", "0", "weight"]) == 2
-    actor = loss.get_stateful_net("actor_network")
-    assert float(actor.spec[keys.DELTA].high.max()) == 1.5
-    assert build(PastPrior(H)).distillation.distribution == "clipped"

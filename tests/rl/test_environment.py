@@ -105,37 +105,6 @@ def test_specs_and_random_actions(batched):
         env.close(raise_if_closed=False)
 
 
-def test_inside_of_workers():
-    prior = PastPrior(H)
-    decoder = make_decoder(prior)
-
-    def one(length):
-        transforms = policy_transforms(prior, observation_steps=TO)
-        return TransformedEnv(
-            CountingEnv(length),
-            Compose(*transforms, PriorAnchor(make_actor(prior)), PriorSpace(decoder)),
-        )
-
-    check_env_specs(SerialEnv(2, [partial(one, n) for n in LENGTHS]))
-
-
-def test_a_bare_step_holds_what_was_decoded():
-    prior = PastPrior(H)
-    env = make_env(prior, make_decoder(prior))
-    data = env.rand_step(env.reset())
-    assert data["next", "decoded", "chunk"].any()
-    assert ("vla_action", "chunk") not in data.keys(True, True)
-    assert not data["decoded", "chunk"].any()
-
-
-def test_chunks_of_another_length():
-    chain = Compose(ChunkStep(H), ActionHistory(H), PriorAnchor(make_actor(PastPrior(H))))
-    env = TransformedEnv(CountingEnv(7), chain)
-    decoder = make_decoder(PreviewPrior(H))
-    with pytest.raises(ValueError, match=r"\(3, 2\), but the policy predicts \(6, 2\)"):
-        env.append_transform(PriorSpace(decoder)).rollout(1)
-
-
 def test_without_anchor_or_chunks():
     decoder = make_decoder(PastPrior(H))
     chain = Compose(ChunkStep(H), ActionHistory(H), PriorSpace(decoder))

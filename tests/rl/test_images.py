@@ -10,14 +10,7 @@ from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.transforms import Compose
 from torchrl.envs.utils import check_env_specs
 
-from tests.rl.training_parts import (
-    EVALUATION_SEED,
-    LENGTHS,
-    H,
-    SolvableEnv,
-    make_actor,
-    make_config,
-)
+from tests.rl.training_parts import EVALUATION_SEED, LENGTHS, H, SolvableEnv, make_actor, make_config
 from tests.toy_env import ACTION_DIM
 from warmprior import (
     EncodeObservation,
@@ -93,16 +86,6 @@ def test_features_are_those_of_the_policy_in_evaluation_mode(policy):
         torch.testing.assert_close(place["features"].flatten(0, 1), expected)
 
 
-def test_the_policy_returns_the_same_chunks_from_features(policy):
-    env, policy = environment(policy), policy.eval()
-    state = env.reset()
-    one, two = (
-        actor(state.clone(), generator=torch.Generator().manual_seed(3))["vla_action", "chunk"]
-        for actor in (policy, policy.replace(observation_key="features"))
-    )
-    assert torch.equal(one, two)
-
-
 @pytest.mark.parametrize("algorithm", ["dsrl-na", "dsrl-sac"])
 def test_agents_learn_from_features_alone(policy, tmp_path, algorithm):
     decisions = []
@@ -133,8 +116,3 @@ def test_agents_learn_from_features_alone(policy, tmp_path, algorithm):
 def test_a_policy_of_vectors_has_nothing_to_encode():
     with pytest.raises(ValueError, match="VelocityMLP takes observations as they are"):
         EncodeObservation(make_actor())
-
-
-def test_without_the_observation(policy):
-    with pytest.raises(KeyError, match="found no 'observation'"):
-        EncodeObservation(policy)(TensorDict({}, []))

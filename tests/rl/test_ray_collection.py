@@ -8,16 +8,8 @@ import torch
 pytest.importorskip("ray")
 
 from tests.processes import apart
-from tests.rl.training_parts import (
-    LENGTHS,
-    H,
-    check_transitions,
-    make_actor,
-    make_env,
-    make_training,
-)
+from tests.rl.training_parts import LENGTHS, H, check_transitions, make_actor, make_env, make_training
 from warmprior import PastPrior
-from warmprior.io.workers import WorkerError
 from warmprior.rl import PriorSpaceConfig
 from warmprior.rl.agent import PriorSpaceAgent
 from warmprior.rl.ray_collection import WarmUpSwitch
@@ -37,6 +29,7 @@ def test_a_buffer_says_which_policy_acts():
         assert torch.equal(*found)
 
 
+@pytest.mark.slow
 @apart
 def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp_path):
     actor = make_actor(PastPrior(H, sigma=0.01))
@@ -63,31 +56,3 @@ def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp
     assert not all(torch.equal(fresh[name], state[name]) for name in fresh)
     again = make_training(tmp_path, actor, warmup_steps=40)
     assert again.steps == training.steps and again.curve == training.curve
-
-
-@pytest.mark.slow
-@apart
-def test_the_same_number_of_actors_collects_the_same(ray_address, tmp_path):
-    found = []
-    for name in ("one", "two"):
-        collection = {"collectors": 2, "ray_address": ray_address}
-        training = make_training(tmp_path / name, collection=collection)
-        curve = training.run()
-        found.append((training.buffer[:], curve))
-    (one, curve), (two, again) = found
-    assert (one == two).all() and curve == again
-
-
-def broken(data):
-    raise RuntimeError("the motors are off")
-
-
-@pytest.mark.slow
-@apart
-def test_an_environment_that_fails_in_an_actor_ends_the_training(ray_address, tmp_path):
-    collection = {"collectors": 1, "ray_address": ray_address}
-    training = make_training(tmp_path, env={"hook": broken}, collection=collection)
-    with pytest.raises(WorkerError, match=r"a Ray collector failed.*the motors are off"):
-        training.run()
-    with pytest.raises(ValueError, match="--collectors 3 need a CPU each, and the cluster has 2"):
-        make_training(tmp_path / "more", collection={"collectors": 3, "ray_address": ray_address}).run()

@@ -10,14 +10,7 @@ from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import RenameTransform, SerialEnv, TransformedEnv
-from torchrl.objectives import (
-    CrossQLoss,
-    REDQLoss,
-    SACLoss,
-    SoftUpdate,
-    TQCLoss,
-    ValueEstimators,
-)
+from torchrl.objectives import CrossQLoss, REDQLoss, SACLoss, SoftUpdate, TQCLoss, ValueEstimators
 
 from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
@@ -171,17 +164,3 @@ def test_discount_of_short_chunks(loss_class, monkeypatch):
     assert goes_on.any() and not goes_on.all()
     expected = reward + GAMMA ** k.float() * goes_on * value
     torch.testing.assert_close(target, expected, rtol=1e-5, atol=1e-5)
-
-
-def test_warm_up_in_the_environment_is_uniform_in_the_box():
-    decoder = make_decoder()
-    actor, _ = make_loss(SACLoss)
-    collector = Collector(
-        make_env(decoder), actor, frames_per_batch=64, total_frames=128, init_random_frames=64
-    )
-    torch.manual_seed(0)
-    batches = list(collector)
-    collector.shutdown()
-    delta = batches[0]["prior", "delta"]
-    assert float(delta.abs().max()) <= DELTA
-    assert float(delta.std()) == pytest.approx(DELTA / 3**0.5, rel=0.05)

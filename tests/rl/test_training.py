@@ -5,21 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from tests.rl.training_parts import (
-    ALGORITHMS,
-    H,
-    check_transitions,
-    make_actor,
-    make_config,
-    make_env,
-    make_training,
-)
-from warmprior import (
-    GaussianPrior,
-    PastPrior,
-    PreviewPrior,
-    keys,
-)
+from tests.rl.training_parts import ALGORITHMS, H, check_transitions, make_actor, make_training
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.rl import PriorSpaceTraining
 
 pytest.importorskip("tqdm")
@@ -38,7 +25,7 @@ class Recorded(PriorSpaceTraining):
 
 @pytest.mark.parametrize(
     ("offset", "truncate", "bootstrap"),
-    [(1.0, True, False), (0.0, True, True), (0.25, False, True)],
+    [(1.0, True, False), (0.25, True, True)],
 )
 def test_transitions_are_those_of_a_rollout_by_hand(tmp_path, offset, truncate, bootstrap):
     training = make_training(
@@ -70,14 +57,13 @@ def test_the_warm_up_draws_from_the_prior_and_learns_nothing(tmp_path):
     assert not all(torch.equal(fresh[name], state[name]) for name in fresh)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize(
-    ("prior", "see_history"),
+    ("algorithm", "prior", "see_history"),
     [
-        (GaussianPrior(H), False),
-        (GaussianPrior(H), True),
-        (PastPrior(H), False),
-        (PreviewPrior(H), False),
+        ("dsrl-na", GaussianPrior(H), True),
+        ("dsrl-na", PastPrior(H), False),
+        ("dsrl-sac", GaussianPrior(H), False),
+        ("dsrl-sac", PreviewPrior(H), False),
     ],
 )
 def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, prior, see_history):
@@ -113,65 +99,9 @@ def test_both_algorithms_train_and_the_policy_stays_frozen(tmp_path, algorithm, 
         assert row["episodes"] == 2 and row["success_rate"] == row["successes"] / 2
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_agent_sees_the_actions_that_condition_the_policy(tmp_path, algorithm):
-    """Its anchor is zero, so that without them the agent could not tell what is decoded."""
-    actor = make_actor(GaussianPrior(H), see_history=True)
-    training = make_training(tmp_path, actor, algorithm=algorithm, environment_steps=30)
-    training.run()
-    data = training.buffer[:][:1].clone()
-    residuals = []
-    for mean in (0.0, 1.0):
-        data[keys.CONDITIONED][..., -1 - H : -1] = mean
-        torch.manual_seed(0)
-        residuals.append(training.agent.policy(data)[keys.DELTA].clone())
-    assert not data[keys.ANCHOR].isnan().any() and not torch.equal(*residuals)
-
-
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_agent_climbs_its_critic(tmp_path, algorithm):
-    """The actor's gradient depends on what the critic thinks of its residual."""
-    training = make_training(tmp_path, algorithm=algorithm, environment_steps=30)
-    training.run()
-    loss, data = training.agent.loss, training.buffer[:]
-    critic = "noise_qvalue_network_params" if algorithm == "dsrl-na" else "qvalue_network_params"
-
-    def gradient():
-        torch.manual_seed(0)
-        loss.zero_grad()
-        loss(data.clone())["loss_actor"].backward()
-        return torch.cat(
-            [p.grad.flatten() for p in loss.actor_network_params.values(True, True) if p.requires_grad]
-        )
-
-    one = gradient()
-    with torch.no_grad():
-        for value in getattr(loss, critic).values(True, True):
-            value.mul_(-2.0)
-    assert not torch.allclose(one, gradient())
-
-
-def test_both_algorithms_want_the_same_entropy(tmp_path):
-    """In units of the box."""
-    losses = {}
-    for algorithm in ALGORITHMS:
-        options = {"alpha_init": 3.0, "target_entropy": -2.5, "delta": 0.7}
-        training = make_training(tmp_path / algorithm, algorithm=algorithm, environment_steps=30, **options)
-        if algorithm == "dsrl-na":
-            training.run()
-            data, weights = training.buffer[:], training.agent.loss.actor_network_params
-        loss = training.agent.loss
-        loss.actor_network_params.data.copy_(weights.data)
-        torch.manual_seed(0)
-        losses[algorithm] = loss(data.clone())["loss_alpha"].item()
-    # In other units they would be 2.4 apart; TorchRL inverts the squashing numerically.
-    assert losses["dsrl-sac"] == pytest.approx(losses["dsrl-na"], abs=0.05)
-
-
-@pytest.mark.parametrize("delta", [0.5, 1.5])
-def test_the_targets_of_sac_by_hand(tmp_path, delta):
+def test_the_targets_of_sac_by_hand(tmp_path):
     """Squared errors to rewards and soft values, with entropies that do not depend on the box."""
-    options = {"algorithm": "dsrl-sac", "alpha_init": 0.7, "delta": delta, "gamma": 0.9}
+    options = {"algorithm": "dsrl-sac", "alpha_init": 0.7, "delta": 1.5, "gamma": 0.9}
     training = make_training(tmp_path, environment_steps=30, **options)
     training.run()
     loss, data = training.agent.loss, training.buffer[:]
@@ -192,43 +122,6 @@ def test_the_targets_of_sac_by_hand(tmp_path, delta):
     expected = (errors + variance).mean().item()
     found = sum(loss(data.clone())["loss_qvalue"].item() for _ in range(300)) / 300
     assert found == pytest.approx(2 * expected, rel=0.02)  # summed over two critics
-
-
-def test_the_environment_may_live_anywhere(tmp_path):
-    """PyTorch takes ``cpu:0`` for another device than ``cpu``."""
-    runs = []
-    for device in (None, "cpu", "cpu:0"):
-        seen = set()
-
-        def spied(seed, device=device, seen=seen):
-            env = make_env(seed, device=device)
-            step = env.step_and_maybe_reset
-
-            def spy(data):
-                seen.add(str(data.device))
-                return step(data)
-
-            env.step_and_maybe_reset = spy
-            return env
-
-        training = PriorSpaceTraining(
-            make_actor(), spied, make_config(), tmp_path / str(device), evaluation_seed=100
-        )
-        curve = training.run()
-        assert seen == {device or "cpu"}
-        again = make_training(tmp_path / str(device))
-        runs.append((curve, training.buffer[:]))
-        assert (again.buffer[:] == training.buffer[:]).all()
-    (curve, data), *others = runs
-    assert all(curve == other and (data == stored).all() for other, stored in others)
-
-
-def test_a_prior_without_noise_warms_up_in_its_box(tmp_path):
-    prior = PastPrior(H, sigma=0.0)
-    training = make_training(tmp_path, make_actor(prior), environment_steps=30)
-    training.run()
-    delta = training.buffer[:][keys.DELTA]
-    assert 0.2 < delta.std() < 0.4 and delta.abs().max() <= 0.5
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from tensordict import TensorDict
 
@@ -46,6 +47,20 @@ def training(folder, config=CONFIG, **options):
     data = options.pop("data", None)
     data = dataset() if data is None else data
     return BehaviourCloning(actor, data, config, folder, **options)
+
+
+def run_until(cloning, iteration):
+    """Run a training until Ctrl-C before the step behind that iteration."""
+    step = cloning.step
+
+    def stopping():
+        if cloning.iteration == iteration:
+            raise KeyboardInterrupt
+        return step()
+
+    cloning.step = stopping
+    with pytest.raises(KeyboardInterrupt):
+        cloning.run(None)
 
 
 def weights(cloning):

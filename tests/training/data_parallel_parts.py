@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import os
 import signal
@@ -10,10 +9,9 @@ import signal
 import torch
 from torch import nn
 
-from tests.training.cloning_parts import CONFIG, actor_for, mlp, training, weights
+from tests.training.cloning_parts import CONFIG, actor_for, mlp, run_until, training, weights
 from warmprior import PastPrior, PreconditionedNetwork, SourceMoments
 from warmprior.io.distributed import rank
-from warmprior.objectives import OTCoupling
 
 STEPS = dataclasses.replace(
     CONFIG,
@@ -48,15 +46,7 @@ def standardised():
 CASES = {
     "plain": ({}, {}, lambda: actor_for(PastPrior(4), mlp())),
     "dropout, withheld": ({"cold_probability": 0.5}, {}, actor_for),
-    "prefetched": ({}, {"prefetch": True}, lambda: actor_for(PastPrior(4), mlp())),
-    "coupled": ({}, {"coupling": OTCoupling()}, lambda: actor_for(PastPrior(4), mlp())),
     "learning prior": ({}, {}, lambda: actor_for(LearningPrior(4), mlp())),
-    "distilled, standardised": (
-        {"self_distillation": 0.5, "weighting": "standardised"},
-        {},
-        lambda: actor_for(PastPrior(4), standardised()),
-    ),
-    "bf16": ({"precision": "bf16"}, {}, lambda: actor_for(PastPrior(4), mlp())),
 }
 """Recipes, options and policies."""
 
@@ -92,25 +82,9 @@ def whole(folder):
     for case in CASES:
         trained(folder, case)
     for name in ("one", "two"):  # the same from the same state
-        stopped_at(folder / name, 12)
+        run_until(cloning(folder / name / "plain", "plain"), 12)
         trained(folder / name, "plain")
     diverges(folder)
-    refuses(folder)
-
-
-def stopped_at(folder, iteration):
-    """End in the middle, as if killed after a step."""
-    part = cloning(folder / "plain", "plain")
-    step = part.step
-
-    def stopping():
-        if part.iteration == iteration:
-            raise KeyboardInterrupt
-        return step()
-
-    part.step = stopping
-    with contextlib.suppress(KeyboardInterrupt):
-        part.run(None)
 
 
 def dies(folder):
@@ -137,11 +111,3 @@ def diverges(folder):
         part.run(None)
     except FloatingPointError as error:
         (folder / f"diverged {rank()}").write_text(str(error))
-
-
-def refuses(folder):
-    """A batch that several processes cannot share."""
-    try:
-        cloning(folder / "odd", "plain", batch_size=15)
-    except ValueError as error:
-        (folder / f"refused {rank()}").write_text(str(error))

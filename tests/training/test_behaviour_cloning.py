@@ -12,25 +12,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.record.loggers.common import Logger
 
-from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, same, training, weights
-from warmprior import (
-    FlowMatchingLoss,
-    Normalizer,
-    PastPrior,
-    VelocityMLP,
-    WarmPriorActor,
-    window_replay_buffer,
-)
-from warmprior.training import (
-    BehaviourCloning,
-    TrainingConfig,
-    ema_of,
-    load_policy,
-    make_optimizer,
-)
+from tests.training.cloning_parts import CONFIG, actor_for, dataset, run_until, same, training, weights
+from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
+from warmprior.training import TrainingConfig, load_policy, make_optimizer
 from warmprior.training.checkpoint import load_state
 
 
@@ -72,42 +57,13 @@ def test_the_loop_by_hand(tmp_path):
     assert cloning.losses[1][1] == pytest.approx(sum(losses[10:]) / 2, rel=1e-4)
 
 
-def test_files(tmp_path):
-    cloning = training(tmp_path / "run")
-    cloning.run()
-    names = sorted(p.name for p in (tmp_path / "run").iterdir())
-    assert names == ["policy_000020", "policy_000040", "state.safetensors"]
-    assert cloning.iteration == 40 and cloning.policy_path(20).name == "policy_000020"
-
-
-def test_normalizer_is_kept_with_the_policy(tmp_path):
-    actor = actor_for()
-    actor.normalizer = Normalizer.fit(dataset())
-    cloning = training(tmp_path, actor=actor)
-    cloning.run()
-    kept = load_policy(cloning.policy_path(40))
-    assert torch.equal(kept.normalizer.loc("action"), actor.normalizer.loc("action"))
-    assert kept.ode.nfe == actor.ode.nfe
-
-
-@pytest.mark.parametrize("stop", [1, 6, 7, 8, 20, 23, 39])
+@pytest.mark.parametrize("stop", [6, 7, 23])
 def test_stopping_anywhere_changes_nothing(tmp_path, stop):
     """Without a kill: an exception in the middle of the loop, then a new object."""
     whole = training(tmp_path / "whole")
     whole.run()
     part = training(tmp_path / "part")
-    take, calls = part.step, 0
-
-    def step():
-        nonlocal calls
-        calls += 1
-        if calls > stop:
-            raise KeyboardInterrupt
-        return take()
-
-    part.step = step
-    with pytest.raises(KeyboardInterrupt):
-        part.run()
+    run_until(part, stop)
     torch.rand(100)  # whatever else uses the global generator in between
     again = training(tmp_path / "part")
     assert again.iteration == max(i for i in (0, 7, 14, 20, 21, 28, 35) if i <= stop)
@@ -129,23 +85,6 @@ def test_a_finished_training_stays_as_it_is(tmp_path):
     assert again.iteration == 40 and again.losses == first.losses
     assert same(weights(again), weights(first))
     assert (tmp_path / "state.safetensors").read_bytes() == before
-
-
-def test_starting_over(tmp_path):
-    first = training(tmp_path)
-    first.run()
-    again = training(tmp_path, resume=False)
-    assert again.iteration == 0
-    again.run()
-    assert same(weights(again), weights(first))  # the same seed
-
-
-def test_evaluation_between_steps_does_not_switch_dropout_off(tmp_path):
-    actor = actor_for().eval()
-    training(tmp_path / "a", actor=actor).run()
-    training(tmp_path / "b").run()
-    one, two = ((tmp_path / n / "state.safetensors").read_bytes() for n in "ab")
-    assert one == two
 
 
 SCRIPT = """
@@ -212,51 +151,6 @@ def _iteration(folder):
     return load_state(path)[1]["iteration"] if path.exists() else 0
 
 
-class ListLogger(Logger):
-    def __init__(self):
-        super().__init__("list", None)
-        self.rows = []
-
-    def _create_experiment(self):
-        return None
-
-    def log_scalar(self, name, value, step=None, **kwargs):
-        self.rows.append((name, step, value))
-
-    def log_video(self, *args, **kwargs): ...
-
-    def log_hparams(self, *args, **kwargs): ...
-
-    def log_histogram(self, *args, **kwargs): ...
-
-    def __repr__(self):
-        return "ListLogger()"
-
-
-def test_logger(tmp_path):
-    logger = ListLogger()
-    cloning = training(tmp_path, logger=logger)
-    cloning.run()
-    assert [(s, v) for n, s, v in logger.rows if n == "train/loss"] == cloning.losses
-    rates = [v for n, _, v in logger.rows if n == "train/learning_rate"]
-    assert len(rates) == 4 and rates[-1] == pytest.approx(0, abs=1e-12)
-
-
-def test_compiled_training_is_close(tmp_path):
-    """The policy that is kept is the plain one, whatever ran it."""
-    config = dataclasses.replace(CONFIG, iterations=2, checkpoints=1)
-    plain = training(tmp_path / "a", config, actor=actor_for(network=mlp()))
-    plain.run()
-    compiled = training(tmp_path / "b", config, actor=actor_for(network=mlp()))
-    compiled.loss_module.velocity_network.compile(backend="eager")
-    compiled.run()
-    one = load_policy(plain.policy_path(2)).state_dict()
-    two = load_policy(compiled.policy_path(2)).state_dict()
-    assert one.keys() == two.keys()
-    for name in one:
-        torch.testing.assert_close(one[name], two[name])
-
-
 def test_default_config_is_the_paper_s():
     config = TrainingConfig()
     assert (config.iterations, config.batch_size, config.learning_rate) == (200_000, 1024, 1e-4)
@@ -264,36 +158,3 @@ def test_default_config_is_the_paper_s():
     assert config.checkpoint_iterations == [20_000 * i for i in range(1, 11)]
     # No more than there are iterations.
     assert TrainingConfig(iterations=3, checkpoints=4).checkpoint_iterations == [1, 2, 3]
-
-
-def test_average_starts_at_the_first_update(tmp_path):
-    network = mlp()
-    average = ema_of(network)
-    with torch.no_grad():
-        network.embed_chunk.weight.add_(1.0)
-    average.update_parameters(network)
-    assert torch.equal(average.module.embed_chunk.weight, network.embed_chunk.weight)
-
-
-def test_data_and_actor_may_name_their_keys(tmp_path):
-    """As the standard names: the same weights after the same steps."""
-    losses = []
-    for name in ("observation", ("sensors", "state")):
-        torch.manual_seed(0)
-        actor = WarmPriorActor(VelocityMLP(2, 3, 4, 2, hidden_dim=8), PastPrior(4), observation_key=name)
-        generator = torch.Generator().manual_seed(0)
-        data = TensorDict(
-            {
-                name: torch.randn(30, 3, generator=generator),
-                "action": torch.randn(30, 2, generator=generator),
-                "episode": torch.arange(30) // 10,
-            },
-            [30],
-        )
-        config = TrainingConfig(iterations=4, batch_size=8, checkpoints=1)
-        training = BehaviourCloning(actor, data, config, tmp_path / str(len(losses)))
-        training.run(None)
-        losses.append(training.losses)
-        loaded = load_policy(training.policy_path(4))
-        assert loaded.in_keys[0] == name
-    assert losses[0] == losses[1]

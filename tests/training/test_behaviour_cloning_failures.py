@@ -9,77 +9,36 @@ import os
 import pytest
 import torch
 
-from tests.training.cloning_parts import (
-    CONFIG,
-    actor_for,
-    dataset,
-    mlp,
-    same,
-    training,
-    weights,
-)
-from warmprior import (
-    PastPrior,
-    PreconditionedNetwork,
-    PreviewPrior,
-    SourceMoments,
-)
-from warmprior.training import TrainingConfig, load_policy
+from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, same, training, weights
+from warmprior import PastPrior, PreviewPrior
+from warmprior.training import load_policy
 from warmprior.training.checkpoint import load_state
 
 
-@pytest.mark.parametrize(
-    ("part", "change"),
-    [
-        ("config", {"config": dataclasses.replace(CONFIG, learning_rate=2e-2)}),
-        ("config", {"config": dataclasses.replace(CONFIG, seed=1)}),
-        ("config", {"config": dataclasses.replace(CONFIG, iterations=80)}),
-        ("prior", {"actor": lambda: actor_for(PastPrior(4, sigma=0.1))}),
-        ("prior", {"actor": lambda: actor_for(PreviewPrior(4))}),
-        ("network", {"actor": lambda: actor_for(network=mlp())}),
-        ("data", {"data": lambda: dataset().set("action", torch.zeros(120, 2))}),
-    ],
-)
-def test_a_state_of_another_run(tmp_path, part, change):
+def test_a_state_of_another_run(tmp_path):
     training(tmp_path).run()
     before = (tmp_path / "state.safetensors").read_bytes()
-    change = {k: v() if callable(v) else v for k, v in change.items()}
-    with pytest.raises(ValueError, match=rf"belongs to another {part}: .*(folder|resume)"):
-        training(tmp_path, **change)
-    assert (tmp_path / "state.safetensors").read_bytes() == before
+    for part, change in (
+        ("config", {"config": dataclasses.replace(CONFIG, learning_rate=2e-2)}),
+        ("config", {"config": dataclasses.replace(CONFIG, seed=1)}),
+        ("prior", {"actor": actor_for(PastPrior(4, sigma=0.1))}),
+        ("prior", {"actor": actor_for(PreviewPrior(4))}),
+        ("network", {"actor": actor_for(network=mlp())}),
+        ("data", {"data": dataset().set("action", torch.zeros(120, 2))}),
+    ):
+        with pytest.raises(ValueError, match=rf"belongs to another {part}: .*(folder|resume)"):
+            training(tmp_path, **change)
+        assert (tmp_path / "state.safetensors").read_bytes() == before
 
 
-def test_a_state_of_other_moments(tmp_path):
-    """The weights alone would fit; what they were trained to add to would be another."""
-    one = torch.ones(4, 2)
-
-    def actor(scale):
-        moments = SourceMoments(0 * one, 0 * one, one, scale * one, 0 * one)
-        return actor_for(PastPrior(4), PreconditionedNetwork(mlp(), moments=moments))
-
-    training(tmp_path, actor=actor(0.5)).run()
-    with pytest.raises(ValueError, match="belongs to another network"):
-        training(tmp_path, actor=actor(0.25))
-    assert training(tmp_path, actor=actor(0.5)).iteration == CONFIG.iterations
-
-
-def test_a_damaged_state(tmp_path):
-    training(tmp_path).run()
-    path = tmp_path / "state.safetensors"
-    path.write_bytes(path.read_bytes()[:1000])
-    with pytest.raises(ValueError, match="not a readable training state"):
-        training(tmp_path)
-
-
-@pytest.mark.parametrize("moment", [1, 2, 5])
-def test_a_full_disk(tmp_path, monkeypatch, moment):
+def test_a_full_disk(tmp_path, monkeypatch):
     cloning = training(tmp_path)
     replace, calls = os.replace, 0
 
     def failing(*args):
         nonlocal calls
         calls += 1
-        if calls >= moment:
+        if calls >= 2:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return replace(*args)
 
@@ -95,7 +54,7 @@ def test_a_full_disk(tmp_path, monkeypatch, moment):
     assert same(weights(again), weights(whole))
 
 
-@pytest.mark.parametrize("bad", [8, 10, 13, 15, 21])
+@pytest.mark.parametrize("bad", [8, 15])
 def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
     """Wherever it appears between two logs or two saves, no NaN reaches the disk."""
     cloning = training(tmp_path)
@@ -124,35 +83,3 @@ def test_nan_stops_and_keeps_the_last_good_state(tmp_path, bad):
     again = training(tmp_path)
     again.run()
     assert same(weights(again), weights(whole))
-
-
-def test_infinite_weights_are_not_saved(tmp_path):
-    """A finite loss whose gradient is not: the weights are bad before any loss is."""
-    cloning = training(tmp_path)
-    step = cloning.step
-
-    def broken():
-        out = step()
-        if cloning.iteration == 14:
-            with torch.no_grad():
-                next(cloning.actor.network.parameters()).view(-1)[0] = float("inf")
-        return out
-
-    cloning.step = broken
-    with pytest.raises(FloatingPointError, match="weights became NaN or infinite"):
-        cloning.run()
-    assert load_state(tmp_path / "state.safetensors")[1]["iteration"] == 7
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"iterations": 0}, "iterations must be at least 1"),
-        ({"batch_size": 0}, "batch_size"),
-        ({"checkpoints": 0}, "checkpoints"),
-        ({"log_every": 0}, "log_every"),
-    ],
-)
-def test_bad_config(options, message):
-    with pytest.raises(ValueError, match=message):
-        TrainingConfig(**options)

@@ -12,7 +12,6 @@ from scipy import stats
 
 import warmprior
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-from warmprior.envs.description import environment_description
 from warmprior.training import model_card, policy_results
 
 ACTOR = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
@@ -77,38 +76,8 @@ def test_its_numbers_are_those_of_the_results(run):
     assert front["pipeline_tag"] == "robotics" and "flow-matching" in front["tags"]
 
 
-def test_delays_have_lines_of_their_own(run):
-    write(run, [row(0, 20, 1, d, delay=d, guidance="none") for d in (0, 2)])
-    card = model_card(ACTOR, policy_results(run, at(run)))
-    assert "| 1 | 0 | none | 5 | 0 |" in card and "| 1 | 2 | none | 5 | 2 |" in card
-
-
 def test_what_is_not_known_is_said():
     card = model_card(ACTOR, repository="me/it")
     assert "license" not in card and "Not measured" in card and "| environment | not known |" in card
     assert 'load_policy("me/it")' in card and "environment_of" not in card
     assert warmprior.__version__ in card
-
-
-class Own(PastPrior):
-    name = "of_the_card"
-
-
-def test_an_environment_and_classes_of_ones_own_are_named():
-    about = environment_description({"env_name": "Lift"}, "ph", 2, "absolute")
-    card = model_card(WarmPriorActor(VelocityMLP(7, 19, 8), PastPrior(8), environment=about))
-    assert "environment_of(actor)" in card and "# past on Lift" in card
-    assert "import Own" not in card
-    card = model_card(WarmPriorActor(VelocityMLP(2, 3, 4), Own(4)))
-    assert f"import Own of {Own.__module__} first" in card
-
-
-def test_results_of_something_else_are_refused(run, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"has no results\.jsonl"):
-        policy_results(tmp_path, at(run))
-    for policy in (tmp_path / "elsewhere" / "policy_000020", at(run).with_name("state")):
-        with pytest.raises(ValueError, match=r"no row of .*name the run"):
-            policy_results(run, policy)
-    (run / "results.jsonl").write_text("{broken")
-    with pytest.raises(ValueError, match=r"results\.jsonl"):
-        policy_results(run, at(run))

@@ -82,12 +82,6 @@ def test_all_learn_of_nan_in_one(folder):
     assert not (folder / "diverges" / "policy_000020").exists()
 
 
-def test_what_several_processes_cannot_train(folder):
-    for number in range(2):
-        odd = (folder / f"refused {number}").read_text()
-        assert "--batch-size 15 cannot be divided among 2 process" in odd
-
-
 def test_a_killed_process_ends_the_others_and_the_state_stays(tmp_path):
     context = together(dies, tmp_path, join=False)
     begun = time.monotonic()

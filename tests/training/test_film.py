@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-from warmprior.training import play_episode, record_filmstrip, record_video
+from warmprior.training import play_episode, record_filmstrip
 
 pytest.importorskip("robosuite")
 
@@ -45,15 +45,3 @@ def test_frames_are_of_the_evaluated_episode(monkeypatch):
         assert np.array_equal(states[2 if policy_seed == 0 else 5], env.base_env.loop.state())
     assert not np.array_equal(states[2], states[5])  # another policy seed, another noise
     assert actor.sampler.generator is None
-
-
-def test_videos_of_odd_sizes_are_refused_before_anything_is_played(tmp_path, monkeypatch):
-    monkeypatch.setattr(film, "play_episode", lambda *_, **__: pytest.fail("played"))
-    actor = WarmPriorActor(VelocityMLP(7, 19, 4, hidden_dim=16), PastPrior(4))
-    path = tmp_path / "odd.mp4"
-    for record in (
-        lambda: record_video(actor, path, seed=0, size=65),
-        lambda: record_filmstrip(actor, seed=0, size=65, video=path),
-    ):
-        with pytest.raises(ValueError, match="even number of pixels, got 65"):
-            record()

@@ -11,7 +11,6 @@ from torchrl.envs import EnvBase, SerialEnv, TransformedEnv
 from tests.toy_env import ACTION_DIM, ChunkPolicy
 from warmprior import PastPrior, policy_transforms
 from warmprior.training import evaluate, play_episode
-from warmprior.transforms import ChunkStep
 
 H = 4
 HOW = {"high": "max", "effort": "sum", "left": "last"}
@@ -115,19 +114,6 @@ def test_batched_episodes_are_those_played_alone(n):
     for one, other in zip(episodes, evaluate(POLICY, make_env(), **options), strict=True):
         assert (one.success, one.steps) == (other.success, other.steps)
         assert one.measures == pytest.approx(other.measures)
-
-
-def test_a_chunk_combines_what_its_own_steps_say():
-    env = TransformedEnv(Saying(), ChunkStep(H, event_keys=("won",), measures={**HOW, "left": "last"}))
-    env.set_seed(2)  # seven steps: chunks of four and three
-    data = env.rollout(9, ChunkPolicy(lambda data: torch.zeros(H, ACTION_DIM)))["next"]
-    chunks = [[values(2, t) for t in part] for part in (range(1, 5), range(5, 8))]
-    assert data["executed_steps"].flatten().tolist() == [4, 3]
-    for name, combine in (("high", max), ("effort", sum), ("left", lambda vs: list(vs)[-1])):
-        expected = [combine(each[name] for each in chunk) for chunk in chunks]
-        assert data[name].flatten().tolist() == pytest.approx(expected, rel=1e-5)
-    won = [any(each["won"] for each in chunk) for chunk in chunks]
-    assert data["won"].flatten().tolist() == won == [True, False]
 
 
 def test_keys_that_are_not_there_are_named():

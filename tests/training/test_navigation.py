@@ -8,7 +8,7 @@ import pytest
 import torch
 from methods import PointPrior
 
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, VelocityMLP, WarmPriorActor
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations, branching_bound, curvature, executed_actions
 from warmprior.envs import navigation_metrics
 from warmprior.training import (
@@ -60,19 +60,7 @@ def trained(tmp_path_factory):
     return train
 
 
-def test_windows_are_the_demonstrated_steps_with_a_full_history():
-    data = navigation_task().data
-    observations = SharedObservations(data, 4)
-    for prior in (GaussianPrior(4), PastPrior(4), PreviewPrior(4)):
-        now, before = observations.windows(prior), observations.windows(prior, offset=4)
-        assert len(now) == 6 * 60
-        assert (now["history", "steps"] >= 4).all()
-        chunk, earlier = now["vla_action", "chunk"], before["vla_action", "chunk"]
-        assert torch.equal(chunk[0, 0], earlier[4, 0])
-        assert torch.equal(earlier[:, :4].flatten(0, 1)[:4], data["action"][:4])
-
-
-@pytest.mark.parametrize("name", ["gaussian", "regression", "history", "preview"])
+@pytest.mark.parametrize("name", ["regression", "preview"])
 def test_judgements_are_reproducible_and_of_what_was_played(trained, name):
     actor, nfe = trained(name, 5), 1 if name == "regression" else 9
     row = judge_navigation(actor, 1, nfe=nfe, rollouts=8)
@@ -85,44 +73,6 @@ def test_judgements_are_reproducible_and_of_what_was_played(trained, name):
     assert row["distance"] == pytest.approx(metrics.distance, nan_ok=True)
 
 
-def test_a_shift_touches_only_policies_with_a_memory(trained):
-    def heights(name, shift):
-        played = play_navigation(trained(name, 5), 3, nfe=1, rollouts=8, shift=shift)
-        return executed_actions(played)[0]
-
-    assert torch.equal(heights("gaussian", 0.0), heights("gaussian", 0.0))
-    assert torch.equal(heights("history", 0.0), heights("history", 0.0))
-    assert not torch.isclose(heights("history", 0.0), heights("history", 5.0)).all()
-
-
-class Explodes(torch.nn.Module):
-    """A field that leaves the numbers only from a history that is shifted."""
-
-    def __init__(self, where):
-        super().__init__()
-        self.where, self.unused = where, torch.nn.Parameter(torch.zeros(()))
-
-    def forward(self, t, a, observation):
-        return torch.where(a.abs() > self.where, torch.inf, torch.zeros_like(a))
-
-
-def test_a_policy_that_diverges_collides_and_has_no_other_metrics():
-    prior = PastPrior(4, sigma=0.0)
-    still = judge_navigation(WarmPriorActor(Explodes(3.0), prior), 0, nfe=1, rollouts=8)
-    gone = judge_navigation(WarmPriorActor(Explodes(-1.0), prior), 0, nfe=1, rollouts=8)
-    assert gone["collision_rate"] == 1.0 and math.isnan(gone["distance"])
-    assert gone["shifted_collision_rate"] == 1.0 and math.isnan(gone["shifted_distance"])
-    assert math.isfinite(still["distance"])
-
-    class Broken(VelocityMLP):
-        def forward(self, t, a, observation):
-            raise ValueError("something else")
-
-    broken = WarmPriorActor(Broken(1, 1, 4, 1, hidden_dim=8), prior)
-    with pytest.raises(Exception, match="something else"):  # which is not taken for divergence
-        judge_navigation(broken, 0, nfe=1, rollouts=8)
-
-
 def bent(actor, seed):
     """Curvature and branching bound on demonstrated observations."""
     batch = SharedObservations(navigation_task().data, 4).windows(actor.prior)
@@ -132,8 +82,8 @@ def bent(actor, seed):
 
 
 def test_warm_sources_stop_mode_switching(trained):
-    """A third of the benchmark's budget, one seed: the contrast is far larger than what that costs."""
-    base, past = trained("gaussian", 1_000, 0), trained("past", 1_000, 0)
+    """A sixth of the benchmark's budget, one seed: the contrast is far larger than what that costs."""
+    base, past = trained("gaussian", 500, 0), trained("past", 500, 0)
     of_base, of_past = (judge_navigation(actor, 0, nfe=9) for actor in (base, past))
     assert of_base["switch_rate"] > 0.4 and of_base["collision_rate"] > 0.8
     assert of_past["switch_rate"] < 0.05 and of_past["collision_rate"] < 0.3

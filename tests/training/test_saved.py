@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import multiprocessing
 import os
 
@@ -12,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 from torch import nn
 
-from tests.toy_env import random_history
+from tests.toy_env import Halfway, random_history
 from warmprior import (
     ChiTransformer,
     GaussianPrior,
@@ -25,34 +24,11 @@ from warmprior import (
     WarmPriorActor,
     keys,
 )
-from warmprior.modules import StartPoint
 from warmprior.training.checkpoint import load_state, save_state
-from warmprior.training.saved import (
-    check_saveable,
-    load_policy,
-    policy_config,
-    save_policy,
-)
+from warmprior.training.saved import load_policy, policy_config, save_policy
 
 H, D_A, D_O, TO = 3, 2, 5, 2
 ACTION = "normalizer.action_scale"
-
-
-class Halfway(StartPoint):
-    """A start that is no source: half of the noise at the time 0.5, around a weight."""
-
-    name = "halfway-of-the-files"
-    time = noise_share = 0.5
-
-    def __init__(self, level=0.0):
-        nn.Module.__init__(self)
-        self.shift = nn.Parameter(torch.full((), level))
-
-    def centre(self, history, observation):
-        return torch.zeros_like(history["forecast"]) + self.shift
-
-    def forward(self, noise, history, observation):
-        return self.centre(history, observation) + self.noise_share * noise
 
 
 def policy(prior=None, network=None, width=D_O, **options):
@@ -123,14 +99,6 @@ def test_round_trip_is_bit_identical(tmp_path, make):
     assert all(torch.equal(theirs[name], value) for name, value in mine.items())
 
 
-def test_at_most_as_many_evaluations_as_it_was_trained_for(tmp_path):
-    saved(tmp_path, max_nfe=1, nfe=None)
-    again = load_policy(tmp_path)
-    assert (again.ode.max_nfe, again.ode.nfe) == (1, 1)
-    with pytest.raises(ValueError, match=r"at most 1 network evaluation\(s\).*nfe=9"):
-        chunk(again, nfe=9)
-
-
 def test_files_hold_no_pickle(tmp_path):
     saved(tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
@@ -146,13 +114,6 @@ def test_a_user_s_prior_travels(tmp_path):
     del Prior._classes["still-for-this-test"]
     with pytest.raises(ValueError, match=r"unknown prior 'still-for-this-test'.*import the module"):
         load_policy(tmp_path)
-
-
-def test_loading_for_another_prior_is_refused(tmp_path):
-    saved(tmp_path, PastPrior(H))
-    load_policy(tmp_path, prior=PastPrior(H))
-    with pytest.raises(ValueError, match=r"trained with PastPrior.*not with GaussianPrior"):
-        load_policy(tmp_path, prior=GaussianPrior(H))
 
 
 @pytest.mark.parametrize("parts", ["all", "network", "normalizer"])
@@ -172,34 +133,7 @@ def test_weights_of_any_precision_come_back_bit_by_bit(tmp_path, dtype, parts):
     assert torch.equal(chunk(again), chunk(actor))
 
 
-def test_a_network_compiled_in_place_acts_and_is_saved_as_before(tmp_path):
-    actor = policy()
-    before, calls = chunk(actor), []
-    actor.network.compile(backend=lambda graph, inputs: calls.append(1) or graph.forward)
-    torch.testing.assert_close(chunk(actor), before)
-    assert calls
-    save_policy(actor, tmp_path)
-    assert torch.equal(chunk(load_policy(tmp_path)), before)
-
-
 # ------------------------------------------------------------------------------- what cannot be saved
-
-
-def test_a_plain_module_cannot_be_saved(tmp_path):
-    with pytest.raises(TypeError, match="cannot save Linear: only VelocityNetwork"):
-        save_policy(WarmPriorActor(nn.Linear(1, 1), PastPrior(H)), tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_network_that_its_configuration_does_not_build():
-    class Forgetful(VelocityMLP):
-        def __init__(self, *args, extra=0, **kwargs):
-            super().__init__(*args, **kwargs)
-            self.extra = nn.Parameter(torch.zeros(extra))
-
-    check_saveable(policy())
-    with pytest.raises(ValueError, match=r"saved Forgetful could not be loaded again.*extra"):
-        check_saveable(policy(network=Forgetful(D_A, D_O, H, TO, hidden_dim=16, extra=3)))
 
 
 def test_an_interrupted_save_leaves_the_old_policy(tmp_path, monkeypatch):
@@ -254,21 +188,13 @@ def test_damage_is_noticed(tmp_path, damage):
     ("change", "said"),
     [
         (lambda t, c: t.pop(ACTION), f"{ACTION} is missing"),
-        (lambda t, c: t.update(more=torch.ones(2)), "more is not part of it"),
         (
             lambda t, c: t.update({ACTION: torch.ones(9)}),
             rf"{ACTION} is \(9,\) of torch.float32, not",
         ),
-        (lambda t, c: t.update({ACTION: t[ACTION].double()}), "of torch.float64, not .*float32"),
-        (lambda t, c: c["network"].update(hidden_dim=8), "is .*, not "),
         (lambda t, c: c["network"].update(name="evil:Net"), "unknown"),
-        (lambda t, c: c["network"].update(hidden_dim="wide"), "cannot be built here"),
         (lambda t, c: c["actor"].update(nfe=0), "nfe"),
         (lambda t, c: c.pop("prior"), "KeyError"),
-        (
-            lambda t, c: c["precision"].update(network="bfloat16"),
-            "of torch.float32, not .*bfloat16",
-        ),
     ],
 )
 def test_parts_that_do_not_fit_each_other(tmp_path, change, said):
@@ -312,12 +238,3 @@ def test_a_policy_that_is_saved_over_is_the_old_one_or_the_new_one(tmp_path):
         writer.kill()
         writer.join()
     assert seen == {0.25, 0.5}
-
-
-def test_earlier_policies_are_called_what_they_are(tmp_path):
-    saved(tmp_path)
-    config = policy_config(load_policy(tmp_path)) | {"format": 4}
-    save_file(load_state(tmp_path / "model.safetensors")[0], tmp_path / "model.safetensors")
-    (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(ValueError, match=r"config\.json has format 4, this version of warmprior reads 5"):
-        load_policy(tmp_path)

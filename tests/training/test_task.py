@@ -10,9 +10,9 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from tests.data.synthetic import env_args_15, write_robomimic_file
+from tests.data.synthetic import write_robomimic_file
 from tests.toy_env import CountingEnv
-from warmprior import GaussianPrior, ODEActor, PoseTrend
+from warmprior import GaussianPrior, PoseTrend
 from warmprior.training import (
     DataOptions,
     NetworkOptions,
@@ -57,11 +57,6 @@ def test_a_task_of_ones_own_is_in_the_units_of_its_demonstrations():
     scaled = Task.of("own", steps(action=2 * raw["action"]), CountingEnv)
     torch.testing.assert_close(scaled.data["action"], task.data["action"])
     assert scaled.identity != task.identity
-
-
-def test_measures_are_combined_in_one_of_three_ways():
-    with pytest.raises(ValueError, match="'effort' is combined by 'max', 'sum' or 'last', not 'mean'"):
-        Task.of("own", steps(), CountingEnv, measures={"effort": "mean"})
 
 
 @pytest.mark.parametrize(
@@ -126,42 +121,6 @@ def test_absolute_actions_have_the_units_of_deltas(path):
     assert trends[0] is None and isinstance(trends[1], PoseTrend)
 
 
-class Towards(torch.nn.Module):
-    """The flow from 0 to a chunk."""
-
-    def __init__(self, chunk):
-        super().__init__()
-        self.chunk = chunk
-
-    def forward(self, t, a, observation):
-        return self.chunk.expand_as(a)
-
-
-def test_what_leaves_the_span_of_the_demonstrations_is_remembered_at_its_bound(path):
-    """Of every dimension: poses range over many control steps, the gripper over one unit."""
-    delta, task = in_both_spaces(path)
-    span = task.data["action"].abs().amax(0)
-    assert delta.clip == 1.0 and span[9] < span.max() / 2
-    actor = new_policy(task, GaussianPrior(8), NetworkOptions(hidden_dim=16), TrainingConfig())
-    demonstrated, beyond = task.data["action"][:8], 1e3 * task.data["action"][8:16].sign()
-    for wanted, expected in ((demonstrated, demonstrated), (beyond, beyond.clamp(-span, span))):
-        mean = {("prior", "noise"): torch.zeros(1, 8, 10), "observation": torch.zeros(1, 2, 19)}
-        ode = ODEActor(Towards(wanted), nfe=1, clip=actor.ode.clip)
-        assert torch.equal(ode(TensorDict(mean, [1]))["vla_action", "chunk"][0], expected)
-
-
-def test_files_without_poses_are_named(tmp_path):
-    h5py = pytest.importorskip("h5py")
-    from warmprior.data import DatasetError
-
-    path = tmp_path / "lift.hdf5"
-    write_robomimic_file(path, lengths=(30,), task="lift", env_args=env_args_15("lift"))
-    with h5py.File(path, "a") as file:
-        del file["data/demo_0/obs/robot0_eef_quat"]
-    with pytest.raises(DatasetError, match=r"lift\.hdf5.*no 'obs/robot0_eef_quat'"):
-        robosuite_task(path, options=DataOptions(actions="absolute"))
-
-
 def test_part_of_a_file_is_its_first_demonstrations(path):
     from warmprior.data import DatasetError
 
@@ -188,34 +147,6 @@ def test_further_demonstrations_are_read_as_a_policy_sees_them(path, tmp_path):
         same, called = read_like(path, task.name, task.facts)
         assert torch.allclose(same["action"], raw["action"], atol=1e-5)
         assert called == "the TRAINING demonstrations (not held out)"
-
-
-def test_another_task_is_refused_before_anything_is_rendered(path, monkeypatch):
-    from warmprior.data import render
-
-    monkeypatch.setattr(render, "render_demonstrations", lambda *_, **__: pytest.fail("rendered"))
-    asked = DataOptions(task=("stack",), dataset=path, obs="image")
-    with pytest.raises(ValueError, match="holds demonstrations of lift, not of stack"):
-        load_task(asked, "stack")
-    facts = {"source": "file", "demonstrations": 2, "sha256": ""}
-    facts["images"] = {"cameras": ["agentview"], "size": 16, "fast_rendering": True}
-    with pytest.raises(ValueError, match=r"of lift, but these .* are for stack"):
-        read_like(path, "stack", facts)
-
-
-def test_of_images_only_that_part_is_rendered(path, monkeypatch):
-    asked = []
-
-    def rendered(*args, **options):
-        asked.append((*args, options))
-        raise LookupError("enough")
-
-    monkeypatch.setattr("warmprior.data.render.render_demonstrations", rendered)
-    options = DataOptions(demonstrations=(1,), obs="image", image_size=16, fast_rendering=True)
-    with pytest.raises(LookupError, match="enough"):
-        robosuite_task(path, options=options)
-    cameras = ("agentview", "robot0_eye_in_hand")
-    assert asked == [(path, cameras, 16, {"demos": 1, "fast": True})]
 
 
 def test_a_lerobot_dataset_is_the_task_of_its_file(path, tmp_path):

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 
-from warmprior import GaussianPrior, PastPrior
+from warmprior import PastPrior
 from warmprior.modules import PreconditionedNetwork
 from warmprior.training import (
-    BehaviourCloning,
     NetworkOptions,
     TrainingConfig,
-    load_policy,
     navigation_task,
     new_policy,
     train_policy,
 )
-from warmprior.training.behaviour_cloning import policy_path
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
 CONFIG = TrainingConfig(iterations=8, batch_size=16, checkpoints=2, save_every=2)
@@ -37,33 +33,6 @@ def train(folder, prior=None, training=CONFIG, **options):
 def equal(one, two):
     pairs = zip(one.parameters(), two.parameters(), strict=True)
     return all(torch.equal(a, b) for a, b in pairs)
-
-
-def test_an_interrupted_training_continues_to_the_same_policy(tmp_path):
-    whole = train(tmp_path / "whole")
-
-    def interrupt(iteration):
-        if iteration == 5:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        train(tmp_path / "cut", progress=interrupt)
-    seen = []
-    again = train(tmp_path / "cut", progress=seen.append)
-    assert seen == [4, 5, 6, 7, 8]  # from the last state on
-    assert equal(again, whole)
-    for checkpoint in (4, 8):
-        paths = [policy_path(tmp_path / name, checkpoint) for name in ("whole", "cut")]
-        assert equal(*map(load_policy, paths))
-
-
-def test_a_finished_training_is_found(tmp_path, monkeypatch):
-    first = train(tmp_path)
-    monkeypatch.setattr(BehaviourCloning, "step", lambda self: pytest.fail("trained again"))
-    assert equal(train(tmp_path), first)
-    for other in ({"prior": GaussianPrior(4)}, {"training": TrainingConfig(iterations=9)}):
-        with pytest.raises(ValueError, match=str(tmp_path)):
-            train(tmp_path, **other)
 
 
 def test_what_is_done_before_makes_no_difference(tmp_path):

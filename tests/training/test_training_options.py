@@ -7,18 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, same, training, weights
+from tests.training.cloning_parts import CONFIG, actor_for, dataset, mlp, run_until, same, training, weights
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
-    HistoryObservation,
-    PastPrior,
-    VelocityMLP,
-    WarmPriorActor,
-    keys,
     window_replay_buffer,
 )
-from warmprior.training import TrainingConfig, ema_of, load_policy, make_optimizer
+from warmprior.training import ema_of, make_optimizer
 
 LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}
 
@@ -56,16 +51,7 @@ def test_stopping_with_a_teacher_changes_nothing(tmp_path):
     whole = training(tmp_path / "whole", config)
     whole.run()
     part = training(tmp_path / "part", config)
-    take = part.step
-
-    def step():
-        if part.iteration == 16:
-            raise KeyboardInterrupt
-        return take()
-
-    part.step = step
-    with pytest.raises(KeyboardInterrupt):
-        part.run()
+    run_until(part, 16)
     again = training(tmp_path / "part", config)
     assert again.iteration == 14
     again.run()
@@ -73,54 +59,3 @@ def test_stopping_with_a_teacher_changes_nothing(tmp_path):
     plain = training(tmp_path / "plain", replace(config, self_distillation=0.0))
     plain.run()
     assert not same(weights(plain), weights(whole))
-
-
-@pytest.mark.parametrize("name", LATER)
-def test_a_state_is_not_continued_with_another_option(tmp_path, name):
-    config = replace(CONFIG, iterations=8, checkpoints=1)
-    one, other = config, replace(config, **{name: LATER[name]})
-    for i, (first, second) in enumerate([(one, other), (other, one)]):
-        training(tmp_path / str(i), first).run()
-        with pytest.raises(ValueError, match="belongs to another config"):
-            training(tmp_path / str(i), second)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (
-            {"times": "late"},
-            "times must be one of uniform, u-shaped, logit-normal, start, got 'late'",
-        ),
-        ({"objective": "huber"}, "objective must be one of velocity, l1"),
-        ({"times": "start", "objective": "l1"}, "objective = l1 needs a flow"),
-        ({"cold_probability": 1.5}, r"cold_probability must lie in \[0, 1\], got 1.5"),
-        ({"self_distillation": -0.1}, "self_distillation must be a finite weight >= 0"),
-        ({"self_distillation": float("inf")}, "self_distillation must be a finite weight >= 0"),
-    ],
-)
-def test_bad_options(options, message):
-    with pytest.raises(ValueError, match=message):
-        TrainingConfig(**options)
-
-
-def test_regression_needs_a_policy_of_one_evaluation_before_training(tmp_path):
-    config = replace(CONFIG, times="start")
-    with pytest.raises(ValueError, match="build the policy with max_nfe=1"):
-        training(tmp_path, config, actor=WarmPriorActor(mlp(), PastPrior(4)))
-    assert not list(tmp_path.iterdir())
-    actor = WarmPriorActor(mlp(), GaussianPrior(4), max_nfe=1)
-    cloning = training(tmp_path, replace(config, iterations=2, checkpoints=1), actor=actor)
-    cloning.run(None)
-    assert load_policy(cloning.policy_path()).ode.max_nfe == 1
-
-
-def test_a_network_that_sees_the_last_actions(tmp_path):
-    """The windows are made with them, of the data's own observation."""
-    width = 3 + HistoryObservation.width(4, 2)
-    network = VelocityMLP(2, width, 4, hidden_dim=8)
-    actor = WarmPriorActor(network, GaussianPrior(4), observation_key=keys.CONDITIONED)
-    cloning = training(tmp_path, replace(CONFIG, iterations=2, checkpoints=1), actor=actor)
-    assert cloning.replay_buffer.sample()[keys.CONDITIONED].shape == (16, 2, width)
-    cloning.run(None)
-    assert load_policy(cloning.policy_path()).in_keys[0] == keys.CONDITIONED

@@ -11,7 +11,6 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from tests.processes import apart
-from tests.toy_env import CountingEnv
 from warmprior import CameraImages, ChunkStep, ObservationStack
 from warmprior.envs import RobosuiteEnv, rendering_backend
 
@@ -72,24 +71,3 @@ def test_specs():
     check_env_specs(env)
     spec = env.observation_spec["observation", "agentview_image"]
     assert spec.shape == (3, 16, 16) and spec.dtype == torch.uint8
-
-
-@pytest.mark.parametrize(
-    ("cameras", "size", "said"),
-    [((), 8, "different cameras"), (("a", "a"), 8, "different cameras"), (("a",), 0, "1 pixel")],
-)
-def test_bad_options(cameras, size, said):
-    with pytest.raises(ValueError, match=said):
-        CameraImages(cameras, size)
-
-
-@apart
-def test_environments_that_cannot_be_rendered_say_so():
-    blind = TransformedEnv(RobosuiteEnv("lift"), CameraImages(["agentview"], 8))
-    with pytest.raises(KeyError, match="sim_state=True"):
-        blind.reset()
-    with pytest.raises(KeyError, match="sim_state=True"):
-        TransformedEnv(CountingEnv(), CameraImages(["agentview"], 8)).reset()
-    unknown = TransformedEnv(lift(), CameraImages(["backstage"], 8))
-    with pytest.raises(ValueError, match="no camera 'backstage'"):
-        unknown.reset()

@@ -9,29 +9,22 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import nn
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import Compose, ParallelEnv, RenameTransform, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import ACTION_DIM, CountingEnv
+from tests.toy_env import ACTION_DIM, PLACES, CountingEnv, placed
 from warmprior import (
     ActionWindow,
     FlowMatchingLoss,
     GaussianPrior,
-    Normalizer,
-    ObservationStack,
     PastPrior,
-    PreconditionedNetwork,
-    VelocityMLP,
     VelocityNetwork,
     WarmPriorActor,
     policy_transforms,
-    window_replay_buffer,
 )
 from warmprior.training.saved import load_policy, save_policy
 
 H, TO = 3, 2
 LENGTHS = (7, 4)
-PLACES = ("single", "serial-outside", "serial-inside", "parallel-outside", "parallel-inside")
 IMAGE = (3, 2, 8)
 
 
@@ -76,7 +69,7 @@ NAMES = {
 
 
 class Encoder(VelocityNetwork):
-    """Takes any observation; its velocity tells all of it."""
+    """Takes any observation; its velocity shows all of it."""
 
     def __init__(self, action_dim, observation_dim, prediction_length, observation_steps):
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
@@ -98,16 +91,7 @@ def build(place, layout, prior, **options):
     options = {"observation_steps": TO, **NAMES[layout], **options}
     transforms = partial(policy_transforms, prior, **options)
 
-    def one(length):
-        return TransformedEnv(CameraEnv(length, layout), transforms())
-
-    batched = SerialEnv if "serial" in place else partial(ParallelEnv, mp_start_method="fork")
-    if place == "single":
-        return one(LENGTHS[0])
-    if place.endswith("inside"):
-        return batched(len(LENGTHS), [partial(one, n) for n in LENGTHS])
-    base = batched(len(LENGTHS), [partial(CameraEnv, n, layout) for n in LENGTHS])
-    return TransformedEnv(base, transforms())
+    return placed(place, transforms, LENGTHS, partial(CameraEnv, layout=layout))
 
 
 def replay(layout, chunks, length):
@@ -121,8 +105,10 @@ def replay(layout, chunks, length):
     return data.set("episode", torch.zeros(length, dtype=torch.int64))
 
 
-@pytest.mark.parametrize("layout", NAMES)
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(
+    ("place", "layout"),
+    [*((place, "nested") for place in PLACES), ("single", "image"), ("serial-outside", "named")],
+)
 def test_a_decision_in_the_environment_is_a_window_of_its_recording(place, layout, tmp_path):
     """What the actor met when it decided, in shape, dtype and value, is what it is trained on."""
     prior, names = PastPrior(H), NAMES[layout]
@@ -169,51 +155,6 @@ def test_a_decision_in_the_environment_is_a_window_of_its_recording(place, layou
         assert torch.equal(loss(row)["loss_flow_matching"], first)
 
 
-@pytest.mark.parametrize("batch", [(), (3,)])
-def test_images_are_stacked_after_the_batch(batch):
-    env = CameraEnv(layout="image")
-    if batch:
-        env = SerialEnv(3, partial(CameraEnv, layout="image"))
-    env = TransformedEnv(env, ObservationStack(TO))
-    check_env_specs(env)
-    assert env.reset()["observation"].shape == (*batch, TO, *IMAGE)
-    data = TensorDict(
-        {
-            "observation": torch.zeros(9, *IMAGE, dtype=torch.uint8),
-            "action": torch.zeros(9, 2),
-            "episode": torch.zeros(9, dtype=torch.int64),
-        },
-        [9],
-    )
-    sample = window_replay_buffer(data, PastPrior(H), batch_size=3).sample()
-    assert sample["observation"].shape == (3, TO, *IMAGE)
-
-
-def test_entries_of_the_root_brought_together():
-    """As of a simulator that knows no nesting."""
-    rename = RenameTransform(["observation"], [("both", "state")])
-    env = TransformedEnv(
-        CountingEnv(), Compose(rename, policy_transforms(PastPrior(H), observation_key="both"))
-    )
-    check_env_specs(env)
-    assert env.rollout(2)["both", "state"].shape == (2, TO, 4)
-
-
-@pytest.mark.parametrize("preconditioned", [False, True])
-def test_networks_of_vectors_say_so(preconditioned):
-    network = VelocityMLP(ACTION_DIM, 4, H, TO, hidden_dim=8)
-    network = PreconditionedNetwork(network) if preconditioned else network
-    env = build("single", "nested", PastPrior(H))
-    with pytest.raises(ValueError, match=r"\[B, To, d_o\].*got the entries \['pixels', 'state'\]"):
-        env.rollout(1, WarmPriorActor(network, PastPrior(H)))
-
-
-def test_a_preconditioned_network_may_take_several():
-    network = PreconditionedNetwork(Encoder(ACTION_DIM, 4, H, TO))
-    rollout = build("single", "nested", PastPrior(H)).rollout(2, WarmPriorActor(network, PastPrior(H)))
-    assert rollout["vla_action", "chunk"].isfinite().all()
-
-
 @pytest.mark.parametrize("place", ["single", "serial-inside", "parallel-outside"])
 def test_the_last_actions_are_appended_to_the_vector_among_several(place):
     env = build(place, "nested", GaussianPrior(H), see_history=True)
@@ -227,39 +168,6 @@ def test_the_last_actions_are_appended_to_the_vector_among_several(place):
     expected = torch.cat([own["state"], added.expand(*own["state"].shape[:-1], -1)], -1)
     assert torch.equal(seen["state"], expected) and bool(added.any())
     env.close()
-
-
-def test_the_last_actions_cannot_be_appended_where_there_is_no_vector():
-    transforms = policy_transforms(GaussianPrior(H), observation_key="sensors", see_history=True)
-    with pytest.raises(ValueError, match=r"appends the last actions to an .* vector.*'state'"):
-        TransformedEnv(CameraEnv(layout="named"), transforms).rollout(1)
-
-
-def test_an_observation_of_another_name():
-    env = TransformedEnv(CameraEnv(layout="named"), ObservationStack(2))
-    for look in (env.reset, lambda: env.observation_spec):
-        with pytest.raises(KeyError, match=r"found no 'observation', only .*'sensors', 'low'"):
-            look()
-
-
-def test_nested_entries_are_normalised_on_both_sides():
-    data = replay("nested", torch.rand(3, H, ACTION_DIM) * 2 - 1, 7)
-    keys = (("observation", "state"), "action")
-    normalizer = Normalizer.fit(data, keys)
-    again = Normalizer.from_config(normalizer.config())
-    again.load_state_dict(normalizer.state_dict())
-    normal = again.normalize(data)
-    state = data["observation", "state"]
-    low, high = state.amin(0), state.amax(0)
-    varies = high > low
-    expected = (2 * (state - low) / (high - low) - 1)[:, varies]
-    torch.testing.assert_close(normal["observation", "state"][:, varies], expected)
-    assert torch.equal(data["observation", "state"], state)  # untouched
-    assert torch.equal(normal["observation", "pixels"], data["observation", "pixels"])
-    env = TransformedEnv(CameraEnv(), policy_transforms(PastPrior(H), normalizer=again))
-    check_env_specs(env)
-    first = env.reset()["observation", "state"][-1]
-    torch.testing.assert_close(first, normal["observation", "state"][0])
 
 
 @pytest.mark.parametrize(("shape", "dtype"), [((9,), None), ((9, 2, 2), None), ((9, 2), torch.int64)])

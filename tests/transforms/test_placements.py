@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import pytest
 import torch
 from torchrl.collectors import Collector
-from torchrl.envs import Compose, InitTracker, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import Compose, InitTracker, StepCounter
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import ACTION_DIM, CountingEnv
+from tests.toy_env import ACTION_DIM, PLACES, placed
 from warmprior import (
     ActionHistory,
     ChunkStep,
@@ -24,7 +22,6 @@ from warmprior import (
 H = 3
 GAMMA = 0.9
 LENGTHS = (7, 4)  # neither is a multiple of H: both end inside a chunk, at different times
-PLACES = ("single", "serial-outside", "serial-inside", "parallel-outside", "parallel-inside")
 
 
 def transforms(prior, execute):
@@ -35,20 +32,6 @@ def transforms(prior, execute):
         gamma=GAMMA,
     )
     return Compose(StepCounter(), chunk, ActionHistory(H), InitTracker())
-
-
-def single(prior, execute, length):
-    return TransformedEnv(CountingEnv(length), transforms(prior, execute))
-
-
-def build(place, prior, execute):
-    if place == "single":
-        return single(prior, execute, LENGTHS[0])
-    batched = SerialEnv if "serial" in place else partial(ParallelEnv, mp_start_method="fork")
-    if place.endswith("outside"):
-        env = batched(2, [partial(CountingEnv, n) for n in LENGTHS])
-        return TransformedEnv(env, transforms(prior, execute))
-    return batched(2, [partial(single, prior, execute, n) for n in LENGTHS])
 
 
 def expected_mean(prior, executed, chunks):
@@ -96,16 +79,25 @@ def check(data, prior, execute):
     return resets
 
 
-@pytest.mark.parametrize("execute", [H, 2])
-@pytest.mark.parametrize("prior_class", [GaussianPrior, PastPrior, PreviewPrior])
-@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize(
+    ("place", "prior_class", "execute"),
+    [
+        *((place, PreviewPrior, 2) for place in PLACES),
+        *(
+            (place, prior, H)
+            for place in ("single", "serial-outside")
+            for prior in (GaussianPrior, PastPrior)
+        ),
+        ("parallel-outside", PastPrior, H),
+    ],
+)
 def test_rollout_and_collector_match_ground_truth(place, prior_class, execute):
     torch.manual_seed(0)
     prior = prior_class(H)
     network = VelocityMLP(ACTION_DIM, 2 + ACTION_DIM, prior.prediction_length, 1, hidden_dim=8)
 
     actor = WarmPriorActor(_Squeezed(network), prior, nfe=2, clip=1.0)
-    env = build(place, prior, execute)
+    env = placed(place, lambda: transforms(prior, execute), LENGTHS)
     try:
         check_env_specs(env)
         assert check(env.rollout(9, actor, break_when_any_done=False), prior, execute) >= 2

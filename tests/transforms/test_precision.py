@@ -11,7 +11,7 @@ from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import ACTION_DIM, ChunkPolicy, CountingEnv
+from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import (
     FlowMatchingLoss,
     Normalizer,
@@ -85,26 +85,6 @@ def test_environments_keep_their_precision(prior_class, env_class, network):
         assert rollout[key].dtype == dtype, key
     warm = rollout["prior", "warm"]
     assert warm[:, 1:].any() and rollout["vla_action", "chunk"].isfinite().all()
-
-
-def test_a_policy_of_another_precision_than_the_environment():
-    """One that casts nothing itself: the history keeps the environment's dtype from reset to step."""
-    prior = PastPrior(H)
-    env = TransformedEnv(DoubleEnv(), policy_transforms(prior))
-    policy = ChunkPolicy(lambda data: torch.full((H, ACTION_DIM), 0.5, dtype=torch.float32))
-    rollout = env.rollout(2, policy)
-    assert rollout["history", "actions"].dtype == torch.float64
-    assert (rollout["history", "actions"][1] == 0.5).all()
-
-
-def test_normalised_data_keep_their_precision():
-    data = demonstrations(torch.float64)
-    data["pixels"] = torch.randint(0, 256, (60, 3), dtype=torch.uint8)
-    normalizer = Normalizer.fit(data, ("observation", "action", "pixels"))
-    out = normalizer.normalize(data)
-    assert out["observation"].dtype == torch.float64
-    assert out["pixels"].min() >= -1 and out["pixels"].max() <= 1
-    torch.testing.assert_close(out["observation"].amin(0), -torch.ones(4).double())
 
 
 def test_batches_come_to_the_network():

@@ -50,15 +50,6 @@ def test_rows_that_reset_or_rest_alone():
     assert data["observation"][..., 0].tolist() == [[0, 0, 1], [1, 2, 3]]
 
 
-def test_continues_from_any_tensordict():
-    """Without state a step depends on its input only: two branches of one episode do not mix."""
-    env = TransformedEnv(CountingEnv(9), ObservationStack(2))
-    start = env.reset()
-    first = env.step(env.rand_action(start.clone()))["next", "observation"]
-    again = env.step(env.rand_action(start.clone()))["next", "observation"]
-    assert torch.equal(first[0], again[0])
-
-
 def test_errors():
     with pytest.raises(ValueError, match="at least 1 step, got 0"):
         ObservationStack(0)

@@ -7,23 +7,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
-from torchrl.data import (
-    LazyMemmapStorage,
-    LazyTensorStorage,
-    RandomSampler,
-    Sequence,
-    TensorDictReplayBuffer,
-)
-from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement, SliceSampler
+from torchrl.data.replay_buffers.samplers import SliceSampler
 
-from tests.toy_env import random_history
 from warmprior import (
     ActionWindow,
-    GaussianPrior,
-    Normalizer,
     PastPrior,
     PreviewPrior,
-    Prior,
     WithheldHistory,
     window_replay_buffer,
 )
@@ -94,99 +83,6 @@ def test_random_episodes(lengths, horizon, further, longer, observation_steps, n
     check(window(every_step(data)), data, window)
 
 
-@pytest.mark.parametrize("shape", [(), (6,), (6, 1), (2, 3)])
-def test_shapes_of_the_sample(shape):
-    data = steps([4, 5])
-    frame, window = torch.randint(0, 9, shape), ActionWindow(data, 2, prediction_length=3)
-    batch_size = shape[:1] if shape == (6, 1) else shape
-    out = window(TensorDict({"frame": frame}, batch_size))
-    assert out["vla_action", "chunk"].shape == (*batch_size, 3, 2)
-    assert out["observation"].shape == (*batch_size, 2, 3)
-    assert out["history"].batch_size == batch_size
-    check(out.reshape(-1), data, window)
-
-
-@pytest.mark.parametrize("horizon", [1, 4])
-def test_agrees_with_torchrl_s_sequences(horizon):
-    """``Sequence`` reads ``H`` steps before the anchor and ``2H`` from it: the same actions."""
-    lengths = [1, 3, 12, 25]
-    data = steps(lengths)
-    done = torch.zeros(len(data), 1, dtype=torch.bool)
-    done[torch.tensor(lengths).cumsum(0) - 1] = True
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(len(data)),
-        sampler=RandomSampler(),
-        batch_size=200,
-        sample_unit=Sequence(
-            length=2 * horizon, burn_in=horizon, episode_boundary="pad", done_key=("next", "done")
-        ),
-    )
-    stored = data.clone()
-    stored["next"] = TensorDict({"done": done, "terminated": done}, [len(data)])
-    buffer.extend(stored)
-    sample = buffer.sample().reshape(-1, 3 * horizon)
-    valid = sample["validity_mask"].reshape(sample.shape)
-    anchor = sample["anchor_index"][:, 0].reshape(-1)
-    assert len(set(anchor.tolist())) > 20
-    found = ActionWindow(data, horizon, prediction_length=2 * horizon)(
-        TensorDict({"frame": anchor}, [len(anchor)])
-    )
-    future = valid[:, horizon:]
-    assert torch.equal(future, ~found["action_is_pad"])
-    target, action = found["vla_action", "chunk"], sample["action"]
-    assert torch.equal(target[future], action[:, horizon:][future])
-    before = valid[:, :horizon]
-    assert torch.equal(found["history", "steps"].squeeze(-1), before.sum(-1))
-    assert torch.equal(found["history", "actions"][before], action[:, :horizon][before])
-    assert not found["history", "actions"][~before].any()
-
-
-def stored(kind, data, folder):
-    storage = (
-        LazyTensorStorage(len(data)) if kind == "tensor" else LazyMemmapStorage(len(data), scratch_dir=folder)
-    )
-    buffer = TensorDictReplayBuffer(storage=storage, batch_size=32)
-    buffer.extend(data)
-    return buffer
-
-
-@pytest.mark.parametrize("kind", ["tensor", "memmap", "mapped"])
-def test_data_out_of_a_replay_buffer(kind, tmp_path):
-    data = steps([3, 7, 2])
-    source = data.memmap(tmp_path) if kind == "mapped" else stored(kind, data, tmp_path)[:]
-    buffer = window_replay_buffer(source, PreviewPrior(2), batch_size=64)
-    check(buffer.sample(), data, ActionWindow(data, 2, prediction_length=4))
-
-
-@pytest.mark.parametrize("kind", ["tensor", "memmap"])
-def test_window_as_the_transform_of_another_buffer(kind, tmp_path):
-    data = steps([3, 7, 2])
-    data["frame"] = torch.arange(len(data))
-    data["weight"] = torch.rand(len(data))
-    buffer = stored(kind, data, tmp_path)
-    window = ActionWindow(data, 2)
-    buffer.append_transform(window)
-    batch = buffer.sample()
-    check(batch, data, window)
-    assert torch.equal(batch["weight"], data["weight"][batch["frame"]])  # the rest stays
-
-
-def test_epochs_visit_every_step_once():
-    data = steps([3, 7, 2])
-    buffer = window_replay_buffer(data, PastPrior(2), batch_size=4, sampler=SamplerWithoutReplacement())
-    seen = [i for batch in buffer for i in batch["frame"].tolist()]
-    assert sorted(seen) == list(range(12))
-
-
-def test_border_windows_are_sampled_like_all_others():
-    data = steps([5] * 20)
-    generator = torch.Generator().manual_seed(0)
-    buffer = window_replay_buffer(data, PastPrior(4), batch_size=20_000, generator=generator)
-    counts = torch.bincount(buffer.sample()["frame"], minlength=100).float()
-    # Expected 200 each, standard deviation 14.
-    assert counts.min() > 200 - 5 * 14.1 and counts.max() < 200 + 5 * 14.1
-
-
 def test_generator_fixes_steps_and_what_is_withheld():
     data = steps([20, 30])
 
@@ -231,13 +127,6 @@ def test_withholding_takes_whole_histories():
     assert torch.equal(batch["observation"][cold], twin["observation"])
 
 
-@pytest.mark.parametrize(("probability", "share"), [(0.0, 1.0), (1.0, 0.0)])
-def test_limits_of_withholding(probability, share):
-    batch = TensorDict({"history": random_history(PastPrior(2), 500, cold=0.0)}, [500])
-    kept = WithheldHistory(probability)(batch)["history", "steps"] > 0
-    assert kept.float().mean() == share
-
-
 def test_a_share_that_is_none_and_a_history_that_is_missing():
     for wrong in (-0.1, 1.1, float("nan"), True, "abc"):
         with pytest.raises(ValueError, match="probability"):
@@ -246,107 +135,8 @@ def test_a_share_that_is_none_and_a_history_that_is_missing():
         WithheldHistory(0.5)(TensorDict({}, [3]))
 
 
-def test_one_buffer_serves_every_prior_of_its_lengths():
-    class Momentum(Prior):
-        name = "momentum-of-the-windows"
-
-        def mean(self, history):
-            actions, warm = history["actions"], (history["steps"] >= 2).unsqueeze(-1)
-            return 2 * actions[..., -1:, :] - actions[..., -2:-1, :] + 0 * actions, warm.expand(
-                *actions.shape[:-1], 1
-            )
-
-    data = steps([3, 7, 12])
-    batch = window_replay_buffer(data, GaussianPrior(3), batch_size=200).sample()
-    place = batch["frame"] - torch.tensor([0] * 3 + [3] * 7 + [10] * 12)[batch["frame"]]
-    for prior, needed in ((PastPrior(3), 3), (GaussianPrior(3), 99), (Momentum(3), 2)):
-        warm = prior.distribution(batch["history"]).warm
-        assert torch.equal(warm.squeeze(-1).all(1), place >= needed)
-    last = data["action"][batch["frame"] - 1], data["action"][batch["frame"] - 2]
-    expected = torch.where((place >= 2)[:, None], 2 * last[0] - last[1], 0.0)
-    torch.testing.assert_close(prior.distribution(batch["history"]).loc[:, 2], expected)
-    with pytest.raises(ValueError, match=r"PreviewPrior.*needs 3 .* of 6.*\"forecast\"\) has 3"):
-        PreviewPrior(3).distribution(batch["history"])
-    del Prior._classes[Momentum.name]
-
-
-def test_a_prior_may_need_more_than_a_chunk():
-    class Longer(PastPrior):
-        name = "longer-of-the-windows"
-        history_length = 7
-
-    prior, data = Longer(2), steps([20])
-    batch = window_replay_buffer(data, prior, batch_size=9).sample()
-    assert batch["history", "actions"].shape == (9, 7, 2)
-    check(batch, data, ActionWindow(data, 2, history_length=7))
-    prior.distribution(batch["history"])
-    del Prior._classes[Longer.name]
-
-
-def test_renamed_keys_and_nested_observation():
-    data = steps([3, 4])
-    renamed = TensorDict(
-        {
-            "state": {"low": data["observation"]},
-            "move": data["action"],
-            "demo": data["episode"],
-        },
-        [7],
-    )
-    window = ActionWindow(
-        renamed,
-        2,
-        frame_key="step",
-        observation_key=("state", "low"),
-        action_key="move",
-        episode_key="demo",
-    )
-    out = window(TensorDict({"step": torch.arange(7)}, [7]))
-    expected = ActionWindow(data, 2)(TensorDict({"frame": torch.arange(7)}, [7]))
-    assert torch.equal(out["state", "low"], expected["observation"])
-    assert torch.equal(out["vla_action", "chunk"], expected["vla_action", "chunk"])
-
-
-@pytest.mark.parametrize("key", ["observation", "action"])
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_bad_values_are_located(key, value):
-    data = steps([3, 4])
-    data[key][4, 1] = value
-    with pytest.raises(ValueError, match=f"'{key}' holds NaN or Inf, first at step 4"):
-        ActionWindow(data, 2)
-
-
-@pytest.mark.parametrize("key", ["observation", "action", "episode"])
-def test_missing_entry(key):
-    data = steps([3, 4])
-    del data[key]
-    with pytest.raises(KeyError, match=f"the data lack '{key}'"):
-        ActionWindow(data, 2)
-
-
-def test_episodes_in_pieces():
-    data = steps([3, 4])
-    data["episode"] = torch.tensor([0, 0, 1, 1, 0, 2, 2])
-    with pytest.raises(ValueError, match="steps of episode 0 are not contiguous"):
-        ActionWindow(data, 2)
-
-
-def test_empty_or_batched_data():
-    data = steps([3, 4])
-    with pytest.raises(ValueError, match=r"flat steps \[N\] with N > 0"):
-        ActionWindow(data[:0], 2)
-    with pytest.raises(ValueError, match="flat steps"):
-        ActionWindow(steps([3, 3]).reshape(2, 3), 2)
-
-
-def test_no_frame():
-    window = ActionWindow(steps([3, 4]), 2)
-    with pytest.raises(KeyError, match="index of each sampled step under 'frame'"):
-        window(TensorDict({"other": torch.arange(3)}, [3]))
-
-
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         ({"observation_steps": 0}, "observation_steps must be at least 1, got 0"),
         ({"chunk_length": 0}, r"need 1 <= chunk_length <= .*chunk_length=0"),
@@ -354,29 +144,22 @@ def test_no_frame():
         ({"history_length": 1}, "history_length=1"),
     ],
 )
-def test_lengths_that_cannot_be(options, told):
-    with pytest.raises(ValueError, match=told):
+def test_lengths_that_cannot_be(options, message):
+    with pytest.raises(ValueError, match=message):
         ActionWindow(steps([3]), **({"chunk_length": 2} | options))
 
 
-def test_data_larger_than_memory_are_never_copied(tmp_path):
-    """Checks, statistics and samples of a file allocate a fraction of what it holds."""
-    wide = TensorDict(
-        {
-            "observation": torch.empty(20_000, 800),  # 64 MB
-            "action": torch.empty(20_000, 7),
-            "episode": torch.empty(20_000, dtype=torch.int64),
-        },
-        [20_000],
-    ).memmap_like(tmp_path)
-    prior = PastPrior(4)
-    with torch.profiler.profile(
-        activities=[torch.profiler.ProfilerActivity.CPU], profile_memory=True
-    ) as profile:
-        Normalizer.fit(wide)
-        window_replay_buffer(wide, prior, batch_size=64).sample()
-    largest = max(event.self_cpu_memory_usage for event in profile.events())
-    assert 0 < largest < 64e6 / 3
+def test_data_that_cannot_be():
+    data, folded = steps([3, 4]), steps([3, 3]).reshape(2, 3)
+    pieces = data.clone().set("episode", torch.tensor([0, 0, 1, 1, 0, 2, 2]))
+    for wrong, error, said in (
+        (data.exclude("action"), KeyError, "the data lack 'action'"),
+        (pieces, ValueError, "steps of episode 0 are not contiguous"),
+        (data[:0], ValueError, r"flat steps \[N\] with N > 0"),
+        (folded, ValueError, "flat steps"),
+    ):
+        with pytest.raises(error, match=said):
+            ActionWindow(wrong, 2)
 
 
 @pytest.mark.parametrize("bad", [0, 777, 1999])

@@ -1,26 +1,97 @@
-"""Demonstration files, damaged."""
+"""Files to damage, and the ways to do so: demonstrations, policies and training states."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import torch
+from tensordict import TensorDict
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
-from tests.fuzz.raw import damage, odd_json
 from tests.fuzz.sandbox import Outcome
+from tests.training.cloning_parts import CONFIG, training
+from warmprior import (
+    ChiTransformer,
+    Normalizer,
+    PastPrior,
+    PreconditionedNetwork,
+    VelocityMLP,
+    WarmPriorActor,
+)
 from warmprior.data import RobomimicExperienceReplay
 from warmprior.envs import modernize_env_args
+from warmprior.training.checkpoint import load_state, module_tensors, named, snapshot_optimizer
+from warmprior.training.saved import load_policy, policy_config, save_policy
 
-NAME = "demonstration files"
+Case = tuple[str, Callable[[], Outcome], str]
+"""How a file was damaged, the load to attempt, and what its error has to name."""
+
+ODD_VALUES: tuple[Any, ...] = (
+    *(None, True, 0, -1, 3, 10**5, 10**9, 10**30, 0.5, -0.5, 1e308, float("nan"), float("inf")),
+    *("", "x", "9", [], [1, 2], {}, {"name": "past"}, [[[[]]]]),
+)
+
+
+def damage(path: Path, rng: np.random.Generator) -> str:
+    """Change the bytes of a file; returns how."""
+    content = bytearray(path.read_bytes())
+    size = len(content)
+    how = str(rng.choice(["flip", "flip", "flip", "head", "cut", "append", "zero", "shuffle"]))
+    # Half of the flips hit the beginning, where headers and metadata are.
+    end = size if rng.random() < 0.5 else max(1, min(size, 4096))
+    if how == "flip":
+        for place in rng.integers(end, size=int(rng.integers(1, 9))):
+            content[place] ^= 1 << int(rng.integers(8))
+    elif how == "head":
+        place = int(rng.integers(min(16, size)))
+        content[place] = int(rng.integers(256))
+    elif how == "cut":
+        del content[int(rng.integers(size)) :]
+    elif how == "append":
+        content += rng.bytes(int(rng.integers(1, 5000)))
+    else:
+        start = int(rng.integers(end))
+        length = int(rng.integers(1, 2000))
+        block = content[start : start + length]
+        new = bytes(len(block)) if how == "zero" else rng.bytes(len(block))
+        content[start : start + length] = new
+    path.write_bytes(content)
+    return how
+
+
+def odd_json(value: Any, rng: np.random.Generator) -> str:
+    """Replace, remove or add one entry somewhere in parsed JSON, in place; returns where."""
+    places: list[tuple[Any, Any]] = []
+
+    def walk(node: Any) -> None:
+        items = node.items() if isinstance(node, dict) else enumerate(node)
+        for key, child in items:
+            places.append((node, key))
+            if isinstance(child, dict | list):
+                walk(child)
+
+    walk(value)
+    node, key = places[int(rng.integers(len(places)))]
+    if rng.random() < 0.2:
+        del node[key]
+        return f"no {key}"
+    new = ODD_VALUES[int(rng.integers(len(ODD_VALUES)))]
+    node[key] = new
+    return f"{key} = {new!r}"
+
+
+# --- demonstration files
+
 KEYS = ("actions", "rewards", "obs/object", "obs/robot0_eef_pos", "obs/robot0_eef_quat")
 
 
-def make(folder: Path) -> None:
+def make_demonstrations(folder: Path) -> None:
     """Write the whole files: contiguous, and in compressed chunks with checksums."""
     write_robomimic_file(folder / "plain.hdf5", masks={"train": [0, 2]})
     write_robomimic_file(folder / "packed.hdf5", masks={"train": [0, 2]})
@@ -161,8 +232,8 @@ def _odd_mask(file, rng):
     file["mask/train"] = values[int(rng.integers(len(values)))]
 
 
-def mutate(folder: Path, rng: np.random.Generator) -> tuple[str, Callable[[], Outcome], str]:
-    """Damage one of the files; returns how, the load to attempt, and what its error has to name."""
+def mutate_demonstrations(folder: Path, rng: np.random.Generator) -> Case:
+    """Damage one of the files."""
     whole = folder / str(rng.choice(["plain.hdf5", "packed.hdf5"]))
     path = folder / "case.hdf5"
     path.write_bytes(whole.read_bytes())
@@ -220,3 +291,92 @@ def _says_so(path: Path, replay: RobomimicExperienceReplay, options: dict) -> bo
         pairs.append((data["action"], actions))
     equal = all(torch.equal(mine, torch.from_numpy(theirs).float()) for mine, theirs in pairs)
     return equal and replay.env_args == modernize_env_args(meta, options["absolute_actions"])
+
+
+# --- saved policies and training states
+
+
+def make_policies(folder: Path) -> None:
+    """Save two policies."""
+    torch.manual_seed(0)
+    data = TensorDict({"observation": torch.randn(50, 5), "action": torch.randn(50, 2)}, [50])
+    networks = {
+        "mlp": PreconditionedNetwork(VelocityMLP(2, 5, 3, 2, hidden_dim=16)),
+        "chi": ChiTransformer(2, 5, 3, embedding_dim=8, num_layers=1, num_heads=2),
+    }
+    for name, network in networks.items():
+        actor = WarmPriorActor(network, PastPrior(3), nfe=2, clip=1.0, normalizer=Normalizer.fit(data))
+        save_policy(actor, folder / name)
+
+
+def make_states(folder: Path) -> None:
+    """Train a little."""
+    training(folder / "whole", CONFIG).run(None)
+
+
+def damaged_copy(whole: Path, case: Path, rng: np.random.Generator) -> str:
+    """Copy a file into another folder, and damage it there; returns how."""
+    case.mkdir(exist_ok=True)
+    (case / whole.name).write_bytes(whole.read_bytes())
+    return damage(case / whole.name, rng)
+
+
+def mutate_policies(folder: Path, rng: np.random.Generator) -> Case:
+    """Damage a policy."""
+    whole, case = folder / str(rng.choice(["mlp", "chi"])), folder / "case"
+    how = damaged_copy(whole / "model.safetensors", case, rng)
+
+    def load() -> Outcome:
+        actor, expected = load_policy(case), load_policy(whole)
+        state, theirs = actor.state_dict(), expected.state_dict()
+        same = state.keys() == theirs.keys() and all(torch.equal(state[n], theirs[n]) for n in state)
+        if same and policy_config(actor) == policy_config(expected):
+            return Outcome("equal")
+        return Outcome("silent", "differs")
+
+    return how, load, str(case)
+
+
+def mutate_states(folder: Path, rng: np.random.Generator) -> Case:
+    """Damage a state."""
+    whole, case = folder / "whole" / "state.safetensors", folder / "case"
+    how = damaged_copy(whole, case, rng)
+
+    def load() -> Outcome:
+        cloning = training(case, CONFIG)
+        stored, facts = load_state(whole)
+        mine = {
+            **named("trained", module_tensors(cloning.trained)),
+            **named("ema", module_tensors(cloning.ema)),
+            **named("optimizer", snapshot_optimizer(cloning.optimizer)),
+        }
+        restored = all(torch.equal(stored[name], value) for name, value in mine.items())
+        same = (cloning.iteration, [list(pair) for pair in cloning.losses]) == (
+            facts["iteration"],
+            facts["losses"],
+        )
+        return Outcome("equal") if restored and same else Outcome("silent", "differs")
+
+    return how, load, str(case / whole.name)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A kind of file.
+
+    Attributes:
+        name: of the kind.
+        make: writes whole files into a folder.
+        mutate: damages a copy of one.
+    """
+
+    name: str
+    make: Callable[[Path], None]
+    mutate: Callable[[Path, np.random.Generator], Case]
+
+
+SUBJECTS = (
+    Subject("demonstration files", make_demonstrations, mutate_demonstrations),
+    Subject("saved policies", make_policies, mutate_policies),
+    Subject("training states", make_states, mutate_states),
+)
