@@ -9,7 +9,7 @@ PLUGIN := plugins/lerobot_policy_warmprior
 GROOT := .venv-groot
 GROOT_NEEDS := tests/lerobot/groot_n15.txt
 
-.PHONY: install benchmark throughput test test-slow test-groot-n15 lint fuzz docs clean
+.PHONY: install benchmark throughput test test-slow test-groot-n15 lint fuzz results docs clean
 
 install: .venv/installed
 
@@ -56,6 +56,10 @@ lint: install
 
 fuzz: install
 	$(BIN)/python -W ignore -m tests.fuzz $(ARGS)
+
+# The charts and the table of the results page, from docs/results.
+results: install
+	$(BIN)/python docs/figures/results.py
 
 docs: install
 	$(BIN)/sphinx-build -W -q -b html -d build/doctrees $(ARGS) docs docs/_build

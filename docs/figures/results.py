@@ -1,0 +1,295 @@
+"""The charts and the table of the results page, from the numbers in docs/results.
+
+python docs/figures/results.py    # or: make results; writes docs/_static/results and the page's table
+
+An interval is of 95%. A success rate has Wilson's score interval, a difference of two Newcombe's. Both take
+the episodes of all seeds as independent; training seeds differ by more than that, paired episodes by less.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from pandas import DataFrame, Series, read_csv
+
+DOCS = Path(__file__).parents[1]
+DATA, OUT, PAGE = DOCS / "results", DOCS / "_static" / "results", DOCS / "results.md"
+GAUSSIAN, PAST, PREVIEW = "gaussian", "past", "preview"
+CORRELATED, WIDE = "past,correlation=0.5", "past,sigma=1"
+SOURCES = {  # what a chart calls them, in which colour and with which mark
+    GAUSSIAN: ("Gaussian source", "#7f7f7f", "o"),
+    PAST: ("WP-Past", "#1f77b4", "o"),
+    PREVIEW: ("WP-Preview", "#d95f02", "o"),
+    CORRELATED: ("WP-Past, correlated noise", "#1b9e77", "o"),
+    WIDE: ("WP-Past, sigma = 1", "#984ea3", "o"),
+    "preview,correlation=0.5": ("WP-Preview, correlated noise", "#e6ab02", "o"),
+    "ot": ("OT-CFM", "0.2", "s"),
+    "cvae": ("learned, autoencoder", "0.2", "^"),
+    "leap": ("learned, of the observation", "0.2", "v"),
+    "step,start_time=0.5": ("STEP", "0.2", "D"),
+    "history": ("history conditioning", "0.2", "P"),
+    "a2a": ("learned, of the last actions", "0.2", "X"),
+    "forecast": ("learned, of both", "0.2", "*"),
+}
+OPERATORS = {"ph": "one operator", "mh": "six operators"}
+
+
+def read(name: str) -> DataFrame:
+    """The rows of one file, with the number of episodes that each stands for."""
+    rows = read_csv(DATA / f"{name}.csv", comment="#")
+    tasks = rows["cells"] if "cells" in rows else rows["task"].str.split().str.len()
+    return rows.assign(total=rows["seeds"] * rows["episodes"] * tasks)
+
+
+def wilson(success: float, total: float) -> np.ndarray:
+    """Lower and upper end of a success rate's interval, in percent."""
+    p, z2 = success / 100, 1.96**2 / total
+    half = np.sqrt(p * (1 - p) * z2 + z2**2 / 4)
+    return 100 * (p + z2 / 2 + np.array([-half, half])) / (1 + z2)
+
+
+def gain(row: Series, base: Series) -> tuple[float, float, float]:
+    """The difference to the base in points, and how far its interval reaches down and up."""
+    a, b = row["success"], base["success"]
+    (low, high), (base_low, base_high) = wilson(a, row["total"]), wilson(b, base["total"])
+    return a - b, np.hypot(a - low, base_high - b), np.hypot(high - a, b - base_low)
+
+
+def gains() -> DataFrame:
+    """Success minus the Gaussian source's at one step: cells, and means of cells."""
+    cells, means = read("one_step"), read("means")
+    names = (
+        cells["task"] + ", " + cells["demonstrations"].astype(str) + " of " + cells["style"].map(OPERATORS)
+    )
+    found = []
+    for rows, name in (cells, names), (means, "mean of " + means["setting"]):
+        for setting, group in rows.groupby(name, sort=False):
+            base = group[group["source"] == GAUSSIAN].iloc[0]
+            for _, row in group[group["source"] != GAUSSIAN].iterrows():
+                found.append([setting, row["source"], *gain(row, base)])
+    return DataFrame(found, columns=["setting", "source", "gain", "down", "up"])
+
+
+def figure(width: float, height: float, columns: int, title: str) -> tuple[Figure, list[Axes]]:
+    """A picture with a title that says what it shows, and its axes."""
+    made = Figure(figsize=(width, height), layout="constrained")
+    made.suptitle(title, fontsize=13, fontweight="bold")
+    return made, list(made.subplots(1, columns, squeeze=False).flat)
+
+
+def save(made: Figure, name: str, columns: int = 5) -> None:
+    """Write the picture, with one legend below."""
+    shown = [pair for axis in made.axes for pair in zip(*axis.get_legend_handles_labels(), strict=True)]
+    handles = {label: handle for handle, label in reversed(shown)}
+    labels = sorted(handles, key=[label for _, label in shown].index)
+    made.legend(
+        [handles[label] for label in labels], labels, loc="outside lower center", ncols=columns, frameon=False
+    )
+    made.savefig(OUT / f"{name}.png", dpi=110)
+
+
+def finish(axis: Axes, title: str, **settings: object) -> None:
+    """Title, labels and a faint grid."""
+    axis.set_title(title, fontsize=10.5)
+    axis.set(**settings)
+    axis.grid(axis="y", color="0.9")
+
+
+def lines(axis: Axes, rows: DataFrame, x: str, ticks: list[int], interval: bool = True) -> None:
+    """Success against a column, a line per source."""
+    for k, (source, (label, color, mark)) in enumerate(SOURCES.items()):
+        part = rows[rows["source"] == source].groupby(x).agg({"success": "mean", "total": "sum"})
+        if len(part):
+            ends = np.array([wilson(*pair) for pair in part[["success", "total"]].to_numpy()]).T
+            bars = np.abs(ends - part["success"].to_numpy()) if interval else None
+            places = part.index.to_numpy(dtype=float) * (1 + 0.025 * (k - 2))
+            axis.errorbar(
+                places, part["success"], bars, color=color, marker=mark, lw=1.6, elinewidth=1, label=label
+            )
+    axis.set(xscale="log", ylim=(-3, 103))
+    axis.set_xticks(ticks, [f"{n:,}" for n in ticks])
+    axis.minorticks_off()
+
+
+def one_step() -> None:
+    """Chart A: gains at one step."""
+    frame = gains()
+    made, (axis,) = figure(
+        11.6, 11.5, 1, "One step: correlated noise is nowhere clearly behind the Gaussian source,\n"
+        "plain warm sources gain with few demonstrations, and lose on square and transport of six operators",
+    )  # fmt: skip
+    names, order = list(dict.fromkeys(frame["setting"])), []
+    for keys in (", 150", ", 300", "of 150"), (", 25", "of 25"), (", 10 ", "of 10"), ("of all",):
+        order += [name for key in keys for name in names if key in name]
+    for k, source in enumerate((PAST, PREVIEW, CORRELATED, WIDE)):
+        part, (label, color, mark) = frame[frame["source"] == source], SOURCES[source]
+        places = [order.index(name) + 0.2 * (k - 1.5) for name in part["setting"]]
+        axis.errorbar(
+            part["gain"], places, xerr=part[["down", "up"]].T, fmt=mark, ms=5, color=color, label=label
+        )
+    for k, name in enumerate(order):
+        if name.startswith("mean"):
+            axis.axhspan(k - 0.5, k + 0.5, color="0.94", zorder=0)
+    axis.axvline(0, color=SOURCES[GAUSSIAN][1], lw=1.5)
+    axis.set_yticks(range(len(order)), order)
+    axis.set_ylim(len(order) - 0.5, -0.5)
+    axis.set_xlabel(
+        "success minus the Gaussian source's, in points, with a 95% interval over seeds x episodes"
+    )
+    axis.grid(axis="x", color="0.9")
+    save(made, "one_step")
+
+
+def steps() -> None:
+    """Chart B: success against the number of integration steps."""
+    rows = read("steps")
+    many, two = rows["demonstrations"] >= 150, rows["task"] == "transport"
+    parts = {
+        "150 or 300 demonstrations, one arm:\nmean of six cells": rows[many & ~two],
+        "150 or 300, two arms:\nmean of two cells": rows[two],
+        "25 of one operator:\nmean of three tasks": rows[rows["demonstrations"] == 25],
+        "10 of one operator:\nmean of three tasks": rows[rows["demonstrations"] == 10],
+    }
+    title = "With few demonstrations warm sources are ahead at one step, and more steps take the lead away"
+    made, axes = figure(11.6, 4.8, 4, title)
+    for axis, (name, part) in zip(axes, parts.items(), strict=True):
+        lines(axis, part, "nfe", [1, 3, 9])
+        finish(axis, name, xlabel="integration steps (NFE)")
+    axes[0].set_ylabel("success in percent, 95% interval")
+    save(made, "steps")
+
+
+def demonstrations() -> None:
+    """Chart C: success against demonstrations, with a dot per seed."""
+    rows = read("one_step")
+    title = (
+        "WP-Past and WP-Preview gain on square and can while demonstrations are few (one step; dots: seeds)"
+    )
+    made, axes = figure(11.6, 4.8, 3, title)
+    for axis, task in zip(axes, ("square", "can", "stack"), strict=True):
+        part = rows[(rows["task"] == task) & (rows["style"] == "ph")]
+        lines(axis, part, "demonstrations", [10, 25, 150], interval=False)
+        for _, row in part[part["seed_success"].notna()].iterrows():
+            each = [int(n) for n in row["seed_success"].split()]
+            place = row["demonstrations"] * (1 + 0.07 * (list(SOURCES).index(row["source"]) - 1))
+            axis.plot([place] * len(each), each, ".", ms=7, alpha=0.55, color=SOURCES[row["source"]][1])
+        finish(axis, task, xlabel="demonstrations of one operator")
+    axes[0].set_ylabel("success in percent")
+    save(made, "demonstrations")
+
+
+def iterations() -> None:
+    """Chart D: success against the length of the training."""
+    rows = read("iterations")
+    six = rows["style"] == "mh"
+    parts = {
+        "transport, six operators (one seed)": rows[six & (rows["seeds"] == 1)],
+        "square, six operators (three seeds)": rows[six & (rows["task"] == "square")],
+        "square, one operator, the paper's loss\n(one seed, two at 20,000)": rows[~six],
+    }
+    title = "WP-Past and WP-Preview need longer training, and correlated noise does not"
+    made, axes = figure(11.6, 4.8, 3, title)
+    for axis, (name, part) in zip(axes, parts.items(), strict=True):
+        lines(axis, part, "iterations", [2_500, 5_000, 10_000, 20_000])
+        finish(axis, name, xlabel="training iterations of batch 128", xlim=(2_100, 24_000))
+    axes[0].set_ylabel("success at one step in percent, 95% interval")
+    save(made, "iterations")
+
+
+def memory() -> None:
+    """Chart E: success against how much of the past the actions follow."""
+    rows = read("memory")
+    each = rows["memory_gain"].astype(str).str.split()
+    rows = rows.assign(gain=each.map(lambda values: np.mean([float(n) for n in values])))
+    made, axes = figure(11.6, 5.4, 2, "With six operators, policies that follow much of the past fail")
+    for axis, task in zip(axes, ("square", "transport"), strict=True):
+        for _, row in rows[rows["task"] == task].iterrows():
+            label, color, mark = SOURCES[row["source"]]
+            axis.plot(row["gain"], row["success"], mark, ms=8, alpha=0.85, color=color, label=label)
+        what = "memory gain: the part of a shift of the past that reappears in the actions"
+        finish(axis, f"{task}, 300 demonstrations of six operators", xlabel=what, ylim=(-4, 100))
+    axes[0].set_ylabel("success at one step in percent")
+    save(made, "memory")
+
+
+def noise() -> None:
+    """Chart F: residual noise, white and correlated."""
+    rows = read("noise")
+    kept = rows["sigma"] * np.sqrt(rows["correlation"] + (1 - rows["correlation"]) / 8)
+    rows = rows.assign(kept=kept)
+    six, few = rows["style"] == "mh", rows["seeds"] > 1
+    parts = {
+        "WP-Past, square, six operators (one seed)": rows[six & ~few & (rows["actions"] == "deltas")],
+        "WP-Past, four settings (two or three seeds)": rows[few],
+        "WP-Preview, square (one seed)": rows[~few],
+    }
+    title = "More noise, white or correlated, takes losses away, and gains as well"
+    made, axes = figure(11.6, 5.6, 3, title)
+    for axis, (name, part), warm in zip(axes, parts.items(), (PAST, PAST, PREVIEW), strict=True):
+        keys = ["task", "demonstrations", "style", "actions"]
+        for k, (setting, group) in enumerate(part.groupby(keys, sort=False)):
+            group = group.assign(
+                gain=group["success"] - group[group["source"] == GAUSSIAN]["success"].iloc[0]
+            )
+            group = group[group["source"] == warm].sort_values("kept")
+            task = "square, can, stack" if " " in setting[0] else setting[0]
+            label = f"{task}, {setting[1]} of {OPERATORS[setting[2]]}, {setting[3]}"
+            color = ("#1f77b4", "#d95f02", "#1b9e77", "#984ea3")[k]
+            white, common = group[group["correlation"] == 0], group[group["correlation"] > 0]
+            axis.plot(white["kept"], white["gain"], "o-", color=color, label=label)
+            axis.plot(common["kept"], common["gain"], "s", ms=8, mfc="none", mew=2, color=color)
+        axis.plot([], [], "s", ms=8, mfc="none", mew=2, color="0.3", label="correlated noise")
+        axis.axhline(0, color=SOURCES[GAUSSIAN][1], lw=1.5)
+        finish(axis, name, xlabel="noise that averaging over a chunk leaves", xlim=(0, None))
+        axis.legend(fontsize=9, loc="upper center", bbox_to_anchor=(0.5, -0.13), frameon=False)
+    axes[0].set_ylabel("success minus the Gaussian source's, in points")
+    made.savefig(OUT / "noise.png", dpi=110)
+
+
+def actions() -> None:
+    """Chart G: deltas and poses."""
+    rows = read("actions")
+    title = (
+        "From absolute poses most warm sources lose, and the Gaussian source does not (one step, one seed)"
+    )
+    made, axes = figure(11.6, 4.8, 4, title)
+    for axis, (setting, part) in zip(axes, rows.groupby(["task", "style"], sort=False), strict=True):
+        for source, group in part.groupby("source", sort=False):
+            label, color, mark = SOURCES[source]
+            axis.plot(group["actions"], group["success"], mark + "-", color=color, label=label)
+        finish(axis, f"{setting[0]}, {OPERATORS[setting[1]]}", ylim=(-3, 103), xlim=(-0.3, 1.3))
+    axes[0].set_ylabel("success in percent of 50 episodes")
+    save(made, "actions")
+
+
+def table() -> str:
+    """Success at one step, in Markdown."""
+    rows = read("means").pivot(index="setting", columns="source", values="success")
+    rows = rows.reindex(index=read("means")["setting"].unique(), columns=list(SOURCES)[:5])
+    text = [
+        "| demonstrations | " + " | ".join(label for label, *_ in list(SOURCES.values())[:5]) + " |",
+        "|---" * 6 + "|",
+    ]
+    for setting, row in rows.iterrows():
+        numbers = [
+            "" if np.isnan(n) else f"{n + 1e-6:.0f}" if n != row.max() else f"**{n + 1e-6:.0f}**" for n in row
+        ]
+        text.append(f"| {setting} | " + " | ".join(numbers) + " |")
+    return "\n".join(text) + "\n"
+
+
+def main() -> None:
+    """Draw the charts, and write the table into the page."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    for draw in one_step, steps, demonstrations, iterations, memory, noise, actions:
+        draw()
+    marked = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
+    PAGE.write_text(marked.sub(table(), PAGE.read_text()))
+
+
+if __name__ == "__main__":
+    main()
