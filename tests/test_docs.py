@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import doctest
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 import re
@@ -113,6 +114,28 @@ def test_errors_that_troubleshooting_quotes_exist():
     for words in quoted:
         pattern = r" \{.*?\} ".join(re.escape(part) for part in words.split(" N "))
         assert re.search(pattern, source), words
+
+
+def test_both_sides_of_the_diff_run(capsys):
+    (diff,) = re.findall(r"```diff\n(.*?)```", (DOCS / "torchrl.md").read_text(), re.S)
+    for side in "-+":
+        kept = [line[1:] for line in diff.splitlines() if line[:1] in ("", " ", side)]
+        exec(compile("\n".join(kept), "torchrl.md", "exec"), {})
+    before, after = capsys.readouterr().out.splitlines()
+    assert before == after == "torch.Size([10])"
+    assert len(re.findall(r"^\+", diff, re.M)) == 5
+
+
+def test_the_table_of_results_is_that_of_the_stored_numbers():
+    spec = importlib.util.spec_from_file_location("results", DOCS / "figures" / "results.py")
+    results = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(results)
+    assert results.table() in results.PAGE.read_text()
+    shown = set(re.findall(r"\(_static/results/(\w+)\.png\)", results.PAGE.read_text()))
+    assert shown == {path.stem for path in results.OUT.glob("*.png")}
+    for file in results.DATA.glob("*.csv"):
+        rows = results.read(file.stem)
+        assert rows["success"].between(0, 100).all() and rows["command"].notna().all()
 
 
 @pytest.fixture(scope="module")
