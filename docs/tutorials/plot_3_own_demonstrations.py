@@ -113,7 +113,7 @@ demos = replay.data
 print(demos.select("observation", "action", "episode"))
 
 # %%
-# What is wrong with a file (a missing key, other lengths, a NaN) is told by file, demonstration and
+# What is wrong with a file (a missing key, other lengths, a NaN) is reported by file, demonstration and
 # key before anything is trained.
 #
 # Or as a LeRobotDataset
@@ -197,13 +197,13 @@ policies = {
 
 
 class StandsAtTheEnd(Transform):
-    """Tells ``"success"``, and keeps the observations."""
+    """Writes ``"success"``, and keeps the observations."""
 
     def __init__(self):
         super().__init__()
         self.seen = []
 
-    def _told(self, tensordict):
+    def _noted(self, tensordict):
         observation = tensordict["observation"]
         self.seen.append(observation.clone())
         return tensordict.set(
@@ -211,10 +211,10 @@ class StandsAtTheEnd(Transform):
         )
 
     def _step(self, tensordict, next_tensordict):
-        return self._told(next_tensordict)
+        return self._noted(next_tensordict)
 
     def _reset(self, tensordict, tensordict_reset):
-        return self._told(tensordict_reset)
+        return self._noted(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec):
         observation_spec["success"] = Categorical(
@@ -250,9 +250,9 @@ for axis, (name, (solved, seen)) in zip(axes, shown.items(), strict=True):
             torch.nan
         )  # no line where the angle wraps around
         axis.plot(torch.arange(len(degrees)) / 20, degrees, lw=0.8, alpha=0.7)
-    told = "" if solved is None else f": {solved} of 20 end upright"
+    share = "" if solved is None else f": {solved} of 20 end upright"
     axis.set(
-        title=name + told, xlabel="seconds", yticks=[-180, -90, 0, 90, 180]
+        title=name + share, xlabel="seconds", yticks=[-180, -90, 0, 90, 180]
     )
 axes[0].set_ylabel("angle in degrees (0 is upright)")
 plt.show()

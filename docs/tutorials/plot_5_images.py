@@ -75,27 +75,31 @@ class ReachEnv(EnvBase):
         places = {name: Unbounded((n, 2)) for name in ("gripper", "part")}
         return places | {"step": Unbounded((n, 1), dtype=torch.int64)}
 
-    def _told(self, gripper, part, step):
+    def _outcome(self, gripper, part, step):
         observation = {"state": gripper, "camera": draw(gripper, part)}
-        told = {"observation": TensorDict(observation, self.batch_size)}
-        told |= {"gripper": gripper, "part": part, "step": step}
-        told["success"] = (gripper - part).norm(dim=-1, keepdim=True) < 0.12
-        return told | {"done": step >= STEPS, "terminated": step >= STEPS}
+        outcome = {"observation": TensorDict(observation, self.batch_size)}
+        outcome |= {"gripper": gripper, "part": part, "step": step}
+        outcome["success"] = (gripper - part).norm(
+            dim=-1, keepdim=True
+        ) < 0.12
+        return outcome | {"done": step >= STEPS, "terminated": step >= STEPS}
 
     def _reset(self, tensordict, **kwargs):
         gripper, part = (torch.rand(2, *self.batch_size, 2) * 2 - 1).unbind(0)
         gripper[:, 1] = gripper[:, 1].abs() - 1  # below
         part[:, 1] = part[:, 1].abs()  # above
         step = torch.zeros(*self.batch_size, 1, dtype=torch.int64)
-        return TensorDict(self._told(gripper, part, step), self.batch_size)
+        return TensorDict(self._outcome(gripper, part, step), self.batch_size)
 
     def _step(self, tensordict):
         gripper = (
             tensordict["gripper"] + 0.12 * tensordict["action"].clamp(-1, 1)
         ).clamp(-1, 1)
-        told = self._told(gripper, tensordict["part"], tensordict["step"] + 1)
+        outcome = self._outcome(
+            gripper, tensordict["part"], tensordict["step"] + 1
+        )
         return TensorDict(
-            told | {"reward": told["success"].float()}, self.batch_size
+            outcome | {"reward": outcome["success"].float()}, self.batch_size
         )
 
     def _set_seed(self, seed):
@@ -210,12 +214,12 @@ def play(actor, camera=True):
 
 
 figure, axes = plt.subplots(1, 3, figsize=(10, 3.4))
-for told, curve in (
+for name, curve in (
     ("with images", losses),
     ("images blanked", blind_losses),
 ):
     means = torch.tensor(curve).view(-1, 10).mean(1)
-    axes[0].plot(torch.arange(len(means)) * 10 + 5, means, label=told)
+    axes[0].plot(torch.arange(len(means)) * 10 + 5, means, label=name)
 axes[0].set(
     title="Training", xlabel="iterations", ylabel="flow-matching loss"
 )
