@@ -281,7 +281,7 @@ def robosuite_task(
     if not index.env_args:
         raise ValueError(
             f"{path} does not say which environment it was recorded in: name a robosuite task with --task, "
-            "train without an environment by python -m warmprior train --observation-keys, or describe a task "
+            "train without an environment (python -m warmprior train --observation-keys), or describe a task "
             "of your own (docs/benchmarks.md)"
         )
     # Not after hours of rendering, or of training.
