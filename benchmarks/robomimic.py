@@ -62,12 +62,13 @@ def run(
         rows, failures = compare(options, policies)
 
         # The table, and what the flows look like.
-        results = summary(rows, options.evaluation.top_k)
+        top_k = options.evaluation.top_k
+        results = summary(rows, top_k)
         source = policies[0].task().facts.get("source")
         notes = beside(options, presets["paper"]) + smaller(options, presets["paper"])
-        full = success_report(results, notes, source)
+        full = success_report(results, top_k, notes, source)
         try:
-            write_report(out, terminal_table(results), full, results, failures)
+            write_report(out, terminal_table(results, top_k), full, results, failures)
         finally:
             draw(options, policies, rows)  # pictures are the lesser loss
 
