@@ -365,7 +365,8 @@ def main(argv: list[str] | None) -> None:
         last = found.groupby([*agents, "seed"], sort=False).tail(1)
         greedy = last[last.evaluation == "greedy"]
         plot_success(greedy, out / "success.png", f"{title}: greedy agents", group="algorithm")
-        text = table(last, agents, ["delta", "environment_steps", "success_rate"])
+        last = last.assign(seeds=last.groupby(agents)["seed"].transform("nunique"))
+        text = table(last, agents, ["seeds", "delta", "environment_steps", "success_rate"])
         write_report(out, text, text, found, failures)
 
 

@@ -103,9 +103,9 @@ def test_the_toy_with_both_algorithms(tmp_path, capsys):
     table = (out / "report.md").read_text()
     assert table.partition("\n\nColumns")[0] in capsys.readouterr().out
     for algorithm, kind in product(algorithms, ("base", "greedy", "stochastic")):
-        start = f"| {algorithm} | WP-Past | {kind} | 0.5 ± 0 |"
+        start = f"| {algorithm} | WP-Past | {kind} | 2 | 0.5 ± 0 |"
         (line,) = (line for line in table.splitlines() if line.startswith(start))
-        mean = float(line.split("|")[6].split("%")[0])
+        mean = float(line.split("|")[7].split("%")[0])
         last = [rates(found[seed, algorithm, "past", ""], kind)[-1] for seed in (0, 1)]
         assert mean == pytest.approx(100 * sum(last) / 2, abs=0.051)
 
@@ -283,7 +283,7 @@ def test_a_training_that_diverges_leaves_the_others_alone(tmp_path, capsys, monk
     assert benchmark.main(argv) == 2
     assert "dsrl-na past, seed 0: loss_qvalue=nan" in capsys.readouterr().err
     assert {row["seed"] for row in stored(out)} == {1}
-    assert is_png(out / "curves.png") and "(1 seed)" in (out / "report.md").read_text()
+    assert is_png(out / "curves.png") and "| greedy | 1 |" in (out / "report.md").read_text()
 
 
 def test_resume_without_a_run(tmp_path, capsys, monkeypatch):
