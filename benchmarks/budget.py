@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 
 from common import Policy, observations_of, policies_of, replace_rows
 from options import PRESETS, HeldOut, MeasuredOptions, check_single, parse, script, started, study
-from plots import plot_budget
-from report import budget_table, write_report
+from plots import plot_lines
+from report import labelled, per_seed, table, write_report
 from robomimic import compare
 
 from warmprior.diagnostics import SharedObservations, action_error, encoded_windows
@@ -74,10 +74,17 @@ def main(argv: list[str] | None) -> None:
         played = read_lines(out / "results.jsonl")
         measured = [{**row, "action_error": error[row["policy"], row["nfe"]]} for row in played]
         rows = replace_rows(out / "results.jsonl", measured)
-        top_k, title = options.evaluation.top_k, policies[0].task().title
-        plot_budget(rows, out / "budget.png", top_k=top_k, title=title)
-        table = budget_table(rows, top_k) + f"- Error: on {source}.\n"
-        write_report(out, table, table, rows, failures)
+        seeds = per_seed(labelled(rows), options.evaluation.top_k)
+        seeds = seeds.sort_values(["iterations", "nfe"], ascending=[True, False], kind="stable")
+        lines = {"success": "success rate", "action_error": "squared error, held out"}
+        title = policies[0].task().title
+        plot_lines(seeds, out / "budget.png", title, "iterations", lines, scale="log")
+        notes = [
+            f"Error: on {source}. It favours the average of all good actions, so it grows with NFE where the "
+            "data leave a choice."
+        ]
+        text = table(seeds, ["iterations", "nfe", "method"], ["success", "action_error"], notes)
+        write_report(out, text, text, rows, failures)
 
 
 if __name__ == "__main__":

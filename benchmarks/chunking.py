@@ -13,9 +13,11 @@ import sys
 
 from common import policies_of
 from options import PRESETS, check_single, parse, script, started, with_parts
-from plots import plot_bars, plot_chunk_lengths, plot_success
-from report import chunk_table, last_checkpoints, write_report
+from plots import plot_bars, plot_lines, plot_success
+from report import labelled, per_seed, table, write_report
 from robomimic import compare
+
+JUMPS = ("boundary_jump", "inner_jump")
 
 
 @script("chunking.py")
@@ -28,15 +30,19 @@ def main(argv: list[str] | None) -> None:
     with started(options, "chunking") as out:
         policies = policies_of(options, options.sources.methods())
         rows, failures = compare(options, policies)
-        top_k, shortest = options.evaluation.top_k, min(options.sources.chunk)
+        seeds = per_seed(labelled(rows, "chunk"), options.evaluation.top_k)
+        seeds = seeds.sort_values(["chunk", "nfe"], ascending=[True, False], kind="stable")
         title = f"{policies[0].task().title}, {options.evaluation.seeds} seed(s)"
-        plot_chunk_lengths(rows, out / "chunk_lengths.png", top_k=top_k, title=title)
-        fewest = rows[rows.nfe == min(rows.nfe)]
-        plot_bars(fewest[fewest.chunk.isin((shortest, 8))], out / "bars.png", top_k=top_k, title=title)
-        short = last_checkpoints(rows[rows.chunk == shortest])
-        plot_success(short, out / "violins.png", title=f"{title}, H = {shortest}")
-        table = chunk_table(rows, top_k)
-        write_report(out, table, table, rows, failures)
+        lines = {"success": "success rate", JUMPS: "jump at boundaries (dotted: inside)"}
+        plot_lines(seeds, out / "chunk_lengths.png", title, "chunk", lines)
+        fewest, shortest = seeds[seeds.nfe == min(seeds.nfe)], min(seeds.chunk)
+        pair = fewest[fewest.chunk.isin((shortest, 8))]
+        bars = {"success": f"success rate (NFE {min(seeds.nfe)})"}
+        plot_bars(pair.assign(chunk="H = " + pair.chunk.astype(str)), out / "bars.png", title, "chunk", bars)
+        short = seeds[seeds.chunk == shortest]
+        plot_success(short, out / "violins.png", f"{title}, H = {shortest}")
+        text = table(seeds, ["chunk", "nfe", "method"], ["success", *JUMPS])
+        write_report(out, text, text, rows, failures)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from common import (
     replace_rows,
     trained_actors,
 )
-from measures import held_out, straightness
+from measures import RATIOS, held_out, straightness
 from options import (
     PRESETS,
     Flat,
@@ -31,8 +31,9 @@ from options import (
     started,
     study,
 )
+from paper import PAPER_CURVATURE
 from plots import plot_flow_paths
-from report import curvature_table, labelled, write_report
+from report import labelled, pooled, problem_title, table, text_of, write_report
 from robomimic import train_all
 
 from warmprior.diagnostics import SharedObservations, encoded_windows, flow_paths
@@ -47,6 +48,11 @@ class CurvatureOptions(MeasuredOptions):
 
     policies: Annotated[PolicyOptions, Flat] = field(default_factory=PolicyOptions)
     coordinate: int = 0  # of the action, in flow_paths.png
+
+    def check(self) -> None:
+        super().check()
+        if self.policies.run is not None and self.data.task:
+            raise ValueError("--run names the policies, and with them the task: leave out --task")
 
     @property
     def name(self) -> str:
@@ -109,8 +115,20 @@ def main(argv: list[str] | None) -> None:
         where = f"{task['task']} {task['data']}: action coordinate {options.coordinate}"
         title = f"{where} along the flow,\n{source}"
         plot_flow_paths(paths, out / "flow_paths.png", title=title)
-        table = curvature_table(rows, task, source)
-        write_report(out, table, table, rows)
+        seeds = rows.seed.dropna().nunique()
+        notes = [
+            f"{problem_title(task)}, {len(observations)} observations of {source}, {seeds} seed(s). In "
+            "brackets: 95% bootstrap intervals over episodes.",
+            "The paper says neither which mean it uses, nor whether it counts a prediction of 2H whole.",
+            "Curvature shrinks with the length of the transport. Divided by the squared mean velocity, it "
+            "does not.",
+        ]
+        chosen = labelled(pooled(rows))
+        if chosen.prior.iloc[0] == "gaussian" and chosen.chunk.iloc[0] == 8 and not text_of(task, "obs"):
+            known = PAPER_CURVATURE.get((task["task"], task["data"]), {})
+            chosen = chosen.assign(paper_ratio=chosen.prior.map(known))
+        text = table(chosen, ["mean", "method"], [*RATIOS, "paper_ratio"], notes)
+        write_report(out, text, text, rows)
 
 
 if __name__ == "__main__":

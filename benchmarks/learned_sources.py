@@ -29,12 +29,13 @@ class Learner(nn.Module):
     r"""A network :math:`f_\phi(o, h)` of observation and last ``H`` actions that learns by a loss of its own.
 
     It learns on the windows that the flow will be trained on (:func:`learn`), and is fixed from then on. The
-    last actions count once there are ``H`` of them. Subclasses are sources or start points as well; they
-    make their networks in :meth:`build`. Observations are single tensors.
+    last actions count once there are ``H`` of them. Subclasses are sources or start points as well.
+    Observations are single tensors.
     """
 
     sees_history: ClassVar[bool] = True
     sees_observation: ClassVar[bool] = True
+    heads: ClassVar[int] = 1  # chunks that the network says
     chunk_length: int
     action_dim: int
     observation_dim: int
@@ -60,7 +61,8 @@ class Learner(nn.Module):
             self.requires_grad_(False)
 
     def build(self) -> None:
-        raise NotImplementedError
+        """Make the networks; one by default."""
+        self.network = self.mlp(self.seen_dim, self.heads * self.chunk_dim)
 
     def check_built(self) -> None:
         """Whether there are networks."""
@@ -99,18 +101,10 @@ class Learner(nn.Module):
             parts.append(known.to(actions.dtype))
         return torch.cat(parts, -1)
 
-    def outputs(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """What the network says, ``[*B, n]``; see :meth:`seen`."""
-        seen = self.seen(history, observation)  # first: it tells if there is no network
-        return self.network(seen)
-
     def predicted(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """The chunk that the network says, ``[*B, H, d_a]``."""
-        return self.as_chunk(self.outputs(history, observation))
-
-    def as_chunk(self, out: Tensor) -> Tensor:
-        """Outputs ``[*B, H d_a]`` as ``[*B, H, d_a]``."""
-        return out.unflatten(-1, (self.chunk_length, self.action_dim))
+        """The chunks that the network says, ``[*B, H, d_a]``, with several heads ``[*B, heads H, d_a]``."""
+        seen = self.seen(history, observation)  # first: it tells if there is no network
+        return self.network(seen).unflatten(-1, (-1, self.action_dim))
 
 
 class LearnedPrior(PastPrior, Learner, abstract=True):
@@ -150,11 +144,12 @@ class ForecastPrior(LearnedPrior):
 
     name = "forecast"
     default_sigma = 1.0
+    heads = 2  # mean and scale
     calibration: Tensor
     typical_scale: Tensor
 
     def build(self) -> None:
-        self.network = self.mlp(self.seen_dim, 2 * self.chunk_dim)
+        super().build()
         self.register_buffer("calibration", torch.ones(self.chunk_length, self.action_dim))
         self.register_buffer("typical_scale", torch.ones(()))
 
@@ -163,8 +158,7 @@ class ForecastPrior(LearnedPrior):
 
     def _gaussian(self, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
         """Mean and scale before the calibration."""
-        out = self.outputs(history, observation)
-        mean, raw = out.unflatten(-1, (2, self.chunk_length, self.action_dim)).unbind(-3)
+        mean, raw = self.predicted(history, observation).chunk(2, -2)
         return mean, SCALE_FLOOR + nn.functional.softplus(raw)
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
@@ -204,9 +198,6 @@ class A2APrior(LearnedPrior):
     name = "a2a"
     default_sigma = 0.0
     sees_observation = False
-
-    def build(self) -> None:
-        self.network = self.mlp(self.seen_dim, self.chunk_dim)
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
         mean = self.predicted(history, observation)
@@ -270,7 +261,7 @@ class CVAEPrior(LearnedPrior):
         self.decoder = self.mlp(self.seen_dim + self.latent_dim, self.chunk_dim)
 
     def decode(self, seen: Tensor, z: Tensor) -> Tensor:
-        return self.as_chunk(self.decoder(torch.cat([seen, z], -1)))
+        return self.decoder(torch.cat([seen, z], -1)).unflatten(-1, (-1, self.action_dim))
 
     mean = GaussianPrior.mean  # none: cold everywhere
 
@@ -324,9 +315,6 @@ class ForecastStart(StartPoint, Learner):
         self.time, self.noise_share = start_time, 1.0 - start_time
         self.stall, self.stall_noise = stall, stall_noise
         self._set_widths(widths, hidden_dim)
-
-    def build(self) -> None:
-        self.network = self.mlp(self.seen_dim, self.chunk_dim)
 
     def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """Share of the forecast."""

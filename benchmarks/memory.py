@@ -14,7 +14,7 @@ from pathlib import Path
 import pandas as pd
 from options import script
 from plots import colors_of, legend_below, new_figure, save
-from report import markdown, read_rows, summary
+from report import read_rows, summary, table
 
 
 @script("memory.py")
@@ -41,9 +41,8 @@ def main(argv: list[str] | None) -> None:
     legend_below(figure)
     save(figure, args.out, f"{len(found)} cells of {len(args.runs)} runs")
 
-    lines = found.assign(cell=found.problem + ", NFE " + found.nfe.astype(str) + ", " + found.method)
-    table = lines.set_index("cell")[["memory_gain", "gain"]].map("{:.3f}".format)
-    print(markdown(table, "cell"), f"\nPicture: {args.out}", sep="")
+    text = table(found, ["problem", "nfe", "method"], ["memory_gain", "gain"])
+    print(text, f"\nPicture: {args.out}", sep="")
 
 
 if __name__ == "__main__":

@@ -211,10 +211,6 @@ class Method:
     def sigma(self) -> float:
         return float(self.prior().sigma)
 
-    @property
-    def takes_sigma(self) -> bool:
-        return "sigma" in _parameters(self.parts.prior)
-
     @cached_property
     def prediction_length(self) -> int:
         return self.prior().prediction_length

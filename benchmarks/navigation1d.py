@@ -19,12 +19,16 @@ from common import Policy, policies_of, replace_rows, trained_actors
 from measures import straightness
 from options import Evaluation, Options, Sources, check_single, parse, script, started
 from plots import plot_flow_paths, plot_navigation
-from report import labelled, navigation_table, write_report
+from report import labelled, table, write_report
 from robomimic import beside, train_all
 
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.training import NetworkOptions, TrainingConfig, judge_navigation, play_navigation
 
+JUDGED = [  # columns of the table
+    *("switch_rate", "commit_rate", "collision_rate", "route_entropy", "distance", "jump_ratio"),
+    *("shifted_collision_rate", "shifted_distance"),
+]
 STEPS = 32  # half of an episode: the longest chunk
 
 # The paper's Algorithm 1 withholds no history; PreviewPrior says why small sigma needs it.
@@ -136,9 +140,11 @@ def main(argv: list[str] | None) -> None:
             )
         ]
         curvatures = replace_rows(out / "curvature.jsonl", flows)
-        table = navigation_table(rows, curvatures, beside(options, Options()))
+        text = table(labelled(rows), ["method", "nfe"], JUDGED, beside(options, Options()))
+        flow = labelled(curvatures[curvatures["mean"] == "training"])
+        text += "\n" + table(flow, ["method"], ["kappa_executed", "relative_executed"])
         # Before the pictures, which are the lesser loss: the trainings took the time.
-        write_report(out, table, table, pd.concat([rows, curvatures]))
+        write_report(out, text, text, pd.concat([rows, curvatures]))
         draw(options, policies, rows, observations)
 
 

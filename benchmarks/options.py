@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
@@ -88,11 +89,14 @@ class Evaluation:
 class Run:
     """Where and how to compute."""
 
-    preset: str = "quick"  # the budget that the other options start from
+    # The budget that the other options start from: quick, cpu or paper; navigation1d.py has quick and wide,
+    # prior_space_rl.py quick, unit and paper.
+    preset: str = "quick"
     out: Path | None = None  # output folder (default: a numbered one under runs/)
     resume: bool = False  # continue in --out, or in the latest default folder, with the options stored there
     envs: int | None = None  # worker processes, with the same results (default: one per core)
     device: str = "cpu"  # of networks and data, such as cuda; one per process under torchrun
+    films: bool = True  # of an episode of every method, and filmstrips; they take time
     compile: bool = False  # torch.compile the network in training
     logger: Literal["csv", "tensorboard", "wandb", "none"] = "csv"  # of the training curves
     engine: Literal["local", "ray"] = "local"  # who computes: processes of this machine, or a Ray cluster
@@ -163,6 +167,15 @@ class Options:
         self.data.check()
         self.network.check(self.data)
         check_batch(self.training.batch_size)
+        if self.seeds.stop > 2**63:  # rows and generators hold no more
+            raise ValueError(f"--seed must be below 2**63, got {self.training.seed}")
+        try:
+            with torch.device("meta"):  # nothing is computed
+                self.network.without_images().make(1, 1, 2)
+        except ValueError as error:
+            raise ValueError(f"--hidden-dim {self.network.hidden_dim}: {error}") from error
+        if self.data.actions != "delta" and any(":" in task for task in self.data.task):
+            raise ValueError("--actions belongs to robosuite's tasks: a task of your own has its own")
         if self.evaluation.play_on and not all(map(is_simulated, self.data.task)):
             raise ValueError("--play-on belongs to robosuite's tasks: leave it out")
         if self.training.weighting == "standardised" and not self.network.precondition:
@@ -325,6 +338,8 @@ def parse[O: Options](
 def read[O: Options](default: O, argv: Sequence[str], description: str | None) -> O:
     """A command line, on top of defaults."""
     written = io.StringIO()
+    # A line that begins with a sign stays a line of its own.
+    description = re.sub(r"^(?=python |torchrun )", "$ ", description or "", flags=re.M)
     try:
         with redirect_stderr(written):
             kind: Any = type(default)
@@ -356,7 +371,7 @@ def output_folder(options: Options, study: str) -> Path:
     return out
 
 
-OF_A_START = ("out", "resume", "envs", "logger", "engine", "ray_address")
+OF_A_START = ("out", "resume", "envs", "films", "logger", "engine", "ray_address")
 """Options of a run that may differ each time it is started: they change no result."""
 
 

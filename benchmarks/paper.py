@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from typing import Any
+
 STATE, IMAGE = "state", "image"
 
 
@@ -46,16 +50,24 @@ PAPER_SIGMA: dict[str, dict[float, float]] = {
 }
 
 
-def paper_success(
-    task: str, data: str, prior: str, nfe: int, chunk: int = 8, seen: str = STATE
-) -> float | None:
-    """The paper's success rate in percent at `H = chunk`, or None where it reports none.
+PAPER_DEFAULT_SIGMA = {"gaussian": 1.0, "past": 0.5, "preview": 1.0}
 
-    >>> paper_success("square", "mh", "preview", 1)
-    77.8
-    >>> paper_success("square", "mh", "preview", 1, seen="image")
-    75.1
+
+def paper_success(row: Mapping[str, Any]) -> float:
+    """The paper's success rate, a share of 1, for the same experiment as a row's; NaN where it has none.
+
+    >>> row = {"task": "square", "data": "mh", "prior": "preview", "sigma": 1.0, "nfe": 1, "chunk": 8}
+    >>> paper_success(row), paper_success(row | {"obs": "image"}), paper_success(row | {"sigma": 0.0})
+    (0.778, 0.751, 0.31)
     """
-    if chunk != 8:
-        return None
-    return PAPER_SUCCESS.get((task, data, seen), {}).get(prior, {}).get(nfe)
+    known = {name: value for name, value in row.items() if isinstance(value, str)}  # others are NaN
+    if row["chunk"] != 8 or "delay" in row or known.get("options") or known.get("actions"):
+        return math.nan
+    seen, prior = known.get("obs", STATE), row["prior"]
+    ablation = (row["task"], row["data"], seen, row["nfe"]) == ("square", "mh", STATE, 1)
+    if ablation and row["sigma"] in PAPER_SIGMA.get(prior, {}):
+        return PAPER_SIGMA[prior][row["sigma"]]
+    if row["sigma"] != PAPER_DEFAULT_SIGMA.get(prior):
+        return math.nan
+    percent = PAPER_SUCCESS.get((row["task"], row["data"], seen), {}).get(prior, {}).get(row["nfe"])
+    return math.nan if percent is None else percent / 100

@@ -11,7 +11,7 @@ import pandas as pd
 from common import Cell, Policy, environment
 from options import Options
 from plots import plot_filmstrip, plot_learning_curves, plot_success
-from report import labelled, last_checkpoints
+from report import labelled, per_seed
 
 from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.tasks import EVALUATION_SEED
@@ -30,7 +30,7 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         played = [p for p in policies if p.name in set(mine.policy)]
         chunks = ", ".join(map(str, sorted(set(mine.chunk))))
         title = f"{played[0].task().title}, H = {chunks}"
-        plot_success(last_checkpoints(mine), out / f"success{end}.png", title=title)
+        plot_success(per_seed(mine, 1), out / f"success{end}.png", title=title)
         label = dict(zip(mine.policy, mine.method, strict=True))
         losses: dict[str, list[list[tuple[int, float]]]] = {}
         for policy in played:
@@ -38,6 +38,8 @@ def draw(options: Options, policies: Sequence[Policy], rows: pd.DataFrame) -> No
         fewest = mine[mine.nfe == min(mine.nfe)]
         plot_learning_curves(losses, fewest, out / f"learning_curves{end}.png", title=title)
         task = played[0].task()
+        if not options.run.films:
+            continue
         if task.environment is not None and rendering_backend() is None:
             print(
                 "No filmstrips: neither EGL nor OSMesa works here. On Debian or Ubuntu: "

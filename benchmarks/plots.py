@@ -12,13 +12,11 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from methods import Method, color
-from pandas import DataFrame, Series
-from paper import PAPER_SIGMA
-from report import agents, labelled, last_checkpoints, pooled, prior_label, seed_success, text_of
+from methods import color
+from pandas import DataFrame
 from torch import Tensor
 
-from warmprior.diagnostics import SeedSummary, success_posterior, summarize_seeds
+from warmprior.diagnostics import success_posterior
 from warmprior.envs.navigation1d import (
     HALF_HEIGHT,
     HALF_WIDTH,
@@ -29,6 +27,7 @@ from warmprior.envs.navigation1d import (
 
 ABOVE, BELOW, INK = "#1f77b4", "#d95f02", "#202020"  # sides of the toy's obstacles, and one path
 PALEST = 0.6  # share of white (or black, where the prior's own colour is bright) in the last shade
+RATES = ("success", "success_rate")
 
 
 # What the pictures share
@@ -49,6 +48,16 @@ def save(figure: Figure, path: str | Path, title: str, size: int = 10) -> None:
     figure.savefig(path, dpi=150)
 
 
+def dress(axis: Any, title: str = "", x: str = "", y: str = "", rate: bool = False) -> None:
+    """Title, labels, grid and, for a share of episodes, limits of an axis."""
+    axis.set_title(title, fontsize=10)
+    axis.set_xlabel(x)
+    axis.set_ylabel(y)
+    axis.grid(axis="y", alpha=0.25)
+    if rate:
+        axis.set_ylim(-0.02, 1.08)
+
+
 def colors_of(rows: DataFrame, name: str = "method") -> dict[Hashable, Any]:
     """The colour of each method: its prior's, in shades where several methods share a prior."""
     colors: dict[Hashable, Any] = {}
@@ -59,14 +68,6 @@ def colors_of(rows: DataFrame, name: str = "method") -> dict[Hashable, Any]:
             share = PALEST * place / max(1, len(methods) - 1)
             colors[method] = tuple((1 - share) * part + share * end for part in own)
     return colors
-
-
-def band(axis: Any, x: Sequence[float], points: Sequence[SeedSummary], **line: Any) -> None:
-    """A line of means, with one standard deviation over seeds shaded."""
-    mean = np.array([point.mean for point in points])
-    spread = np.nan_to_num([point.std for point in points])
-    drawn = axis.plot(x, mean, **{"marker": "o", "ms": 4, "lw": 1.4} | line)[0]
-    axis.fill_between(x, mean - spread, mean + spread, color=drawn.get_color(), alpha=0.2, lw=0)
 
 
 def legend_below(figure: Figure) -> None:
@@ -92,55 +93,20 @@ def legend_below(figure: Figure) -> None:
 
 
 def side_by_side(
-    axis: Any, rows: DataFrame, group: str, draw: Callable[[float, DataFrame, dict[str, Any]], None]
+    axis: Any, rows: DataFrame, group: str, draw: Callable[..., None], colors: Mapping[Hashable, Any]
 ) -> None:
     """Draw the methods of each group beside each other; the legend names each of them once."""
-    methods, groups = list(rows["method"].unique()), list(rows[group].unique())
+    methods, groups = list(colors), list(rows[group].unique())
     step, named = len(methods) + 0.8, set()
     for g, (_, members) in enumerate(rows.groupby(group, sort=False)):
         for method, cell in members.groupby("method", sort=False):
-            look = {"color": cell["color"].iloc[0], "label": None if method in named else method}
-            draw(g * step + methods.index(method), cell, look)
+            name = None if method in named else method
+            draw(g * step + methods.index(method), cell, color=colors[method], label=name)
             named.add(method)
     axis.set_xticks([g * step + (len(methods) - 1) / 2 for g in range(len(groups))], groups)
-    axis.grid(axis="y", alpha=0.25)
 
 
-def bars(
-    axis: Any,
-    rows: DataFrame,
-    group: str,
-    found: Callable[[DataFrame], SeedSummary],
-    form: str,
-    scale: float = 1.0,
-) -> None:
-    """Bars of means, with one standard deviation over seeds and the mean in writing."""
-
-    def draw(x: float, cell: DataFrame, look: dict[str, Any]) -> None:
-        point = found(cell)
-        std = None if math.isnan(point.std) else point.std
-        axis.bar(x, point.mean, 0.85, yerr=std, capsize=3, **look)
-        axis.annotate(
-            f"{scale * point.mean:{form}}",
-            (x, point.mean + (std or 0.0)),  # above the error bar
-            (0, 4),
-            textcoords="offset points",
-            annotation_clip=False,
-            ha="center",
-            fontsize=8,
-        )
-
-    side_by_side(axis, rows, group, draw)
-
-
-def coloured(rows: DataFrame, chunks: bool = True) -> DataFrame:
-    """The rows with their `method` in words and its `color`."""
-    rows = labelled(rows, chunks)
-    colors = colors_of(rows)
-    return rows.assign(color=[colors[method] for method in rows["method"]])
-
-
-# Comparisons
+# Comparisons of methods: rows have their `method` in words
 
 
 def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nfe") -> None:
@@ -148,13 +114,12 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
 
     The width at height p is the density Beta(k + 1, n - k + 1), the tick its mean; k/n stands below.
     """
-    rows = coloured(rows)
-    rows[group] = [f"NFE {name}" if group == "nfe" else str(name).upper() for name in rows[group]]
+    rows = rows.assign(group=group.upper() + " " + rows[group].astype(str).str.upper())
     width = 2.2 + 0.55 * (rows["method"].nunique() + 1) * rows[group].nunique()
     figure, (axis,) = new_figure(width, 4.2)
     grid = np.linspace(0.0, 1.0, 801)
 
-    def draw(x: float, cell: DataFrame, look: dict[str, Any]) -> None:
+    def draw(x: float, cell: DataFrame, **look: Any) -> None:
         k, n = int(cell["successes"].sum()), int(cell["episodes"].sum())
         posterior = success_posterior(k, n)
         density = posterior.pdf(grid)
@@ -163,25 +128,92 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
         axis.plot([x - 0.3, x + 0.3], [posterior.mean()] * 2, color="black", lw=1.2)
         axis.text(x, -0.025, f"{k}/{n}", ha="center", va="top", fontsize=7, color="0.35")
 
-    side_by_side(axis, rows, group, draw)
+    side_by_side(axis, rows, "group", draw, colors_of(rows))
+    dress(axis, title, y="success rate (posterior density)")
     axis.set_ylim(-0.08, 1.0)
-    axis.set_yticks(np.linspace(0, 1, 6))
-    axis.set_ylabel("success rate (posterior density)")
-    axis.set_title(title, fontsize=10)
     legend_below(figure)
     figure.savefig(path, dpi=150)
 
 
-def plot_bars(rows: DataFrame, path: str | Path, top_k: int, title: str) -> None:
-    """Success at one NFE as bars, a group per chunk length (Fig. 6)."""
-    rows = coloured(rows, chunks=False)
-    rows["group"] = "H = " + rows["chunk"].astype(str)
-    figure, (axis,) = new_figure(1.8 + 1.5 * rows["chunk"].nunique(), 3.6)
-    bars(axis, rows, "group", lambda cell: seed_success(cell, top_k), ".0f", 100)
-    axis.set_ylim(0, 1.08)
-    axis.set_ylabel(f"success rate (NFE {rows['nfe'].iloc[0]})")
+def plot_bars(
+    rows: DataFrame,
+    path: str | Path,
+    title: str,
+    group: str,
+    measures: Mapping[str, str],
+    column: str = "problem",
+) -> None:
+    """Means over seeds as bars with their deviation: a line of panels per measure, a panel per `column`.
+
+    Methods stand beside each other in groups; `measures` maps columns of the rows to what is written
+    beside the axis.
+    """
+    panels, colors = rows[column].unique(), colors_of(rows)
+    width = 1.0 + rows[group].nunique() * (0.6 + 0.33 * rows["method"].nunique())
+    figure, axes = new_figure(width * len(panels), 0.4 + 2.8 * len(measures), len(measures), len(panels))
+    places = [(name, panel) for name in measures for panel in panels]
+    for axis, (name, panel) in zip(axes, places, strict=True):
+        rate = name in RATES
+
+        def draw(x: float, cell: DataFrame, axis: Any = axis, name: str = name, **look: Any) -> None:
+            mean, std = cell[name].mean(), cell[name].std()
+            shown = f"{100 * mean:.0f}" if name in RATES else f"{mean:.2f}"
+            axis.bar(x, mean, 0.85, yerr=None if math.isnan(std) else std, capsize=3, **look)
+            above = mean + (0.0 if math.isnan(std) else std)  # the error bar
+            axis.annotate(shown, (x, above), (0, 4), textcoords="offset points", ha="center", fontsize=8)
+
+        known = rows[(rows[column] == panel) & rows[name].notna()]
+        side_by_side(axis, known, group, draw, colors)
+        first = panel == panels[0]
+        dress(axis, panel, y=measures[name] if first else "", rate=rate)
+        if not rate:
+            axis.margins(y=0.1)  # for the numbers above the bars
+            axis.set_ylim(bottom=0)
     legend_below(figure)
     save(figure, path, title)
+
+
+def plot_lines(
+    rows: DataFrame,
+    path: str | Path,
+    title: str,
+    x: str,
+    measures: Mapping[str | tuple[str, str], str],
+    column: str = "nfe",
+    scale: str = "even",
+) -> list[Any]:
+    """Means over seeds against `x`, their deviation shaded: panels in a line per measure, one per `column`.
+
+    Of a pair of measures the second is dotted. The values of `x` stand evenly, in the order of the rows, or
+    on the `log` or `linear` scale. Returns the axes.
+    """
+    panels, values, colors = rows[column].unique(), list(rows[x].unique()), colors_of(rows)
+    figure, axes = new_figure(3.6 * len(panels), 0.4 + 2.8 * len(measures), len(measures), len(panels))
+    places = [(names, panel) for names in measures for panel in panels]
+    for axis, (names, panel) in zip(axes, places, strict=True):
+        pair = (names,) if isinstance(names, str) else names
+        for method, group in rows[rows[column] == panel].groupby("method", sort=False):
+            for name, style in zip(pair, ("-", ":"), strict=False):
+                points = group.dropna(subset=[name]).astype({name: float}).groupby(x, sort=False)[name]
+                mean, std = points.mean(), points.std().fillna(0.0)
+                at = [values.index(value) if scale == "even" else value for value in mean.index]
+                look = {"color": colors[method], "ls": style, "label": method if style == "-" else None}
+                axis.plot(at, mean, marker="o", ms=3, lw=1.3, **look)
+                axis.fill_between(at, mean - std, mean + std, color=colors[method], alpha=0.2, lw=0)
+        first, rate = panel == panels[0], pair[0] in RATES
+        words = panel if isinstance(panel, str) else f"{column.upper()} {panel}"
+        dress(axis, words, x.replace("_", " "), measures[names] if first else "", rate)
+        if not rate:
+            axis.set_ylim(bottom=0)
+        if scale == "log":
+            axis.set_xscale("log")
+            axis.minorticks_off()
+        if scale != "linear":
+            ticks = values if scale == "log" else range(len(values))
+            axis.set_xticks(ticks, [f"{value:,g}" for value in values], fontsize=8)
+    legend_below(figure)
+    save(figure, path, title)
+    return axes
 
 
 def plot_learning_curves(
@@ -192,26 +224,20 @@ def plot_learning_curves(
 ) -> None:
     """Loss and success against the iteration; `losses` by method, a list of (iteration, loss) per seed."""
     figure, (left, right) = new_figure(9.0, 3.6, columns=2)
-    rows = labelled(rows)
     colors = colors_of(rows)
     for method, seeds in losses.items():
         for i, curve in enumerate(seeds):
             name = method if i == 0 else None
-            left.plot(*zip(*curve, strict=True), color=colors.get(method), lw=1.0, label=name)
+            left.plot(*zip(*curve, strict=True), color=colors[method], lw=1.0, label=name)
     for method, group in rows.groupby("method", sort=False):
-        points = {n: seed_success(cell, 1) for n, cell in group.groupby("checkpoint")}
-        mean, std = np.array([(point.mean, point.std) for point in points.values()]).T
+        rates = group.groupby("checkpoint")["success_rate"]
         look = {"marker": "o", "ms": 4, "lw": 1.0, "capsize": 2, "color": colors[method]}
-        right.errorbar(list(points), mean, yerr=np.nan_to_num(std), **look)
+        right.errorbar(rates.mean().index, rates.mean(), yerr=rates.std().fillna(0.0), **look)
     left.set_yscale("log")
-    left.set_ylabel("flow-matching loss (own source)")
+    dress(left, x="iteration", y="flow-matching loss (own source)")
+    dress(right, x="iteration", y=f"success rate (NFE {rows['nfe'].iloc[0]})", rate=True)
     right.set_xlim(left.get_xlim())
-    right.set_ylim(-0.02, 1.02)
-    right.set_ylabel(f"success rate (NFE {rows['nfe'].iloc[0]})")
-    for axis in (left, right):
-        axis.set_xlabel("iteration")
-        axis.grid(alpha=0.25)
-    left.legend(frameon=False, fontsize=8)
+    legend_below(figure)
     save(figure, path, title)
 
 
@@ -223,193 +249,6 @@ def plot_filmstrip(frames: Sequence[np.ndarray], labels: Sequence[str], path: st
         axis.set_axis_off()
         axis.text(0.5, -0.04, label, transform=axis.transAxes, ha="center", va="top", fontsize=7)
     save(figure, path, title, 9)
-
-
-def plot_agents(rows: DataFrame, path: str | Path, title: str, warmup_steps: int) -> None:
-    """Success of agents against control steps (Fig. 7), of the greedy and of the stochastic one.
-
-    Seeds are averaged evaluation by evaluation: they are due at the same number of control steps, and made
-    at the next decision.
-    """
-    figure, axes = new_figure(10.0, 3.8, 1, 2, share=True)
-    rows = agents(rows)
-    rows["source"] = [prior_label(row) for row in rows.to_dict("records")]
-    colors = colors_of(rows, "source")
-    for axis, kind in zip(axes, ("greedy", "stochastic"), strict=True):
-        shown = rows[rows["evaluation"].isin(["base", kind])]
-        for agent, group in shown.groupby("agent", sort=False):
-            first, seeds = group.iloc[0], group.groupby("seed", sort=False)
-            # What all seeds have.
-            points = list(group.groupby(seeds.cumcount()))[: seeds.size().min()]
-            style = "--" if first["algorithm"] == "dsrl-sac" else "-"
-            band(
-                axis,
-                [point["environment_steps"].mean() for _, point in points],
-                [summarize_seeds(list(point["success_rate"])) for _, point in points],
-                **{"color": colors[first["source"]], "ls": style, "ms": 3, "label": agent},
-            )
-        axis.axvspan(0, warmup_steps, color="0.92", lw=0, zorder=-1)
-        axis.set_title(f"{kind} agent; at 0 the frozen policy", fontsize=9)
-        axis.set_xlabel("control steps (shaded: warm-up)")
-        axis.set_ylim(-0.02, 1.02)
-        axis.grid(alpha=0.25)
-    axes[0].set_ylabel("success rate")
-    axes[0].legend(frameon=False, fontsize=8, loc="lower right")
-    save(figure, path, title)
-
-
-# Studies
-
-
-def plot_sigma(rows: DataFrame, curvatures: DataFrame, path: str | Path, top_k: int, title: str) -> None:
-    """Success at one NFE against sigma, and curvature and branching bound relative to the first policy's.
-
-    A panel per source that takes sigma. Curvature and bound are those of the executed positions, with the
-    mean of the training. The paper's success is added where it measured the same.
-    """
-    measured = pooled(curvatures[curvatures["mean"] == "training"])
-    rows, measured = (
-        part.assign(source=[prior_label(row) for row in part.to_dict("records")]) for part in (rows, measured)
-    )
-    first = rows.iloc[0]
-    same = [first.get(name) for name in ("task", "data", "chunk", "nfe")] == ["square", "mh", 8, 1]
-    sources = {source: group for source, group in rows.groupby("source", sort=False)}
-    warm = [
-        source
-        for source, group in sources.items()
-        if Method(group["prior"].iloc[0], int(first["chunk"])).takes_sigma
-    ]
-    base = next((source for source in sources if source not in warm), None)
-    figure, axes = new_figure(5.2 * len(warm), 4.2, 1, len(warm))
-    for axis, source in zip(axes, warm, strict=True):
-        group = sources[source].sort_values("sigma", ascending=False, kind="stable")
-        prior, sigmas = group["prior"].iloc[0], list(group["sigma"].unique())
-        points = [seed_success(cell, top_k) for _, cell in group.groupby("sigma", sort=False)]
-        band(axis, range(len(sigmas)), points, color=color(prior), label="success rate")
-        if base is not None:
-            line = {"color": color(sources[base]["prior"].iloc[0]), "ls": "--", "lw": 1.2}
-            axis.axhline(seed_success(sources[base], top_k).mean, label=base, **line)
-        if same and not any(text_of(group.iloc[0], name) for name in ("options", "obs")):
-            paper = PAPER_SIGMA.get(prior, {})
-            x = [i for i, sigma in enumerate(sigmas) if sigma in paper]
-            look = {"color": "black", "ms": 10, "label": "paper"}
-            axis.plot(x, [paper[sigmas[i]] for i in x], "*", **look)
-        right = axis.twinx()
-        at = measured[(measured["source"] == source) & measured["sigma"].isin(sigmas)]
-        for name, marker, words in (
-            ("ratio_executed", "s", "curvature (executed H)"),
-            ("bound_executed", "^", "branching bound"),
-        ):
-            scale = 1.0 if name == "ratio_executed" else measured[name].iloc[0]
-            known = at[at[name].notna()].sort_values("sigma", ascending=False)
-            if len(known) and scale:
-                x = [sigmas.index(sigma) for sigma in known["sigma"]]
-                look = {"color": "0.3", "ls": ":", "marker": marker, "ms": 4, "lw": 1.0}
-                right.plot(x, list(known[name] / scale), label=words, **look)
-        right.set_ylim(bottom=0)
-        right.set_ylabel("relative to the first policy")
-        axis.set_xticks(range(len(sigmas)), [f"{sigma:g}" for sigma in sigmas])
-        axis.set_xlabel(r"$\sigma$")
-        axis.set_ylim(-0.02, 1.02)
-        axis.set_ylabel("success rate")
-        axis.set_title(source, fontsize=10)
-        axis.grid(axis="y", alpha=0.25)
-        both = zip(axis.get_legend_handles_labels(), right.get_legend_handles_labels(), strict=True)
-        axis.legend(*(a + b for a, b in both), fontsize=7, frameon=False, loc="upper right")
-    save(figure, path, title)
-
-
-def success_above(
-    rows: DataFrame, x: str, scale: Callable[[float], float], width: float, top_k: int, below: Any
-) -> tuple[Figure, list[Any], list[Any]]:
-    """A column per NFE, in the order of the rows: success against `x` above, and what `below` draws."""
-    nfes = rows["nfe"].unique()
-    figure, axes = new_figure(width * len(nfes), 6.0, 2, len(nfes))
-    for nfe, upper, lower in zip(nfes, axes, axes[len(nfes) :], strict=False):
-        for method, group in rows[rows["nfe"] == nfe].groupby("method", sort=False):
-            found, own = dict(list(group.groupby(x))), group["color"].iloc[0]
-            places, cells = [scale(value) for value in found], list(found.values())
-            points = [seed_success(cell, top_k) for cell in cells]
-            band(upper, places, points, color=own, label=method)
-            below(lower, places, cells, own)
-        upper.set_title(f"NFE {nfe}", fontsize=10)
-        upper.set_ylim(-0.02, 1.02)
-        lower.set_ylim(bottom=0)
-        for axis in (upper, lower):
-            axis.grid(alpha=0.25)
-    axes[0].set_ylabel("success rate")
-    axes[0].legend(frameon=False, fontsize=8)
-    return figure, axes, axes[len(nfes) :]
-
-
-def plot_chunk_lengths(rows: DataFrame, path: str | Path, top_k: int, title: str) -> None:
-    """Success against the chunk length, and below the jumps of the last checkpoints.
-
-    Drawn through is the jump at boundaries of chunks, dotted that between the actions inside, in normalised
-    action units.
-    """
-    rows = coloured(rows, chunks=False).sort_values("nfe", ascending=False, kind="stable")
-    chunks = sorted(rows["chunk"].unique())
-
-    def below(axis: Any, x: list[float], cells: list[DataFrame], own: Any) -> None:
-        for name, style in (("boundary_jump", "-"), ("inner_jump", ":")):
-            jumps = [last_checkpoints(cell)[name].astype(float).mean() for cell in cells]
-            known = Series(jumps, x).dropna()
-            axis.plot(known.index, known, color=own, ls=style, marker="o", ms=3, lw=1.2)
-
-    figure, axes, lower = success_above(rows, "chunk", chunks.index, 3.4, top_k, below)
-    for axis in axes:
-        axis.set_xticks(range(len(chunks)), [str(chunk) for chunk in chunks])
-    for axis in lower:
-        axis.set_xlabel("chunk length H")
-    lower[0].set_ylabel("jump at boundaries (dotted: inside)")
-    save(figure, path, title)
-
-
-def plot_budget(rows: DataFrame, path: str | Path, top_k: int, title: str) -> None:
-    """Success, and below the error on held-out demonstrations, against the iterations of the training."""
-    rows = coloured(rows).sort_values("nfe", kind="stable")
-    budgets = sorted(rows["iterations"].unique())
-
-    def below(axis: Any, x: list[float], cells: list[DataFrame], own: Any) -> None:
-        band(axis, x, [summarize_seeds(list(cell["action_error"])) for cell in cells], color=own)
-
-    figure, axes, lower = success_above(rows, "iterations", float, 3.6, top_k, below)
-    for axis in axes:
-        axis.set_xscale("log")
-        axis.set_xticks(budgets, [f"{budget:,}" for budget in budgets], fontsize=8)
-        axis.minorticks_off()
-    for axis in lower:
-        axis.set_xlabel("iterations")
-    lower[0].set_ylabel("squared error of executed actions, held out", fontsize=9)
-    save(figure, path, title)
-
-
-def plot_delays(rows: DataFrame, path: str | Path, top_k: int, title: str) -> None:
-    """Success at one NFE, and jumps where chunks take effect, as bars in groups of one delay."""
-    rows = coloured(rows.sort_values("delay", kind="stable"))
-    rows["group"] = "delay " + rows["delay"].astype(str)
-    rows["panel"] = rows["task"] + " " + rows["data"]
-    panels = rows["panel"].unique()
-    width = 1.0 + rows["delay"].nunique() * (0.6 + 0.33 * rows["method"].nunique())
-    figure, axes = new_figure(width * len(panels), 6.0, 2, len(panels))
-
-    def jump(cell: DataFrame) -> SeedSummary:
-        return summarize_seeds(list(cell["boundary_jump"]))
-
-    for panel, above, below in zip(panels, axes, axes[len(panels) :], strict=False):
-        members = rows[rows["panel"] == panel]
-        known = last_checkpoints(members[members["boundary_jump"].notna()])
-        bars(above, members, "group", lambda cell: seed_success(cell, top_k), ".0f", 100)
-        bars(below, known, "group", jump, ".2f")
-        above.set_title(panel, fontsize=10)
-        above.set_ylim(0, 1.08)
-        below.margins(y=0.1)  # for the numbers above the bars
-        below.set_ylim(bottom=0)
-    axes[0].set_ylabel(f"success rate (NFE {rows['nfe'].iloc[0]})")
-    axes[len(panels)].set_ylabel("jump where chunks take effect")
-    legend_below(figure)
-    save(figure, path, title)
 
 
 # The navigation toy, and paths of the flow
@@ -453,16 +292,15 @@ def plot_navigation(
             axis.plot(x, drawn[0], color=INK, lw=1.3)
             axis.plot(x[::chunk_length], drawn[0, ::chunk_length], "o", color=INK, ms=2.8)
         letter = f"({ascii_lowercase[i]}) " if i < len(ascii_lowercase) else ""
-        axis.set_title(f"{letter}{name}", fontsize=10)
+        below = i >= len(panels) + 1 - 3
+        dress(
+            axis, letter + name, "position (observation)" if below else "", "" if i % 3 else "height (action)"
+        )
         place = {"transform": axis.transAxes, "ha": "center", "va": "bottom", "fontsize": 8}
         axis.text(0.5, 0.02, "\n".join(lines), **place)
         axis.set_xlim(-1, 1)
         axis.set_ylim(-1.5, 1.15)
         axis.set_yticks([-1, 0, 1])
-        if i % 3 == 0:
-            axis.set_ylabel("height (action)")
-        if i >= len(panels) + 1 - 3:
-            axis.set_xlabel("position (observation)")
     save(figure, path, title)
 
 
@@ -474,8 +312,6 @@ def plot_flow_paths(paths: Mapping[str, Tensor], path: str | Path, title: str) -
         sides(axis, np.linspace(0.0, 1.0, values.shape[1]), values, -1, lw=0.7, alpha=0.5)
         for time, end in ((0.0, values[:, 0]), (1.0, values[:, -1])):
             axis.plot(np.full(len(end), time), end, "o", color=INK, ms=1.8, alpha=0.6)
-        axis.set_title(name, fontsize=9)
-        axis.set_xlabel("flow time t")
-        axis.grid(alpha=0.25)
+        dress(axis, name, "flow time t")
     axes[0].set_ylabel("first action of the chunk")
     save(figure, path, title)

@@ -18,6 +18,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_type_hints
 
+import pandas as pd
 import tyro
 from common import Rows, facts_of, finished_policies, policies_of, slug, trained_actors
 from methods import Method
@@ -36,8 +37,8 @@ from options import (
     study,
     with_parts,
 )
-from plots import plot_agents, plot_success
-from report import agent_table, problem_title, read_rows, write_report
+from plots import plot_lines, plot_success
+from report import labelled, problem_title, read_rows, table, write_report
 from robomimic import train_all
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose
@@ -69,7 +70,7 @@ AgentOptions: Any = make_dataclass(
         if f.name not in SHARED and f.default is not MISSING
     ],
     frozen=True,
-    namespace={"__doc__": PriorSpaceConfig.__doc__},
+    namespace={"__doc__": str(PriorSpaceConfig.__doc__).replace("``", "")},
 )
 
 
@@ -357,15 +358,36 @@ def main(argv: list[str] | None) -> None:
             rows.add(*({**facts, "delta": training.decoder.delta, **point} for point in training.curve))
         if not rows.rows:
             raise FloatingPointError("; ".join(failures))
-        found = read_rows(rows.path)
+        found = labelled(read_rows(rows.path))
         title = f"{problem_title(task)}, NFE {options.evaluation.nfe[0]}"
-        plot_agents(found, out / "curves.png", title=title, warmup_steps=options.rl.warmup_steps)
-        greedy = found[found.evaluation == "greedy"]
-        ends = greedy.groupby(["algorithm", "prior", "options", "seed"], sort=False).tail(1)
-        title = f"{title}: greedy agents"
-        plot_success(ends, out / "success.png", title=title, group="algorithm")
-        table = agent_table(found)
-        write_report(out, table, table, found, failures)
+        draw(found, out / "curves.png", title, options.rl.warmup_steps)
+        agents = ["algorithm", "method", "evaluation"]
+        last = found.groupby([*agents, "seed"], sort=False).tail(1)
+        greedy = last[last.evaluation == "greedy"]
+        plot_success(greedy, out / "success.png", f"{title}: greedy agents", group="algorithm")
+        last = last.assign(seeds=last.groupby(agents)["seed"].transform("nunique"))
+        text = table(last, agents, ["seeds", "delta", "environment_steps", "success_rate"])
+        write_report(out, text, text, found, failures)
+
+
+def draw(rows: pd.DataFrame, path: Path, title: str, warmup_steps: int) -> None:
+    """Success of greedy and of stochastic agents against control steps (Fig. 7); at 0 the frozen policy.
+
+    Seeds are averaged evaluation by evaluation: they are due at the same number of control steps, and made
+    at the next decision.
+    """
+    kinds = ("greedy", "stochastic")
+    parts = [rows[rows.evaluation.isin(["base", kind])].assign(panel=f"{kind} agent") for kind in kinds]
+    shown = pd.concat(parts)
+    shown["method"] = shown.algorithm.str.upper() + ", " + shown.method
+    agent = ["panel", "method"]
+    number = shown.groupby([*agent, "seed"]).cumcount()
+    same = shown.groupby([*agent, number])
+    shown["environment_steps"] = same["environment_steps"].transform("mean")
+    # What all seeds have.
+    shown = shown[same["seed"].transform("size") == shown.groupby(agent)["seed"].transform("nunique")]
+    lines = {"success_rate": f"success rate (from {warmup_steps:,} steps on it learns)"}
+    plot_lines(shown, path, title, "environment_steps", lines, "panel", "linear")
 
 
 if __name__ == "__main__":

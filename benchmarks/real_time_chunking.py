@@ -19,8 +19,8 @@ from typing import Literal
 from common import Cell, policies_of
 from methods import Method
 from options import PRESETS, Options, check_single, parse, script, started, study
-from plots import plot_delays
-from report import delay_table, write_report
+from plots import plot_bars
+from report import labelled, per_seed, table, write_report
 from robomimic import compare
 
 from warmprior.modules.checks import check_whole_numbers
@@ -102,15 +102,24 @@ def main(argv: list[str] | None) -> None:
         alone = options.toy == "alone"
         policies = policies_of(options, options.sources.methods(), *toy, only=alone)
         rows, failures = compare(options, policies, options.conditions)
-        top_k, several = options.evaluation.top_k, rows.nfe.nunique() > 1
-        for nfe, mine in rows.groupby("nfe"):
-            end = f"_nfe{nfe}.png" if several else ".png"
-            title = f"{mine.execute.iloc[0]} actions per decision, {options.evaluation.seeds} seed(s)"
-            plot_delays(mine, out / f"real_time_chunking{end}", top_k=top_k, title=title)
+        seeds = per_seed(labelled(rows), options.evaluation.top_k)
+        seeds = seeds.sort_values(["nfe", "delay"], ascending=[False, True], kind="stable")
+        lines = {"success": "success rate", "boundary_jump": "jump where chunks take effect"}
+        for nfe, mine in seeds.groupby("nfe"):
+            end = f"_nfe{nfe}.png" if seeds.nfe.nunique() > 1 else ".png"
+            title = (
+                f"NFE {nfe}, {mine.execute.iloc[0]} actions per decision, {options.evaluation.seeds} seed(s)"
+            )
+            mine = mine.assign(delay="delay " + mine.delay.astype(str))
+            plot_bars(mine, out / f"real_time_chunking{end}", title, "delay", lines)
         given = {f.name.replace("_", " "): getattr(options.rtc, f.name) for f in fields(options.rtc)}
         guidance = ", ".join(f"{name} {value}" for name, value in given.items() if value is not None)
-        table = delay_table(rows, top_k, guidance)
-        write_report(out, table, table, rows, failures)
+        notes = [f"{seeds.execute.iloc[0]} actions per decision at every delay. RTC: {guidance}."]
+        if "rtc" in options.guidance and options.rtc.sigma is None:
+            notes.append("Without a sigma, the weight of the guidance is that of the source's own width.")
+        names = ["success", "boundary_jump", "inner_jump"]
+        text = table(seeds, ["problem", "nfe", "delay", "method"], names, notes)
+        write_report(out, text, text, rows, failures)
 
 
 if __name__ == "__main__":

@@ -62,12 +62,13 @@ def run(
         rows, failures = compare(options, policies)
 
         # The table, and what the flows look like.
-        results = summary(rows, options.evaluation.top_k)
+        top_k = options.evaluation.top_k
+        results = summary(rows, top_k)
         source = policies[0].task().facts.get("source")
         notes = beside(options, presets["paper"]) + smaller(options, presets["paper"])
-        full = success_report(results, notes, source)
+        full = success_report(results, top_k, notes, source)
         try:
-            write_report(out, terminal_table(results), full, results, failures)
+            write_report(out, terminal_table(results, top_k), full, results, failures)
         finally:
             draw(options, policies, rows)  # pictures are the lesser loss
 
@@ -94,8 +95,7 @@ def compare(
             f"{rows.path} has rows of {min(others)}: it was begun with other versions or data. Finish it "
             "with those, or choose another --out"
         )
-    describe(options, policies)
-    failures = train_together(policies)
+    failures = begin(options, policies)
     with Jobs(options.run, [options.run.folder, policies_folder(options.run)]) as jobs:
         for policy in sorted(policies, key=lambda policy: policy.training.seed):
             cells = [
@@ -118,8 +118,7 @@ def compare(
 
 def train_all(options: Options, policies: Sequence[Policy]) -> None:
     """Train what is missing, and play nothing."""
-    describe(options, policies)
-    failures = train_together(policies)
+    failures = begin(options, policies)
     with Jobs(options.run, [options.run.folder, policies_folder(options.run)]) as jobs:
         for policy in policies:
             jobs.submit(str(policy), train, policy, training=True, status=policy.status)
@@ -127,16 +126,16 @@ def train_all(options: Options, policies: Sequence[Policy]) -> None:
             raise PartialFailure("; ".join(f"{name}: {why}" for name, why in failures.items()))
 
 
-def describe(options: Options, policies: Sequence[Policy]) -> None:
-    """Write `tasks.json`: what the demonstrations are."""
+def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
+    """Write `tasks.json`, and under torchrun train each policy in all processes together; what failed.
+
+    The first process goes on alone.
+    """
     tasks = {policy.place: policy.task() for policy in policies}.values()
     text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
     if not rank():
         write_atomic(options.run.folder / "tasks.json", lambda path: path.write_text(text))
 
-
-def train_together(policies: Sequence[Policy]) -> dict[str, str]:
-    """Under torchrun all processes train each policy together, and the first one goes on; what failed."""
     failures = {}
     for policy in policies if world_size() > 1 else ():
         try:

@@ -9,15 +9,18 @@ The policies of robomimic.py with the same options are used, not trained again.
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 from common import observations_of, policies_of, replace_rows, trained_actors
 from measures import straightness
 from options import PRESETS, MeasuredOptions, Options, check_single, parse, script, started, study
-from plots import plot_sigma
-from report import sigma_table, write_report
+from paper import paper_success
+from plots import plot_lines
+from report import labelled, per_seed, pooled, table, write_report
 from robomimic import compare
 
 SIGMAS = (1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0)
@@ -27,6 +30,20 @@ def preset(base: Options) -> MeasuredOptions:
     """The paper's seven, at one network evaluation per chunk."""
     sources, evaluation = replace(base.sources, sigma=SIGMAS), replace(base.evaluation, nfe=(1,))
     return study(MeasuredOptions, base, sources=sources, evaluation=evaluation)
+
+
+def draw(rows: pd.DataFrame, curvatures: pd.DataFrame, path: Path, top_k: int, title: str) -> None:
+    """Success and, relative to the first policy, curvature and branching bound against sigma.
+
+    A line per source; one that takes no sigma has a single point.
+    """
+    flow = pooled(curvatures[curvatures["mean"] == "training"])
+    flow = flow.assign(relative_bound=flow.bound_executed / (flow.bound_executed.iloc[0] or math.nan))
+    both = labelled(pd.concat([per_seed(rows, top_k), flow]), "sigma", "chunk")
+    both = both.assign(panel=title).sort_values("sigma", ascending=False, kind="stable")
+    pair = ("ratio_executed", "relative_bound")
+    lines = {"success": "success rate", pair: "curvature (dotted: bound)"}
+    plot_lines(both, path, "", "sigma", lines, column="panel")
 
 
 @script("sigma.py")
@@ -47,17 +64,16 @@ def main(argv: list[str] | None) -> None:
             draws=options.held_out.draws,
         )
         curvatures = replace_rows(out / "curvature.jsonl", flow)
-        top_k, task = options.evaluation.top_k, policies[0].task()
-        chunk, nfe = options.sources.chunk[0], options.evaluation.nfe[0]
-        plot_sigma(
-            rows,
-            curvatures,
-            out / "sigma.png",
-            top_k=top_k,
-            title=f"{task.title}, H = {chunk}, NFE {nfe}, {options.evaluation.seeds} seed(s)",
-        )
-        table = sigma_table(rows, curvatures, top_k) + f"- Flow: on {source}.\n"
-        write_report(out, table, table, pd.concat([rows, curvatures]), failures)
+        title = f"{policies[0].task().title}, NFE {options.evaluation.nfe[0]}"
+        draw(rows, curvatures, out / "sigma.png", options.evaluation.top_k, title)
+        seeds = per_seed(labelled(rows, "sigma"), options.evaluation.top_k)
+        seeds = seeds.assign(paper=seeds.apply(paper_success, axis=1))
+        text = table(seeds, ["method", "sigma"], ["success", "paper"])
+        flow = labelled(pooled(curvatures), "sigma")
+        names = ["ratio_executed", "ratio_relative", "bound_executed"]
+        notes = [f"Flow: on {source}, relative to the first policy. -: the policy predicts no motion."]
+        text += "\n" + table(flow, ["method", "sigma", "mean"], names, notes)
+        write_report(out, text, text, pd.concat([rows, curvatures]), failures)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 
+import numpy as np
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
@@ -11,7 +12,7 @@ from tests.io.hub_server import TOKEN, model_hub
 from tests.processes import apart
 from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
 from warmprior.__main__ import main
-from warmprior.training.saved import save_policy
+from warmprior.training.saved import load_policy, save_policy
 
 pytest.importorskip("robosuite")
 from warmprior.envs import rendering_backend
@@ -155,6 +156,7 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
         ("--dataset missing.hdf5", "--dataset missing.hdf5: no such file"),
         ("--encoder small", "--encoder belong to --obs image"),
         ("--chunk 0", "chunk_length"),
+        ("--observation-keys state", "--observation-keys belongs to --dataset lerobot:"),
     ],
 )
 def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, message):
@@ -162,6 +164,27 @@ def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, m
     said = capsys.readouterr().err
     assert message in said and said.startswith("warmprior: error: ")
     assert not (tmp_path / "out").exists()
+
+
+def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
+    pytest.importorskip("lerobot.datasets")
+    from lerobot.datasets import LeRobotDataset
+
+    features = {
+        name: {"dtype": "float32", "shape": (width,), "names": None}
+        for name, width in {"arm": 3, "cup": 2, "action": 4}.items()
+    }
+    dataset = LeRobotDataset.create("local/cups", 10, features, root=tmp_path / "cups", use_videos=False)
+    for _ in range(2):
+        for step in range(12):
+            values = {name: np.full(f["shape"], step, np.float32) for name, f in features.items()}
+            dataset.add_frame({**values, "task": "stack cups"})
+        dataset.save_episode()
+    dataset.finalize()
+    words = f"train --dataset lerobot:{tmp_path / 'cups'} --observation-keys arm cup --iterations 2"
+    assert main([*words.split(), "--hidden-dim", "8", "--out", str(tmp_path / "out")]) == 0
+    actor = load_policy(capsys.readouterr().out.strip())
+    assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
 
 
 def test_demonstrations_replace_no_file(tmp_path, capsys):

@@ -11,6 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from warmprior.data import lerobot_steps
+from warmprior.data.opening import LEROBOT, name_of_place
 from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
@@ -18,6 +20,7 @@ from warmprior.modules.registry import make
 from warmprior.training import (
     DataOptions,
     NetworkOptions,
+    Task,
     TrainingConfig,
     find_tasks,
     train_policy,
@@ -134,6 +137,7 @@ class Train:
         prior: its source (gaussian, past, preview, or package.module:Class of your own); options follow as in
             past,sigma=0.3.
         chunk: chunk length H.
+        observation_keys: of a LeRobotDataset of any robot: the features that policies see, in this order.
         out: folder of the trainings (default: policies); an interrupted one continues.
         device: of the network, such as cuda.
     """
@@ -143,8 +147,22 @@ class Train:
     training: TrainingConfig
     prior: str = "past"
     chunk: int = 8
+    observation_keys: tuple[str, ...] = ()
     out: Path | None = None
     device: str = "cpu"
+
+
+def _tasks(options: Train) -> list[Task]:
+    data, keys = options.data, options.observation_keys
+    if not keys:
+        return find_tasks(data, options.network.observation_steps)
+    place = str(data.dataset)
+    if not place.startswith(LEROBOT):
+        raise ValueError("--observation-keys belongs to --dataset lerobot:FOLDER or lerobot:USER/NAME")
+    steps = lerobot_steps(place.removeprefix(LEROBOT), keys)
+    if (first := data.first("ph")) is not None:
+        steps = steps[steps["episode"] < first]
+    return [Task.of(name_of_place(place), steps)]
 
 
 def train(args: argparse.Namespace) -> None:
@@ -160,7 +178,7 @@ def train(args: argparse.Namespace) -> None:
     )
     options.network.check(options.data)
     prior = make(Prior, options.prior, options.chunk)
-    for task in find_tasks(options.data, options.network.observation_steps):
+    for task in _tasks(options):
         name = f"{task.name}-{task.style}-{prior.name}-seed{options.training.seed}"
         folder = (options.out or Path("policies")) / name
         train_policy(

@@ -12,7 +12,6 @@ from learned_sources import (
     ForecastPrior,
     ForecastStart,
     LeapPrior,
-    LearnedPrior,
     LearningWindows,
     learn,
 )
@@ -308,8 +307,6 @@ def test_bad_input_is_named(data):
     nested = TensorDict({"pose": torch.zeros(1, 1, D_O)}, [1])
     with pytest.raises(ValueError, match=r"ForecastPrior takes one tensor.*nested"):
         built(ForecastPrior).distribution(history, nested)
-    with pytest.raises(NotImplementedError):
-        LearnedPrior(H, widths=[1, 1, 1])
     prior = built(ForecastPrior)
     for options in ({"iterations": 0}, {"iterations": 1, "held_out": 1.0}):
         with pytest.raises(ValueError, match="iterations >= 1"):

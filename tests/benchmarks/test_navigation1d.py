@@ -32,7 +32,7 @@ def test_run_writes_rows_report_and_pictures(tmp_path, capsys):
     deployed = {row["prior"] for row in curved if row["mean"] == "deployed"}
     assert deployed == {"past"}
     report = (out / "report.md").read_text()
-    assert report in capsys.readouterr().out and report.count("NFE") >= 4 * 2 - 1
+    assert report.partition("\n\nColumns")[0] in capsys.readouterr().out
     for picture in ("navigation1d.png", "flow_paths.png"):
         assert is_png(out / picture)
 
@@ -69,4 +69,4 @@ def test_a_picture_that_cannot_be_drawn_costs_no_table(tmp_path, capsys, monkeyp
     few = {"iterations": 2, "episodes": 2, "chunk": 32, "nfe": 1, "prior": "gaussian", "envs": 1}
     argv = command_line(**few, logger="none", out=out)
     assert "no picture" in refused(navigation1d.main, argv, capsys)
-    assert "| Base, NFE 1 |" in (out / "report.md").read_text()
+    assert "| Base | 1 |" in (out / "report.md").read_text()

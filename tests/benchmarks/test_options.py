@@ -96,6 +96,9 @@ def test_every_option_has_its_own_name():
         ("--task nothing", "unknown task 'nothing'"),
         ("--data source", "--data source is that of MimicGen's files: add --download"),
         ("--seed -1", "seed must be at least 0"),
+        (f"--seed {2**63 - 1} --seeds 2", "--seed must be below 2**63"),
+        ("--network chi_transformer --hidden-dim 32", "--hidden-dim 32: num_heads must divide"),
+        ("--task own.module:task --actions absolute", "--actions belongs to robosuite's tasks"),
         ("--learning-rate nan", "learning_rate must be a finite number > 0"),
         ("--betas 0.9 2", "betas must lie in [0, 1)"),
         ("--self-distillation -1", "self_distillation must be a finite weight >= 0, got -1"),
@@ -232,7 +235,11 @@ def test_help_says_what_every_option_is(script, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "90")  # one column of boxes
     with pytest.raises(SystemExit):
         importlib.import_module(script).main(["--help"])
-    text = capsys.readouterr().out.partition("show this help")[2]  # behind the examples
+    examples, _, text = capsys.readouterr().out.partition("show this help")
+    assert re.search(r"^\$ python benchmarks/\w+\.py", examples, re.M)
+    assert not re.search(r"(?<!\$) python benchmarks", examples)
+    assert "``" not in text and ":class:" not in text
+    assert "prior_space_rl.py quick, unit and paper" in re.sub(r"[\s│]+", " ", text)
     lines = "\n".join(line.strip("│ ") for line in text.splitlines())
     entries = re.split(r"\n(?=--[a-z])", lines)[1:]
     names, texts = zip(*(entry.split(maxsplit=1) for entry in entries), strict=True)

@@ -39,7 +39,9 @@ def row(won=5, episodes=10, **more):
     k, n = outcomes.count("1"), len(outcomes)
     counts = {"successes": k, "episodes": n, "success_rate": k / n, "outcomes": outcomes}
     more.setdefault("sigma", SIGMA.get(more.get("prior"), 1.0))
-    return FACTS | counts | more
+    made = FACTS | counts | more
+    of_a_policy = ("task", "data", "obs", "prior", "options", "sigma", "chunk", "seed", "iterations")
+    return {"policy": "-".join(str(made.get(name)) for name in of_a_policy)} | made
 
 
 def compared():
@@ -55,13 +57,20 @@ def compared():
 
 def table(rows, top_k=1, **options):
     rows = rows if isinstance(rows, pd.DataFrame) else pd.DataFrame(rows)
-    return report.success_report(report.summary(rows, top_k), **options)
+    return report.success_report(report.summary(rows, top_k), top_k, **options)
 
 
 def cells_of(text, start):
     """The cells of the line of a table that starts so."""
     (line,) = (line for line in text.splitlines() if line.startswith(f"| {start}"))
     return line.strip("| ").split(" | ")[1:]
+
+
+def lines_of(text):
+    """The lines of the last table of a text, by column."""
+    found = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("|")]
+    start = max(i for i, line in enumerate(found) if line[0] == "---") - 1
+    return [dict(zip(found[start], line, strict=True)) for line in found[start + 2 :]]
 
 
 def test_rows_are_read_as_they_were_written(tmp_path):
@@ -90,7 +99,7 @@ def test_methods_and_problems_have_names_that_differ():
             row(prior="past", sigma=1.0, guidance="rtc", obs="image"),
         ]
     )
-    assert list(report.labelled(rows, chunks=False)["method"]) == [
+    assert list(report.labelled(rows, "chunk")["method"]) == [
         "Base",
         "RTC",
         "WP-Past, correlation=0.5, sigma 0.5",
@@ -168,19 +177,22 @@ def test_measures_are_means_of_the_last_checkpoints_beside_the_baselines():
     assert past["kappa_ratio"] == 1.0 and math.isnan(past["gain"])
     assert past["memory_gain"] == pytest.approx(0.2)
     assert past["memory_gain_std"] == pytest.approx(math.sqrt(0.02))
-    assert base["jump_ratio"] == pytest.approx(3.0)
-    assert past["jump_ratio"] == pytest.approx(0.6 / 0.3)
+    assert base["boundary_jump"] == pytest.approx(0.6) == past["boundary_jump"]
+    assert past["inner_jump"] == pytest.approx(0.3)  # of the seed that has one
 
 
 def test_the_papers_numbers_stand_beside_the_same_experiment_alone():
     same = [row(prior="past", data="mh"), row(prior="past", data="mh", obs="image")]
+    same.append(row(prior="past", data="mh", sigma=0.0))  # of the ablation
     others = [
         row(prior="past", data="mh", **more)
-        for more in ({"sigma": 1.0}, {"options": "correlation=0.5"}, {"chunk": 4})
+        for more in ({"sigma": 1.0}, {"options": "correlation=0.5"}, {"chunk": 4}, {"delay": 0})
     ]
     others += [row(prior="past", data="mh", actions="absolute"), row(prior="past", task="lift")]
-    values = [report.summary(pd.DataFrame([one]), 1)["paper"][0] for one in (*same, *others)]
-    assert values[:2] == pytest.approx([0.701, 0.776]) and np.isnan(values[2:]).all()
+    found = [report.summary(pd.DataFrame([one]), 1).iloc[0] for one in (*same, *others)]
+    values = [one["paper"] for one in found]
+    assert values[:3] == pytest.approx([0.701, 0.776, 0.05]) and np.isnan(values[3:]).all()
+    assert found[0]["paper_gain"] == pytest.approx(0.701 - 0.659)  # Table 1: Base has 65.9
 
 
 def test_the_report_has_the_layout_of_table_1():
@@ -191,11 +203,12 @@ def test_the_report_has_the_layout_of_table_1():
         "**80.0** (+30.0*)",
         "50.0 (+0.0)",
     ]
-    assert cells_of(text, "Square-PH, episodes") == ["-", "9 : 0 (1.00)", "1 : 1 (0.50)"]
-    assert cells_of(text, "Square-PH, paper") == ["83.6", "86.6 (+3.0)", "87.3 (+3.7)"]
+    assert cells_of(text, "Square-PH, paper") == ["83.6", "86.6", "87.3"]
+    counts = [(line["won"], line["lost"], line["paired"]) for line in lines_of(text)]
+    assert counts == [("-", "-", "-"), ("9", "0", "1.00"), ("1", "1", "0.50")]
     assert "3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed" in text
-    assert "gains within a row" in text and text.endswith("- A note.\n")
-    assert "bound" not in text and "Memory" not in text
+    assert "gains within a row" in text and "- A note.\n" in text
+    assert "source_leak" not in text and "memory_gain" not in text  # nobody measured them
     assert "gains within a row" not in table(compared(), source="official")
 
 
@@ -214,9 +227,8 @@ def test_leaks_are_marked_above_their_bound_and_no_zero_has_a_minus():
     leaks = {"source_leak": 0.3, "inner_step_ratio": 1.5, "memory_gain": -0.0001}
     rows = [row(46, 50), row(45, 50, seed=1), row(45, 50, prior="past", **leaks)]
     text = table([*rows, row(46, 50, prior="past", seed=1, **leaks)])
-    assert cells_of(text, "Square-PH, spread") == ["-", "0.30"]
-    assert cells_of(text, "Square-PH, step") == ["-", "1.50 (!)"]
-    assert cells_of(text, "Square-PH, memory") == ["-", "0.000 ± 0.000"]
+    found = [[line[name] for name in leaks] for line in lines_of(text)]
+    assert found == [["-"] * 3, ["0.30 ± 0.00", "1.50 ± 0.00 (!)", "0.000 ± 0.000"]]
     assert cells_of(text, "Square-PH, measured") == ["**91.0**", "**91.0** (+0.0)"]
 
 
@@ -235,29 +247,30 @@ def test_the_terminal_table_fits_and_says_first_what_came_out(methods, nfes, tas
         for nfe in range(nfes)
         for t in range(tasks)
     ]
-    text = report.terminal_table(report.summary(pd.DataFrame(rows), 1))
+    text = report.terminal_table(report.summary(pd.DataFrame(rows), 1), 1)
     assert max(map(len, text.splitlines())) <= 120
     lines = text.splitlines()
     assert lines[0].startswith(f"{methods} method") and lines[3] == ""
-    assert text.count(">50.0 (+10.0)") == tasks * nfes * (methods - 1)
+    assert text.count("**50.0** (+10.0)") == tasks * nfes * (methods - 1)
 
 
 def test_the_first_lines_name_the_best_methods_and_how_sure_that_is():
     rows = [row(k, prior=p, nfe=9) for p, k in (("gaussian", 6), ("past", 4), ("preview", 5))]
-    lines = report.terminal_table(report.summary(pd.concat([compared(), pd.DataFrame(rows)]), 1))
+    lines = report.terminal_table(
+        report.summary(pd.concat([compared(), pd.DataFrame(rows)], ignore_index=True), 1), 1
+    )
     first, best, sure, *_ = lines.splitlines()
     assert first == (
         "3 methods on Square-PH: H = 8, 3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed."
     )
-    assert best == (
-        "Best success (%): at NFE 9 Base 60.0 (WP-Preview -10.0); at NFE 1 WP-Past 80.0 (+30.0 over Base)."
-    )
+    assert best == "Best success: Base 60.0% at NFE 9; WP-Past 80.0% at NFE 1."
     chances = [
         (np.random.beta(k + 1, n - k + 1, 200_000) > np.random.beta(b + 1, n - b + 1, 200_000)).mean()
         for k, b, n in ((5, 6, 10), (24, 15, 30))  # of the last checkpoints of all seeds
     ]
     said = re.fullmatch(
-        r"Probability of beating Base: (\S+) for WP-Preview at NFE 9; (\S+) for WP-Past at NFE 1\.",
+        r"Gain over Base and its probability: WP-Preview -10\.0%, (\S+) at NFE 9; "
+        r"WP-Past \+30\.0%, (\S+) at NFE 1\.",
         sure,
     )
     assert [float(chance) for chance in said.groups()] == pytest.approx(chances, abs=0.01)
@@ -267,111 +280,66 @@ def test_a_report_is_written_before_what_is_missing_is_an_error(tmp_path, capsys
     summary = report.summary(compared(), 1)
     with pytest.raises(PartialFailure, match=r"1 failed.*: past, seed 1: no memory"):
         report.write_report(tmp_path, "short", "# full\n", summary, ["past, seed 1: no memory"])
-    assert (tmp_path / "report.md").read_text() == "# full\n\nMissing:\n\n- past, seed 1: no memory\n"
+    text = (tmp_path / "report.md").read_text()
+    assert text.startswith("# full\n\nMissing:\n\n- past, seed 1: no memory\n\nColumns")
+    assert "- `won`: episodes that this method solves" in text
     written = pd.read_csv(tmp_path / "results.csv")
     assert list(written["success"]) == pytest.approx([0.5, 0.8, 0.5])
     shown = capsys.readouterr().out
     assert "short\n" in shown and "no memory" in shown and str(tmp_path) in shown
-    report.write_report(tmp_path, "short", "full")
-    assert (tmp_path / "report.md").read_text() == "full\n"
-
-
-# Studies
+    report.write_report(tmp_path, "short", "full", summary)
+    assert "Missing" not in (tmp_path / "report.md").read_text()
 
 
 def curved(prior="gaussian", mean="training", seed=0, **more):
-    facts = {
-        "policy": prior,
-        "prior": prior,
-        "options": "",
-        "sigma": SIGMA.get(prior, 1.0),
-        "chunk": 8,
-    }
+    """A row of curvature.jsonl."""
+    facts = {"policy": prior, "prior": prior, "options": "", "sigma": SIGMA.get(prior, 1.0), "chunk": 8}
     names = ("ratio", "ratio_executed", "ratio_relative", "ratio_one_step")
     ends = {name + end: 1.0 for name in names for end in ("", "_low", "_high")}
     facts |= {"seed": seed, "mean": mean, "observations": 1000, "bound_executed": 8.0}
     return facts | ends | more
 
 
-def test_sigma_table_takes_the_mean_of_the_training_where_there_is_no_other():
-    rows = pd.DataFrame([row(5), row(6, prior="past"), row(8, prior="past", seed=1)])
-    past = [curved("past", m, ratio_executed=r) for m, r in (("training", 0.5), ("deployed", 0.7))]
-    text = report.sigma_table(rows, pd.DataFrame([curved(), *past]), 1)
-    assert cells_of(text, "Base, sigma 1") == ["50.0", "1.000", "1.000", "1.000", "8.00", "8.00"]
-    assert cells_of(text, "WP-Past, sigma 0.5")[:3] == ["70.0 ± 14.1", "0.500", "0.700"]
+def test_a_table_has_the_mean_and_deviation_of_every_group_in_the_order_of_the_rows():
+    rows = [row(nfe=9, switch_rate=0.5, collision_rate=0.25), row(nfe=9, seed=1, collision_rate=0.35)]
+    rows = report.labelled(pd.DataFrame([*rows, row(switch_rate=0.5, collision_rate=0.1)]))
+    names = ["success_rate", "switch_rate", "collision_rate", "jerk"]
+    nine, one = lines_of(report.table(rows, ["method", "nfe"], names, ["A note."]))
+    assert list(nine) == ["method", "nfe", *names[:3]]  # nobody has a jerk
+    assert list(nine.values()) == [
+        *("Base", "9", "50.0% ± 0.0%", "0.500 (1 not finite)", "0.300 ± 0.071")  # 0.1 / sqrt(2)
+    ]
+    assert list(one.values()) == ["Base", "1", "50.0%", "0.500", "0.100"]
+    with pytest.raises(KeyError, match="no column is called 'nonsense'"):
+        report.table(rows.assign(nonsense=1.0), ["method"], ["nonsense"])
 
 
-def test_chunk_and_budget_tables_have_a_line_per_length():
-    jumps = {"boundary_jump": 0.25, "action_error": 0.01}
-    rows = pd.DataFrame([row(k, chunk=h, nfe=n, **jumps) for h, n, k in ((8, 1, 5), (1, 1, 6), (8, 9, 7))])
-    text = report.chunk_table(rows, 1)
-    assert text.startswith("|  | NFE 1: Base | NFE 9: Base |")
-    assert cells_of(text, "H = 8, success") == ["50.0", "70.0"]
-    assert cells_of(text, "H = 1, jump") == ["0.250", "-"]
-    rows = pd.DataFrame([row(k, iterations=n, checkpoint=n, **jumps) for n, k in ((90, 9), (100, 8))])
-    text = report.budget_table(rows, 1)
-    assert (cells_of(text, "90"), cells_of(text, "100")) == (["90.0 (0.0100)"], ["80.0 (0.0100)"])
-
-
-def test_curvature_table_has_the_layout_of_table_2():
+def test_a_table_of_ratios_has_their_intervals_and_averages_over_seeds_where_there_are_some():
     past = {"ratio": 0.625, "ratio_low": 0.5, "ratio_high": 0.75, "ratio_one_step": None}
-    rows = [curved(seed=s) for s in (0, 1, None)]
-    rows += [curved("past", m, s, **past) for m in ("training", "deployed") for s in (0, 1, None)]
-    rows = pd.DataFrame(rows)
-    text = report.curvature_table(rows, {"task": "square", "data": "mh"}, "a test")
-    assert cells_of(text, "Square-MH, whole prediction, deployed") == [
-        "1.000",
-        "0.625 [0.500, 0.750]",
-    ]
-    assert cells_of(text, "Square-MH, error of one Euler step, executed H, tr")[1] == "no motion"
-    assert cells_of(text, "Square-MH, paper") == ["1.000", "0.705"]
-    assert "1,000 observations of a test, averaged over 2 training seeds" in text
-    for facts in ({"task": "square", "data": "mh", "obs": "image"}, {"task": "lift", "data": "ph"}):
-        assert "paper (" not in report.curvature_table(rows, facts, "a test")
-    assert "paper (" not in report.curvature_table(rows[3:], {"task": "square", "data": "mh"}, "")
+    rows = pd.DataFrame([*(curved(seed=s) for s in (0, 1, None)), curved("past", seed=None, **past)])
+    averages = report.labelled(report.pooled(rows))
+    base, mine = lines_of(report.table(averages, ["mean", "method"], ["ratio", "ratio_one_step"]))
+    assert (mine["mean"], mine["method"], mine["ratio"]) == ("training", "WP-Past", "0.625 [0.500, 0.750]")
+    assert mine["ratio_one_step"] == "-" and base["ratio"] == "1.000 [1.000, 1.000]"
+    assert len(report.pooled(rows[:1])) == 1  # a single seed has no average
 
 
-def test_navigation_table_has_the_curvature_at_the_largest_nfe():
-    judged = {"switch_rate": 0.5, "collision_rate": 0.25}
-    rows = [
-        row(nfe=9, **judged),
-        row(nfe=9, seed=1, **judged | {"switch_rate": None}),
-        row(**judged),
-    ]
-    flows = [curved(seed=s, kappa_executed=k, task=None) for s, k in ((0, 1.0), (1, 2.0))]
-    text = report.navigation_table(pd.DataFrame(rows), pd.DataFrame(flows), ["A note."])
-    nine, one = cells_of(text, "Base, NFE 9"), cells_of(text, "Base, NFE 1")
-    assert nine[:3] == ["0.500 (1 not finite)", "-", "0.250 ± 0.000"]
-    assert (nine[6], one[6], one[0]) == ("1.500 ± 0.707", "-", "0.500")
-
-
-def test_delay_table_has_a_line_per_delay_and_a_column_per_guidance():
-    jumps = {"boundary_jump": 0.5, "inner_jump": None, "execute": 4, "nfe": 9}
+def test_a_training_counts_by_its_last_checkpoint_and_succeeds_by_its_best_ones():
+    rates = {50: 9, 100: 3, 150: 6}
     rows = pd.DataFrame(
-        row(3 + d + (g == "rtc"), delay=d, guidance=g, **jumps) for d in (2, 0) for g in ("none", "rtc")
+        row(k, checkpoint=n, iterations=150, boundary_jump=n / 100, nfe=nfe)
+        for nfe in (9, 1)
+        for n, k in rates.items()
     )
-    text = report.delay_table(rows, 1, "max weight 5")
-    lines = text.splitlines()
-    assert lines[0] == "|  | Base | RTC |" and lines[2].startswith("| square ph, NFE 9, delay 0, succ")
-    assert cells_of(text, "square ph, NFE 9, delay 2, success") == ["50.0", "60.0"]
-    assert "step inside |" not in text and "- RTC: max weight 5." in text
+    found = report.per_seed(rows, 2)
+    assert list(found["nfe"]) == [9, 1] and list(found["checkpoint"]) == [150, 150]
+    assert list(found["success"]) == pytest.approx([(9 + 6) / 20] * 2)
+    assert list(found["success_rate"]) == [0.6, 0.6] and list(found["boundary_jump"]) == [1.5, 1.5]
+
+
+def test_delays_are_places_of_their_own():
+    rows = pd.DataFrame(
+        row(3 + d + (g == "rtc"), delay=d, guidance=g) for d in (2, 0) for g in ("none", "rtc")
+    )
     assert cells_of(table(rows), "Square-PH, delay 2, measured") == ["50.0", "**60.0** (+10.0)"]
-
-
-def test_agent_table_has_the_last_evaluation_of_every_seed():
-    points = [("base", 0, (0.2, 0.4)), ("greedy", 90, (0.1, 0.1)), ("greedy", 200, (0.6, 1.0))]
-    agents = pd.DataFrame(
-        row(prior="past", algorithm="dsrl-na", delta=0.5, evaluation=e, environment_steps=n, seed=s)
-        | {"success_rate": rate}
-        for e, n, rates in points
-        for s, rate in enumerate(rates)
-    )
-    text = report.agent_table(agents)
-    line = ["0.5", "200", "30.0 ± 14.1", "80.0 ± 28.3", "-"]
-    assert cells_of(text, "DSRL-NA, WP-Past (2 seeds)") == line
-
-
-def test_lines_without_any_cell_are_left_out():
-    rows = pd.DataFrame({"a": ["0", "1"], "b": ["x", "y"], "kappa": [None, 1.0]})
-    frame = report.cells(rows, "a", "b", {"": report.mean_cell("kappa", ".1f")})
-    assert report.markdown(frame, "h") == "| h | x | y |\n|---|---|---|\n| 1 | - | 1.0 |\n"
+    assert cells_of(table(rows), "Square-PH, delay 0, measured") == ["30.0", "**40.0** (+10.0)"]

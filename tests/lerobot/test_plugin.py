@@ -24,8 +24,18 @@ from tests.lerobot.tiny import (
     tiny_smolvlm,
     windows,
 )
-from warmprior import HistoryObservation, PastPrior, RealTimeChunking, StartPoint, keys
+from warmprior import (
+    HistoryObservation,
+    Normalizer,
+    PastPrior,
+    RealTimeChunking,
+    StartPoint,
+    VelocityMLP,
+    keys,
+)
+from warmprior.data import lerobot_steps
 from warmprior.history import cold_history
+from warmprior.training import precondition
 
 pytest.importorskip("lerobot")
 pytest.importorskip("lerobot_policy_warmprior")
@@ -193,8 +203,37 @@ def flow_batch(length, size=3):
     }
 
 
+def test_the_flow_policy_is_preconditioned_for_the_dataset(found, tmp_path):
+    """By the moments that this library fits to the same steps; and its averaged weights play."""
+    from lerobot.datasets import LeRobotDatasetMetadata
+
+    write_dataset(tmp_path / "data")
+    meta = LeRobotDatasetMetadata("local/tiny", root=tmp_path / "data")
+    config = flow_policy(found).config
+    widths = {name: feature["shape"] for name, feature in meta.features.items()}
+    for name, feature in config.input_features.items():
+        feature.shape = tuple(widths[name])
+    config.output_features["action"].shape = tuple(widths["action"])
+    policy = found["warm_flow"](config, dataset_meta=meta)
+    steps = lerobot_steps(tmp_path / "data", config.observed)
+    data = Normalizer.fit(steps).normalize(steps)
+    network = policy.actor.network
+    sizes = network.action_dim, network.observation_dim, network.prediction_length, network.observation_steps
+    own = precondition(VelocityMLP(*sizes), data, policy.actor.prior)
+    for name, value in own.moments.state_dict().items():
+        torch.testing.assert_close(policy.actor.network.moments.state_dict()[name], value)
+    before = [weight.clone() for weight in policy.averaged.module.parameters()]
+    policy.update()  # the first one copies
+    with torch.no_grad():
+        for weight in policy.actor.network.parameters():
+            weight.add_(1.0)
+    policy.update()
+    for old, new in zip(before, policy.averaged.module.parameters(), strict=True):
+        torch.testing.assert_close(new, old + 0.005)
+
+
 def test_the_flow_policys_loss_is_algorithm_1(found):
-    policy = flow_policy(found, prior="past,sigma=0.0").eval()
+    policy = flow_policy(found, prior="past,sigma=0.0", precondition=False).eval()
     batch = flow_batch(8)
     batch["action_is_pad"][0, :2] = True  # the beginning of an episode
     batch["action_is_pad"][1, 6:] = True  # and an end

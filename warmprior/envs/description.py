@@ -115,7 +115,7 @@ def environment_parts(
     if not _describes_robosuite(description):
         raise ValueError(
             f"the policy keeps no description of a robosuite environment, but {description}: build the "
-            "environment yourself, with policy_transforms(actor.prior, normalizer=actor.normalizer)"
+            "environment yourself, with policy_transforms(actor)"
         )
     make_env, adapters = robosuite_parts(description)
     normalizer = copy.deepcopy(actor.normalizer)

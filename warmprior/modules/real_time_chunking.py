@@ -71,19 +71,19 @@ class RealTimeChunking:
     behind it by ``schedule``, and is 0 from ``horizon`` on.
 
     Args:
-        horizon: first position without guidance, LeRobot's ``execution_horizon`` and the official code's
-            ``prefix_attention_horizon``; ``None``, the default, for all that is left of the old chunk, as in
+        horizon: first position without guidance, LeRobot's execution_horizon and the official code's
+            prefix_attention_horizon; None, the default, for all that is left of the old chunk, as in
             the official studies. It never reaches further than that.
-        schedule: ``"exp"`` (the official default), ``"linear"`` (LeRobot's), ``"ones"`` or ``"zeros"``.
+        schedule: "exp" (the official default), "linear" (LeRobot's), "ones" or "zeros".
         max_guidance_weight: :math:`\beta`; 5 in the official code, 10 in LeRobot.
-        jacobian: ``False`` takes the identity for :math:`J`, as LeRobot 0.6 does: no gradients, 0.6 of the
+        jacobian: False takes the identity for :math:`J`, as LeRobot 0.6 does: no gradients, 0.6 of the
             time, and another method, which is not exact where the formula is.
         sigma: what to take for the source's standard deviation; its own by default. 1 is the published
             weight whatever the source.
         data_std: :math:`S`, how far actions spread where the observation is known, in normalised units. A
             scale of the data in the weight is also what POTR (arXiv 2605.24433) names :math:`\sigma_d`.
         trust_region: bound of the correction's part that is perpendicular to the velocity, as a share of
-            the velocity's norm; ``None`` for none. POTR bounds that part too; this form is ours.
+            the velocity's norm; None for none. POTR bounds that part too; this form is ours.
 
     Raises:
         ValueError: for an unknown schedule, or a number that is not positive.

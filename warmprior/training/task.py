@@ -122,7 +122,7 @@ class Task:
         cls,
         name: str,
         data: TensorDictBase,
-        make_env: Callable[..., EnvBase],
+        make_env: Callable[..., EnvBase] | None = None,
         *,
         style: str = "human",
         success: NestedKey = SUCCESS,
@@ -135,7 +135,7 @@ class Task:
             name: see above.
             data: contiguous steps ``[N]`` in raw units: ``"observation"`` ``[N, d_o]``, ``"action"``
                 ``[N, d_a]`` and ``"episode"``, an integer ``[N]``.
-            make_env: see above.
+            make_env: see above; without one, policies are trained and not played.
 
         Keyword Args:
             style: see above.
@@ -164,7 +164,7 @@ class Task:
             name,
             style,
             normalizer.normalize(data.select(OBSERVATION, ACTION, EPISODE)),
-            make_env,
+            make_env or _no_environment,
             normalizer,
             success=success,
             measures=measures or {},
@@ -217,6 +217,10 @@ class Task:
     def longest(self) -> int:
         """Steps of the longest demonstration."""
         return int(self.data[EPISODE].flatten().bincount().max())
+
+
+def _no_environment() -> EnvBase:
+    raise ValueError("these demonstrations have no environment: give Task.of a function that builds one")
 
 
 def robosuite_task(
@@ -277,7 +281,8 @@ def robosuite_task(
     if not index.env_args:
         raise ValueError(
             f"{path} does not say which environment it was recorded in: name a robosuite task with --task, "
-            "or describe a task of your own (docs/benchmarks.md)"
+            "train without an environment (python -m warmprior train --observation-keys), or describe a task "
+            "of your own (docs/benchmarks.md)"
         )
     # Not after hours of rendering, or of training.
     if source == "file" and options.task not in ((), (_name_of(index),)):

@@ -10,7 +10,6 @@ from tempfile import TemporaryDirectory
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import EnvBase
 from torchrl.record.loggers.common import Logger
 
 from warmprior import keys
@@ -167,7 +166,7 @@ def train_policy(
     """
     task = demonstrations
     if not isinstance(task, Task):
-        task = Task.of("demonstrations", task, _nowhere)
+        task = Task.of("demonstrations", task)
     network, training = network or NetworkOptions(), training or TrainingConfig()
     on_cpu = torch.device(device).type == "cpu"
     if directory is None and world_size() > 1:
@@ -201,7 +200,3 @@ def train_policy(
         cloning.run(description, progress)
         from_leader(lambda: None)  # other processes wait until the first has written it
         return load_policy(cloning.policy_path())
-
-
-def _nowhere() -> EnvBase:
-    raise ValueError("these demonstrations came without an environment: give train_policy a Task")

@@ -30,7 +30,7 @@ class TrainingConfig:
         warmup_ratio: share of the iterations over which the learning rate rises.
         ema_rate: decay of the averaged weights that are evaluated.
         checkpoints: how many policies to keep at most, evenly spaced, the last at the end.
-        save_every: iterations between saves of the training state; ``None`` for ten per checkpoint.
+        save_every: iterations between saves of the training state, ten per checkpoint by default.
         log_every: iterations per logged mean loss.
         seed: of initial weights, sampling, source, times and dropout.
         times: how the times of the loss are distributed.

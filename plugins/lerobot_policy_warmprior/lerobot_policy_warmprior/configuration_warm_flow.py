@@ -7,13 +7,29 @@ from dataclasses import dataclass, field
 from lerobot.configs.policies import PreTrainedConfig
 from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.optim.optimizers import AdamWConfig
-from lerobot.optim.schedulers import DiffuserSchedulerConfig
+from lerobot.optim.schedulers import LRSchedulerConfig
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 
 from warmprior import Prior
 from warmprior.lerobot import history_indices
 from warmprior.modules.registry import make
+from warmprior.training import warmup_cosine
 
-__all__ = ["WarmFlowConfig"]
+__all__ = ["WarmFlowConfig", "WarmupRatioConfig"]
+
+
+@LRSchedulerConfig.register_subclass("warmup_ratio")
+@dataclass
+class WarmupRatioConfig(LRSchedulerConfig):
+    """The paper's schedule: a linear warm-up over a share of the training, then a cosine to zero."""
+
+    num_warmup_steps: int | None = None
+    warmup_ratio: float = 0.2
+
+    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
+        """The schedule of a training of that many steps."""
+        return warmup_cosine(optimizer, num_training_steps, self.warmup_ratio)
 
 
 @PreTrainedConfig.register_subclass("warm_flow")
@@ -21,12 +37,16 @@ __all__ = ["WarmFlowConfig"]
 class WarmFlowConfig(PreTrainedConfig):
     """The paper's policy from state: a ChiTransformer that carries the prior's source to a chunk.
 
+    The recipe is the paper's (Table 3), but for the preconditioning, which `precondition=false` turns off.
+
     Attributes:
         n_obs_steps: ``To``, observations per decision.
         n_action_steps: ``H``, actions executed per decision, and remembered by the prior.
         prior: its name, with options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
         cold_probability: share of the training windows whose history is withheld.
-        nfe: network evaluations per chunk.
+        nfe: network evaluations per chunk; 1 is one-step inference.
+        precondition: by the second moments of source and data, see PreconditionedNetwork.
+        ema_rate: decay of the averaged weights, which play.
         network: configuration of another velocity network, as JSON (``VelocityNetwork.config()``).
         embedding_dim: width of the transformer.
         num_layers: its depth.
@@ -39,6 +59,8 @@ class WarmFlowConfig(PreTrainedConfig):
     prior: str = "past"
     cold_probability: float = 0.0
     nfe: int = 9
+    precondition: bool = True
+    ema_rate: float = 0.995
     network: str = ""
     embedding_dim: int = 384
     num_layers: int = 8
@@ -52,10 +74,9 @@ class WarmFlowConfig(PreTrainedConfig):
         }
     )
     optimizer_lr: float = 1e-4
-    optimizer_betas: tuple[float, float] = (0.9, 0.95)
-    optimizer_weight_decay: float = 1e-3
-    scheduler_name: str = "cosine"
-    scheduler_warmup_steps: int = 1_000
+    optimizer_betas: tuple[float, float] = (0.9, 0.999)
+    optimizer_weight_decay: float = 1e-5
+    scheduler_warmup_ratio: float = 0.2
 
     def make_prior(self) -> Prior:
         """The source distribution.
@@ -95,11 +116,12 @@ class WarmFlowConfig(PreTrainedConfig):
             lr=self.optimizer_lr,
             betas=self.optimizer_betas,
             weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=0.0,
         )
 
-    def get_scheduler_preset(self) -> DiffuserSchedulerConfig:
+    def get_scheduler_preset(self) -> WarmupRatioConfig:
         """The paper's warm-up and cosine."""
-        return DiffuserSchedulerConfig(name=self.scheduler_name, num_warmup_steps=self.scheduler_warmup_steps)
+        return WarmupRatioConfig(warmup_ratio=self.scheduler_warmup_ratio)
 
     @property
     def observation_delta_indices(self) -> list[int]:

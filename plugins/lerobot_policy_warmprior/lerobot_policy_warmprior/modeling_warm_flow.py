@@ -17,14 +17,19 @@ from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from warmprior import (
     ChiTransformer,
     FlowMatchingLoss,
+    Normalizer,
+    PreconditionedNetwork,
+    Prior,
     VelocityNetwork,
     WarmPriorActor,
     WithheldHistory,
     keys,
 )
+from warmprior.data import lerobot_steps
 from warmprior.history import window_history
 from warmprior.lerobot import ActionMemory
 from warmprior.modules.registry import from_config
+from warmprior.training import ema_of, precondition
 
 __all__ = ["WarmFlowPolicy"]
 
@@ -34,7 +39,9 @@ class WarmFlowPolicy(PreTrainedPolicy):
 
     Args:
         config: its options.
-        kwargs: what LeRobot tells of the dataset; nothing of it is needed.
+        dataset_meta: LeRobot's description of the dataset of a training, to which the preconditioning is
+            fitted.
+        kwargs: what else LeRobot says of the dataset; nothing of it is needed.
 
     Raises:
         ValueError: if the network does not fit the dataset, the prior has networks of its own, which
@@ -44,7 +51,7 @@ class WarmFlowPolicy(PreTrainedPolicy):
     config_class = WarmFlowConfig
     name = "warm_flow"
 
-    def __init__(self, config: WarmFlowConfig, **kwargs: Any) -> None:
+    def __init__(self, config: WarmFlowConfig, dataset_meta: Any = None, **kwargs: Any) -> None:
         super().__init__(config)
         config.validate_features()
         prior = config.make_prior()
@@ -79,14 +86,44 @@ class WarmFlowPolicy(PreTrainedPolicy):
                 num_heads=config.num_heads,
                 dropout=config.dropout,
             )
+            if config.precondition:
+                network = self._preconditioned(network, prior, dataset_meta)
         # What the data span is [-1, 1]; nothing beyond it is executed, nor remembered. In other units than
         # those of the extremes it is not known.
         spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX
         self.actor = WarmPriorActor(network, prior, nfe=config.nfe, clip=1.0 if spans else None)
+        self.averaged = ema_of(network, config.ema_rate)
         self._withheld = WithheldHistory(config.cold_probability)
         # Of the same weights, so that it is no part of the module and is not saved again.
         self.__dict__["_made"] = None
         self.reset()
+
+    def _preconditioned(
+        self, network: VelocityNetwork, prior: Prior, dataset_meta: Any
+    ) -> PreconditionedNetwork:
+        """The network in the moments of source and demonstrations; a saved policy has its own in its file."""
+        if dataset_meta is None:
+            return PreconditionedNetwork(network)
+        mode = self.config.normalization_mapping.get("ACTION")
+        if mode != NormalizationMode.MIN_MAX:
+            raise ValueError(
+                f"the preconditioning is fitted to actions that are normalised by MIN_MAX, not by {mode}: "
+                "choose that, or --policy.precondition=false"
+            )
+        steps = lerobot_steps(dataset_meta.root, self.config.observed)
+        low, high = (torch.as_tensor(dataset_meta.stats["action"][end]).float() for end in ("min", "max"))
+        normalizer = Normalizer({keys.ACTION: low}, {keys.ACTION: high})
+        return precondition(
+            network,
+            normalizer.normalize(steps),
+            prior,
+            observation_steps=self.config.n_obs_steps,
+            withhold=self.config.cold_probability,
+        )
+
+    def update(self) -> None:
+        """Average the weights: LeRobot calls it after every step of a training."""
+        self.averaged.update_parameters(self.actor.network)
 
     def get_optim_params(self) -> Any:
         """Weights that decay, and those that do not."""
@@ -175,7 +212,10 @@ class WarmFlowPolicy(PreTrainedPolicy):
         observation = self._observation(seen)
         history = self._memory.decide(len(observation), observation.device)
         data = TensorDict({keys.OBSERVATION: observation, keys.HISTORY: history}, history.shape)
-        chunk = self.actor(data)[keys.CHUNK]
+        acting = self.actor
+        if self.averaged.n_averaged:
+            acting = acting.replace(network=self.averaged.module)
+        chunk = acting(data)[keys.CHUNK]
         self._memory.record(chunk)
         return chunk
 

@@ -1,0 +1,135 @@
+"""What the columns of rows and tables mean: one definition each, with the format of their numbers.
+
+A report lists below its tables what their columns mean, and `docs/benchmarks.md` shows them all.
+Rows are those of `results.jsonl` and `curvature.jsonl`; a table has means over training seeds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+# Name -> (format of its numbers, meaning).
+COLUMNS: dict[str, tuple[str, str]] = {
+    # What is compared.
+    "problem": ("", "task and style in words"),
+    "method": ("", "the source in words, with its options; sigma and H where several are compared"),
+    "task": ("", "task"),
+    "data": ("", "style of the demonstrations: ph, mh, or one's own"),
+    "actions": ("", "space of the actions, where it is not that of recorded deltas"),
+    "obs": ("", "what policies see, where it is not the state"),
+    "prior": ("", "method, as --prior names it"),
+    "options": ("", "its options that are not at their defaults"),
+    "sigma": ("g", "noise of the source"),
+    "chunk": ("d", "chunk length H"),
+    "seed": ("d", "training seed; empty for the average over several"),
+    "iterations": ("d", "length of the training"),
+    "policy": ("", "folder of the policy in policies/, or its method"),
+    "checkpoint": ("d", "iteration of the training at which the policy was saved"),
+    "nfe": ("d", "network evaluations per chunk"),
+    "execute": ("d", "actions executed per decision"),
+    "delay": ("d", "control steps until a chunk takes effect"),
+    "guidance": ("", "rtc: guided by Real-Time Chunking"),
+    "algorithm": ("", "how the agent learns"),
+    "delta": ("g", "half the width of the agent's box"),
+    "environment_steps": ("d", "control steps that the agent has learnt from"),
+    "evaluation": ("", "base: the frozen policy; greedy or stochastic: the agent"),
+    "mean": (
+        "",
+        "history of the source: of the training, or deployed, after the policy's own last decision",
+    ),
+    "observations": ("d", "observations that the measure is the mean of"),
+    # Success.
+    "episodes": ("d", "evaluation episodes of the last checkpoint, of all seeds in a table"),
+    "successes": ("d", "episodes solved"),
+    "success_rate": (".1%", "share of episodes solved"),
+    "outcomes": ("", "1 or 0 for every episode, in the order of their seeds"),
+    "success": (".1%", "success rate, of each seed the mean of its best --top-k checkpoints"),
+    "seeds": ("d", "training seeds"),
+    "checkpoints": ("d", "checkpoints per training"),
+    "low": (".1%", "lower end of the 95% interval of the success rate (last checkpoints, Beta posterior)"),
+    "high": (".1%", "upper end of that interval"),
+    "gain": ("+.1%", "success minus that of the first method at the same NFE"),
+    "one_sigma": ("", "whether the gain exceeds the sum of both deviations over seeds (the paper's rule)"),
+    "better": (".2f", "probability of a higher success rate than the first method's, episodes taken alone"),
+    "won": ("d", "episodes that this method solves and the first one does not, from equal seeds"),
+    "lost": ("d", "the opposite"),
+    "paired": (".2f", "probability of winning an episode that only one of the two solves"),
+    "paper": (".1%", "the paper's success rate, on the official demonstrations"),
+    "paper_ratio": (".3f", "the paper's ratio of curvatures, on the official demonstrations"),
+    "paper_gain": ("+.1%", "the paper's gain over the Gaussian source"),
+    "mean_steps": (".1f", "control steps per episode"),
+    "action_error": (".4f", "mean squared error of executed actions on demonstrations held out"),
+    # Jumps and distances, in normalised action units.
+    "boundary_jump": (".3f", "mean distance between consecutive actions where a chunk takes effect"),
+    "inner_jump": (".3f", "the same elsewhere"),
+    "jump_ratio": (".3f", "the first of these over the second"),
+    "mean_error": (".3f", "root mean square from the source's mean to the demonstrated actions"),
+    "mean_revision_data": (".3f", "the same to the prediction, on demonstrated states"),
+    "mean_revision": (".3f", "the same in the evaluation episodes"),
+    # What reaches the actions, on 512 observations of the training data.
+    "source_leak": (
+        ".2f",
+        "spread of actions over draws of the source / that of the data; (!): above 1, the network has not "
+        "learnt to ignore the source's noise",
+    ),
+    "inner_step_ratio": (".2f", "step between actions of a chunk / that of the data; (!): above 1.3"),
+    "memory_gain": (
+        "z.3f",
+        "share of a shift of what was done or forecast that reappears in the actions (0: ignored)",
+    ),
+    # The flow.
+    "kappa": (".3f", "curvature of the flow (of results.jsonl: over the executed positions)"),
+    "kappa_executed": (".3f", "curvature over the executed positions"),
+    "relative_curvature": (".3f", "curvature over the executed positions per squared mean velocity"),
+    "relative": (".3f", "curvature per squared mean velocity"),
+    "relative_executed": (".3f", "the same over the executed positions"),
+    "speed": (".3f", "squared mean velocity"),
+    "speed_executed": (".3f", "squared mean velocity of the executed positions"),
+    "one_step_error": (".3f", "root mean square error of one Euler step"),
+    "one_step_error_executed": (".3f", "the same over the executed positions"),
+    "bound": (".2f", "bound of the branching cost (of results.jsonl: over the executed positions)"),
+    "bound_executed": (".2f", "bound of the branching cost over the executed positions"),
+    "coverage": (".2f", "share of demonstrated actions inside the source's 90% interval"),
+    "ratio": (".3f", "kappa over the first policy's, with a 95% bootstrap interval over episodes"),
+    "ratio_executed": (".3f", "the same of kappa_executed"),
+    "ratio_relative": (".3f", "the same of relative_executed"),
+    "ratio_one_step": (".3f", "the same of one_step_error_executed"),
+    "training_seconds": (".0f", "processor time of the training, with its teacher's"),
+    # The toy.
+    "switch_rate": (".3f", "share of chunk boundaries at which the side changes"),
+    "commit_rate": (".3f", "share of rollouts that stay on one side"),
+    "collision_rate": (".3f", "share of rollouts that enter an obstacle"),
+    "route_entropy": (".3f", "entropy of the routes, in bits"),
+    "recombination_rate": (".3f", "share of rollouts on a route that no demonstration takes"),
+    "distance": (".3f", "mean distance to the height of the nearest demonstration"),
+    "jump": (".3f", "mean change of height at chunk boundaries"),
+    "jerk": (".3f", "mean norm of the third difference of executed actions"),
+    "shifted_switch_rate": (".3f", "switch_rate with the history shifted"),
+    "shifted_distance": (".3f", "distance with the history shifted"),
+    "shifted_collision_rate": (".3f", "collision_rate with the history shifted"),
+}
+
+# What the end of a name means.
+ENDS = {
+    "_std": "standard deviation over training seeds",
+    "_low": "lower end of the 95% interval",
+    "_high": "upper end of the 95% interval",
+    "_ratio": "divided by the first method's",
+}
+
+
+def column(name: str) -> tuple[str, str]:
+    """Format and meaning of a column."""
+    if name in COLUMNS:
+        return COLUMNS[name]
+    if name.startswith("episode_"):
+        return ".3f", "what the task measures of an episode under this name, in the mean"
+    for end, words in ENDS.items():
+        if name.endswith(end) and name.removesuffix(end) in COLUMNS:
+            return ".2f", f"{name.removesuffix(end)}: {words}"
+    raise KeyError(f"no column is called {name!r}: columns.py says what each of them means")
+
+
+def definitions(names: Iterable[str]) -> str:
+    """A list of columns and their meanings, in Markdown."""
+    return "".join(f"- `{name}`: {column(name)[1]}\n" for name in names)
