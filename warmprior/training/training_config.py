@@ -35,9 +35,9 @@ class TrainingConfig:
         seed: of initial weights, sampling, source, times and dropout.
         times: how the times of the loss are distributed.
         objective: the loss: squared error of velocities, or L1 error of predicted samples (L1 Flow).
-        weighting: of the loss: ``"velocity"`` takes errors as they are, ``"standardised"`` in units of what
-            preconditioning leaves, so that every time counts alike. By default the latter where the network
-            is preconditioned.
+        weighting: of the loss: errors as they are (velocity), or in units of what preconditioning leaves, so
+            that every time counts alike (standardised). By default the latter where the network is
+            preconditioned.
         self_distillation: weight of learning in one step where the flow of averaged weights ends.
         precision: of the network's matrix products in training; weights, averages and optimiser are float32.
         cold_probability: share of the windows whose history is withheld; the paper's Algorithm 1 has none.
