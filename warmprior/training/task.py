@@ -489,6 +489,9 @@ def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
     Examples:
         >>> task_places(DataOptions(task=("lift", "can"), download=True))
         [('lift', 'ph'), ('can', 'ph')]
+        >>> task_places(DataOptions(task=("can", "tool_hang"), data=("ph", "mh"), download=True))
+        Data: there are no official mh demonstrations of tool_hang.
+        [('can', 'ph'), ('can', 'mh'), ('tool_hang', 'ph')]
         >>> task_places(DataOptions(data=("core",)))
         Traceback (most recent call last):
             ...
@@ -506,7 +509,14 @@ def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
     found: dict[tuple[str | None, str], None] = {}
     for name in names:
         one_style = name is not None and not is_simulated(name)
-        found |= dict.fromkeys((name, style) for style in options.data[: 1 if one_style else None])
+        styles = options.data[: 1 if one_style else None]
+        if options.download and name in TASKS:
+            there = tuple(style for style in styles if style in TASKS[name].official)
+            if there and there != styles:
+                left_out = ", ".join(style for style in styles if style not in there)
+                print(f"Data: there are no official {left_out} demonstrations of {name}.", flush=True)
+                styles = there
+        found |= dict.fromkeys((name, style) for style in styles)
     return list(found)
 
 
