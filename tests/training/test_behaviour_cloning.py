@@ -17,6 +17,7 @@ from tests.training.cloning_parts import CONFIG, actor_for, dataset, run_until, 
 from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
 from warmprior.training import TrainingConfig, load_policy, make_optimizer
 from warmprior.training.checkpoint import load_state
+from warmprior.training.training_config import PAPER
 
 
 def test_the_loop_by_hand(tmp_path):
@@ -151,8 +152,9 @@ def _iteration(folder):
     return load_state(path)[1]["iteration"] if path.exists() else 0
 
 
-def test_default_config_is_the_paper_s():
-    config = TrainingConfig()
+def test_the_papers_recipe():
+    """Table 3."""
+    config = PAPER
     assert (config.iterations, config.batch_size, config.learning_rate) == (200_000, 1024, 1e-4)
     assert (config.weight_decay, config.warmup_ratio, config.ema_rate) == (1e-5, 0.2, 0.995)
     assert config.checkpoint_iterations == [20_000 * i for i in range(1, 11)]

@@ -1,13 +1,14 @@
 """Behaviour cloning, evaluation and worker processes."""
 
 from warmprior.io.workers import WorkerError
-from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
+from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.card import model_card, policy_results
 from warmprior.training.evaluation import Episode, evaluate, parallel_env, play_episode
 from warmprior.training.film import Filmstrip, record_filmstrip, record_video
 from warmprior.training.navigation import judge_navigation, play_navigation
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.options import DataOptions, NetworkOptions
+from warmprior.training.precondition import precondition
 from warmprior.training.saved import check_saveable, load_policy, push_policy, save_policy
 from warmprior.training.task import Task, find_tasks, load_task, navigation_task, robosuite_task
 from warmprior.training.train import new_policy, train_policy

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -24,12 +22,7 @@ from warmprior.io.files import exclusive
 from warmprior.io.workers import count_devices
 from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.compiled import uncompiled
-from warmprior.modules.interpolant import Interpolant
-from warmprior.modules.network import VelocityNetwork
-from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
-from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
@@ -46,80 +39,20 @@ from warmprior.training.checkpoint import (
     select,
     snapshot_optimizer,
 )
+from warmprior.training.identity import coupling_identity, data_digest, fixed_identity, network_identity
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.placement import Prefetch
 from warmprior.training.saved import check_saveable, load_policy, save_policy
 from warmprior.training.training_config import TrainingConfig
-from warmprior.transforms.window import window_replay_buffer, without_images
+from warmprior.transforms.window import window_replay_buffer
 
-__all__ = ["BehaviourCloning", "data_digest", "policy_path", "precondition"]
-
-TREND_BATCHES = 16
-"""Of 1,024 windows, to which a :class:`PoseTrend` is fitted."""
-
-HASHED_AT_ONCE = 2**26
-"""Bytes of the data."""
+__all__ = ["BehaviourCloning", "policy_path"]
 
 WINDOWS_SEED = 1_000_003
 """Added to the seed of windows that have a generator of their own: other draws than those of the sources."""
 
 STATE_FORMAT = 6
 """Part of every state's identity; raised whenever the same options give other weights."""
-
-
-def precondition(
-    network: VelocityNetwork,
-    data: TensorDictBase,
-    prior: Prior,
-    *,
-    observation_steps: int = 2,
-    coupling: Coupling | None = None,
-    withhold: float = 0.0,
-    rest: RestingAction | None = None,
-    interpolant: Interpolant | None = None,
-) -> PreconditionedNetwork:
-    """Wrap a network in what is known of a prior's source and the demonstrations before any training.
-
-    Args:
-        network: the network to wrap.
-        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`.
-        prior: the source distribution.
-
-    Keyword Args:
-        observation_steps: ``To``.
-        coupling: how the training pairs sources and targets; as they come by default.
-        withhold: share of the windows whose history is withheld.
-        rest: for absolute actions, to take off what follows from where the grippers are.
-        interpolant: the path, that of the loss; linear by default.
-
-    Returns:
-        The preconditioned network; the same for the same data and prior.
-
-    Examples:
-        >>> from warmprior import PastPrior, VelocityMLP
-        >>> from warmprior.envs import navigation_demonstrations
-        >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
-        >>> demos = navigation_demonstrations()
-        >>> type(precondition(network, demos, PastPrior(4), observation_steps=1)).__name__
-        'PreconditionedNetwork'
-    """
-    generator = torch.Generator(data.device or "cpu").manual_seed(0)
-    if coupling is None:  # which may look at them
-        data = without_images(data)
-    windows = window_replay_buffer(
-        data,
-        prior,
-        batch_size=1024,
-        observation_steps=observation_steps,
-        withhold=withhold,
-        generator=generator,
-    )
-    trend = None
-    if rest is not None:
-        batch = torch.cat([windows.sample() for _ in range(TREND_BATCHES)])
-        trend = PoseTrend.fit(batch, prior, rest, generator=generator)
-    moments = SourceMoments.fit(windows, prior, coupling=coupling, trend=trend, generator=generator)
-    return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=interpolant)
 
 
 class BehaviourCloning:
@@ -265,10 +198,10 @@ class BehaviourCloning:
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
             "config": asdict(config) | {"betas": list(config.betas)},
-            "prior": actor.prior.config() | _fixed_identity(actor.prior),
-            "start": None if actor.start is None else actor.start.config() | _fixed_identity(actor.start),
-            "coupling": _coupling_identity(coupling),
-            "network": _network_identity(actor.network),
+            "prior": actor.prior.config() | fixed_identity(actor.prior),
+            "start": None if actor.start is None else actor.start.config() | fixed_identity(actor.start),
+            "coupling": coupling_identity(coupling),
+            "network": network_identity(actor.network),
             "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
             "policy": {"observation_steps": observation_steps, "clip": actor.ode.clip},
             "format": STATE_FORMAT,
@@ -540,38 +473,3 @@ def _learning(prior: Prior) -> list[nn.Parameter]:
 def policy_path(directory: Path, iteration: int) -> Path:
     """Where a training in ``directory`` keeps the policy of one iteration."""
     return directory / f"policy_{iteration:06d}"
-
-
-def _network_identity(network: nn.Module) -> Any:
-    network = uncompiled(network)
-    config: Any = network.config
-    return {**config(), **_fixed_identity(network)}
-
-
-def _coupling_identity(coupling: Coupling | None) -> Any:
-    if coupling is None:
-        return None
-    config = getattr(coupling, "config", None)
-    return config() if config else getattr(coupling, "__qualname__", type(coupling).__qualname__)
-
-
-def _fixed_identity(part: object) -> dict[str, str]:
-    """Digest of what is not trained, such as moments: it is part of what a network, or a prior, is."""
-    if not isinstance(part, nn.Module):
-        return {}
-    trained = {n for n, p in part.named_parameters(remove_duplicate=False) if p.requires_grad}
-    state = part.state_dict()
-    fixed = {name: value.tolist() for name, value in state.items() if name not in trained}
-    digest = hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
-    return {"buffers": digest}
-
-
-def data_digest(data: TensorDictBase) -> str:
-    """Digest of demonstrations: of the names and values of all entries."""
-    digest = hashlib.sha256()
-    for key, value in sorted(data.items(True, True), key=lambda item: str(item[0])):
-        digest.update(str(key).encode())
-        rows = max(1, HASHED_AT_ONCE // max(1, value[:1].nbytes))  # it may be larger than the memory
-        for part in value.split(rows):
-            digest.update(part.cpu().contiguous().view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()[:16]

@@ -30,7 +30,7 @@ from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.trend import RestingAction
-from warmprior.training.behaviour_cloning import data_digest
+from warmprior.training.identity import data_digest
 from warmprior.training.options import DataOptions, is_simulated
 from warmprior.transforms.absolute_actions import AbsoluteActions
 

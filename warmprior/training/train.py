@@ -18,9 +18,10 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.modules.start import StartPoint
 from warmprior.objectives.couplings import Coupling
-from warmprior.training.behaviour_cloning import BehaviourCloning, precondition
+from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.options import NetworkOptions
 from warmprior.training.placement import placed
+from warmprior.training.precondition import precondition
 from warmprior.training.saved import load_policy
 from warmprior.training.task import Task
 from warmprior.training.threads import torch_threads
