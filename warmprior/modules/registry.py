@@ -6,7 +6,7 @@ import importlib
 import inspect
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 __all__ = ["Registered", "find", "from_config", "make", "options_of"]
@@ -20,7 +20,8 @@ class Registered:
 
     Raises:
         ValueError: when a subclass takes the name of another, or one that no file can have.
-        TypeError: when a constructor is given arguments behind ``*``, which have no names to save them by.
+        TypeError: when a constructor is given arguments behind ``*`` that have no names in its base class to
+            save them by.
 
     Examples:
         >>> class Shape(Registered): ...
@@ -67,7 +68,7 @@ class Registered:
             elif parameter.kind is not parameter.VAR_POSITIONAL:
                 arguments[name] = value
             elif value:
-                raise TypeError(f"{cls.__name__} must name its arguments: *{name} could not be saved")
+                arguments |= _named(cls, value)
         return self
 
     def config(self) -> dict[str, Any]:
@@ -212,6 +213,16 @@ def _known[T: Registered](base: type[T], name: Any, advice: str) -> type[T]:
         known = ", ".join(sorted(base._classes))
         raise ValueError(f"unknown {_kind(base)} {name!r}: it is none of {known}; {advice}")
     return base._classes[name]
+
+
+def _named(cls: type, values: Sequence[Any]) -> dict[str, Any]:
+    """Arguments behind ``*``, by the names that the constructor of the base class has for them."""
+    following = [base for base in cls.__mro__ if "__init__" in vars(base)][1]
+    parameters = list(inspect.signature(vars(following)["__init__"]).parameters.values())[1:]
+    names = [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+    if len(values) > len(names):
+        raise TypeError(f"{cls.__name__} must name its arguments: what is behind * could not be saved")
+    return dict(zip(names, values, strict=False))
 
 
 def _kind(base: type) -> str:
