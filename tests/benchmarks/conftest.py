@@ -76,16 +76,3 @@ def validation(tmp_path_factory):
     path = tmp_path_factory.mktemp("held-out") / "val.hdf5"
     write_robomimic_file(path, lengths=(25, 30), task="lift", seed=1)
     return path
-
-
-@pytest.fixture
-def no_work(monkeypatch):
-    """Nothing is generated, downloaded or trained."""
-
-    def never(*args, **options):
-        raise AssertionError("work was begun")
-
-    places = ["common.train_policy", "robomimic.train", "measures.generate_demonstrations"]
-    loaders = ("generate_demonstrations", "download_robomimic", "download_mimicgen")
-    for place in [*places, *(f"warmprior.training.task.{name}" for name in loaders)]:
-        monkeypatch.setattr(place, never)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,7 +16,6 @@ import jobs
 import robomimic
 from common import Cell, play
 from options import PRESETS, parse
-from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
 from tests.benchmarks import drift
@@ -31,7 +28,7 @@ from warmprior import RealTimeChunking, policy_transforms
 from warmprior.diagnostics import smoothness
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import rank, world_size
-from warmprior.training import Episode, play_episode
+from warmprior.training import play_episode
 
 ROOT = Path(__file__).parents[2]
 
@@ -112,39 +109,6 @@ def test_a_row_is_what_episodes_played_by_hand_give(finished, cell, row):
         (mine,) = (r for r in stored(finished) if policy.facts.items() | row.items() <= r.items())
         assert all(mine[name] == found[name] for name in found)
         assert 0 < mine["success_rate"] < 1 and "episode_side" in mine
-
-
-def test_a_measure_may_be_called_what_a_column_is_called():
-    chunk = torch.zeros(1, 4, 1)
-    source = {"loc": chunk, "warm": torch.zeros(1, 4, 1, dtype=torch.bool)}
-    after = {"executed_steps": torch.full((1, 1), 4), "done": torch.ones(1, 1, dtype=torch.bool)}
-    written = {"vla_action": {"chunk": chunk}, "prior": source, "next": after}
-    decisions = TensorDict(written, [1])
-    own = {"success_rate": 7.0, "kappa": 3.0}
-    found = [Episode(s, s > 0, 9, decisions, measures=own) for s in (0, 1)]
-    policy = SimpleNamespace(facts={}, seconds=1.0)
-    (row,) = [common.row(policy, Cell(20, 3), found, {"kappa": 0.5})]
-    assert (row["success_rate"], row["episode_success_rate"]) == (0.5, 7.0)
-    assert (row["kappa"], row["episode_kappa"]) == (0.5, 3.0)
-
-
-def test_the_reward_is_no_measure_of_a_task():
-    with pytest.raises(KeyError, match="of drift does not write 'reward' beside its reward"):
-        common.check_environment(replace(drift.task(), measures={"reward": "max"}))
-
-
-@pytest.mark.parametrize("text", ["{}", "[]", "x", '{"seconds": null}'])
-def test_a_damaged_clock_is_named(text, tmp_path):
-    path = tmp_path / "status.json"
-    path.write_text(text)
-    with pytest.raises(ValueError, match=r"status.json does not say .*: remove it"):
-        common.clock(path)
-
-
-def test_two_tasks_of_one_name_are_refused():
-    names = [f"tests.benchmarks.drift:{name}" for name in ("task", "other")]
-    with pytest.raises(ValueError, match="two tasks are called drift own"):
-        policies_of(["--task", *names, "--nfe", "1"])
 
 
 def test_a_run_continues_with_what_is_missing(finished, tmp_path, capsys):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from learned_sources import (
@@ -18,7 +16,7 @@ from learned_sources import (
 from tensordict import TensorDict
 
 from tests.toy_env import random_history
-from warmprior import GaussianPrior, PriorSampler, VelocityMLP, WarmPriorActor, window_transforms
+from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor, window_transforms
 from warmprior.modules import Prior, StartPoint
 from warmprior.modules.registry import from_config, make
 from warmprior.training import load_policy, save_policy
@@ -233,14 +231,6 @@ class TestStep:
                 a = a + 0.25 * network(torch.full((3,), t), a, data["observation"])
             torch.testing.assert_close(out["vla_action", "chunk"], a)
 
-    @pytest.mark.parametrize(
-        "options",
-        [{"start_time": 1.0}, {"start_time": True}, {"stall": -1.0}, {"stall_noise": math.inf}],
-    )
-    def test_options_out_of_range(self, options):
-        with pytest.raises(ValueError, match=next(iter(options))):
-            ForecastStart(H, **options)
-
 
 @pytest.mark.parametrize("kind", LEARNED)
 def test_configurations_build_the_same_learner(kind, data, batch):
@@ -274,46 +264,3 @@ def test_the_same_seed_learns_the_same_and_leaves_other_draws_alone(data):
     assert torch.equal(torch.get_rng_state(), state)
     pairs = zip(first.parameters(), second.parameters(), strict=True)
     assert all(torch.equal(a, b) for a, b in pairs)
-
-
-def test_a_sampler_hands_on_the_observation(batch):
-    prior = built(ForecastPrior)
-    with pytest.raises(ValueError, match=r"ForecastPrior takes one tensor .*got none"):
-        PriorSampler(prior)(batch.clone())
-    sampler = PriorSampler(prior, observation_key="observation")
-    out = sampler(batch.clone(), generator=torch.Generator().manual_seed(0))
-    mean, scale, _ = prior.distribution(batch["history"], batch["observation"])
-    eps = torch.randn(mean.shape, generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(out["prior", "noise"], mean + scale * eps)
-
-
-def test_bad_input_is_named(data):
-    for options, said in (
-        ({"widths": [1, 1]}, "zip"),
-        ({"widths": [0, 1, 1]}, "at least 1"),
-        ({"widths": [1, 1, 1.5]}, "observation_steps"),
-        *(({"hidden_dim": wrong}, "hidden_dim") for wrong in (0, 1.5, True)),
-    ):
-        with pytest.raises(ValueError, match=said):
-            LeapPrior(H, **options)
-    for options in ({"latent_dim": 0}, {"latent_dim": 2.5}, {"beta": 0.0}, {"beta": math.inf}):
-        with pytest.raises(ValueError, match=next(iter(options))):
-            CVAEPrior(H, **options)
-    history = random_history(GaussianPrior(H), 1, action_dim=D_A)
-    with pytest.raises(ValueError, match=r"ForecastPrior has no networks yet: give widths"):
-        ForecastPrior(H).distribution(history)
-    with pytest.raises(ValueError, match="LeapPrior has no networks yet"):
-        learn(LeapPrior(H), data, iterations=1)
-    nested = TensorDict({"pose": torch.zeros(1, 1, D_O)}, [1])
-    with pytest.raises(ValueError, match=r"ForecastPrior takes one tensor.*nested"):
-        built(ForecastPrior).distribution(history, nested)
-    prior = built(ForecastPrior)
-    for options in ({"iterations": 0}, {"iterations": 1, "held_out": 1.0}):
-        with pytest.raises(ValueError, match="iterations >= 1"):
-            learn(prior, data, observation_steps=1, **options)
-    broken = data.clone()
-    broken["action"][5] = math.nan
-    with pytest.raises(ValueError, match="NaN"):
-        learn(prior, broken, iterations=20, observation_steps=1)
-    with pytest.raises(FloatingPointError, match=r"ForecastPrior became NaN .*lower the learning"):
-        learn(prior, data, iterations=20, observation_steps=1, learning_rate=1e30)

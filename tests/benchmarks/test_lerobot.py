@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import shutil
-
 import pytest
 
 pytest.importorskip("robosuite")
@@ -14,7 +11,7 @@ pytest.importorskip("lerobot")
 import curvature
 import robomimic
 
-from tests.benchmarks.script_parts import command_line, described, options, refused, stored, written
+from tests.benchmarks.script_parts import command_line, described, options, stored, written
 from warmprior.data import convert_robomimic
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
@@ -30,14 +27,6 @@ def offline():
 @pytest.fixture(scope="module")
 def folder(dataset, tmp_path_factory):
     return convert_robomimic(dataset, tmp_path_factory.mktemp("data") / "lift", progress=False)
-
-
-@pytest.fixture
-def bare(folder, tmp_path):
-    """As from another converter: it does not say which environment it is of."""
-    copy = shutil.copytree(folder, tmp_path / "bare")
-    (copy / "meta" / "warmprior.json").unlink()
-    return copy
 
 
 def test_results_are_those_of_the_file(dataset, folder, tmp_path, monkeypatch):
@@ -62,26 +51,3 @@ def test_results_are_those_of_the_file(dataset, folder, tmp_path, monkeypatch):
     few = {"run": "lerobot", "out": "curvature", "observations": 20, "steps": 4}
     assert curvature.main(command_line(**few, validation=place)) == 0
     assert "TRAINING demonstrations" in (tmp_path / "curvature" / "report.md").read_text()
-
-
-def test_what_does_not_fit_is_refused(folder, bare, tmp_path, capsys, no_work):
-    whole, undescribed = f"lerobot:{folder}", f"lerobot:{bare}"
-    for place, extra, said in (
-        (whole, {"task": "can"}, "was recorded in Lift, not in PickPlaceCan"),
-        (undescribed, {"task": None}, "does not say which environment"),
-        (
-            undescribed,
-            {"task": "can"},
-            r"the observations are .* those of PickPlaceCan",
-        ),
-        (
-            undescribed,
-            {"task": "transport"},
-            "'action' has 7 columns, but TwoArmTransport takes 14",
-        ),
-        (f"lerobot:{tmp_path}/absent", {}, "no such folder"),
-        (str(folder), {}, f"no such file; for a LeRobotDataset write lerobot:{folder}"),
-    ):
-        line = refused(robomimic.main, options(place, tmp_path / "out", **extra), capsys)
-        assert re.search(said, line), line
-    assert not list(tmp_path.glob("out/*"))

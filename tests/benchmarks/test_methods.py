@@ -8,7 +8,7 @@ import pytest
 import torch
 from methods import METHODS, Method
 
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.history import cold_history
 from warmprior.modules.prior import Prior
 from warmprior.objectives import OTCoupling, ReflowCoupling
@@ -116,10 +116,3 @@ def test_couplings_are_those_of_the_table():
     a0, seen = torch.randn(4, H, 1), torch.randn(4, 1, 1)
     expected = ReflowCoupling(teacher, 2)(a0, a0, seen)[1]
     assert torch.equal(coupling(a0, a0, seen)[1], expected)
-
-
-def test_sources_that_learn_are_given_the_widths_of_the_data():
-    prior = Method("forecast,hidden_dim=16", H).prior((2, 5, 1))
-    assert (prior.action_dim, prior.observation_dim, prior.hidden_dim) == (2, 5, 16)
-    assert Method("step", H).start((2, 5, 1)).observation_steps == 1
-    assert type(Method("past", H).prior((2, 5, 1))) is PastPrior

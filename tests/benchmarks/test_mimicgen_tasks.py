@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.script_parts import command_line, described, options, refused, stored
+from tests.benchmarks.script_parts import described, options, stored
 from tests.data.synthetic import env_args_14, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
 
@@ -53,51 +53,6 @@ def test_papers_recipe(package, tmp_path, monkeypatch):
     assert found.data.data == ("source",) and found.data.first("source") is None
     assert paper_success("coffee_d0", "source", "preview", 1, seen="image") == 29.4
     assert paper_success("threading_d0", "source", "past", 3, seen="image") == 16.6
-
-
-def test_what_can_be_had_decides_the_task(package, tmp_path):
-    quick = read(tmp_path)
-    assert quick.data.task == ("stack",) and quick.data.count("ph") == 10
-    assert (quick.training.iterations, quick.training.batch_size) == (5_000, 128)
-    core = ["--download", "--task", "coffee_d0", "--data", "core", "--demonstrations", "10"]
-    assert read(tmp_path, *core).data.first("core") == 10
-
-
-def test_tasks_without_an_expert_say_where_data_are(tmp_path, capsys, no_work):
-    argv = command_line(task="coffee_d0", out=tmp_path / "out")
-    assert "no scripted expert for coffee_d0: add --download" in refused(script.main, argv, capsys)
-    argv = command_line(task="coffee", out=tmp_path / "out")
-    assert "choose one of lift, " in (said := refused(script.main, argv, capsys))
-    assert "coffee_d0" in said and not list(tmp_path.glob("out/*"))
-
-
-def test_without_the_package_nothing_is_begun(tmp_path, capsys, no_work, monkeypatch):
-    monkeypatch.setattr("warmprior.envs.mimicgen.find_spec", lambda name: None)
-    file = tmp_path / "stack.hdf5"
-    write_robomimic_file(file, task="stack_d0")
-    for source in (["--download"], ["--dataset", str(file)]):
-        argv = [*source, "--out", str(tmp_path / "out")]
-        assert "need NVlabs' package" in refused(script.main, argv, capsys)
-
-
-def test_robosuites_stack_from_scripted_demonstrations(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
-    argv = command_line(
-        demonstrations=1,
-        iterations=20,
-        episodes=1,
-        envs=1,
-        nfe=1,
-        prior="past",
-        logger="none",
-        out=tmp_path / "out",
-    )
-    assert script.main(argv) == 0
-    (row,) = stored(tmp_path / "out")
-    assert (row["task"], row["data"], row["iterations"]) == ("stack", "ph", 20)
-    (task,) = described(tmp_path / "out", "tasks")
-    assert task["demonstrations"] == 1 and task["source"] == "scripted"
-    assert "paper (official data)" not in capsys.readouterr().out  # it has another Stack
 
 
 def test_a_file_in_mimicgens_environment(tmp_path):

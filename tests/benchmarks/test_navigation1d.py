@@ -44,29 +44,3 @@ def test_run_writes_rows_report_and_pictures(tmp_path, capsys):
     # Another recipe does not fit these policies.
     said = refused(navigation1d.main, [*argv, "--resume", "--cold-probability", "0.5"], capsys)
     assert "was started with other values of --cold-probability" in said
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--chunk 64", "--chunk must be at most 32, got 64"),
-        ("--chunk 4 8", "this study has one --chunk"),
-        ("--cold-probability 2", "cold_probability"),
-    ],
-)
-def test_bad_options_stop_before_any_work(tmp_path, capsys, no_work, words, message):
-    out = tmp_path / "runs" / "out"
-    assert message in refused(navigation1d.main, [*words.split(), "--out", out], capsys)
-    assert not out.exists() and not (tmp_path / "runs" / "policies").exists()
-
-
-def test_a_picture_that_cannot_be_drawn_costs_no_table(tmp_path, capsys, monkeypatch):
-    def broken(*args):
-        raise ValueError("no picture")
-
-    monkeypatch.setattr(navigation1d, "draw", broken)
-    out = tmp_path / "out"
-    few = {"iterations": 2, "episodes": 2, "chunk": 32, "nfe": 1, "prior": "gaussian", "envs": 1}
-    argv = command_line(**few, logger="none", out=out)
-    assert "no picture" in refused(navigation1d.main, argv, capsys)
-    assert "| Base | 1 |" in (out / "report.md").read_text()

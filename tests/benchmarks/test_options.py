@@ -21,18 +21,15 @@ from options import (
     Options,
     Run,
     adapted,
-    differences,
     from_record,
     parse,
     recorded,
     started,
     study,
-    with_parts,
 )
 from robomimic import beside, smaller
 
-from warmprior.envs import rendering
-from warmprior.training import DataOptions, NetworkOptions
+from warmprior.training import DataOptions
 
 IMAGE = DataOptions(obs="image")
 STUDIES = (budget.BudgetOptions, real_time_chunking.DelayOptions)
@@ -89,47 +86,12 @@ def test_every_option_has_its_own_name():
     assert found.run.envs == 2
 
 
-@pytest.mark.parametrize(
-    ("argv", "message"),
-    [
-        ("--no-precondition", "--no-precondition needs --weighting velocity"),
-        ("--task nothing", "unknown task 'nothing'"),
-        ("--data source", "--data source is that of MimicGen's files: add --download"),
-        ("--seed -1", "seed must be at least 0"),
-        (f"--seed {2**63 - 1} --seeds 2", "--seed must be below 2**63"),
-        ("--network chi_transformer --hidden-dim 32", "--hidden-dim 32: num_heads must divide"),
-        ("--task own.module:task --actions absolute", "--actions belongs to robosuite's tasks"),
-        ("--learning-rate nan", "learning_rate must be a finite number > 0"),
-        ("--betas 0.9 2", "betas must lie in [0, 1)"),
-        ("--self-distillation -1", "self_distillation must be a finite weight >= 0, got -1"),
-        ("--grid dense-jump:2", "the jump of a grid must start in (0, 1), got 'dense-jump:2'"),
-        ("--objective l1 --prior past regression --nfe 1", "leave out regression"),
-        ("--self-distillation 1 --prior regression --nfe 1", "leave out regression"),
-        ("--task can --dataset x.hdf5 --download", "leave out --download"),
-        ("--logger wandb", "--logger wandb needs the package wandb"),
-    ],
-)
-def test_what_cannot_work_is_refused_before_any_work(argv, message, tmp_path, monkeypatch):
-    monkeypatch.setattr("options.find_spec", lambda name: None)
-    with pytest.raises((ValueError, ImportError)) as error:
-        read(*argv.split(), out=tmp_path / "out")
-    assert message in str(error.value) and not (tmp_path / "out").exists()
-
-
 def test_an_address_without_a_cluster_is_refused_before_anything_is_written(tmp_path):
     pytest.importorskip("ray")
     argv = ["--engine", "ray", "--ray-address", "127.0.0.1:1"]
     with pytest.raises(ConnectionError, match=r"127\.0\.0\.1:1 is no cluster"):
         read(*argv, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_who_computes_is_no_part_of_a_run():
-    local = PRESETS["quick"]
-    elsewhere = replace(local, run=Run(engine="ray", ray_address="head:6379", envs=3, resume=True))
-    assert recorded(elsewhere) == recorded(local)
-    other = with_parts(elsewhere, training={"seed": 3}, run={"compile": True})
-    assert set(differences(recorded(local), recorded(other))) == {"--seed", "--compile"}
 
 
 def test_what_fails_at_once_is_not_in_the_way_of_its_correction(tmp_path):
@@ -194,20 +156,6 @@ def preset_of_images(name):
     return adapted(PRESETS[name], Options(data=IMAGE, run=Run(preset=name)))
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS))
-def test_presets_of_states_are_untouched(name):
-    assert adapted(PRESETS[name], Options(run=Run(preset=name))) is PRESETS[name]
-
-
-def test_the_papers_encoder_where_its_weights_can_be_had(monkeypatch):
-    monkeypatch.setattr("options.imagenet_weights", dict)
-    found = preset_of_images("paper")
-    # Table 3: 84 x 84 pixels, 76 x 76 random crop, ResNet-18 from ImageNet, batches of 256.
-    assert (found.data.image_size, found.network.crop_size) == (84, 76)
-    assert (found.network.encoder, found.training.batch_size) == ("resnet18-imagenet", 256)
-    assert not found.data.fast_rendering and not found.network.share_encoder
-
-
 def test_where_they_cannot_be_had_it_starts_from_random_ones_and_says_so(offline, capsys):
     assert preset_of_images("paper").network.encoder == "resnet18"
     said = capsys.readouterr().out
@@ -220,14 +168,6 @@ def test_where_they_cannot_be_had_it_starts_from_random_ones_and_says_so(offline
     # Asked for elsewhere, missing weights are an error before any work.
     with pytest.raises(OSError, match="cannot be had"):
         replace(PRESETS["quick"], data=IMAGE).check()
-
-
-def test_without_a_renderer_images_are_refused_as_an_option(monkeypatch):
-    monkeypatch.setattr(rendering, "rendering_backend", lambda: None)
-    with pytest.raises(ValueError, match=r"--obs image needs .*libegl1.*libosmesa6"):
-        IMAGE.check()
-    with pytest.raises(ValueError, match="belong to --obs image"):
-        NetworkOptions(crop_size=9).check(DataOptions())
 
 
 @pytest.mark.parametrize("script", ["robomimic", "sigma", "prior_space_rl", "real_time_chunking", "pusht"])

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import pytest
 
 pytest.importorskip("tyro")
 pytest.importorskip("lerobot")
 
-import common
 import pusht
 
 from tests.data.lerobot_parts import write_lerobot
@@ -37,12 +34,3 @@ def test_it_takes_as_many_demonstrations_as_are_asked_for(folder):
     assert every.data["observation"].shape[-1] == 2 + 16
     assert every.data["observation"].abs().max().item() == pytest.approx(1.0)
     assert every.success == "is_success" and every.measures == {"coverage": "max"}
-
-
-def test_the_environment_is_that_of_its_extra(folder):
-    task = pusht.task(DataOptions(dataset=f"lerobot:{folder}"))
-    if find_spec("gym_pusht") is None:
-        with pytest.raises(ImportError, match="pusht"):
-            task.make_env()
-    else:
-        common.check_environment(task)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 
 import pytest
 
@@ -12,7 +11,6 @@ from tests.benchmarks.script_parts import (
     described,
     is_png,
     options,
-    refused,
     stored,
     written,
 )
@@ -77,22 +75,3 @@ def test_it_continues_with_the_rows_that_are_missing(tmp_path):
     (out / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in kept))
     assert script.main(command_line(resume=[], out=out)) == 0
     assert stored(out) == before and written(tmp_path) == policies
-
-
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({"delay": 5}, r"--delay 5 with --execute 3 and gaussian.*too long.*at most 4"),
-        ({"delay": 2, "execute": 7}, r"--delay 2 with --execute 7 and gaussian.*at most 6"),
-        ({"delay": 3, "rtc__horizon": 2}, r"horizon=2, before the delay of 3"),
-        ({"execute": 9}, r"need 0 <= delay and execute <= H = 8"),
-        ({"delay": -1}, r"--delay -1.*need 0 <= delay"),
-        ({"chunk": [4, 8]}, r"one --chunk"),
-        ({"play_on": []}, r"leave out --play-on, or add --toy no"),
-        ({"prior": "regression", "nfe": 1, "guidance": "rtc"}, r"regression is no flow to guide"),
-        ({"rtc__max_guidance_weight": 0}, r"max_guidance_weight must be > 0"),
-    ],
-)
-def test_what_cannot_be_is_refused_before_any_work(no_work, given, said, tmp_path, capsys):
-    line = refused(script.main, command_line(**given, out=tmp_path / "out"), capsys)
-    assert re.search(said, line), line

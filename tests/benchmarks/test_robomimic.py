@@ -24,7 +24,6 @@ import robomimic
 from options import PRESETS, parse, started
 
 from warmprior.envs import rendering_backend
-from warmprior.io.files import exclusive
 
 SCRIPT = Path(robomimic.__file__)
 
@@ -95,56 +94,6 @@ def test_a_prior_of_ones_own_enters_by_its_place(dataset, tmp_path, capsys):
     assert robomimic.main([*map(str, again), "--prior", "gaussian", place]) == 0
 
 
-@pytest.mark.parametrize(
-    ("extra", "message"),
-    [
-        ({"nfe": 0}, "--nfe must be a whole number of at least 1, got 0"),
-        ({"episodes": 0}, "--episodes must be a whole number of at least 1, got 0"),
-        ({"seeds": 0}, "--seeds must be a whole number of at least 1, got 0"),
-        ({"envs": 0}, "--envs must be a whole number of at least 1, got 0"),
-        ({"chunk": 0}, "--chunk must be a whole number of at least 1, got 0"),
-        ({"device": "cuda:99"}, "--device cuda:99 does not work here"),
-        ({"task": "can"}, "holds demonstrations of lift"),
-        ({"task": ["lift", "can"]}, "name at most one --task"),
-        ({"demonstrations": 5}, "there are 3 demonstrations, fewer than the 5 to be taken"),
-        ({"prior": "regression", "nfe": 9}, "regression is trained for --nfe 1 alone"),
-        ({"prior": "ot", "batch_size": 1}, "ot pairs within a batch"),
-        ({"prior": "nobodys"}, "unknown prior 'nobodys'"),
-        ({"dataset": "missing.hdf5"}, "--dataset missing.hdf5: no such file"),
-        ({"preset": "nobodys"}, "--preset must be one of quick, cpu, paper"),
-        ({"chunk": 41}, "predicts more steps than the longest demonstration"),
-        ({"ray_address": "node:6379"}, "--ray-address belongs to --engine ray"),
-        ({"force_download": []}, "--force-download belongs to --download"),
-        ({"encoder": "small"}, "--encoder belong to --obs image"),
-        ({"dataset": None, "task": "tool_hang"}, "add --download for the official data"),
-        ({"dataset": None, "task": "nowhere:task"}, "No module named 'nowhere'"),
-    ],
-    ids=str,
-)
-def test_bad_options_stop_before_any_work(dataset, tmp_path, capsys, no_work, extra, message):
-    argv = options(dataset, tmp_path / "out", **extra)
-    assert message in refused(robomimic.main, argv, capsys)
-    assert not list(tmp_path.glob("policies/*")) and not list(tmp_path.glob("out/*"))
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--episods 3", "--episods"),
-        ("--rl.delta 1", "--rl.delta"),
-        ("--logger paper", "invalid choice 'paper'"),
-        ("--data xy", "invalid choice 'xy'"),
-        ("--episodes many", "--episodes"),
-    ],
-)
-def test_what_is_no_option_is_named_by_the_parser(tmp_path, capsys, words, message):
-    with pytest.raises(SystemExit) as stop:
-        robomimic.main([*words.split(), "--out", str(tmp_path / "out")])
-    said = capsys.readouterr()
-    assert stop.value.code == 2 and message in said.err and not said.out
-    assert not (tmp_path / "out").exists()
-
-
 def test_resuming_takes_the_stored_options_and_refuses_others(dataset, tmp_path, monkeypatch):
     monkeypatch.chdir(dataset.parent)
     first = begin(*options(dataset.name, tmp_path, chunk=4, sigma=0.3, prior="past"))
@@ -172,15 +121,6 @@ def test_resuming_takes_the_stored_options_and_refuses_others(dataset, tmp_path,
         parse(PRESETS, list(map(str, resume)), "sigma", None)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "[]", '{"study": "robomimic", "options": {"tusk": {}}}', '{"study": "robomimic"}']
-)
-def test_damaged_options_are_named(tmp_path, text):
-    (tmp_path / "options.json").write_text(text)
-    with pytest.raises(ValueError, match=r"options\.json|holds a run of None"):
-        read("--resume", "--out", tmp_path)
-
-
 def test_default_folders_are_numbered_past_the_latest(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert str(begin().run.out) == "runs/square-ph-quick"
@@ -190,16 +130,6 @@ def test_default_folders_are_numbered_past_the_latest(tmp_path, monkeypatch):
     assert str(read("--resume").run.out) == "runs/square-ph-quick-2"
     assert str(read("--data", "mh", "--preset", "cpu").run.out) == "runs/square-mh-cpu"
     assert str(read("--task", "can", "stack").run.out) == "runs/can-stack-ph-quick"
-
-
-def test_a_folder_that_cannot_be_written_is_refused_first(dataset, tmp_path, capsys):
-    out, file = tmp_path / "out", tmp_path / "file"
-    with exclusive(out):
-        said = refused(robomimic.main, options(dataset, out), capsys)
-        assert f"{out} is in use by another process" in said
-    assert not list(out.iterdir())
-    file.write_text("not a folder")
-    assert str(file) in refused(robomimic.main, options(dataset, file), capsys)
 
 
 @pytest.mark.slow

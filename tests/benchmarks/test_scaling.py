@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
 
@@ -44,11 +43,6 @@ def test_episodes_of_their_own_length():
     assert lockstep(episodes, 2, lambda n: 1.0) == (1 + 5) + (1 + 2) + (1 + 2)
 
 
-def test_more_cores_never_take_longer_when_episodes_are_equal():
-    times = [apart(EQUAL, cores) for cores in range(1, 14)]
-    assert all(a >= b for a, b in itertools.pairwise(times))
-
-
 @pytest.mark.slow
 def test_the_script(tmp_path, monkeypatch):
     monkeypatch.setattr(scaling, "TRAINED", 10)
@@ -70,8 +64,3 @@ def test_the_script(tmp_path, monkeypatch):
     assert all(len(e["decisions"]) == len(e["steps"]) for e in results["recorded"])
     assert (out / "scaling.png").stat().st_size > 10_000
     assert re.search(r"^16 +\d", (out / "table.txt").read_text(), re.M)
-
-
-def test_no_policy(tmp_path, capsys):
-    assert scaling.main([str(tmp_path / "none")]) == 2
-    assert "none" in capsys.readouterr().err

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import importlib
-import json
-import shutil
 
 import pytest
 
-from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
-from tests.data.synthetic import write_robomimic_file
+from tests.benchmarks.script_parts import command_line, is_png, options, stored, written
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
@@ -162,74 +159,3 @@ def test_studies_cover_the_papers_grid_by_default(scripts, monkeypatch):
     names = ("gaussian", "past", "preview")
     assert lengths == {(n, h) for n in names for h in (1, 2, 4, 8, 16)}
     assert made["chunking"].evaluation.nfe == (9, 3, 1)
-
-
-@pytest.mark.parametrize(
-    ("script", "extra", "message"),
-    [
-        ("sigma", {"sigma": [-1.0]}, "sigma"),
-        ("sigma", {"nfe": [1, 3]}, "this study has one --nfe, got 1 3"),
-        ("sigma", {"chunk": [4, 8]}, "this study has one --chunk, got 4 8"),
-        ("chunking", {"dataset": None, "task": ["lift", "can"]}, "this study has one --task"),
-        ("budget", {"budgets": [0]}, "--budgets must be a whole number of at least 1, got 0"),
-        ("budget", {"sigma": [0.1, 0.2]}, "this study has one --sigma"),
-        ("curvature", {"prior": "regression"}, "none of these policies has a flow"),
-        ("curvature", {"coordinate": 9}, "--coordinate must be in [0, 7)"),
-        ("curvature", {"validation": None}, "add --validation FILE"),
-        ("sigma", {"validation": None}, "add --validation FILE"),
-        ("budget", {"validation": None}, "add --validation FILE"),
-        ("curvature", {"validation": "missing.hdf5"}, "missing.hdf5"),
-        ("budget", {"validation": "square"}, "holds demonstrations of square"),
-        ("sigma", {"observations": 5_000}, "5000 observations are asked for"),
-        ("sigma", {"steps": 1}, "--steps must be at least 2"),
-        ("budget", {"draws": 0}, "--draws must be a whole number of at least 1"),
-    ],
-)
-def test_what_cannot_be_is_named_before_any_training(
-    scripts, dataset, validation, tmp_path, capsys, no_work, script, extra, message
-):
-    if extra.get("validation") == "square":
-        path = tmp_path / "other.hdf5"
-        write_robomimic_file(path, lengths=(25, 30), task="square", seed=1)
-        extra = {"validation": path}
-    out = tmp_path / "out"
-    values = {"out": out} if script == "chunking" else measured(out, validation)
-    assert message in refused(scripts[script].main, options(dataset, **values | extra), capsys)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--run {empty}", "it has no results.jsonl; name a run of robomimic.py"),
-        ("--run {run} --out {run}", "holds a run"),
-        ("--run {run} --task can", "--run names the policies, and with them the task"),
-        ("--resume --out {run}", "holds a run of robomimic"),
-        ("--resume --out {run}-other", "--resume: there is no run"),
-    ],
-)
-def test_what_is_no_finished_run_is_named(scripts, finished, tmp_path, capsys, words, message):
-    (tmp_path / "empty").mkdir()
-    argv = words.format(run=finished, empty=tmp_path / "empty").split()
-    argv += [] if "--out" in argv else ["--out", tmp_path / "out"]
-    before = (finished / "options.json").read_bytes()
-    assert message in refused(scripts["curvature"].main, argv, capsys)
-    assert (finished / "options.json").read_bytes() == before
-
-
-@pytest.mark.parametrize("change", [{"sigma": 1.0}, {"chunk": 4}, {"iterations": 2}, {"policy": ""}])
-def test_a_run_that_cannot_be_compared_is_named(scripts, finished, tmp_path, capsys, change):
-    """Several policies of a prior are not taken for seeds, and what is missing is missed."""
-    run = tmp_path / "runs" / "run"
-    shutil.copytree(finished.parent / "policies", tmp_path / "runs" / "policies")
-    run.mkdir()
-    row = next(row for row in stored(finished) if row["prior"] == "past")
-    source = tmp_path / "runs" / "policies" / row["policy"]
-    other = row | {"policy": "other"} | change
-    if change.get("policy") is None:
-        at = f"policy_{other['iterations']:06d}"
-        shutil.copytree(source / f"policy_{row['iterations']:06d}", source.with_name("other") / at)
-    (run / "results.jsonl").write_text("".join(json.dumps(r) + "\n" for r in (row, other)))
-    (run / "tasks.json").write_text('[{"task": "lift", "data": "ph"}]')
-    said = refused(scripts["curvature"].main, command_line(run=run, out=tmp_path / "out"), capsys)
-    missing = change.get("policy") is not None
-    assert ("is missing: finish the run" if missing else "one sigma and chunk length") in said

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import sys
 import time
 from pathlib import Path
 
@@ -70,43 +69,10 @@ def test_what_needs_a_gpu_is_skipped_by_name(throughput, tmp_path, capsys):
         assert results[name] is None and f"{name}: skipped, needs a GPU" in said.out + said.err
 
 
-def test_jobs_are_timed_on_the_engines_that_are_there(throughput, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    throughput.main(["--only", "job_overhead", "--repeats", "1", "--out", str(tmp_path)])
-    (found,) = json.loads((tmp_path / "throughput.json").read_text())["job_overhead"].items()
-    assert found[0] == "local" and found[1] > 0
-
-
-def test_images(throughput, tmp_path):
-    names = ["image_windows_over_h5py", "encoder_share"]
-    throughput.main(["--only", *names, "--repeats", "1", "--out", str(tmp_path)])
-    results = json.loads((tmp_path / "throughput.json").read_text())
-    # What they are on a busy machine says nothing.
-    assert results["image_windows_over_h5py"] > 0
-    assert results["encoder_share"].keys() == {"1", "3", "9"}
-    assert min(results["encoder_share"].values()) > 0
-
-
 def test_ratio_of_known_times(throughput):
     clock = throughput.Clock(5, Bar())
     ratio = clock.ratio(lambda: time.sleep(0.03), lambda: time.sleep(0.01))
     assert ratio == pytest.approx(3, rel=0.4)
-
-
-def test_rounds_are_interleaved_and_the_first_is_dropped(throughput):
-    order = []
-    times = throughput.Clock(3, Bar()).times(
-        lambda: order.append("a"), lambda: order.append("b"), before=lambda: order.append("|")
-    )
-    assert "".join(order) == "|ba|ab|ba|ab"
-    assert [len(rounds) for rounds in times] == [3, 3]
-
-
-@pytest.mark.parametrize("arguments", [["--only", "nothing"], ["--repeats", "0"]])
-def test_bad_options(throughput, arguments, capsys):
-    with pytest.raises(SystemExit):
-        throughput.main(arguments)
-    assert "usage" in capsys.readouterr().err
 
 
 @pytest.mark.slow

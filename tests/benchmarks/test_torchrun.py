@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.benchmarks.script_parts import command_line, options, stored
+from tests.benchmarks.script_parts import command_line
 from warmprior.training.checkpoint import load_state
 
 pytest.importorskip("robosuite")
@@ -37,21 +37,6 @@ def run(script, argv, launcher=TORCHRUN):
     process = start(script, argv, launcher)
     out, err = process.communicate(timeout=300)
     return process.returncode, out, err
-
-
-@pytest.mark.slow
-def test_robomimic_trains_by_two_processes_and_plays_by_one(dataset, tmp_path):
-    """The facts of one process in the same order; each process draws its own part of a batch."""
-    rows = {}
-    for name, launcher in (("one", (sys.executable,)), ("two", TORCHRUN)):
-        argv = options(dataset, tmp_path / name / "out", prior=["gaussian", "past"])
-        code, out, err = run("robomimic.py", argv, launcher)
-        assert code == 0, err
-        assert out.count("Output folder") == 1 and out.count("results.csv and pictures") == 1
-        rows[name] = stored(tmp_path / name / "out")
-    facts = ("prior", "sigma", "seed", "checkpoint", "nfe", "episodes")
-    said = {name: [[row[fact] for fact in facts] for row in mine] for name, mine in rows.items()}
-    assert said["one"] == said["two"]
 
 
 def second_process(parent, deadline=60):
