@@ -50,12 +50,6 @@ def inline(request):
         cached.cache_clear()
 
 
-@pytest.fixture
-def processes(inline, monkeypatch):
-    """Jobs are computed in fresh processes, as users have it."""
-    monkeypatch.setattr("jobs.Local", inline)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def short_episodes():
     """Policies of a few iterations solve nothing: their episodes need not go to the time limit."""

@@ -6,7 +6,6 @@ import importlib
 from itertools import groupby
 
 import pytest
-from torchrl.envs import UnaryTransform
 
 from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
 
@@ -119,23 +118,8 @@ def test_papers_recipes():
         assert not config.backup_entropy and recipe.agent(True, "dsrl-sac", 3).backup_entropy
         assert recipe.agents.algorithm == (BOTH if task == "transport" else BOTH[:1])
     # Options of the command line stand above those of the task.
-    recipe = read("--preset paper --task square --rl.gamma 0.9 --episodes 3 --nfe 9")
-    config = recipe.agent(True, "dsrl-na", 0)
-    assert (config.gamma, config.evaluation_episodes, config.nfe) == (0.9, 3, 9)
-
-
-def test_a_training_that_diverges_leaves_the_others_alone(tmp_path, capsys, monkeypatch):
-    class Diverging(benchmark.PriorSpaceTraining):
-        def run(self):
-            if self.config.seed == 0:
-                raise FloatingPointError("loss_qvalue=nan")
-            return super().run()
-
-    monkeypatch.setattr(benchmark, "PriorSpaceTraining", Diverging)
-    argv = unit(tmp_path / "out", seeds=2, rl__environment_steps=200, rl__warmup_steps=100)
-    assert benchmark.main(argv) == 2
-    assert "dsrl-na past, seed 0: loss_qvalue=nan" in capsys.readouterr().err
-    assert {row["seed"] for row in stored(tmp_path / "out")} == {1}
+    config = read("--preset paper --task square --rl.gamma 0.9 --nfe 9").agent(True, "dsrl-na", 0)
+    assert (config.gamma, config.nfe) == (0.9, 9)
 
 
 def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
@@ -168,21 +152,7 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("factor", "least", "most"), [(1.0, 0.9, 1.0), (-1.0, 0.0, 0.05)])
-def test_the_toy_is_solved_for_its_reward(tmp_path, monkeypatch, factor, least, most):
-    """In the benchmark's budget; with the reward negated the agent keeps away from the goal."""
-    make = benchmark.environment
-
-    def paying(options, actor):
-        make_env = make(options, actor)
-
-        def make_paying(seed):
-            paid = UnaryTransform(["reward"], ["reward"], fn=lambda reward: factor * reward)
-            return make_env(seed).append_transform(paid)
-
-        return make_paying
-
-    monkeypatch.setattr(benchmark, "environment", paying)
+def test_the_toy_is_solved_in_the_benchmarks_budget(tmp_path):
     assert benchmark.main(["--preset", "unit", "--seeds", "1", "--out", str(tmp_path / "out")]) == 0
     (points,) = agents(stored(tmp_path / "out")).values()
-    assert rates(points, "base")[0] <= 0.6 and least <= rates(points, "greedy")[-1] <= most
+    assert rates(points, "base")[0] <= 0.6 and rates(points, "greedy")[-1] >= 0.9

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import re
 
@@ -13,8 +14,10 @@ from scipy import integrate, stats
 
 pytest.importorskip("tyro")
 
+import memory
 import report
 
+from tests.benchmarks.script_parts import is_png
 from warmprior.io.script import PartialFailure
 
 FACTS = {"task": "square", "data": "ph", "prior": "gaussian", "options": "", "sigma": 1.0, "chunk": 8}
@@ -73,7 +76,6 @@ def test_methods_and_problems_have_names_that_differ():
     assert list(found["method"]) == methods
     problems = ["Tool-Hang-PH", "Square-PH, absolute actions", "Square-PH, image observations"]
     assert list(found["problem"]) == problems
-    assert list(report.labelled(pd.DataFrame(rows))["method"])[1] == f"{methods[1]}, H 4"
 
 
 def test_a_summary_is_what_scipy_and_counting_say():
@@ -155,29 +157,23 @@ def test_measures_are_means_of_the_last_checkpoints_beside_the_baseline():
     assert [line["inner_step_ratio"] for line in lines_of(table(rows))] == ["-", "1.50 ± 0.00 (!)"]
 
 
-def test_the_terminal_table_fits():
-    options = ["", *(f"correlation=0.{k},a_long_name_of_an_option_beyond_the_width=1" for k in range(14))]
-    rows = [
-        row(4 + (o != ""), prior="past" if o else "gaussian", options=o, nfe=nfe, task=f"task{t}")
-        for o, nfe, t in itertools.product(options, range(1, 10), range(2))
-    ]
-    text = report.terminal_table(report.summary(pd.DataFrame(rows), 1), 1)
-    assert max(map(len, text.splitlines())) <= 120
-    assert text.startswith("15 methods") and text.splitlines()[3] == ""
-    assert text.count("**50.0** (+10.0)") == 2 * 9 * 14
-
-
-def test_the_first_lines_name_the_best_methods_and_how_sure_that_is():
+def test_the_terminal_table_fits_and_says_first_what_came_out():
     rows = [row(k, prior=p, nfe=9) for p, k in (("gaussian", 6), ("past", 4), ("preview", 5))]
     found = report.summary(pd.concat([compared(), pd.DataFrame(rows)], ignore_index=True), 1)
-    facts, best, sure, *_ = report.terminal_table(found, 1).splitlines()
+    facts, best, sure, empty, *_ = report.terminal_table(found, 1).splitlines()
     assert facts.endswith("H = 8, 3 seeds with 10 episodes each, best 1 of 2 checkpoints per seed.")
-    assert best == "Best success: Base 60.0% at NFE 9; WP-Past 80.0% at NFE 1."
+    assert best == "Best success: Base 60.0% at NFE 9; WP-Past 80.0% at NFE 1." and empty == ""
     said = re.findall(r"(\S+ [+-]\d+\.\d%), (\S+) at NFE (\d)", sure)
     chance = {(one["prior"], one["nfe"]): one["better"] for _, one in found.iterrows()}
     assert [(gain, nfe) for gain, _, nfe in said] == [("WP-Preview -10.0%", "9"), ("WP-Past +30.0%", "1")]
     expected = [chance["preview", 9], chance["past", 1]]
     assert [float(one) for _, one, _ in said] == pytest.approx(expected, abs=0.006)
+    names = [f"correlation=0.{k},a_long_name_of_an_option_beyond_the_width=1" for k in range(14)]
+    cells = [{"nfe": nfe, "task": task} for nfe in range(1, 10) for task in "ab"]
+    rows = [row(**cell) for cell in cells]
+    rows += [row(6, prior="past", options=options, **cell) for options in names for cell in cells]
+    text = report.terminal_table(report.summary(pd.DataFrame(rows), 1), 1)
+    assert max(map(len, text.splitlines())) <= 120 and text.count("60.0** (+10.0)") == 2 * 9 * 14
 
 
 def test_a_report_is_written_before_what_is_missing_is_an_error(tmp_path, capsys):
@@ -193,8 +189,6 @@ def test_a_report_is_written_before_what_is_missing_is_an_error(tmp_path, capsys
     assert list(written["success"]) == pytest.approx([0.5, 0.8, 0.5])
     shown = capsys.readouterr().out
     assert "short\n" in shown and "no memory" in shown and str(tmp_path) in shown
-    report.write_report(tmp_path, "short", "full", summary)
-    assert "Missing" not in (tmp_path / "report.md").read_text()
 
 
 def test_a_table_has_the_mean_and_deviation_of_every_group_in_the_order_of_the_rows():
@@ -214,3 +208,16 @@ def test_a_training_counts_by_its_last_checkpoint_and_succeeds_by_its_best_ones(
     (found,) = report.per_seed(pd.DataFrame(rows), 2).to_dict("records")
     assert (found["checkpoint"], found["boundary_jump"], found["success_rate"]) == (150, 1.5, 0.6)
     assert found["success"] == pytest.approx((9 + 6) / 20)
+
+
+def test_gains_of_all_runs_stand_beside_what_is_remembered(tmp_path, capsys):
+    one = [row(5, memory_gain=0.0), row(8, prior="past", memory_gain=0.25)]
+    # The first method has no gain, and what was not measured no point.
+    two = [row(5, task="can", memory_gain=0.0), row(8, task="can", prior="past", memory_gain=None)]
+    for name, rows in (("one", one), ("two", two)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "results.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    argv = [str(tmp_path / name) for name in ("one", "two")]
+    assert memory.main([*argv, "--out", str(tmp_path / "a.png")]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
+    assert lines[2:] == ["| Square-PH | 1 | WP-Past | 0.250 | +30.0% |"] and is_png(tmp_path / "a.png")
