@@ -342,25 +342,8 @@ def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
 
 def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
     """Observations that no policy was trained on, where there are some, and what they are in words."""
-    task, chunk_length = policy.task(), policy.method.chunk_length
-    steps, count = policy.network.observation_steps, options.held_out.observations
-    if task.normalizer is None or "file" not in task.facts:  # of a task of one's own
-        if options.held_out.validation is not None:
-            raise ValueError(f"--validation belongs to robosuite's tasks, and {task.name} is none")
-        data = task.data.to(policy.run.device)
-        shared = SharedObservations(data, chunk_length, observation_steps=steps)
-        if len(shared) > count:
-            generator = torch.Generator().manual_seed(0)
-            shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
-        return shared, "the TRAINING demonstrations (not held out)"
-    return held_out(
-        options.held_out,
-        facts_of(task),
-        task.normalizer,
-        chunk_length=chunk_length,
-        observation_steps=steps,
-        device=policy.run.device,
-    )
+    task, steps = policy.task(), policy.network.observation_steps
+    return held_out(options, facts_of(task), task.normalizer, policy.method.chunk_length, steps, task.data)
 
 
 def trained_actors(policies: Sequence[Policy]) -> dict[Method, dict[int, WarmPriorActor]]:
@@ -508,26 +491,13 @@ def batches(evaluation: Evaluation) -> list[range]:
     return [seeds[i : i + EPISODES_PER_JOB] for i in range(0, len(seeds), EPISODES_PER_JOB)]
 
 
-class Rows:
-    """`results.jsonl`: the rows of a run, in a given order, written atomically after each."""
-
-    def __init__(self, path: Path, order: Callable[[dict[str, Any]], Any] = lambda row: 0) -> None:
-        self.path, self.order = path, order
-        self.rows: list[dict[str, Any]] = read_lines(path) if path.exists() else []
-
-    def find(self, facts: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The row of these facts, if there is one."""
-        known = (row for row in self.rows if all(row.get(k) == v for k, v in facts.items()))
-        return next(known, None)
-
-    def add(self, *rows: Mapping[str, Any]) -> None:
-        """Add rows, and write all."""
-        self.rows = sorted([*self.rows, *map(dict, rows)], key=self.order)
-        replace_rows(self.path, self.rows)
+def stored_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of a file, if there is one."""
+    return read_lines(path) if path.exists() else []
 
 
-def replace_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Write a file of rows, and read it again as a table."""
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Write a file of rows in the place of another, and read it again as a table."""
     # JSON has no NaN: what is not known is null.
     known = [
         {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}

@@ -59,7 +59,7 @@ class Job:
             return None
 
 
-def _call(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, str | None]:
+def call(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, str | None]:
     """In a worker: the result, or why there is none, as text: some exceptions cannot be pickled."""
     import torch
 
@@ -98,11 +98,11 @@ class Local:
         slot = self._slot(job)
         assert slot is not None, "takes(job) says so"
         try:
-            self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
+            self._busy[slot] = self._pools[slot].submit(call, job.function, job.args)
         except (KeyError, BrokenProcessPool):  # none yet, or it died with an earlier job
             env = {"CUDA_VISIBLE_DEVICES": "".join(self._gpus[slot : slot + 1])}
             self._pools[slot] = fresh_processes(1, env=env if self._gpus else None)
-            self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
+            self._busy[slot] = self._pools[slot].submit(call, job.function, job.args)
         return self._busy[slot]
 
     def close(self, kill: bool) -> None:
@@ -135,7 +135,7 @@ class Ray:
         self._connection = ray_cluster(run.ray_address, run.envs, folders)
         self._ray = self._connection.__enter__()
         self.workers = run.envs or int(self._ray.cluster_resources().get("CPU", 1))
-        self._task = self._ray.remote(_call)
+        self._task = self._ray.remote(call)
         self._running: dict[Future[Any], Any] = {}
 
     def takes(self, job: Job) -> bool:

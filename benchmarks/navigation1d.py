@@ -15,7 +15,7 @@ from typing import Any
 
 import pandas as pd
 import torch
-from common import Policy, policies_of, replace_rows, trained_actors
+from common import Policy, policies_of, trained_actors, write_rows
 from measures import straightness
 from options import Evaluation, Options, Sources, check_single, parse, script, started
 from plots import plot_flow_paths, plot_navigation
@@ -127,7 +127,7 @@ def main(argv: list[str] | None) -> None:
             for policy in policies
             for nfe in policy.method.nfes(options.evaluation.nfe)
         ]
-        rows = replace_rows(out / "results.jsonl", judged)
+        rows = write_rows(out / "results.jsonl", judged)
         observations = SharedObservations(policies[0].task().data, options.sources.chunk[0])
         flows = [
             row  # seed by seed: the source samples belong to the seed
@@ -139,7 +139,7 @@ def main(argv: list[str] | None) -> None:
                 seed=seed,
             )
         ]
-        curvatures = replace_rows(out / "curvature.jsonl", flows)
+        curvatures = write_rows(out / "curvature.jsonl", flows)
         text = table(labelled(rows), ["method", "nfe"], JUDGED, beside(options, Options()))
         flow = labelled(curvatures[curvatures["mean"] == "training"])
         text += "\n" + table(flow, ["method"], ["kappa_executed", "relative_executed"])

@@ -24,7 +24,7 @@ class Inline:
         import jobs
 
         future = Future()
-        future.set_result(jobs._call(job.function, job.args))
+        future.set_result(jobs.call(job.function, job.args))
         return future
 
     def close(self, kill):

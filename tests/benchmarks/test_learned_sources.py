@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 from learned_sources import A2APrior, CVAEPrior, ForecastPrior, ForecastStart, LeapPrior, learn
-from learned_sources import LearningWindows as Windows
 from tensordict import TensorDict
 
 from tests.toy_env import random_history
@@ -40,6 +39,11 @@ def learned(kind, data, iterations=400, **options):
     learner = built(kind, **options)
     learn(learner, data, iterations=iterations, observation_steps=1, learning_rate=1e-2)
     return learner
+
+
+def learning_windows(chunk, counted, history, observation):
+    parts = {"vla_action": {"chunk": chunk}, "action_is_pad": ~counted.squeeze(-1)}
+    return TensorDict({**parts, "history": history, "observation": observation}, [len(chunk)])
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +108,7 @@ def test_the_loss_of_a_cvae_is_its_equation():
     g = torch.Generator().manual_seed(0)
     a1, seen = torch.randn(5, H, D_A, generator=g), torch.randn(5, 1, D_O, generator=g)
     history = random_history(prior, 5, action_dim=D_A)
-    windows = Windows(a1, torch.ones(5, H, 1, dtype=torch.bool), history, seen)
+    windows = learning_windows(a1, torch.ones(5, H, 1, dtype=torch.bool), history, seen)
     found = prior.learning_loss(windows, torch.Generator().manual_seed(1))
     code = prior.encoder(torch.cat([seen.flatten(1), a1.flatten(1)], -1))
     mean, deviation = code[:, :3], (0.5 * code[:, 3:]).exp()
@@ -127,7 +131,7 @@ def test_the_calibration_makes_errors_as_large_as_they_are_said_to_be():
     a1 = mean + factor * scale * torch.randn(500, H, 3, generator=g)
     counted = torch.rand(500, H, 1, generator=g) < 0.7
     a1 = a1.masked_fill(~counted, 100.0)
-    prior.calibrate(Windows(a1, counted, history, seen))
+    prior.calibrate(learning_windows(a1, counted, history, seen))
     same, calibrated, _ = prior.distribution(history, seen)
     assert torch.equal(same, mean)
     torch.testing.assert_close(calibrated / scale, factor.expand_as(scale), rtol=0.1, atol=0)
@@ -137,7 +141,7 @@ def test_the_calibration_makes_errors_as_large_as_they_are_said_to_be():
     torch.testing.assert_close(prior.typical_scale, typical)
     narrow = from_config(Prior, prior.config() | {"sigma": 0.5})
     narrow.load_state_dict(prior.state_dict())
-    narrow.calibrate(Windows(mean, counted, history, seen))  # without any error: half the floor
+    narrow.calibrate(learning_windows(mean, counted, history, seen))  # without any error: half the floor
     scale = narrow.distribution(history, seen).scale
     torch.testing.assert_close(scale, torch.full_like(scale, 0.01))
 

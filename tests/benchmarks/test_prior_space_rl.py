@@ -113,10 +113,10 @@ def test_papers_recipes():
         recipe = read(f"--preset paper --task {task} --download")
         base, config = (recipe.agent(anchored, "dsrl-na", 0) for anchored in (False, True))
         found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
-        assert (*found, recipe.agents.horizon, *recipe.sources.chunk, base.delta or 1.5) == values
+        assert (*found, recipe.horizon, *recipe.sources.chunk, base.delta or 1.5) == values
         assert config.delta is None  # the paper's 0.5
         assert not config.backup_entropy and recipe.agent(True, "dsrl-sac", 3).backup_entropy
-        assert recipe.agents.algorithm == (BOTH if task == "transport" else BOTH[:1])
+        assert recipe.algorithm == (BOTH if task == "transport" else BOTH[:1])
     # Options of the command line stand above those of the task.
     config = read("--preset paper --task square --rl.gamma 0.9 --nfe 9").agent(True, "dsrl-na", 0)
     assert (config.gamma, config.nfe) == (0.9, 9)
