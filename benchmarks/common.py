@@ -48,7 +48,6 @@ from warmprior.training import (
 )
 from warmprior.training.behaviour_cloning import STATE_FORMAT, policy_path
 from warmprior.training.checkpoint import (
-    check_identity,
     load_state,
     module_tensors,
     restore_module,
@@ -79,7 +78,7 @@ class Policy:
     @property
     def folder(self) -> Path:
         """Where its training lies, or will lie."""
-        return policies_folder(self.run) / self.name
+        return self.run.policies / self.name
 
     def __str__(self) -> str:
         return f"{self.facts['task']} {self.facts['data']}, {self.method}, seed {self.training.seed}"
@@ -120,8 +119,7 @@ class Policy:
     @property
     def seconds(self) -> float | None:
         """Processor time of its training, with its teacher's; None if it is not trained."""
-        teacher = self.teacher()
-        own = clock(self.status) if self.status.exists() else None
+        teacher, own = self.teacher(), clock(self.status)
         others = 0.0 if teacher is None else teacher.seconds
         return None if own is None or others is None else own + others
 
@@ -134,11 +132,6 @@ def facts_of(task: Task) -> dict[str, Any]:
     return {"task": task.name, "data": task.style, **task.facts}
 
 
-def policies_folder(run: Run) -> Path:
-    """Where policies lie: beside the run, so that others share them."""
-    return run.folder.absolute().parent / "policies"
-
-
 def policies_of(
     options: Options, methods: Sequence[Method], *more: tuple[str, str], only: bool = False
 ) -> list[Policy]:
@@ -146,7 +139,7 @@ def policies_of(
 
     The tasks are those that the options name and `more`, or with `only` the latter alone.
     """
-    check_writable(policies_folder(options.run))
+    check_writable(options.run.policies)
     run = replace(options.run, out=options.run.folder.absolute())
     with leader_first():  # other processes find what it has generated, rendered or downloaded
         places = [*([] if only else task_places(options.data)), *more]
@@ -214,10 +207,7 @@ def policy_of(task: Task, like: Policy, method: Method) -> Policy:
         "task": task.name,
         "data": task.style,
         **task.space,
-        "prior": method.name,
-        "options": method.options,
-        "sigma": method.sigma,
-        "chunk": method.chunk_length,
+        **method.facts,
         "seed": like.training.seed,
         "iterations": like.training.iterations,
     }
@@ -281,19 +271,14 @@ def train(policy: Policy) -> None:
         torch.cuda.empty_cache()  # for the next training, which may be another worker's
 
 
-def clock(status: Path) -> float:
-    """The processor time in a status file."""
-    try:
-        return float(read_json(status)["seconds"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{status} does not say how long the training has taken: remove it, and the count begins anew"
-        ) from error
+def clock(status: Path) -> float | None:
+    """The processor time in a status file, if there is one."""
+    return read_json(status)["seconds"] if status.exists() else None
 
 
 def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
     """Write how far a training is, once a second, and the processor time, of earlier starts as well."""
-    began = time.process_time() - (clock(path) if path.exists() else 0.0)
+    began = time.process_time() - (clock(path) or 0.0)
     wrote = time.monotonic()
 
     def write(iteration: int) -> None:
@@ -310,12 +295,10 @@ def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
 
 def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
     """Let a source learn, or take what it learnt when the training was begun."""
-    path, identity = policy.folder / "learner.safetensors", policy.method.config()
+    path = policy.folder / "learner.safetensors"
     if path.exists():
-        tensors, facts = load_state(path)
-        check_identity(path, facts, identity)
         with restoring(path):
-            restore_module(learner, tensors)
+            restore_module(learner, load_state(path)[0])
         return
     learn(
         learner,
@@ -325,7 +308,7 @@ def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
         withhold=training.cold_probability,
         seed=training.seed,
     )
-    save_state(path, module_tensors(learner), identity)
+    save_state(path, module_tensors(learner), policy.method.config())
 
 
 def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:

@@ -202,10 +202,7 @@ def straightness(
             rows.append(
                 {
                     "policy": str(method),
-                    "prior": method.name,
-                    "options": method.options,
-                    "sigma": method.sigma,
-                    "chunk": method.chunk_length,
+                    **method.facts,
                     "mean": mean,
                     "seed": s,
                     "observations": len(observations),

@@ -117,6 +117,11 @@ class Run:
         assert self.out is not None
         return self.out
 
+    @property
+    def policies(self) -> Path:
+        """Where policies lie: beside the run, so that others share them."""
+        return self.folder.absolute().parent / "policies"
+
 
 @dataclass(frozen=True)
 class Options:

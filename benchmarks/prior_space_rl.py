@@ -345,10 +345,7 @@ def main(argv: list[str] | None) -> None:
                 "data": task["data"],
                 **{space: task[space] for space in ("actions", "obs") if space in task},
                 "algorithm": algorithm,
-                "prior": method.name,
-                "options": method.options,
-                "sigma": method.sigma,
-                "chunk": method.chunk_length,
+                **method.facts,
                 "nfe": options.evaluation.nfe[0],
                 "seed": seed,
             }

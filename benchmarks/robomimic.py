@@ -26,7 +26,6 @@ from common import (
     facts_of,
     measure,
     play,
-    policies_folder,
     policies_of,
     row,
     stored_rows,
@@ -103,7 +102,7 @@ def compare(
             "with those, or choose another --out"
         )
     failures = begin(options, policies)
-    with Jobs(options.run, [options.run.folder, policies_folder(options.run)]) as jobs:
+    with Jobs(options.run) as jobs:
         for policy in sorted(policies, key=lambda policy: policy.training.seed):
             cells = [
                 replace(condition, checkpoint=checkpoint, nfe=nfe)
@@ -127,7 +126,7 @@ def compare(
 def train_all(options: Options, policies: Sequence[Policy]) -> None:
     """Train what is missing, and play nothing."""
     failures = begin(options, policies)
-    with Jobs(options.run, [options.run.folder, policies_folder(options.run)]) as jobs:
+    with Jobs(options.run) as jobs:
         for policy in policies:
             jobs.submit(str(policy), train, policy, training=True, status=policy.status)
         if failures := failures or jobs.wait():

@@ -55,8 +55,10 @@ def test_failures_cost_themselves_alone(engine, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(workers, "_forks", True)  # whatever Ray makes of it, it is as before afterwards
     monkeypatch.setattr(jobs, "DEATHS", 2)
     (tmp_path / "dies").touch()  # the first worker of job 4 is killed while it trains
+    for name in ("out", "policies"):
+        (tmp_path / name).mkdir()
     found = {}
-    with Jobs(Run(envs=2, engine=engine), [tmp_path]) as pool:
+    with Jobs(Run(out=tmp_path / "out", envs=2, engine=engine)) as pool:
         for n in range(5):
             group = f"policy {n}"
             trained = pool.submit(f"train {n}", train, tmp_path, n, group=group, training=True)
