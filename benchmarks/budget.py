@@ -65,7 +65,7 @@ def main(argv: list[str] | None) -> None:
     presets = {name: study(BudgetOptions, base, observations=1_000) for name, base in PRESETS.items()}
     options = parse(presets, argv, "budget", __doc__)
     with started(options, "budget") as out:
-        policies = policies_of(options, options.sources.methods())
+        policies = policies_of(options)
         # Before the hours of training: what cannot be measured on is better known now.
         observations, source = observations_of(options, policies[0])
         _, failures = compare(options, policies)

@@ -132,9 +132,7 @@ def facts_of(task: Task) -> dict[str, Any]:
     return {"task": task.name, "data": task.style, **task.facts}
 
 
-def policies_of(
-    options: Options, methods: Sequence[Method], *more: tuple[str, str], only: bool = False
-) -> list[Policy]:
+def policies_of(options: Options, *more: tuple[str, str], only: bool = False) -> list[Policy]:
     """One policy per task, recipe, method and seed, the baseline's first; demonstrations are read, or made.
 
     The tasks are those that the options name and `more`, or with `only` the latter alone.
@@ -156,7 +154,7 @@ def policies_of(
             check_environment(task)
         network = options.network if task.images else options.network.without_images()
         for training in options.trainings():
-            for method in methods:
+            for method in options.sources.methods():
                 if method.chunk_length > task.longest:
                     raise ValueError(
                         f"{method} predicts more steps than the longest demonstration of {task.title} has, "

@@ -34,7 +34,7 @@ from plots import plot_flow_paths
 from report import labelled, pooled, problem_title, table, text_of, write_report
 from robomimic import train_all
 
-from warmprior.diagnostics import SharedObservations, encoded_windows, flow_paths
+from warmprior.diagnostics import encoded_windows, flow_paths
 from warmprior.diagnostics.flow import sees_history
 
 SHOWN = 40
@@ -58,13 +58,6 @@ class CurvatureOptions(MeasuredOptions):
         return super().name if self.policies is None else self.policies.resolve().name
 
 
-def check_coordinate(options: CurvatureOptions, observations: SharedObservations) -> None:
-    """Refuse a coordinate that actions do not have."""
-    width = observations.data["action"].shape[-1]
-    if not 0 <= options.coordinate < width:
-        raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
-
-
 @script("curvature.py")
 def main(argv: list[str] | None) -> None:
     """Train the policies, or take those of a run, and measure how straight their flows are."""
@@ -73,19 +66,23 @@ def main(argv: list[str] | None) -> None:
     if not any(method.is_flow for method in options.sources.methods()):
         raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
     with started(options, "curvature") as out:
-        if options.policies is None:
-            policies = policies_of(options, options.sources.methods())
-            # Before the training: what cannot be measured on is better known now.
+        run = options.policies
+        if run is None:
+            policies = policies_of(options)
+            task = facts_of(policies[0].task())
             observations, source = observations_of(options, policies[0])
-            check_coordinate(options, observations)
-            train_all(options, policies)
-            task, actors = facts_of(policies[0].task()), trained_actors(policies)
         else:
-            task, actors = finished_policies(options.policies, options.run.device)
+            task, actors = finished_policies(run, options.run.device)
             first: Any = next(iter(next(iter(actors.values())).values()))
             lengths = first.prior.chunk_length, first.network.observation_steps
             observations, source = held_out(options, task, first.normalizer, *lengths)
-            check_coordinate(options, observations)
+        # Before the training: what cannot be measured is better known now.
+        width = observations.data["action"].shape[-1]
+        if not 0 <= options.coordinate < width:
+            raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
+        if run is None:
+            train_all(options, policies)
+            actors = trained_actors(policies)
         measured = straightness(actors, observations, n_steps=options.steps, draws=options.draws)
         rows = write_rows(out / "curvature.jsonl", measured)
 

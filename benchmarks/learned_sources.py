@@ -342,23 +342,20 @@ def learn(
     data: TensorDictBase,
     *,
     iterations: int,
-    batch_size: int = 256,
     learning_rate: float = 1e-3,
-    weight_decay: float = 1e-2,
     observation_steps: int = 2,
     withhold: float = 0.0,
-    held_out: float = 0.1,
     seed: int = 0,
 ) -> None:
-    """Train the networks of a learner, in place, and calibrate it on episodes that it does not learn from."""
-    if iterations < 1 or not 0.0 < held_out <= 0.5:
-        raise ValueError(f"need iterations >= 1 and 0 < held_out <= 0.5, got {iterations} and {held_out}")
+    """Train the networks of a learner, in place, and calibrate it on episodes that it does not learn from.
+
+    These are every tenth, or of fewer the second.
+    """
     learner.check_built()
     data = without_images(data)  # no learner sees them
     episodes = data[keys.EPISODE].flatten()
     number = episodes.unique(return_inverse=True)[1]
-    every = max(2, round(1 / held_out))
-    apart = number % every == every - 1 if int(number.max()) + 1 >= every else number == 1
+    apart = number % 10 == 9 if int(number.max()) >= 9 else number == 1
     device = data.device or torch.device("cpu")
     generator = torch.Generator(device).manual_seed(seed)
 
@@ -376,9 +373,9 @@ def learn(
         torch.manual_seed(seed)
         learner.build()
         learner.to(device)
-    buffer = windows(data[~apart], batch_size)
+    buffer = windows(data[~apart], 256)
     learner.requires_grad_(True).train()
-    optimizer = AdamW(learner.parameters(), lr=learning_rate, weight_decay=weight_decay, fused=True)
+    optimizer = AdamW(learner.parameters(), lr=learning_rate, weight_decay=1e-2, fused=True)
     schedule = warmup_cosine(optimizer, iterations, 0.1)
     for _ in range(iterations):
         loss = learner.learning_loss(buffer.sample(), generator)

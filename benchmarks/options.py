@@ -155,8 +155,6 @@ class Options:
         self.data.check()
         self.network.check(self.data)
         check_batch(self.training.batch_size)
-        if self.seeds.stop > 2**63:  # rows and generators hold no more
-            raise ValueError(f"--seed must be below 2**63, got {self.training.seed}")
         try:
             with torch.device("meta"):  # nothing is computed
                 self.network.without_images().make(1, 1, 2)

@@ -246,9 +246,9 @@ def frozen_policies(
     options: AgentsOptions,
 ) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
     """The task, and the frozen policies by method and seed: of --run, or trained now."""
-    run, methods = options.policies, options.sources.methods()
+    run = options.policies
     if run is None:
-        policies = policies_of(options, methods)
+        policies = policies_of(options)
         train_all(options, policies)
         return facts_of(policies[0].task()), trained_actors(policies)
     task, actors = finished_policies(run, options.run.device)

@@ -56,7 +56,7 @@ def run(
     with started(options, study) as out:
         # Demonstrations: generated, downloaded, or read from --dataset. On them a policy per task, method and
         # seed: network, recipe and data are equal, and the source differs.
-        policies = policies_of(options, options.sources.methods())
+        policies = policies_of(options)
 
         # A row per policy, checkpoint and NFE: what it is, how it was played, and what came out.
         rows, failures = compare(options, policies)

@@ -53,7 +53,7 @@ def main(argv: list[str] | None) -> None:
     options = parse(presets, argv, "sigma", __doc__)
     check_single(options, "nfe")
     with started(options, "sigma") as out:
-        policies = policies_of(options, options.sources.methods())
+        policies = policies_of(options)
         # Before the hours of training: what cannot be measured on is better known now.
         observations, source = observations_of(options, policies[0])
         rows, failures = compare(options, policies)

@@ -38,8 +38,7 @@ def untimed(out):
 
 def policies_of(argv):
     """The policies that a command line compares."""
-    found = parse(PRESETS, argv, "robomimic", None)
-    return common.policies_of(found, found.sources.methods())
+    return common.policies_of(parse(PRESETS, argv, "robomimic", None))
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import time
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 pytest.importorskip("robosuite")
 
@@ -41,13 +40,6 @@ def test_peers_learn_from_the_same_windows(name):
         peer.module.eval()
         peer.decide(3)
     assert len(calls) == 3
-
-
-def test_operations_are_counted():
-    layer = torch.nn.Linear(5, 7, bias=False)
-    peer = peers.Peer("", layer, lambda batch: layer(batch["x"]), int, 1)
-    # Forward, and the gradient of the weights; that of the input is not asked for.
-    assert peers.flop_of(peer, TensorDict({"x": torch.randn(3, 5)}, [3])) == 2 * (2 * 3 * 5 * 7)
 
 
 def episode(*steps, decision=1.0):

@@ -55,7 +55,6 @@ def test_every_method_arrives_in_a_fresh_process():
         (("past,age=3", H), r"age is unknown to it.*its options are sigma, correlation"),
         (("gaussian,sigma=0.3", H), "sigma is unknown to it, or without effect"),
         (("past,sigma=0.3", H, 0.5), "both set sigma"),
-        (("ot,observation_weight=-1", H), "observation_weight"),
         (("warmprior:PastPrior", H), "is a part of methods, and none itself"),
     ],
 )

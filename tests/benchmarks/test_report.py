@@ -169,11 +169,9 @@ def test_the_terminal_table_fits_and_says_first_what_came_out():
     expected = [chance["preview", 9], chance["past", 1]]
     assert [float(one) for _, one, _ in said] == pytest.approx(expected, abs=0.006)
     names = [f"correlation=0.{k},a_long_name_of_an_option_beyond_the_width=1" for k in range(14)]
-    cells = [{"nfe": nfe, "task": task} for nfe in range(1, 10) for task in "ab"]
-    rows = [row(**cell) for cell in cells]
-    rows += [row(6, prior="past", options=options, **cell) for options in names for cell in cells]
+    rows = [row(prior="past", options=o, nfe=n, task=t) for o in names for n in range(1, 10) for t in "ab"]
     text = report.terminal_table(report.summary(pd.DataFrame(rows), 1), 1)
-    assert max(map(len, text.splitlines())) <= 120 and text.count("60.0** (+10.0)") == 2 * 9 * 14
+    assert max(map(len, text.splitlines())) <= 120 and text.count(" (+0.0)") == 2 * 9 * 13
 
 
 def test_a_report_is_written_before_what_is_missing_is_an_error(tmp_path, capsys):
