@@ -14,8 +14,8 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from common import Policy, observations_of, policies_of, replace_rows
-from options import PRESETS, HeldOut, MeasuredOptions, check_single, parse, script, started, study
+from common import Policy, observations_of, policies_of, write_rows
+from options import PRESETS, MeasuredOptions, check_single, parse, script, started, study
 from plots import plot_lines
 from report import labelled, per_seed, table, write_report
 from robomimic import compare
@@ -62,18 +62,17 @@ def errors(
 @script("budget.py")
 def main(argv: list[str] | None) -> None:
     """Train and play a policy per source and number of iterations."""
-    few = HeldOut(observations=1_000)
-    presets = {name: study(BudgetOptions, base, held_out=few) for name, base in PRESETS.items()}
+    presets = {name: study(BudgetOptions, base, observations=1_000) for name, base in PRESETS.items()}
     options = parse(presets, argv, "budget", __doc__)
     with started(options, "budget") as out:
-        policies = policies_of(options, options.sources.methods())
+        policies = policies_of(options)
         # Before the hours of training: what cannot be measured on is better known now.
         observations, source = observations_of(options, policies[0])
         _, failures = compare(options, policies)
         error = errors(policies, observations, options.evaluation.nfe)
         played = read_lines(out / "results.jsonl")
         measured = [{**row, "action_error": error[row["policy"], row["nfe"]]} for row in played]
-        rows = replace_rows(out / "results.jsonl", measured)
+        rows = write_rows(out / "results.jsonl", measured)
         seeds = per_seed(labelled(rows), options.evaluation.top_k)
         seeds = seeds.sort_values(["iterations", "nfe"], ascending=[True, False], kind="stable")
         lines = {"success": "success rate", "action_error": "squared error, held out"}

@@ -28,7 +28,7 @@ def main(argv: list[str] | None) -> None:
     options = parse(presets, argv, "chunking", __doc__)
     check_single(options, "task", "data", "sigma")
     with started(options, "chunking") as out:
-        policies = policies_of(options, options.sources.methods())
+        policies = policies_of(options)
         rows, failures = compare(options, policies)
         seeds = per_seed(labelled(rows, "chunk"), options.evaluation.top_k)
         seeds = seeds.sort_values(["chunk", "nfe"], ascending=[True, False], kind="stable")

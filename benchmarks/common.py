@@ -48,7 +48,6 @@ from warmprior.training import (
 )
 from warmprior.training.behaviour_cloning import STATE_FORMAT, policy_path
 from warmprior.training.checkpoint import (
-    check_identity,
     load_state,
     module_tensors,
     restore_module,
@@ -79,7 +78,7 @@ class Policy:
     @property
     def folder(self) -> Path:
         """Where its training lies, or will lie."""
-        return policies_folder(self.run) / self.name
+        return self.run.policies / self.name
 
     def __str__(self) -> str:
         return f"{self.facts['task']} {self.facts['data']}, {self.method}, seed {self.training.seed}"
@@ -120,8 +119,7 @@ class Policy:
     @property
     def seconds(self) -> float | None:
         """Processor time of its training, with its teacher's; None if it is not trained."""
-        teacher = self.teacher()
-        own = clock(self.status) if self.status.exists() else None
+        teacher, own = self.teacher(), clock(self.status)
         others = 0.0 if teacher is None else teacher.seconds
         return None if own is None or others is None else own + others
 
@@ -134,19 +132,12 @@ def facts_of(task: Task) -> dict[str, Any]:
     return {"task": task.name, "data": task.style, **task.facts}
 
 
-def policies_folder(run: Run) -> Path:
-    """Where policies lie: beside the run, so that others share them."""
-    return run.folder.absolute().parent / "policies"
-
-
-def policies_of(
-    options: Options, methods: Sequence[Method], *more: tuple[str, str], only: bool = False
-) -> list[Policy]:
+def policies_of(options: Options, *more: tuple[str, str], only: bool = False) -> list[Policy]:
     """One policy per task, recipe, method and seed, the baseline's first; demonstrations are read, or made.
 
     The tasks are those that the options name and `more`, or with `only` the latter alone.
     """
-    check_writable(policies_folder(options.run))
+    check_writable(options.run.policies)
     run = replace(options.run, out=options.run.folder.absolute())
     with leader_first():  # other processes find what it has generated, rendered or downloaded
         places = [*([] if only else task_places(options.data)), *more]
@@ -163,7 +154,7 @@ def policies_of(
             check_environment(task)
         network = options.network if task.images else options.network.without_images()
         for training in options.trainings():
-            for method in methods:
+            for method in options.sources.methods():
                 if method.chunk_length > task.longest:
                     raise ValueError(
                         f"{method} predicts more steps than the longest demonstration of {task.title} has, "
@@ -214,10 +205,7 @@ def policy_of(task: Task, like: Policy, method: Method) -> Policy:
         "task": task.name,
         "data": task.style,
         **task.space,
-        "prior": method.name,
-        "options": method.options,
-        "sigma": method.sigma,
-        "chunk": method.chunk_length,
+        **method.facts,
         "seed": like.training.seed,
         "iterations": like.training.iterations,
     }
@@ -281,19 +269,14 @@ def train(policy: Policy) -> None:
         torch.cuda.empty_cache()  # for the next training, which may be another worker's
 
 
-def clock(status: Path) -> float:
-    """The processor time in a status file."""
-    try:
-        return float(read_json(status)["seconds"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{status} does not say how long the training has taken: remove it, and the count begins anew"
-        ) from error
+def clock(status: Path) -> float | None:
+    """The processor time in a status file, if there is one."""
+    return read_json(status)["seconds"] if status.exists() else None
 
 
 def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
     """Write how far a training is, once a second, and the processor time, of earlier starts as well."""
-    began = time.process_time() - (clock(path) if path.exists() else 0.0)
+    began = time.process_time() - (clock(path) or 0.0)
     wrote = time.monotonic()
 
     def write(iteration: int) -> None:
@@ -310,12 +293,10 @@ def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
 
 def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
     """Let a source learn, or take what it learnt when the training was begun."""
-    path, identity = policy.folder / "learner.safetensors", policy.method.config()
+    path = policy.folder / "learner.safetensors"
     if path.exists():
-        tensors, facts = load_state(path)
-        check_identity(path, facts, identity)
         with restoring(path):
-            restore_module(learner, tensors)
+            restore_module(learner, load_state(path)[0])
         return
     learn(
         learner,
@@ -325,7 +306,7 @@ def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
         withhold=training.cold_probability,
         seed=training.seed,
     )
-    save_state(path, module_tensors(learner), identity)
+    save_state(path, module_tensors(learner), policy.method.config())
 
 
 def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
@@ -342,25 +323,8 @@ def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
 
 def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
     """Observations that no policy was trained on, where there are some, and what they are in words."""
-    task, chunk_length = policy.task(), policy.method.chunk_length
-    steps, count = policy.network.observation_steps, options.held_out.observations
-    if task.normalizer is None or "file" not in task.facts:  # of a task of one's own
-        if options.held_out.validation is not None:
-            raise ValueError(f"--validation belongs to robosuite's tasks, and {task.name} is none")
-        data = task.data.to(policy.run.device)
-        shared = SharedObservations(data, chunk_length, observation_steps=steps)
-        if len(shared) > count:
-            generator = torch.Generator().manual_seed(0)
-            shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
-        return shared, "the TRAINING demonstrations (not held out)"
-    return held_out(
-        options.held_out,
-        facts_of(task),
-        task.normalizer,
-        chunk_length=chunk_length,
-        observation_steps=steps,
-        device=policy.run.device,
-    )
+    task, steps = policy.task(), policy.network.observation_steps
+    return held_out(options, facts_of(task), task.normalizer, policy.method.chunk_length, steps, task.data)
 
 
 def trained_actors(policies: Sequence[Policy]) -> dict[Method, dict[int, WarmPriorActor]]:
@@ -508,26 +472,13 @@ def batches(evaluation: Evaluation) -> list[range]:
     return [seeds[i : i + EPISODES_PER_JOB] for i in range(0, len(seeds), EPISODES_PER_JOB)]
 
 
-class Rows:
-    """`results.jsonl`: the rows of a run, in a given order, written atomically after each."""
-
-    def __init__(self, path: Path, order: Callable[[dict[str, Any]], Any] = lambda row: 0) -> None:
-        self.path, self.order = path, order
-        self.rows: list[dict[str, Any]] = read_lines(path) if path.exists() else []
-
-    def find(self, facts: Mapping[str, Any]) -> dict[str, Any] | None:
-        """The row of these facts, if there is one."""
-        known = (row for row in self.rows if all(row.get(k) == v for k, v in facts.items()))
-        return next(known, None)
-
-    def add(self, *rows: Mapping[str, Any]) -> None:
-        """Add rows, and write all."""
-        self.rows = sorted([*self.rows, *map(dict, rows)], key=self.order)
-        replace_rows(self.path, self.rows)
+def stored_rows(path: Path) -> list[dict[str, Any]]:
+    """The rows of a file, if there is one."""
+    return read_lines(path) if path.exists() else []
 
 
-def replace_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Write a file of rows, and read it again as a table."""
+def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+    """Write a file of rows in the place of another, and read it again as a table."""
     # JSON has no NaN: what is not known is null.
     known = [
         {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in row.items()}

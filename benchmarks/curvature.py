@@ -7,8 +7,8 @@ python benchmarks/curvature.py --data mh --preset cpu         # of these options
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from common import (
@@ -16,16 +16,14 @@ from common import (
     finished_policies,
     observations_of,
     policies_of,
-    replace_rows,
     trained_actors,
+    write_rows,
 )
 from measures import RATIOS, held_out, straightness
 from options import (
     PRESETS,
-    Flat,
-    HeldOut,
+    FinishedRun,
     MeasuredOptions,
-    PolicyOptions,
     parse,
     script,
     started,
@@ -36,7 +34,7 @@ from plots import plot_flow_paths
 from report import labelled, pooled, problem_title, table, text_of, write_report
 from robomimic import train_all
 
-from warmprior.diagnostics import SharedObservations, encoded_windows, flow_paths
+from warmprior.diagnostics import encoded_windows, flow_paths
 from warmprior.diagnostics.flow import sees_history
 
 SHOWN = 40
@@ -46,60 +44,47 @@ SHOWN = 40
 class CurvatureOptions(MeasuredOptions):
     """What to measure."""
 
-    policies: Annotated[PolicyOptions, Flat] = field(default_factory=PolicyOptions)
+    policies: FinishedRun = None  # a finished run of robomimic.py, whose policies to take instead of training
     coordinate: int = 0  # of the action, in flow_paths.png
 
     def check(self) -> None:
         super().check()
-        if self.policies.run is not None and self.data.task:
+        if self.policies is not None and self.data.task:
             raise ValueError("--run names the policies, and with them the task: leave out --task")
 
     @property
     def name(self) -> str:
         """Of the output folder."""
-        run = self.policies.run
-        return super().name if run is None else run.resolve().name
-
-
-def check_coordinate(options: CurvatureOptions, observations: SharedObservations) -> None:
-    """Refuse a coordinate that actions do not have."""
-    width = observations.data["action"].shape[-1]
-    if not 0 <= options.coordinate < width:
-        raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
+        return super().name if self.policies is None else self.policies.resolve().name
 
 
 @script("curvature.py")
 def main(argv: list[str] | None) -> None:
     """Train the policies, or take those of a run, and measure how straight their flows are."""
-    many = HeldOut(observations=2_000)
-    presets = {n: study(CurvatureOptions, base, held_out=many) for n, base in PRESETS.items()}
+    presets = {name: study(CurvatureOptions, base, observations=2_000) for name, base in PRESETS.items()}
     options = parse(presets, argv, "curvature", __doc__)
     if not any(method.is_flow for method in options.sources.methods()):
         raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
     with started(options, "curvature") as out:
-        if options.policies.run is None:
-            policies = policies_of(options, options.sources.methods())
-            # Before the training: what cannot be measured on is better known now.
+        run = options.policies
+        if run is None:
+            policies = policies_of(options)
+            task = facts_of(policies[0].task())
             observations, source = observations_of(options, policies[0])
-            check_coordinate(options, observations)
-            train_all(options, policies)
-            task, actors = facts_of(policies[0].task()), trained_actors(policies)
         else:
-            task, actors = finished_policies(options.policies.run, options.run.device)
+            task, actors = finished_policies(run, options.run.device)
             first: Any = next(iter(next(iter(actors.values())).values()))
-            observations, source = held_out(
-                options.held_out,
-                task,
-                first.normalizer,
-                chunk_length=first.prior.chunk_length,
-                observation_steps=first.network.observation_steps,
-                device=options.run.device,
-            )
-            check_coordinate(options, observations)
-        measured = straightness(
-            actors, observations, n_steps=options.held_out.steps, draws=options.held_out.draws
-        )
-        rows = replace_rows(out / "curvature.jsonl", measured)
+            lengths = first.prior.chunk_length, first.network.observation_steps
+            observations, source = held_out(options, task, first.normalizer, *lengths)
+        # Before the training: what cannot be measured is better known now.
+        width = observations.data["action"].shape[-1]
+        if not 0 <= options.coordinate < width:
+            raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
+        if run is None:
+            train_all(options, policies)
+            actors = trained_actors(policies)
+        measured = straightness(actors, observations, n_steps=options.steps, draws=options.draws)
+        rows = write_rows(out / "curvature.jsonl", measured)
 
         few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
         labels = dict(zip(rows.policy, labelled(rows).method, strict=True))
@@ -110,7 +95,7 @@ def main(argv: list[str] | None) -> None:
                 generator = torch.Generator(options.run.device).manual_seed(0)
                 windows = few.windows(actor.prior, see_history=sees_history(actor))
                 windows = encoded_windows(actor, windows)
-                path = flow_paths(actor, windows, options.held_out.steps, generator=generator)
+                path = flow_paths(actor, windows, options.steps, generator=generator)
                 paths[labels[str(method)]] = path[..., 0, options.coordinate].cpu()
         where = f"{task['task']} {task['data']}: action coordinate {options.coordinate}"
         title = f"{where} along the flow,\n{source}"

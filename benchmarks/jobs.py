@@ -16,9 +16,10 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
@@ -59,7 +60,7 @@ class Job:
             return None
 
 
-def _call(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, str | None]:
+def call(function: Callable[..., Any], args: tuple[Any, ...]) -> tuple[Any, str | None]:
     """In a worker: the result, or why there is none, as text: some exceptions cannot be pickled."""
     import torch
 
@@ -98,11 +99,11 @@ class Local:
         slot = self._slot(job)
         assert slot is not None, "takes(job) says so"
         try:
-            self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
+            self._busy[slot] = self._pools[slot].submit(call, job.function, job.args)
         except (KeyError, BrokenProcessPool):  # none yet, or it died with an earlier job
             env = {"CUDA_VISIBLE_DEVICES": "".join(self._gpus[slot : slot + 1])}
             self._pools[slot] = fresh_processes(1, env=env if self._gpus else None)
-            self._busy[slot] = self._pools[slot].submit(_call, job.function, job.args)
+            self._busy[slot] = self._pools[slot].submit(call, job.function, job.args)
         return self._busy[slot]
 
     def close(self, kill: bool) -> None:
@@ -128,14 +129,15 @@ def _gpus(device: str) -> list[str]:
 class Ray:
     """Tasks of a Ray cluster."""
 
-    def __init__(self, run: Run, folders: list[Path]) -> None:
+    def __init__(self, run: Run) -> None:
         from warmprior.io.ray_cluster import ray_cluster
 
         self._device = run.device
+        folders = [] if run.out is None else [run.folder, run.policies]
         self._connection = ray_cluster(run.ray_address, run.envs, folders)
         self._ray = self._connection.__enter__()
         self.workers = run.envs or int(self._ray.cluster_resources().get("CPU", 1))
-        self._task = self._ray.remote(_call)
+        self._task = self._ray.remote(call)
         self._running: dict[Future[Any], Any] = {}
 
     def takes(self, job: Job) -> bool:
@@ -166,14 +168,11 @@ class Jobs:
     longest, and nothing should wait for them in the end.
     """
 
-    def __init__(self, run: Run, folders: list[Path] | None = None) -> None:
+    def __init__(self, run: Run) -> None:
         # Either says what it `takes`, starts it (a future that raises if the worker dies), and closes.
-        self.engine: Local | Ray = (
-            Ray(run, folders or []) if run.engine == "ray" else Local(run.envs, run.device)
-        )
+        self.engine: Local | Ray = Ray(run) if run.engine == "ray" else Local(run.envs, run.device)
         self._waiting: list[Job] = []
         self._failed: dict[str, str] = {}  # by group, why
-        self._all = 0
 
     def __enter__(self) -> Self:
         return self
@@ -187,7 +186,6 @@ class Jobs:
         """Add a job, with options of :class:`Job`; :meth:`wait` computes it."""
         job = Job(name, function, args, group=group or name, **options)
         self._waiting.append(job)
-        self._all += 1
         return job
 
     def say(self, line: str) -> None:
@@ -198,7 +196,8 @@ class Jobs:
     def wait(self) -> dict[str, str]:
         """Compute all jobs; what failed, by group, and why."""
         running: dict[Future[Any], Job] = {}
-        with Progress(self.engine.workers, self._all) as progress:
+        ended = 0
+        with progress(self.engine.workers) as show:
             while self._waiting or running:
                 while (job := self._next()) is not None:
                     self._waiting.remove(job)
@@ -206,8 +205,8 @@ class Jobs:
                 finished, _ = wait(running, timeout=1.0, return_when=FIRST_COMPLETED)
                 for future in finished:
                     job = running.pop(future)
-                    progress.ended += self._ended(job, future)
-                progress.show(list(running.values()), len(self._waiting) + len(running))
+                    ended += self._ended(job, future)
+                show(list(running.values()), ended, ended + len(self._waiting) + len(running))
         return self._failed
 
     def _next(self) -> Job | None:
@@ -246,36 +245,34 @@ class Jobs:
         return 1 + before - len(self._waiting)
 
 
-class Progress:
-    """A bar of all jobs and one per worker on a terminal; elsewhere a line per training, now and then."""
+@contextmanager
+def progress(workers: int) -> Iterator[Callable[[list[Job], int, int], None]]:
+    """Show a bar of all jobs and one per worker on a terminal; elsewhere a line per training, now and then.
 
-    def __init__(self, workers: int, total: int) -> None:
-        self.ended = 0
-        self._spoke = time.monotonic()
-        # disable=None: no bars without a terminal.
-        options: dict[str, Any] = {"leave": False, "dynamic_ncols": True, "disable": None}
-        self._whole = tqdm(total=total, desc="jobs", **options)
-        self._bars = [tqdm(position=1 + i, bar_format="{desc}", **options) for i in range(min(workers, 8))]
+    It gives a function of the running jobs, and of how many jobs are done, of how many.
+    """
+    spoke = time.monotonic()
+    # disable=None: no bars without a terminal.
+    options: dict[str, Any] = {"leave": False, "dynamic_ncols": True, "disable": None}
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        for bar in (*self._bars, self._whole):
-            bar.close()
-
-    def show(self, running: list[Job], left: int) -> None:
-        """Show how far the running jobs are."""
-        self._whole.total, self._whole.n = self.ended + left, self.ended
-        self._whole.refresh()
-        if not self._whole.disable:
-            for bar, job in zip_longest(self._bars, running[: len(self._bars)]):
+    def show(running: list[Job], ended: int, total: int) -> None:
+        nonlocal spoke
+        whole.total, whole.n = total, ended
+        whole.refresh()
+        if not whole.disable:
+            for bar, job in zip_longest(bars, running[: len(bars)]):
                 done = job and job.iterations()
                 bar.n, bar.total = done or (0, 1)
                 bar.bar_format = "{desc}: {percentage:3.0f}%|{bar}| {n}/{total}" if done else "{desc}"
                 bar.set_description_str(job.name if job else "")
-        elif time.monotonic() - self._spoke > LINES_EVERY:
-            self._spoke = time.monotonic()
+        elif time.monotonic() - spoke > LINES_EVERY:
+            spoke = time.monotonic()
             for job in running:
                 if done := job.iterations():
                     print(f"{job.name}: {done[0]:,} of {done[1]:,} iterations", flush=True)
+
+    with ExitStack() as stack:
+        whole = stack.enter_context(tqdm(total=1, desc="jobs", **options))
+        worker = {"bar_format": "{desc}", **options}
+        bars = [stack.enter_context(tqdm(position=1 + i, **worker)) for i in range(min(workers, 8))]
+        yield show

@@ -70,12 +70,12 @@ class Learner(nn.Module):
             name = type(self).__name__
             raise ValueError(f"{name} has no networks yet: give widths=[d_a, d_o, To], and learn(...)")
 
-    def learning_loss(self, windows: LearningWindows, generator: torch.Generator | None = None) -> Tensor:
+    def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         """What the networks minimise on windows; the error of their forecast by default."""
-        predicted = self.predicted(windows.history, windows.observation)
-        return windows.mean((windows.a1 - predicted).square())
+        predicted = self.predicted(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        return inside_mean(windows, (windows[keys.CHUNK] - predicted).square())
 
-    def calibrate(self, windows: LearningWindows) -> None:
+    def calibrate(self, windows: TensorDictBase) -> None:
         """Correct the source by its error on windows that were held out; nothing by default."""
 
     def mlp(self, inputs: int, outputs: int) -> MLP:
@@ -165,19 +165,19 @@ class ForecastPrior(LearnedPrior):
         mean, scale = self._gaussian(history, observation)
         return self._everywhere(mean, self.sigma * self._calibrated(scale))
 
-    def learning_loss(self, windows: LearningWindows, generator: torch.Generator | None = None) -> Tensor:
-        mean, scale = self._gaussian(windows.history, windows.observation)
-        return windows.mean(scale.log() + 0.5 * ((windows.a1 - mean) / scale).square())
+    def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
+        mean, scale = self._gaussian(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        return inside_mean(windows, scale.log() + 0.5 * ((windows[keys.CHUNK] - mean) / scale).square())
 
-    def calibrate(self, windows: LearningWindows) -> None:
+    def calibrate(self, windows: TensorDictBase) -> None:
         """Scale by the root mean square of the standardised error, and note what scale that gives."""
-        mean, scale = self._gaussian(windows.history, windows.observation)
-        counted = windows.counted
-        squared = ((windows.a1 - mean) / scale).square() * counted
+        mean, scale = self._gaussian(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        counted = ~windows[keys.IS_PAD].unsqueeze(-1)
+        squared = ((windows[keys.CHUNK] - mean) / scale).square() * counted
         known = counted.sum(0).clamp_min(1)
         found = torch.where(counted.any(0), squared.sum(0) / known, 1.0)
         self.calibration.copy_(found.sqrt())
-        self.typical_scale.copy_(windows.mean(self._calibrated(scale).square()).sqrt())
+        self.typical_scale.copy_(inside_mean(windows, self._calibrated(scale).square()).sqrt())
 
 
 class LeapPrior(ForecastPrior):
@@ -270,14 +270,15 @@ class CVAEPrior(LearnedPrior):
         loc, scale, warm = super().distribution(history, observation)
         return _Decoded(loc, scale, warm, prior=self, seen=self.seen(history, observation))
 
-    def learning_loss(self, windows: LearningWindows, generator: torch.Generator | None = None) -> Tensor:
-        seen = self.seen(windows.history, windows.observation)
-        found = self.encoder(torch.cat([seen, (windows.a1 * windows.counted).flatten(-2)], -1))
+    def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
+        seen = self.seen(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        inside = ~windows[keys.IS_PAD].unsqueeze(-1)
+        found = self.encoder(torch.cat([seen, (windows[keys.CHUNK] * inside).flatten(-2)], -1))
         mean, log_variance = found.chunk(2, -1)
         eps = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
         z = mean + (0.5 * log_variance).exp() * eps
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
-        error = windows.mean((windows.a1 - self.decode(seen, z)).square())
+        error = inside_mean(windows, (windows[keys.CHUNK] - self.decode(seen, z)).square())
         return error + self.beta * divergence / self.chunk_dim * self.latent_dim
 
 
@@ -330,25 +331,10 @@ class ForecastStart(StartPoint, Learner):
         return (1 - self.time) * noise + self.time * forecast
 
 
-@dataclass(frozen=True)
-class LearningWindows:
-    """Windows of demonstrations, as a :class:`Learner` is given them."""
-
-    a1: Tensor  # targets, [B, P, d_a]
-    counted: Tensor  # positions inside the episode, bool [B, P, 1]
-    history: TensorDictBase  # before them, [B], see warmprior.history
-    observation: Tensor  # [B, To, d_o]
-
-    @classmethod
-    def of(cls, batch: TensorDictBase) -> LearningWindows:
-        """Those of a batch of :func:`~warmprior.window_replay_buffer`."""
-        counted = ~batch[keys.IS_PAD].unsqueeze(-1)
-        return cls(batch[keys.CHUNK], counted, batch[keys.HISTORY], batch[keys.OBSERVATION])
-
-    def mean(self, values: Tensor) -> Tensor:
-        """Mean over the coordinates inside the episode; 0 if no position is inside."""
-        counted = self.counted.expand_as(values)
-        return (values * counted).sum() / counted.sum().clamp_min(1)
+def inside_mean(windows: TensorDictBase, values: Tensor) -> Tensor:
+    """Mean over the coordinates of a chunk inside the episode; 0 if no position is inside."""
+    counted = (~windows[keys.IS_PAD]).unsqueeze(-1).expand_as(values)
+    return (values * counted).sum() / counted.sum().clamp_min(1)
 
 
 def learn(
@@ -356,23 +342,20 @@ def learn(
     data: TensorDictBase,
     *,
     iterations: int,
-    batch_size: int = 256,
     learning_rate: float = 1e-3,
-    weight_decay: float = 1e-2,
     observation_steps: int = 2,
     withhold: float = 0.0,
-    held_out: float = 0.1,
     seed: int = 0,
 ) -> None:
-    """Train the networks of a learner, in place, and calibrate it on episodes that it does not learn from."""
-    if iterations < 1 or not 0.0 < held_out <= 0.5:
-        raise ValueError(f"need iterations >= 1 and 0 < held_out <= 0.5, got {iterations} and {held_out}")
+    """Train the networks of a learner, in place, and calibrate it on episodes that it does not learn from.
+
+    These are every tenth, or of fewer the second.
+    """
     learner.check_built()
     data = without_images(data)  # no learner sees them
     episodes = data[keys.EPISODE].flatten()
     number = episodes.unique(return_inverse=True)[1]
-    every = max(2, round(1 / held_out))
-    apart = number % every == every - 1 if int(number.max()) + 1 >= every else number == 1
+    apart = number % 10 == 9 if int(number.max()) >= 9 else number == 1
     device = data.device or torch.device("cpu")
     generator = torch.Generator(device).manual_seed(seed)
 
@@ -390,12 +373,12 @@ def learn(
         torch.manual_seed(seed)
         learner.build()
         learner.to(device)
-    buffer = windows(data[~apart], batch_size)
+    buffer = windows(data[~apart], 256)
     learner.requires_grad_(True).train()
-    optimizer = AdamW(learner.parameters(), lr=learning_rate, weight_decay=weight_decay, fused=True)
+    optimizer = AdamW(learner.parameters(), lr=learning_rate, weight_decay=1e-2, fused=True)
     schedule = warmup_cosine(optimizer, iterations, 0.1)
     for _ in range(iterations):
-        loss = learner.learning_loss(LearningWindows.of(buffer.sample()), generator)
+        loss = learner.learning_loss(buffer.sample(), generator)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -407,4 +390,4 @@ def learn(
         )
     unseen = data[apart] if bool(apart.any()) else data
     with torch.no_grad():
-        learner.calibrate(LearningWindows.of(windows(unseen, CALIBRATION_WINDOWS).sample()))
+        learner.calibrate(windows(unseen, CALIBRATION_WINDOWS).sample())

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 from methods import Method
-from options import HeldOut
+from options import MeasuredOptions
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
@@ -108,19 +108,29 @@ def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
 
 
 def held_out(
-    options: HeldOut,
+    options: MeasuredOptions,
     facts: Mapping[str, Any],
-    normalizer: Normalizer,
-    *,
+    normalizer: Normalizer | None,
     chunk_length: int,
     observation_steps: int,
-    device: str = "cpu",
+    own: TensorDictBase | None = None,
 ) -> tuple[SharedObservations, str]:
-    """Observations that no policy of a task was trained on, and what they are in words."""
+    """Observations that no policy of a task was trained on, and what they are in words.
+
+    A task of one's own has none: its training data, if given as `own`.
+    """
     place: Path | str
-    name, style = facts["task"], facts["data"]
-    if "file" not in facts:
-        raise ValueError(f"{name} is a task of one's own: name it with --task in place of --run")
+    name, device, count = facts["task"], options.run.device, options.observations
+    generator = torch.Generator().manual_seed(0)
+    if normalizer is None or "file" not in facts:
+        if own is None:
+            raise ValueError(f"{name} is a task of one's own: name it with --task in place of --run")
+        if options.validation is not None:
+            raise ValueError(f"--validation belongs to robosuite's tasks, and {name} is none")
+        shared = SharedObservations(own.to(device), chunk_length, observation_steps=observation_steps)
+        if len(shared) > count:
+            shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
+        return shared, "the TRAINING demonstrations (not held out)"
     if options.validation is not None:
         place, words = options.validation, ""
     elif facts.get("source") != "scripted":
@@ -131,18 +141,14 @@ def held_out(
     else:
         # As many as the training demonstrations suggest, with room to spare.
         usable = 0.8 * (facts["steps"] / facts["demonstrations"] - chunk_length)
-        count = max(20, int(-(-options.observations // max(1.0, min(50.0, usable)))))
-        place = generate_demonstrations(name, style, count, HELD_OUT_SEED)
-        words = f"{count} newly generated demonstrations"
+        episodes = max(20, int(-(-count // max(1.0, min(50.0, usable)))))
+        place = generate_demonstrations(name, facts["data"], episodes, HELD_OUT_SEED)
+        words = f"{episodes} newly generated demonstrations"
     data, called = read_like(place, name, facts)
     # A copy: the data are normalised on the CPU, the policy may live elsewhere.
-    data = copy.deepcopy(normalizer).to("cpu").normalize(data)
+    data = copy.deepcopy(normalizer).to("cpu").normalize(data).to(device)
     shared = SharedObservations(
-        data.to(device),
-        chunk_length,
-        observation_steps=observation_steps,
-        count=options.observations,
-        generator=torch.Generator().manual_seed(0),
+        data, chunk_length, observation_steps=observation_steps, count=count, generator=generator
     )
     return shared, words or called
 
@@ -196,10 +202,7 @@ def straightness(
             rows.append(
                 {
                     "policy": str(method),
-                    "prior": method.name,
-                    "options": method.options,
-                    "sigma": method.sigma,
-                    "chunk": method.chunk_length,
+                    **method.facts,
                     "mean": mean,
                     "seed": s,
                     "observations": len(observations),

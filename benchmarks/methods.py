@@ -89,16 +89,7 @@ METHODS: dict[str, Composition] = {
     "leap": Composition("Learnable prior", "#b8a9c9", LeapPrior),
 }
 
-OWN_COLORS = [
-    "#1b9e77",
-    "#e7298a",
-    "#66a61e",
-    "#a6761d",
-    "#e41a1c",
-    "#377eb8",
-    "#984ea3",
-    "#17becf",
-]
+OWN_COLORS = ["#1b9e77", "#e7298a", "#66a61e", "#a6761d", "#e41a1c", "#377eb8", "#984ea3", "#17becf"]
 
 
 def composition(name: str) -> Composition:
@@ -195,6 +186,12 @@ class Method:
             file = inspect.getfile(self.parts.prior)
             config["code"] = digest_of(Path(file).read_text(encoding="utf-8"))
         return config
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What every row says of it."""
+        config = {"prior": self.name, "options": self.options, "sigma": self.sigma}
+        return {**config, "chunk": self.chunk_length}
 
     @property
     def name(self) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 
 import pandas as pd
 import torch
-from common import Policy, policies_of, replace_rows, trained_actors
+from common import Policy, policies_of, trained_actors, write_rows
 from measures import straightness
 from options import Evaluation, Options, Sources, check_single, parse, script, started
 from plots import plot_flow_paths, plot_navigation
@@ -111,35 +111,21 @@ def main(argv: list[str] | None) -> None:
     """Train the policies, roll them out and measure their flows."""
     options = parse(NAVIGATION_PRESETS, argv, "navigation1d", __doc__, adapt=lambda base, asked: base)
     with started(options, "navigation1d") as out:
-        policies = policies_of(options, options.sources.methods(), ("navigation", "toy"), only=True)
+        policies = policies_of(options, ("navigation", "toy"), only=True)
         train_all(options, policies)
+        episodes = {"rollouts": options.evaluation.episodes}
         judged = [
-            {
-                **policy.facts,
-                "nfe": nfe,
-                **judge_navigation(
-                    policy.load(),
-                    policy.training.seed,
-                    nfe=nfe,
-                    rollouts=options.evaluation.episodes,
-                ),
-            }
-            for policy in policies
-            for nfe in policy.method.nfes(options.evaluation.nfe)
+            {**p.facts, "nfe": nfe, **judge_navigation(p.load(), p.training.seed, nfe=nfe, **episodes)}
+            for p in policies
+            for nfe in p.method.nfes(options.evaluation.nfe)
         ]
-        rows = replace_rows(out / "results.jsonl", judged)
+        rows = write_rows(out / "results.jsonl", judged)
         observations = SharedObservations(policies[0].task().data, options.sources.chunk[0])
-        flows = [
-            row  # seed by seed: the source samples belong to the seed
-            for seed in options.seeds
-            for row in straightness(
-                trained_actors([p for p in policies if p.training.seed == seed]),
-                observations,
-                draws=4,
-                seed=seed,
-            )
-        ]
-        curvatures = replace_rows(out / "curvature.jsonl", flows)
+        flows = []
+        for seed in options.seeds:  # the source samples belong to the seed
+            actors = trained_actors([p for p in policies if p.training.seed == seed])
+            flows += straightness(actors, observations, draws=4, seed=seed)
+        curvatures = write_rows(out / "curvature.jsonl", flows)
         text = table(labelled(rows), ["method", "nfe"], JUDGED, beside(options, Options()))
         flow = labelled(curvatures[curvatures["mean"] == "training"])
         text += "\n" + table(flow, ["method"], ["kappa_executed", "relative_executed"])

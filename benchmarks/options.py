@@ -117,22 +117,10 @@ class Run:
         assert self.out is not None
         return self.out
 
-
-@dataclass(frozen=True)
-class HeldOut:
-    """Observations to measure on, which no policy was trained on."""
-
-    validation: Path | None = None  # demonstrations, as --dataset names them (default: newly generated ones)
-    observations: int = 500  # how many; the paper's curvature has 2000
-    steps: int = 100  # Euler steps of a curvature
-    draws: int = 1  # source samples per observation
-
-    def __post_init__(self) -> None:
-        check_counts(self, "observations", "draws", "steps")
-        if self.steps < 2:
-            raise ValueError(f"--steps must be at least 2, got {self.steps}")
-        if self.validation is not None:
-            check_place(self.validation, "--validation")
+    @property
+    def policies(self) -> Path:
+        """Where policies lie: beside the run, so that others share them."""
+        return self.folder.absolute().parent / "policies"
 
 
 @dataclass(frozen=True)
@@ -167,8 +155,6 @@ class Options:
         self.data.check()
         self.network.check(self.data)
         check_batch(self.training.batch_size)
-        if self.seeds.stop > 2**63:  # rows and generators hold no more
-            raise ValueError(f"--seed must be below 2**63, got {self.training.seed}")
         try:
             with torch.device("meta"):  # nothing is computed
                 self.network.without_images().make(1, 1, 2)
@@ -194,22 +180,27 @@ class Options:
                 raise ValueError(f"{method.name} pairs within a batch: --batch-size must be at least 2")
 
 
-@dataclass(frozen=True)
-class PolicyOptions:
-    """Which policies to take."""
-
-    run: Path | None = None  # a finished run of robomimic.py, whose policies to take instead of training them
+# A finished run of robomimic.py, whose policies to take instead of training them.
+FinishedRun = Annotated[Path | None, tyro.conf.arg(name="run")]
 
 
 @dataclass(frozen=True)
 class MeasuredOptions(Options):
-    """A comparison with measures on held-out observations, of one task and chunk length."""
+    """A comparison with measures on observations that no policy was trained on."""
 
-    held_out: Annotated[HeldOut, Flat] = field(default_factory=HeldOut)
+    validation: Path | None = None  # demonstrations, as --dataset names them (default: newly generated ones)
+    observations: int = 500  # how many to measure on; the paper's curvature has 2000
+    steps: int = 100  # Euler steps of a curvature
+    draws: int = 1  # source samples per observation
 
     def check(self) -> None:
         super().check()
         check_single(self, "task", "data", "chunk")
+        check_counts(self, "observations", "draws", "steps")
+        if self.steps < 2:
+            raise ValueError(f"--steps must be at least 2, got {self.steps}")
+        if self.validation is not None:
+            check_place(self.validation, "--validation")
 
 
 def check_single(options: Options, *names: str) -> None:
@@ -274,9 +265,12 @@ def adapted[O: Options](preset: O, asked: Options) -> O:
     return preset
 
 
-def with_parts[O](options: O, **parts: Mapping[str, Any]) -> O:
-    """Options with some leaves replaced, by part."""
-    made: Any = {part: replace(getattr(options, part), **values) for part, values in parts.items()}
+def with_parts[O](options: O, **parts: Any) -> O:
+    """Options with some leaves replaced: by part, or where they are no part's."""
+    made: Any = {
+        part: replace(getattr(options, part), **values) if isinstance(values, Mapping) else values
+        for part, values in parts.items()
+    }
     return replace(options, **made)  # type: ignore[type-var]
 
 
@@ -375,21 +369,13 @@ OF_A_START = ("out", "resume", "envs", "films", "logger", "engine", "ray_address
 """Options of a run that may differ each time it is started: they change no result."""
 
 
-def recorded(options: Any) -> dict[str, Any]:
+def recorded(options: Options) -> dict[str, Any]:
     """Options as JSON holds them, without those of a start."""
-
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {key: plain(v) for key, v in value.items()}
-        if isinstance(value, (tuple, list)):
-            return [plain(v) for v in value]
-        # The same file from another working directory.
-        return resolved_place(value) if isinstance(value, Path) else value
-
-    tree = plain(asdict(options))
-    if "run" in tree:
-        tree["run"] = {k: v for k, v in tree["run"].items() if k not in OF_A_START}
-        del tree["data"]["force_download"]
+    # A path is that of the same file from another working directory.
+    tree: dict[str, Any] = json.loads(json.dumps(asdict(options), default=resolved_place))
+    for name in OF_A_START:
+        del tree["run"][name]
+    del tree["data"]["force_download"]
     return tree
 
 
@@ -400,7 +386,7 @@ def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> Iterator[
         if isinstance(one, dict) and isinstance(two, dict):
             yield from differences(one, two)
         elif one != two:
-            yield "--" + name.replace("_", "-")
+            yield "--run" if name == "policies" else "--" + name.replace("_", "-")
 
 
 def stored_options[O: Options](kind: type[O], out: Path, study: str) -> O:

@@ -181,11 +181,11 @@ def plot_lines(
     measures: Mapping[str | tuple[str, str], str],
     column: str = "nfe",
     scale: str = "even",
-) -> list[Any]:
+) -> None:
     """Means over seeds against `x`, their deviation shaded: panels in a line per measure, one per `column`.
 
     Of a pair of measures the second is dotted. The values of `x` stand evenly, in the order of the rows, or
-    on the `log` or `linear` scale. Returns the axes.
+    on the `log` or `linear` scale.
     """
     panels, values, colors = rows[column].unique(), list(rows[x].unique()), colors_of(rows)
     figure, axes = new_figure(3.6 * len(panels), 0.4 + 2.8 * len(measures), len(measures), len(panels))
@@ -213,7 +213,6 @@ def plot_lines(
             axis.set_xticks(ticks, [f"{value:,g}" for value in values], fontsize=8)
     legend_below(figure)
     save(figure, path, title)
-    return axes
 
 
 def plot_learning_curves(

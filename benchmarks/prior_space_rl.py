@@ -20,15 +20,22 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import pandas as pd
 import tyro
-from common import Rows, facts_of, finished_policies, policies_of, slug, trained_actors
+from common import (
+    facts_of,
+    finished_policies,
+    policies_of,
+    slug,
+    stored_rows,
+    trained_actors,
+    write_rows,
+)
 from methods import Method
 from navigation1d import NAVIGATION_PRESETS
 from options import (
     PRESETS,
     Evaluation,
-    Flat,
+    FinishedRun,
     Options,
-    PolicyOptions,
     Sources,
     check_single,
     parse,
@@ -38,7 +45,7 @@ from options import (
     with_parts,
 )
 from plots import plot_lines, plot_success
-from report import labelled, problem_title, read_rows, table, write_report
+from report import labelled, problem_title, table, write_report
 from robomimic import train_all
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.transforms import Compose
@@ -75,10 +82,12 @@ AgentOptions: Any = make_dataclass(
 
 
 @dataclass(frozen=True)
-class GroupOptions:
-    """The agents to compare."""
+class AgentsOptions(Options):
+    """A comparison of agents; the frozen policies are those of a comparison of sources."""
 
-    algorithm: tuple[Literal["dsrl-na", "dsrl-sac"], ...] = ("dsrl-na",)  # of their learning
+    policies: FinishedRun = None  # a finished run of robomimic.py, whose policies to take instead of training
+    rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
+    algorithm: tuple[Literal["dsrl-na", "dsrl-sac"], ...] = ("dsrl-na",)  # of the agents' learning
     horizon: int | None = None  # time limit in control steps (default: the task's)
     base_delta: float | None = None  # half the box around zero, without --rl.delta (default: 1.5)
     num_envs: int = 4  # parallel environments of an agent
@@ -91,15 +100,6 @@ class GroupOptions:
         check_counts(self, "horizon", "num_envs", "threads", "collectors")
         if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
             raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
-
-
-@dataclass(frozen=True)
-class AgentsOptions(Options):
-    """A comparison of agents; the frozen policies are those of a comparison of sources."""
-
-    policies: Annotated[PolicyOptions, Flat] = field(default_factory=PolicyOptions)
-    rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
-    agents: Annotated[GroupOptions, Flat] = field(default_factory=GroupOptions)
 
     @property
     def is_toy(self) -> bool:
@@ -115,15 +115,15 @@ class AgentsOptions(Options):
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "data", "chunk", "sigma", "nfe")
-        if self.agents.collectors is not None and self.run.engine != "ray":
+        if self.collectors is not None and self.run.engine != "ray":
             raise ValueError("--collectors belongs to --engine ray")
-        if not self.is_toy and self.policies.run is None:
+        if not self.is_toy and self.policies is None:
             self.data.check()
             self.network.check(self.data)
         for method in self.sources.methods():
             if not method.is_flow:
                 raise ValueError(f"--prior {method.name} is no flow: there is no source space to act in")
-            for algorithm in self.agents.algorithm:
+            for algorithm in self.algorithm:
                 self.agent(method.has_anchor, algorithm, 0)
 
     def agent(self, anchored: bool, algorithm: str, seed: int) -> PriorSpaceConfig:
@@ -137,7 +137,7 @@ class AgentsOptions(Options):
             "backup_entropy": shared["backup_entropy"] or algorithm == "dsrl-sac",
         }
         if shared["delta"] is None and not anchored:
-            own["delta"] = self.agents.base_delta
+            own["delta"] = self.base_delta
         return PriorSpaceConfig(**{**shared, **own})
 
 
@@ -162,7 +162,7 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
             alpha_init=0.05,
             evaluate_every=6_000,
         ),
-        agents=GroupOptions(threads=1),
+        threads=1,
     ),
     # The navigation toy with a goal, three seeds: about two minutes.
     "unit": AgentsOptions(
@@ -187,7 +187,8 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
             reward_offset=0.0,
             evaluate_every=6_000,
         ),
-        agents=GroupOptions(num_envs=32, threads=1),
+        num_envs=32,
+        threads=1,
     ),
     # DSRL's hyper-parameters per task, three seeds: needs a GPU.
     "paper": study(
@@ -201,32 +202,34 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
 }
 
 # What a preset does differently on a task.
-BY_TASK: dict[tuple[str, str], dict[str, dict[str, Any]]] = {
+BY_TASK: dict[tuple[str, str], dict[str, Any]] = {
     # Weak policies: solved in 0.3 to 0.8 of the episodes.
     ("quick", "lift"): {
         "data": {"demonstrations": (5,)},
         "training": {"iterations": 300},
-        "agents": {"horizon": 90},
+        "horizon": 90,
     },
     ("quick", "can"): {"training": {"iterations": 500}},
-    ("paper", "lift"): {"rl": {"updates": 30}, "agents": {"horizon": 300}},
-    ("paper", "can"): {"agents": {"horizon": 300}},
+    ("paper", "lift"): {"rl": {"updates": 30}, "horizon": 300},
+    ("paper", "can"): {"horizon": 300},
     ("paper", "square"): {
         "rl": {"gamma": 0.999, "warmup_steps": 32_000},
-        "agents": {"horizon": 400},
+        "horizon": 400,
     },
     # DSRL's own choice there is SAC.
     ("paper", "transport"): {
         "rl": {"hidden_dim": 128, "warmup_steps": 640_000},
         "sources": {"chunk": (8,)},
-        "agents": {"horizon": 800, "base_delta": 1.0, "algorithm": ("dsrl-na", "dsrl-sac")},
+        "horizon": 800,
+        "base_delta": 1.0,
+        "algorithm": ("dsrl-na", "dsrl-sac"),
     },
 }
 
 
 def adapt(preset: AgentsOptions, asked: AgentsOptions) -> AgentsOptions:
     """The preset with the hyper-parameters of the task."""
-    name, given, run = asked.run.preset, asked.data.task, asked.policies.run
+    name, given, run = asked.run.preset, asked.data.task, asked.policies
     if name == "unit":
         return preset
     if run is not None and (run / "tasks.json").exists():
@@ -243,9 +246,9 @@ def frozen_policies(
     options: AgentsOptions,
 ) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
     """The task, and the frozen policies by method and seed: of --run, or trained now."""
-    run, methods = options.policies.run, options.sources.methods()
+    run = options.policies
     if run is None:
-        policies = policies_of(options, methods)
+        policies = policies_of(options)
         train_all(options, policies)
         return facts_of(policies[0].task()), trained_actors(policies)
     task, actors = finished_policies(run, options.run.device)
@@ -272,10 +275,10 @@ def frozen_policies(
 def environment(options: AgentsOptions, actor: WarmPriorActor) -> Callable[[int], EnvBase]:
     """The environment of agents around a frozen policy, as a function of its seed."""
     if options.is_toy:
-        return partial(toy, actor, options.agents.num_envs)
+        return partial(toy, actor, options.num_envs)
     make_env, make_transforms = environment_parts(actor)
-    make_env = partial(make_env, horizon=options.agents.horizon, **options.evaluation.environment)
-    return partial(simulators, actor, make_env, make_transforms, options.agents.num_envs)
+    make_env = partial(make_env, horizon=options.horizon, **options.evaluation.environment)
+    return partial(simulators, actor, make_env, make_transforms, options.num_envs)
 
 
 def toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
@@ -317,10 +320,10 @@ def learn(
         folder,
         evaluation_seed=EVALUATION_SEED,
         description=name,
-        collectors=options.agents.collectors,
+        collectors=options.collectors,
         ray_address=options.run.ray_address,
     )
-    with torch_threads(options.agents.threads):
+    with torch_threads(options.threads):
         training.run()
     return training
 
@@ -331,9 +334,9 @@ def main(argv: list[str] | None) -> None:
     options = parse(AGENT_PRESETS, argv, "rl", __doc__, adapt=adapt)
     with started(options, "rl") as out:
         task, frozen = frozen_policies(options)
-        rows = Rows(out / "results.jsonl")
-        failures = []
-        for seed, algorithm, method in product(options.seeds, options.agents.algorithm, frozen):
+        path = out / "results.jsonl"
+        rows, failures = stored_rows(path), []
+        for seed, algorithm, method in product(options.seeds, options.algorithm, frozen):
             source = ",".join(filter(None, (method.name, method.options)))
             name, actor = f"{algorithm} {source}, seed {seed}", frozen[method][seed]
             folder = out / f"{algorithm}-{slug(source)}-seed{seed}"
@@ -342,10 +345,7 @@ def main(argv: list[str] | None) -> None:
                 "data": task["data"],
                 **{space: task[space] for space in ("actions", "obs") if space in task},
                 "algorithm": algorithm,
-                "prior": method.name,
-                "options": method.options,
-                "sigma": method.sigma,
-                "chunk": method.chunk_length,
+                **method.facts,
                 "nfe": options.evaluation.nfe[0],
                 "seed": seed,
             }
@@ -354,11 +354,12 @@ def main(argv: list[str] | None) -> None:
             except FloatingPointError as error:  # no reason to keep the other agents from learning
                 failures.append(f"{name}: {error}")
                 continue
-            rows.rows = [row for row in rows.rows if not facts.items() <= row.items()]
-            rows.add(*({**facts, "delta": training.decoder.delta, **point} for point in training.curve))
-        if not rows.rows:
+            rows = [row for row in rows if not facts.items() <= row.items()]
+            rows += [{**facts, "delta": training.decoder.delta, **point} for point in training.curve]
+            write_rows(path, rows)
+        if not rows:
             raise FloatingPointError("; ".join(failures))
-        found = labelled(read_rows(rows.path))
+        found = labelled(write_rows(path, rows))
         title = f"{problem_title(task)}, NFE {options.evaluation.nfe[0]}"
         draw(found, out / "curves.png", title, options.rl.warmup_steps)
         agents = ["algorithm", "method", "evaluation"]

@@ -61,19 +61,18 @@ class DelayOptions(Options):
             cells = self.conditions(method)
             if not cells:
                 raise ValueError(f"{method.name} is no flow to guide: add --guidance none, or leave it out")
-            for delay, execute, guidance in ((c.delay, c.execute, c.guidance) for c in cells):
-                assert delay is not None and execute is not None
-                left = method.prediction_length - execute
+            for cell in cells:
+                delay, execute, length = cell.delay or 0, cell.execute or 1, method.prediction_length
                 try:
                     if execute > method.chunk_length or delay < 0:
                         raise ValueError(f"need 0 <= delay and execute <= H = {method.chunk_length}")
-                    check_delay(delay, execute, method.prediction_length)
-                    if guidance is not None:
-                        guidance.check_delay(delay, left)
+                    check_delay(delay, execute, length)
+                    if cell.guidance is not None:
+                        cell.guidance.check_delay(delay, length - execute)
                 except ValueError as error:
                     raise ValueError(
                         f"--delay {delay} with --execute {execute} and {method.name}, which predicts "
-                        f"{method.prediction_length}: {error}"
+                        f"{length}: {error}"
                     ) from error
 
     def conditions(self, method: Method) -> list[Cell]:
@@ -100,7 +99,7 @@ def main(argv: list[str] | None) -> None:
     with started(options, STUDY) as out:
         toy = [] if options.toy == "no" else [("navigation", "toy")]
         alone = options.toy == "alone"
-        policies = policies_of(options, options.sources.methods(), *toy, only=alone)
+        policies = policies_of(options, *toy, only=alone)
         rows, failures = compare(options, policies, options.conditions)
         seeds = per_seed(labelled(rows), options.evaluation.top_k)
         seeds = seeds.sort_values(["nfe", "delay"], ascending=[False, True], kind="stable")

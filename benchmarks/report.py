@@ -259,6 +259,7 @@ def terminal_table(found: DataFrame, top_k: int, width: int = 120) -> str:
     frame = wide(rows, rows["text"], "line", "column").rename_axis(index=None, columns=None)
     frame.index = [textwrap.shorten(name, width * 2 // 3, placeholder=" ...") for name in frame.index]
     legend = f"Success (%), gain over {first}. **: the best. *: above both deviations over seeds."
+    legend = textwrap.shorten(legend, width, placeholder=" ...")
     return "\n".join([headline(found, top_k, width), "", frame.to_string(line_width=width), "", legend])
 
 

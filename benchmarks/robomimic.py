@@ -22,19 +22,19 @@ import pandas as pd
 from common import (
     Cell,
     Policy,
-    Rows,
     batches,
     facts_of,
     measure,
     play,
-    policies_folder,
     policies_of,
     row,
+    stored_rows,
     train,
+    write_rows,
 )
 from jobs import Jobs
 from methods import Method
-from options import PRESETS, Evaluation, Options, parse, script, started
+from options import PRESETS, Evaluation, Options, parse, script, started, with_parts
 from pictures import draw
 from report import success_report, summary, terminal_table, write_report
 
@@ -56,7 +56,7 @@ def run(
     with started(options, study) as out:
         # Demonstrations: generated, downloaded, or read from --dataset. On them a policy per task, method and
         # seed: network, recipe and data are equal, and the source differs.
-        policies = policies_of(options, options.sources.methods())
+        policies = policies_of(options)
 
         # A row per policy, checkpoint and NFE: what it is, how it was played, and what came out.
         rows, failures = compare(options, policies)
@@ -89,14 +89,20 @@ def compare(
         delays = row.get("delay") or 0, row.get("guidance") or ""
         return places[row["policy"]], row["checkpoint"], -row["nfe"], *delays
 
-    rows = Rows(options.run.folder / "results.jsonl", order)
-    if others := {row["policy"] for row in rows.rows} - places.keys():
+    def add(row: dict[str, Any]) -> None:
+        rows.append(row)
+        rows.sort(key=order)
+        write_rows(path, rows)
+
+    path = options.run.folder / "results.jsonl"
+    rows = stored_rows(path)
+    if others := {row["policy"] for row in rows} - places.keys():
         raise ValueError(
-            f"{rows.path} has rows of {min(others)}: it was begun with other versions or data. Finish it "
+            f"{path} has rows of {min(others)}: it was begun with other versions or data. Finish it "
             "with those, or choose another --out"
         )
     failures = begin(options, policies)
-    with Jobs(options.run, [options.run.folder, policies_folder(options.run)]) as jobs:
+    with Jobs(options.run) as jobs:
         for policy in sorted(policies, key=lambda policy: policy.training.seed):
             cells = [
                 replace(condition, checkpoint=checkpoint, nfe=nfe)
@@ -106,20 +112,21 @@ def compare(
                     conditions(policy.method),
                 )
             ]
-            missing = [cell for cell in cells if not rows.find(policy.facts | cell.facts())]
+            facts = {cell: (policy.facts | cell.facts()).items() for cell in cells}
+            missing = [cell for cell in cells if not any(facts[cell] <= row.items() for row in rows)]
             if str(policy) not in failures:
-                submit(jobs, policy, missing, evaluation, rows)
+                submit(jobs, policy, missing, evaluation, add)
         failures |= jobs.wait()
     reasons = [f"{policy}: {reason}" for policy, reason in failures.items()]
-    if not rows.rows:
+    if not rows:
         raise PartialFailure("; ".join(reasons))
-    return pd.DataFrame(rows.rows), reasons
+    return pd.DataFrame(rows), reasons
 
 
 def train_all(options: Options, policies: Sequence[Policy]) -> None:
     """Train what is missing, and play nothing."""
     failures = begin(options, policies)
-    with Jobs(options.run, [options.run.folder, policies_folder(options.run)]) as jobs:
+    with Jobs(options.run) as jobs:
         for policy in policies:
             jobs.submit(str(policy), train, policy, training=True, status=policy.status)
         if failures := failures or jobs.wait():
@@ -147,7 +154,13 @@ def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
     return failures
 
 
-def submit(jobs: Jobs, policy: Policy, cells: Sequence[Cell], evaluation: Evaluation, rows: Rows) -> None:
+def submit(
+    jobs: Jobs,
+    policy: Policy,
+    cells: Sequence[Cell],
+    evaluation: Evaluation,
+    add: Callable[[dict[str, Any]], None],
+) -> None:
     """Train, measure and play a policy; a cell whose episodes are complete becomes a row."""
     last, was_there = policy.training.iterations, policy.is_trained
     episodes: dict[Cell, list[Episode]] = {cell: [] for cell in cells}
@@ -167,7 +180,7 @@ def submit(jobs: Jobs, policy: Policy, cells: Sequence[Cell], evaluation: Evalua
         at_end = cell.checkpoint == last
         if len(mine) == evaluation.episodes and (measures or not at_end):
             made = row(policy, cell, mine, measures.get(cell.nfe, {}) if at_end else {})
-            rows.add(made)
+            add(made)
             jobs.say(f"played {policy}, {cell}: {made['successes']} of {len(mine)} solved")
 
     group = str(policy)
@@ -189,13 +202,20 @@ def beside(options: Options, usual: Options) -> list[str]:
         "training": ("times", "objective", "weighting", "self_distillation", "precision"),
         "evaluation": ("grid",),
     }
+    mine, theirs = in_force(options), in_force(usual)
     given = [
         f"--{name.replace('_', '-')} {value}"
         for part, names in parts.items()
         for name in names
-        if (value := getattr(getattr(options, part), name)) != getattr(getattr(usual, part), name)
+        if (value := getattr(getattr(mine, part), name)) != getattr(getattr(theirs, part), name)
     ]
     return [f"Beside the paper, for all sources: {', '.join(given)}."] if given else []
+
+
+def in_force(options: Options) -> Options:
+    """Options with the weighting that follows from the network, where none is given."""
+    weighting = "standardised" if options.network.precondition else "velocity"
+    return with_parts(options, training={"weighting": options.training.weighting or weighting})
 
 
 def smaller(options: Options, paper: Options) -> list[str]:

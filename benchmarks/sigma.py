@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
-from common import observations_of, policies_of, replace_rows, trained_actors
+from common import observations_of, policies_of, trained_actors, write_rows
 from measures import straightness
 from options import PRESETS, MeasuredOptions, Options, check_single, parse, script, started, study
 from paper import paper_success
@@ -53,17 +53,13 @@ def main(argv: list[str] | None) -> None:
     options = parse(presets, argv, "sigma", __doc__)
     check_single(options, "nfe")
     with started(options, "sigma") as out:
-        policies = policies_of(options, options.sources.methods())
+        policies = policies_of(options)
         # Before the hours of training: what cannot be measured on is better known now.
         observations, source = observations_of(options, policies[0])
         rows, failures = compare(options, policies)
-        flow = straightness(
-            trained_actors(policies),
-            observations,
-            n_steps=options.held_out.steps,
-            draws=options.held_out.draws,
-        )
-        curvatures = replace_rows(out / "curvature.jsonl", flow)
+        actors = trained_actors(policies)
+        flow = straightness(actors, observations, n_steps=options.steps, draws=options.draws)
+        curvatures = write_rows(out / "curvature.jsonl", flow)
         title = f"{policies[0].task().title}, NFE {options.evaluation.nfe[0]}"
         draw(rows, curvatures, out / "sigma.png", options.evaluation.top_k, title)
         seeds = per_seed(labelled(rows, "sigma"), options.evaluation.top_k)

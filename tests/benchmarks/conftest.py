@@ -24,7 +24,7 @@ class Inline:
         import jobs
 
         future = Future()
-        future.set_result(jobs._call(job.function, job.args))
+        future.set_result(jobs.call(job.function, job.args))
         return future
 
     def close(self, kill):
@@ -50,12 +50,6 @@ def inline(request):
         cached.cache_clear()
 
 
-@pytest.fixture
-def processes(inline, monkeypatch):
-    """Jobs are computed in fresh processes, as users have it."""
-    monkeypatch.setattr("jobs.Local", inline)
-
-
 @pytest.fixture(scope="module", autouse=True)
 def short_episodes():
     """Policies of a few iterations solve nothing: their episodes need not go to the time limit."""
@@ -76,16 +70,3 @@ def validation(tmp_path_factory):
     path = tmp_path_factory.mktemp("held-out") / "val.hdf5"
     write_robomimic_file(path, lengths=(25, 30), task="lift", seed=1)
     return path
-
-
-@pytest.fixture
-def no_work(monkeypatch):
-    """Nothing is generated, downloaded or trained."""
-
-    def never(*args, **options):
-        raise AssertionError("work was begun")
-
-    places = ["common.train_policy", "robomimic.train", "measures.generate_demonstrations"]
-    loaders = ("generate_demonstrations", "download_robomimic", "download_mimicgen")
-    for place in [*places, *(f"warmprior.training.task.{name}" for name in loaders)]:
-        monkeypatch.setattr(place, never)

@@ -25,71 +25,50 @@ class DriftEnv(EnvBase):
     def __init__(self) -> None:
         super().__init__(device="cpu", batch_size=[])
         self.seed_ = 0
-
-        def flag():
-            return Categorical(2, dtype=torch.bool, shape=(1,))
-
-        self.observation_spec = Composite(
-            observation=Unbounded((OBSERVATION_DIM,)), solved=flag(), side=Unbounded((1,))
-        )
+        flag = Categorical(2, dtype=torch.bool, shape=(1,))
+        seen = {"observation": Unbounded((OBSERVATION_DIM,)), "solved": flag.clone(), "side": Unbounded((1,))}
+        self.observation_spec = Composite(seen)
         self.action_spec = Bounded(-1, 1, (ACTION_DIM,))
         self.reward_spec = Unbounded((1,))
-        self.done_spec = Composite({k: flag() for k in ("done", "terminated", "truncated")})
+        self.done_spec = Composite({k: flag.clone() for k in ("done", "terminated", "truncated")})
 
     def _set_seed(self, seed):
         self.seed_ = seed
 
-    def _says(self, done):
-        side = self.state[:ACTION_DIM].sum()
-        return {
-            "observation": self.state.clone(),
-            "solved": done & (side > 0),
-            "side": side.reshape(1),
-            "done": done,
-            "terminated": done,
-            "truncated": torch.zeros(1, dtype=torch.bool),
-        }
+    def _says(self, **more):
+        done, side = torch.tensor([self.left == 0]), self.state[:ACTION_DIM].sum().reshape(1)
+        ends = {"done": done, "terminated": done, "truncated": torch.zeros(1, dtype=torch.bool)}
+        seen = {"observation": self.state.clone(), "solved": done & (side > 0), "side": side}
+        return TensorDict(seen | ends | more, [])
 
     def _reset(self, tensordict=None, **kwargs):
         self.left = 9 + self.seed_ % 7
-        generator = torch.Generator().manual_seed(self.seed_)
-        self.state = torch.randn(OBSERVATION_DIM, generator=generator)
-        return TensorDict(self._says(torch.zeros(1, dtype=torch.bool)), [])
+        self.state = torch.randn(OBSERVATION_DIM, generator=torch.Generator().manual_seed(self.seed_))
+        return self._says()
 
     def _step(self, tensordict):
         self.left -= 1
         self.state = self.state.clone()
         self.state[:ACTION_DIM] += 0.4 * tensordict["action"]
-        said = self._says(torch.tensor([self.left == 0]))
-        return TensorDict(said | {"reward": torch.zeros(1)}, [])
+        return self._says(reward=torch.zeros(1))
 
 
 def demonstrations(seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    episodes = [
-        TensorDict(
-            {
-                "observation": torch.randn(n, OBSERVATION_DIM, generator=generator).cumsum(0),
-                "action": torch.randn(n, ACTION_DIM, generator=generator).tanh(),
-                "episode": torch.full((n,), i),
-            },
-            [n],
-        )
-        for i, n in enumerate((30, 5, 40))
+    generator, lengths = torch.Generator().manual_seed(seed), torch.tensor([30, 5, 40])
+    parts = [
+        [torch.randn(n, width, generator=generator) for width in (OBSERVATION_DIM, ACTION_DIM)]
+        for n in lengths
     ]
-    return torch.cat(episodes)
+    seen = torch.cat([seen.cumsum(0) for seen, _ in parts])
+    actions = torch.cat([actions for _, actions in parts])
+    episode = torch.arange(3).repeat_interleave(lengths)
+    return TensorDict({"observation": seen, "action": actions.tanh(), "episode": episode}, [75])
 
 
 def task(options=None, seed=0):
     """Named as ``--task tests.benchmarks.drift:task``."""
-    return Task.of(
-        "drift",
-        demonstrations(seed),
-        DriftEnv,
-        style="own",
-        success="solved",
-        measures={"side": "max"},
-    )
+    ends = {"success": "solved", "measures": {"side": "max"}}
+    return Task.of("drift", demonstrations(seed), DriftEnv, style="own", **ends)
 
 
 def other(options):
@@ -114,21 +93,7 @@ class Widening(PastPrior, torch.nn.Module):
 
 def arguments(out, **more):
     """A command line of robomimic.py on it."""
-    values = {
-        "task": f"{__name__}:task",
-        "out": out,
-        "prior": ["gaussian", "past", "preview"],
-        "chunk": H,
-        "iterations": 20,
-        "batch_size": 16,
-        "learning_rate": 1e-2,
-        "checkpoints": 2,
-        "log_every": 5,
-        "hidden_dim": 16,
-        "episodes": 7,
-        "seeds": 2,
-        "nfe": [3, 1],
-        "envs": 1,
-        "logger": "none",
-    }
+    values = {"task": f"{__name__}:task", "out": out, "prior": ["gaussian", "past", "preview"], "chunk": H}
+    values |= {"iterations": 20, "batch_size": 16, "learning_rate": 1e-2, "checkpoints": 2, "log_every": 5}
+    values |= {"hidden_dim": 16, "episodes": 7, "seeds": 2, "nfe": [3, 1], "envs": 1, "logger": "none"}
     return command_line(**values | more)

@@ -8,38 +8,26 @@ import pytest
 import torch
 from methods import METHODS, Method
 
-from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.history import cold_history
-from warmprior.modules.prior import Prior
 from warmprior.objectives import OTCoupling, ReflowCoupling
 from warmprior.training import TrainingConfig
 
 H = 3
 
 
-class Bare(Prior):
-    """No source: it has neither a mean nor a distribution."""
-
-
-@pytest.mark.parametrize(
-    ("one", "two"),
-    [
+def test_methods_are_equal_if_and_only_if_they_do_the_same():
+    for one, two in (
         (("past", H), ("past,correlation=0.0,sigma=0.5", H)),
         (("past,sigma=0.3", H), ("past", H, 0.3)),
         (("gaussian", H), ("gaussian", H, 0.3)),  # --sigma belongs to those that take it
         (("step,stall=1,start_time=0.7", H), ("step,start_time=0.7,stall=1", H)),
-    ],
-)
-def test_methods_are_equal_if_they_do_the_same(one, two):
-    first, second = Method(*one), Method(*two)
-    assert first == second and hash(first) == hash(second) and first.config() == second.config()
-
-
-@pytest.mark.parametrize(
-    "other", [("past", H + 1), ("past", H, 0.3), ("past,correlation=0.5", H), ("preview", H)]
-)
-def test_methods_differ_in_each_of_their_options(other):
-    assert Method(*other) != Method("past", H) and Method(*other).config() != Method("past", H).config()
+    ):
+        first, second = Method(*one), Method(*two)
+        assert first == second and hash(first) == hash(second) and first.config() == second.config()
+    past = Method("past", H)
+    for other in (("past", H + 1), ("past", H, 0.3), ("past,correlation=0.5", H), ("preview", H)):
+        assert Method(*other) != past and Method(*other).config() != past.config()
 
 
 def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch):
@@ -52,27 +40,21 @@ def test_a_prior_of_ones_own_is_another_once_it_is_edited(tmp_path, monkeypatch)
     assert one == same != Method("edited_prior:Mine", H).config()
 
 
-@pytest.mark.parametrize("text", [*METHODS, "tests.benchmarks.user_priors:HeldAction"])
-def test_every_method_arrives_in_a_fresh_process(text):
-    method = Method(text, H)
-    again = pickle.loads(pickle.dumps(method))
-    assert again == method and again.sigma == method.sigma and str(again) == str(method)
-    assert method.prediction_length == (2 * H if method.name == "preview" else H)
+def test_every_method_arrives_in_a_fresh_process():
+    for text in (*METHODS, "tests.benchmarks.drift:Widening"):
+        method = Method(text, H)
+        again = pickle.loads(pickle.dumps(method))
+        assert again == method and again.sigma == method.sigma and str(again) == str(method)
+        assert method.prediction_length == (2 * H if method.name == "preview" else H)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (("nobodys", H), "unknown prior 'nobodys'.*methods: gaussian, past"),
-        (("no.such:Prior", H), "no prior at no.such:Prior"),
         (("past,age=3", H), r"age is unknown to it.*its options are sigma, correlation"),
         (("gaussian,sigma=0.3", H), "sigma is unknown to it, or without effect"),
         (("past,sigma=0.3", H, 0.5), "both set sigma"),
-        (("past,sigma=-1", H), "sigma"),
-        (("past", 0), "chunk_length"),
-        (("ot,observation_weight=-1", H), "observation_weight"),
-        ((f"{__name__}:Bare", H), "Bare"),
-        (("methods:PointPrior", H), "is a part of methods, and none itself"),
         (("warmprior:PastPrior", H), "is a part of methods, and none itself"),
     ],
 )
@@ -97,13 +79,8 @@ def test_history_is_withheld_from_those_alone_that_remember():
     training = TrainingConfig(cold_probability=0.5)
     remember = {name for name in METHODS if Method(name, H).recipe(training).cold_probability}
     assert remember == {"past", "preview", "forecast", "history", "step", "a2a"}
-    assert {name for name in METHODS if Method(name, H).needs_vector} == {
-        "forecast",
-        "ot",
-        "step",
-        "cvae",
-        "leap",
-    }
+    vector = {name for name in METHODS if Method(name, H).needs_vector}
+    assert vector == {"forecast", "ot", "step", "cvae", "leap"}
     assert not Method("ot,observation_weight=0", H).needs_vector
 
 
@@ -116,10 +93,3 @@ def test_couplings_are_those_of_the_table():
     a0, seen = torch.randn(4, H, 1), torch.randn(4, 1, 1)
     expected = ReflowCoupling(teacher, 2)(a0, a0, seen)[1]
     assert torch.equal(coupling(a0, a0, seen)[1], expected)
-
-
-def test_sources_that_learn_are_given_the_widths_of_the_data():
-    prior = Method("forecast,hidden_dim=16", H).prior((2, 5, 1))
-    assert (prior.action_dim, prior.observation_dim, prior.hidden_dim) == (2, 5, 16)
-    assert Method("step", H).start((2, 5, 1)).observation_steps == 1
-    assert type(Method("past", H).prior((2, 5, 1))) is PastPrior

@@ -1,37 +1,34 @@
-"""The studies on manipulation tasks from the command line: shared policies, rows, pictures, errors."""
+"""The studies from the command line: shared policies, rows, pictures, and what continues."""
 
 from __future__ import annotations
-
-import importlib
-import json
-import shutil
 
 import pytest
 
 from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
-from tests.data.synthetic import write_robomimic_file
 
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
+
+import budget
+import chunking
+import curvature
+import navigation1d
+import real_time_chunking
+import robomimic
+import sigma
 
 from warmprior.data import RobomimicExperienceReplay
 from warmprior.diagnostics import SharedObservations, action_error
 from warmprior.training import load_policy
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
-NAMES = ("robomimic", "curvature", "sigma", "chunking", "budget")
 
 
 @pytest.fixture(scope="module")
-def scripts():
-    return {name: importlib.import_module(name) for name in NAMES}
-
-
-@pytest.fixture(scope="module")
-def finished(scripts, inline, short_episodes, dataset, tmp_path_factory):
+def finished(inline, short_episodes, dataset, tmp_path_factory):
     """A finished run of robomimic.py with two seeds."""
     out = tmp_path_factory.mktemp("runs") / "main"
-    assert scripts["robomimic"].main(options(dataset, out, seeds=2, iterations=60)) == 0
+    assert robomimic.main(options(dataset, out, seeds=2, iterations=60)) == 0
     return out
 
 
@@ -39,94 +36,69 @@ def measured(out, validation):
     return {"out": out, "validation": validation, "observations": 20, "steps": 8}
 
 
-def test_curvature_of_a_finished_run_trains_nothing(scripts, finished, dataset, validation, capsys):
-    before = written(finished.parent)
-    out, own = finished.parent / "of-main", finished.parent / "own"
-    argv = {"run": finished, **measured(out, validation)}
-    assert scripts["curvature"].main(command_line(**argv)) == 0
+def test_curvature_of_a_finished_run_trains_nothing(finished, dataset, validation, tmp_path, capsys):
+    before, out = written(finished.parent), tmp_path / "flow"
+    assert curvature.main(command_line(run=finished, **measured(out, validation))) == 0
     rows, report = stored(out, "curvature"), (out / "report.md").read_text()
     assert len(rows) == (1 + 2 + 2) * 3  # training and deployed means; two seeds and their average
-    assert {row["observations"] for row in rows} == {20}
     base = [row for row in rows if row["prior"] == "gaussian"]
     assert len(base) == 3 and all(row["ratio"] in (1.0, None) for row in base)
-    assert all(row["speed"] > 0 for row in rows)
-    said = capsys.readouterr().out
-    assert report.partition("\n\nColumns")[0] in said and "20 observations of val.hdf5, 2 seed(s)" in report
-    assert "not held out" not in report
+    assert all(row["speed"] > 0 and row["observations"] == 20 for row in rows)
+    assert "20 observations of val.hdf5, 2 seed(s)" in report and "not held out" not in report
     assert is_png(out / "flow_paths.png")
-    # The same options find the same policies.
-    same = options(dataset, seeds=2, iterations=60, **measured(own, validation))
-    assert scripts["curvature"].main(same) == 0
+    # The same options find the same policies; the training data are allowed, but called what they are.
+    own = finished.parent / "own"
+    assert curvature.main(options(dataset, seeds=2, iterations=60, **measured(own, validation))) == 0
     assert stored(own, "curvature") == rows and written(finished.parent) == before
-    # The training data are allowed, but called what they are.
-    argv |= {"validation": dataset, "out": finished.parent / "training"}
-    assert scripts["curvature"].main(command_line(**argv)) == 0
-    assert "not held out" in (finished.parent / "training" / "report.md").read_text()
+    assert curvature.main(command_line(run=finished, **measured(tmp_path / "train", dataset))) == 0
+    assert "not held out" in (tmp_path / "train" / "report.md").read_text()
+    # Of a run without the policy of a seed, what is missing is missed.
+    path = next((finished.parent / "policies").glob("*-past-seed1-*/policy_000060"))
+    path.rename(path.with_name("away"))
+    said = refused(curvature.main, command_line(run=finished, **measured(tmp_path / "no", dataset)), capsys)
+    path.with_name("away").rename(path)
+    assert "is missing: finish the run" in said
 
 
-def test_sigma_study(scripts, finished, dataset, validation):
+def test_sigma_study(finished, dataset, validation):
     before, out = written(finished.parent), finished.parent / "sigma"
-    argv = options(
-        dataset,
-        seeds=1,
-        iterations=60,
-        prior=["gaussian", "past", "past,correlation=0.5"],
-        sigma=[0.5, 0.0],
-        **measured(out, validation),
-    )
-    assert scripts["sigma"].main(argv) == 0
+    prior = ["gaussian", "past", "past,correlation=0.5"]
+    argv = options(dataset, iterations=60, prior=prior, sigma=[0.5, 0.0], **measured(out, validation))
+    assert sigma.main(argv) == 0
     after = written(finished.parent)
-    assert before.items() <= after.items()
     # Of 1 + 4 policies the Gaussian one and that of past with sigma 0.5 existed: 3 are new.
     new = {path.parents[1].name for path in after.keys() - before.keys() if "policy_" in str(path)}
-    assert len(new) == 3
-    cells = [(r["prior"], r["options"], r["sigma"], r["seed"]) for r in stored(out)]
-    assert len(set(cells)) == len(cells) == 5
-    flow = stored(out, "curvature")
-    assert len(flow) == 1 + 4 * 2
+    assert len(new) == 3 and before.items() <= after.items()
+    rows, flow, report = stored(out), stored(out, "curvature"), (out / "report.md").read_text()
+    cells = {(r["prior"], r["options"], r["sigma"]) for r in rows}
+    assert len(cells) == len(rows) == 5 and len(flow) == 1 + 4 * 2
     bounds = {r["sigma"]: r["bound"] for r in flow if r["prior"] == "past" and not r["options"]}
     assert bounds[0.0] < bounds[0.5]  # the bound grows with sigma^2
-    assert is_png(out / "sigma.png")
-    rows, report = stored(out), (out / "report.md").read_text()
-    for line in ("| Base | 1 |", "| WP-Past, correlation=0.5 | 0.5 |"):
-        assert report.count(line) == (2 if "Base" in line else 3)  # success; flow, by mean
+    assert is_png(out / "sigma.png") and report.count("| WP-Past, correlation=0.5 | 0.5 |") == 3
     # Continuing measures the same again, once.
-    assert scripts["sigma"].main([*argv, "--resume"]) == 0
+    assert sigma.main([*argv, "--resume"]) == 0
     assert written(finished.parent) == after
     assert stored(out) == rows and (out / "report.md").read_text() == report
 
 
-def test_chunk_length_study(scripts, dataset, tmp_path):
-    out = tmp_path / "chunks"
-    argv = options(dataset, out, chunk=[1, 8], prior=["gaussian", "past"])
-    assert scripts["chunking"].main(argv) == 0
-    rows = stored(out)
+def test_chunk_length_study(dataset, tmp_path):
+    argv = options(dataset, tmp_path / "out", chunk=[1, 8], prior=["gaussian", "past"])
+    assert chunking.main(argv) == 0
+    rows = stored(tmp_path / "out")
     assert [row["chunk"] for row in rows] == [1, 1, 8, 8]
     for row in rows:
-        assert row["boundary_jump"] > 0
-        assert (row["inner_jump"] is None) == (row["chunk"] == 1)
-    for picture in ("chunk_lengths.png", "bars.png", "violins.png"):
-        assert is_png(out / picture)
-    assert (out / "report.md").read_text().count("| WP-Past |") == 2  # a line per chunk length
-    # Continuing plays nothing again.
-    before = written(out.parent)
-    assert scripts["chunking"].main([*argv, "--resume"]) == 0
-    assert stored(out) == rows and written(out.parent) == before
+        assert row["boundary_jump"] > 0 and (row["inner_jump"] is None) == (row["chunk"] == 1)
+    assert all(is_png(tmp_path / "out" / f"{name}.png") for name in ("chunk_lengths", "bars", "violins"))
 
 
-def test_every_budget_is_a_training_of_its_own(scripts, dataset, validation, tmp_path, capsys):
+def test_every_budget_is_a_training_of_its_own(dataset, validation, tmp_path):
     out = tmp_path / "runs" / "budget"
     more = {"budgets": [4, 2], "prior": "past", "seeds": 2, "nfe": [1, 3], "checkpoints": 2}
     argv = options(dataset, **measured(out, validation) | more)
-    assert scripts["budget"].main(argv) == 0
+    assert budget.main(argv) == 0
     cells = {(r["iterations"], r["seed"], r["nfe"]): r for r in stored(out)}
     assert list(cells) == [(n, s, f) for n in (2, 4) for s in (0, 1) for f in (3, 1)]
-    assert all(row["checkpoint"] == n for (n, *_), row in cells.items())
-    report = (out / "report.md").read_text()
-    assert report.partition("\n\nColumns")[0] in capsys.readouterr().out and is_png(out / "budget.png")
-    names = sorted(path.name for path in (out.parent / "policies").glob("*/policy_*"))
-    assert names == ["policy_000002"] * 2 + ["policy_000004"] * 2
-
+    assert is_png(out / "budget.png")
     # The errors are those of the policies on disk, each trained for its own number of iterations.
     for (n, _, nfe), row in cells.items():
         actor = load_policy(out.parent / "policies" / row["policy"] / f"policy_{n:06d}")
@@ -136,100 +108,55 @@ def test_every_budget_is_a_training_of_its_own(scripts, dataset, validation, tmp
         assert row["action_error"] == pytest.approx(error, rel=0.3)  # any draw of 20 is close
     assert len({row["action_error"] for row in cells.values()}) == len(cells)
     mean = (cells[2, 0, 3]["action_error"] + cells[2, 1, 3]["action_error"]) / 2
-    (line,) = (line for line in report.splitlines() if line.startswith("| 2 | 3 |"))
-    assert line.split("|")[5].startswith(f" {mean:.4f} ±")
-
-    before, rows = written(out.parent), stored(out)
-    assert scripts["budget"].main([*argv, "--resume"]) == 0
-    assert written(out.parent) == before and stored(out) == rows
+    assert f"| 2 | 3 | WP-Past | 0.0% ± 0.0% | {mean:.4f} ±" in (out / "report.md").read_text()
 
 
-def test_studies_cover_the_papers_grid_by_default(scripts, monkeypatch):
-    made = {}
+def test_navigation_has_its_own_columns_and_pictures(tmp_path, capsys):
+    out = tmp_path / "runs" / "out"
+    few = {"prior": ["gaussian", "regression", "past"], "iterations": 5, "episodes": 4, "chunk": 32}
+    argv = command_line(**few, envs=1, logger="none", out=out)
+    assert navigation1d.main(argv) == 0
+    played, curved = stored(out), stored(out, "curvature")
+    policies = {(row["prior"], row["sigma"]) for row in played}
+    assert policies == {("gaussian", 1.0), ("regression", 0.0), ("past", 0.1), ("past", 0.5)}
+    # All but the regression at 9 and at 1 network evaluation.
+    assert len(played) == 4 * 2 - 1
+    for row in played:
+        assert {"switch_rate", "collision_rate", "route_entropy", "distance"} <= set(row)
+        assert (row["task"], row["chunk"], row["iterations"]) == ("navigation", 32, 5)
+    assert {(row["prior"], row["sigma"]) for row in curved} == policies - {("regression", 0.0)}
+    assert {row["prior"] for row in curved if row["mean"] == "deployed"} == {"past"}
+    assert (out / "report.md").read_text().partition("\n\nColumns")[0] in capsys.readouterr().out
+    assert is_png(out / "navigation1d.png") and is_png(out / "flow_paths.png")
 
-    def keep(found, study):
-        made[study] = found
-        raise ValueError("enough")
-
-    for name in ("sigma", "chunking"):
-        monkeypatch.setattr(scripts[name], "started", keep)
-        assert scripts[name].main([]) == 2
-    grid = {(method.name, method.sigma) for method in made["sigma"].sources.methods()}
-    sigmas = {1.5, 1.0, 0.5, 0.3, 0.1, 0.05, 0.0}
-    assert grid == {("gaussian", 1.0)} | {(n, s) for n in ("past", "preview") for s in sigmas}
-    assert made["sigma"].evaluation.nfe == (1,)
-    lengths = {(m.name, m.chunk_length) for m in made["chunking"].sources.methods()}
-    names = ("gaussian", "past", "preview")
-    assert lengths == {(n, h) for n in names for h in (1, 2, 4, 8, 16)}
-    assert made["chunking"].evaluation.nfe == (9, 3, 1)
+    # A folder with results is left alone, unless its policies are to be reused.
+    assert "--resume" in refused(navigation1d.main, argv, capsys)
+    before = written(out.parent)
+    assert before and navigation1d.main([*argv, "--resume"]) == 0
+    assert stored(out) == played and written(out.parent) == before
 
 
-@pytest.mark.parametrize(
-    ("script", "extra", "message"),
-    [
-        ("sigma", {"sigma": [-1.0]}, "sigma"),
-        ("sigma", {"nfe": [1, 3]}, "this study has one --nfe, got 1 3"),
-        ("sigma", {"chunk": [4, 8]}, "this study has one --chunk, got 4 8"),
-        ("chunking", {"dataset": None, "task": ["lift", "can"]}, "this study has one --task"),
-        ("budget", {"budgets": [0]}, "--budgets must be a whole number of at least 1, got 0"),
-        ("budget", {"sigma": [0.1, 0.2]}, "this study has one --sigma"),
-        ("curvature", {"prior": "regression"}, "none of these policies has a flow"),
-        ("curvature", {"coordinate": 9}, "--coordinate must be in [0, 7)"),
-        ("curvature", {"validation": None}, "add --validation FILE"),
-        ("sigma", {"validation": None}, "add --validation FILE"),
-        ("budget", {"validation": None}, "add --validation FILE"),
-        ("curvature", {"validation": "missing.hdf5"}, "missing.hdf5"),
-        ("budget", {"validation": "square"}, "holds demonstrations of square"),
-        ("sigma", {"observations": 5_000}, "5000 observations are asked for"),
-        ("sigma", {"steps": 1}, "--steps must be at least 2"),
-        ("budget", {"draws": 0}, "--draws must be a whole number of at least 1"),
-    ],
-)
-def test_what_cannot_be_is_named_before_any_training(
-    scripts, dataset, validation, tmp_path, capsys, no_work, script, extra, message
-):
-    if extra.get("validation") == "square":
-        path = tmp_path / "other.hdf5"
-        write_robomimic_file(path, lengths=(25, 30), task="square", seed=1)
-        extra = {"validation": path}
+TINY = {"iterations": 20, "episodes": 2, "envs": 1, "nfe": 2, "logger": "none", "hidden_dim": 16}
+
+
+def test_real_time_chunking_of_a_task_beside_the_toy(dataset, tmp_path):
     out = tmp_path / "out"
-    values = {"out": out} if script == "chunking" else measured(out, validation)
-    assert message in refused(scripts[script].main, options(dataset, **values | extra), capsys)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--run {empty}", "it has no results.jsonl; name a run of robomimic.py"),
-        ("--run {run} --out {run}", "holds a run"),
-        ("--run {run} --task can", "--run names the policies, and with them the task"),
-        ("--resume --out {run}", "holds a run of robomimic"),
-        ("--resume --out {run}-other", "--resume: there is no run"),
-    ],
-)
-def test_what_is_no_finished_run_is_named(scripts, finished, tmp_path, capsys, words, message):
-    (tmp_path / "empty").mkdir()
-    argv = words.format(run=finished, empty=tmp_path / "empty").split()
-    argv += [] if "--out" in argv else ["--out", tmp_path / "out"]
-    before = (finished / "options.json").read_bytes()
-    assert message in refused(scripts["curvature"].main, argv, capsys)
-    assert (finished / "options.json").read_bytes() == before
-
-
-@pytest.mark.parametrize("change", [{"sigma": 1.0}, {"chunk": 4}, {"iterations": 2}, {"policy": ""}])
-def test_a_run_that_cannot_be_compared_is_named(scripts, finished, tmp_path, capsys, change):
-    """Several policies of a prior are not taken for seeds, and what is missing is missed."""
-    run = tmp_path / "runs" / "run"
-    shutil.copytree(finished.parent / "policies", tmp_path / "runs" / "policies")
-    run.mkdir()
-    row = next(row for row in stored(finished) if row["prior"] == "past")
-    source = tmp_path / "runs" / "policies" / row["policy"]
-    other = row | {"policy": "other"} | change
-    if change.get("policy") is None:
-        at = f"policy_{other['iterations']:06d}"
-        shutil.copytree(source / f"policy_{row['iterations']:06d}", source.with_name("other") / at)
-    (run / "results.jsonl").write_text("".join(json.dumps(r) + "\n" for r in (row, other)))
-    (run / "tasks.json").write_text('[{"task": "lift", "data": "ph"}]')
-    said = refused(scripts["curvature"].main, command_line(run=run, out=tmp_path / "out"), capsys)
-    missing = change.get("policy") is not None
-    assert ("is missing: finish the run" if missing else "one sigma and chunk length") in said
+    own = {"prior": ["gaussian", "preview"], "delay": [0, 3], "rtc__schedule": "linear", "episodes": 1}
+    argv = options(dataset, out, **TINY | own)
+    assert real_time_chunking.main(argv) == 0
+    rows = stored(out)
+    cells = [(row["task"], row["prior"], row["delay"], row["guidance"], row["execute"]) for row in rows]
+    assert cells == [
+        (task, prior, delay, guidance, 5)  # of 8, as many as the largest delay leaves
+        for task in ("lift", "navigation")
+        for prior in ("gaussian", "preview")
+        for delay in (0, 3)
+        for guidance in ("none", "rtc")
+    ]
+    report = (out / "report.md").read_text()
+    assert "| Lift-PH | 2 | 3 | RTC + WP-Preview |" in report and "schedule linear" in report
+    assert is_png(out / "real_time_chunking.png")
+    # The latency and the guidance change what is done, and not what is trained.
+    lift = [row for row in rows if row["task"] == "lift"]
+    assert len({row["boundary_jump"] for row in lift}) == len(lift)
+    assert len({row["policy"] for row in rows}) == 4

@@ -1,0 +1,92 @@
+"""Measurements of the library itself: their arithmetic against closed forms, and a short run of each."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+import pytest
+import torch
+
+pytest.importorskip("robosuite")
+
+import peers
+import scaling
+import throughput
+
+from warmprior import GaussianPrior, window_replay_buffer
+
+
+@pytest.mark.parametrize("name", peers.PEERS)
+def test_peers_learn_from_the_same_windows(name):
+    for package in peers.PEERS[name][1]:
+        pytest.importorskip(package)
+    torch.manual_seed(0)
+    peer = peers.PEERS[name][0](1.5e6, "cpu")
+    assert 0.6 < peer.parameters / 1.5e6 < 1.6
+    weights = [p for p in peer.module.parameters() if p.requires_grad]
+    before = [p.detach().clone() for p in weights]
+    batch = window_replay_buffer(peers.steps(4, 50), GaussianPrior(peers.H), batch_size=8).sample()
+    peers.training_step(peer, lambda: batch, "cpu")()
+    moved = [not torch.equal(a, b) for a, b in zip(weights, before, strict=True)]
+    assert sum(moved) > 0.8 * len(moved)
+    # Every evaluation passes through each layer of the network once.
+    kinds = torch.nn.Conv1d if "diffusion" in name else torch.nn.Linear
+    layers = [m for n, m in peer.module.named_modules() if isinstance(m, kinds) and "text" not in n]
+    calls = []
+    layers[-1].register_forward_hook(lambda *_: calls.append(None))
+    with torch.no_grad():
+        peer.module.eval()
+        peer.decide(3)
+    assert len(calls) == 3
+
+
+def episode(*steps, decision=1.0):
+    return scaling.Played((decision,) * len(steps), steps)
+
+
+def test_simulated_times_are_those_of_closed_forms():
+    equal = [episode(2.0, 2.0, 2.0)] * 12  # nine seconds each
+    for cores in (1, 2, 3, 4, 6, 12):
+        rounds = 12 // cores
+        assert scaling.apart(equal, cores) == 9.0 * rounds
+        assert scaling.lockstep(equal, cores, lambda n: 1.0) == 9.0 * rounds
+        assert scaling.lockstep(equal, cores, float) == (3 * cores + 6.0) * rounds  # one after another
+    episodes = [episode(1.0), episode(5.0), episode(1.0), episode(2.0, 2.0)]
+    assert scaling.apart(episodes, 1) == 2 + 6 + 2 + 6
+    # 0-2 first, 0-6 second; third 2-4, fourth 4-10
+    assert scaling.apart(episodes, 2) == 10.0
+    # Rows: steps 1, 1 and 5, 2, 2; of each round the longer, and a decision.
+    assert scaling.lockstep(episodes, 2, lambda n: 1.0) == (1 + 5) + (1 + 2) + (1 + 2)
+
+
+def throughputs(folder, *argv):
+    throughput.main([*argv, "--repeats", "1", "--out", str(folder)])
+    return json.loads((folder / "throughput.json").read_text())
+
+
+def test_throughput_writes_every_key(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    results = throughputs(tmp_path, "--only", "windows_per_second", "job_overhead")
+    found = {key for key, value in results.items() if value is not None}
+    assert found == {"windows_per_second", "job_overhead", "meta"} and len(results) == 20
+    assert results["windows_per_second"] > 0 and results["job_overhead"].keys() == {"local"}
+
+
+def test_rounds_are_interleaved_and_the_first_is_dropped():
+    class Bar:
+        def set_postfix(self, **kwargs): ...
+
+    order = []
+    calls = (lambda: order.append("a"), lambda: order.append("b"))
+    times = throughput.Clock(3, Bar()).times(*calls, before=lambda: order.append("|"))
+    assert "".join(order) == "|ba|ab|ba|ab" and [len(rounds) for rounds in times] == [3, 3]
+    ratio = throughput.Clock(5, Bar()).ratio(lambda: time.sleep(0.03), lambda: time.sleep(0.01))
+    assert ratio == pytest.approx(3, rel=0.4)
+
+
+@pytest.mark.slow
+def test_every_throughput_can_be_measured(tmp_path):
+    missing = {name for name, value in throughputs(tmp_path).items() if value is None}
+    assert missing <= {"lerobot_windows_over_getitem", "cuda_train_step_over_network", "cuda_latency"}

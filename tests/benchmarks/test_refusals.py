@@ -1,0 +1,67 @@
+"""What scripts refuse, in a line, before they write, generate, download or train anything."""
+
+from __future__ import annotations
+
+import importlib
+
+import pytest
+
+from tests.benchmarks.script_parts import refused
+
+pytest.importorskip("robosuite")
+pytest.importorskip("tyro")
+
+FILE = "--dataset {file} --nfe 1"
+HELD_OUT = f"{FILE} --validation {{file}}"
+DRIFT = "tests.benchmarks.drift"
+IMAGES = f"{FILE} --obs image --fast-rendering"
+
+
+@pytest.fixture
+def no_work(monkeypatch):
+    def never(*args, **options):
+        raise AssertionError("work was begun")
+
+    loaders = ("generate_demonstrations", "download_robomimic", "download_mimicgen")
+    for place in ("common.train_policy", *(f"warmprior.training.task.{name}" for name in loaders)):
+        monkeypatch.setattr(place, never)
+    for place in ("training.options.require_rendering", "envs.mimicgen.find_spec"):
+        monkeypatch.setattr(f"warmprior.{place}", lambda *names: None)
+
+
+@pytest.mark.parametrize(
+    ("script", "words", "message"),
+    [
+        ("robomimic", "--nfe 0", "--nfe must be a whole number of at least 1, got 0"),
+        ("robomimic", "--device cuda:99", "--device cuda:99 does not work here"),
+        ("robomimic", f"{FILE} --task can", "holds demonstrations of lift"),
+        ("robomimic", "--prior regression --nfe 9", "regression is trained for --nfe 1 alone"),
+        ("robomimic", "--prior ot --batch-size 1", "ot pairs within a batch"),
+        ("robomimic", f"--task {DRIFT}:task {DRIFT}:other", "two tasks are called drift"),
+        ("robomimic", "--no-precondition --weighting standardised", "needs --weighting velocity"),
+        ("robomimic", "--network chi_transformer --hidden-dim 32", "--hidden-dim 32: num_heads must divide"),
+        ("robomimic", "--objective l1 --prior past regression --nfe 1", "leave out regression"),
+        ("robomimic", "--ray-address 127.0.0.1:1", "--ray-address belongs to --engine ray"),
+        ("robomimic", f"{IMAGES} --prior ot", "ot reads observations that are one vector"),
+        ("navigation1d", "--chunk 64", "--chunk must be at most 32, got 64"),
+        ("mimicgen_tasks", "--download --task stack_d0", "need NVlabs' package"),
+        ("sigma", f"{HELD_OUT} --chunk 4 8", "this study has one --chunk, got 4 8"),
+        ("sigma", f"{HELD_OUT} --observations 5000", "5000 observations are asked for"),
+        ("budget", FILE, "add --validation FILE"),
+        ("curvature", f"{HELD_OUT} --prior regression", "none of these policies has a flow"),
+        ("curvature", f"{HELD_OUT} --observations 20 --coordinate 9", "--coordinate must be in [0, 7)"),
+        ("curvature", "--run {tmp}", "it has no results.jsonl; name a run of robomimic.py"),
+        ("real_time_chunking", "--delay 5", "too long"),
+        ("real_time_chunking", "--prior regression --nfe 1 --guidance rtc", "regression is no flow to guide"),
+        ("prior_space_rl", "--preset unit --rl.delta 0", "delta must be a finite number > 0, got 0.0"),
+        ("prior_space_rl", "--preset unit --task can", "navigation and --preset unit belong together"),
+        ("prior_space_rl", "--preset unit --collectors 2", "--collectors belongs to --engine ray"),
+        ("prior_space_rl", "--preset paper", "has hyper-parameters per task: add the --task"),
+    ],
+)  # fmt: skip
+def test_what_cannot_work_is_refused_before_any_work(
+    script, words, message, dataset, no_work, tmp_path, capsys
+):
+    argv = [*words.format(file=dataset, tmp=tmp_path).split(), "--out", tmp_path / "out"]
+    assert message in refused(importlib.import_module(script).main, argv, capsys)
+    assert not list(tmp_path.glob("policies/*")) and not list(tmp_path.glob("out/*"))

@@ -1,0 +1,131 @@
+"""Tasks, data and observations of other kinds through the benchmarks: policies, rows, and what reads them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.benchmarks.script_parts import command_line, described, options, stored, written
+from tests.data.synthetic import env_args_14, write_robomimic_file
+from tests.envs.mimicgen_stub import write_mimicgen
+from tests.processes import apart
+from warmprior import ImageEncoder
+from warmprior.data import RobomimicExperienceReplay, convert_robomimic
+from warmprior.diagnostics import encoded_windows
+from warmprior.training import DataOptions, load_policy
+
+pytest.importorskip("robosuite")
+pytest.importorskip("tyro")
+
+import curvature
+import mimicgen_tasks
+import pusht
+import robomimic
+
+from warmprior.envs import rendering_backend
+from warmprior.envs.tasks import TaskSpec
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*do not move")
+
+
+def flow(run, validation, **more):
+    """Measure the flow of a run's policies; the report's text."""
+    few = {"run": run, "validation": validation, "out": f"{run}-flow", "observations": 6, "steps": 3}
+    assert curvature.main(command_line(**few | more)) == 0
+    return Path(f"{run}-flow", "report.md").read_text()
+
+
+def test_absolute_actions_are_named_and_lie_beside_the_others(dataset, validation, tmp_path):
+    for actions in ("absolute", "delta"):
+        argv = options(dataset, tmp_path / actions, prior=["gaussian", "past"], actions=actions)
+        assert robomimic.main(argv) == 0
+    absolute, delta = (stored(tmp_path / name) for name in ("absolute", "delta"))
+    assert [row["actions"] for row in absolute] == ["absolute"] * 2
+    assert not any("actions" in row for row in delta)
+    assert "Lift-PH, absolute actions" in (tmp_path / "absolute" / "report.md").read_text()
+    paths = [tmp_path / "policies" / row["policy"] / "policy_000030" for row in (*absolute, *delta)]
+    assert [load_policy(path).network.action_dim for path in paths] == [10, 10, 7, 7]
+    # What reads the run later knows it as well: coordinate 9 is none of the recorded actions.
+    assert "Lift-PH, absolute actions" in flow(tmp_path / "absolute", validation, coordinate=9)
+
+
+@pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
+def test_images_are_seen_through_the_encoder(lift_demonstrations, tmp_path, monkeypatch):
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(TaskSpec, "horizon", lambda spec, style: 9)  # episodes of two decisions
+    few = {"obs": "image", "image_size": 16, "crop_size": 12, "encoder": "small", "iterations": 4}
+    argv = options(lift_demonstrations, tmp_path / "run", prior=["gaussian", "history"], **few)
+    assert apart(robomimic.main)([*argv, "--fast-rendering"]) == 0
+    assert [row["obs"] for row in stored(tmp_path / "run")] == ["image"] * 2
+    assert described(tmp_path / "run", "tasks")[0]["images"]["fast_rendering"] is True
+    measured = apart(flow)(tmp_path / "run", lift_demonstrations)
+    assert "Lift-PH, image observations" in measured and "| History |" in measured
+    # By hand: the encoder's features of raw images stand in place of them.
+    (path,) = tmp_path.glob("cache/rendered/*.hdf5")
+    (folder,) = tmp_path.glob("policies/*gaussian*/policy_000004")
+    actor = load_policy(folder).eval()
+    names = ["robot0_eef_pos", "robot0_eef_quat", "robot0_gripper_qpos"]
+    cameras = ["agentview_image", "robot0_eye_in_hand_image"]
+    data = RobomimicExperienceReplay(path, observation_keys=names, image_keys=cameras).data[:10]
+    data = actor.normalizer.normalize(data.exclude("next"))
+    observation = torch.stack([data["observation"]] * 2, 1).auto_batch_size_(1)
+    windows = data.select("action").set("observation", observation)
+    encoder = next(part for part in actor.modules() if isinstance(part, ImageEncoder))
+    with torch.no_grad():
+        found = encoded_windows(actor, windows, split=3)["observation"]
+        torch.testing.assert_close(found, encoder(observation), atol=1e-5, rtol=0)
+
+
+def test_results_of_a_lerobot_dataset_are_those_of_the_file(dataset, tmp_path, monkeypatch):
+    pytest.importorskip("lerobot")
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    place = f"lerobot:{convert_robomimic(dataset, tmp_path / 'lift', progress=False)}"
+    for name, data in (("file", dataset), ("lerobot", place)):
+        few = {"prior": "past", "iterations": 10, "task": None}
+        assert robomimic.main(options(data, tmp_path / name, **few)) == 0
+    (mine,), (theirs,) = (stored(tmp_path / name) for name in ("lerobot", "file"))
+    assert {k for k in mine if mine[k] != theirs[k]} <= {"policy", "training_seconds"}
+    facts, others = (described(tmp_path / name, "tasks")[0] for name in ("lerobot", "file"))
+    assert {k for k in facts if facts[k] != others[k]} == {"file", "sha256"}
+    # Found again from another working directory, and by the other benchmarks.
+    before = written(tmp_path / "policies")
+    monkeypatch.chdir(tmp_path)
+    assert robomimic.main(["--resume", "--out", "lerobot"]) == 0
+    assert "TRAINING demonstrations" in flow("lerobot", place)
+    assert written(tmp_path / "policies") == before
+
+
+def test_push_t_takes_as_many_demonstrations_as_are_asked_for(tmp_path):
+    pytest.importorskip("lerobot")
+    from tests.data.lerobot_parts import write_lerobot
+
+    widths = {"observation.state": 2, "observation.environment_state": 16, "action": 2}
+    features = {name: {"dtype": "float32", "shape": (n,), "names": None} for name, n in widths.items()}
+    write_lerobot(tmp_path / "pusht", lengths=(6, 4, 9), features=features)
+    given = [DataOptions(dataset=f"lerobot:{tmp_path}/pusht", demonstrations=n) for n in ((), (2,))]
+    every, two = map(pusht.task, given)
+    # The agent, then the block's corners; both within [-1, 1].
+    assert (every.data["observation"].shape, two.data["observation"].shape) == ((19, 18), (10, 18))
+    assert every.data["observation"].abs().max().item() == pytest.approx(1.0)
+    assert every.success == "is_success" and every.measures == {"coverage": "max"}
+
+
+def test_a_file_in_mimicgens_environment(tmp_path):
+    """As a user starts it: the package is not taken for the script, nor is it missed by workers."""
+    write_mimicgen(tmp_path / "site")
+    file, out = tmp_path / "stack.hdf5", tmp_path / "out"
+    write_robomimic_file(file, lengths=(30, 20, 9), task="stack_d0", env_args=env_args_14("stack_d0"))
+    argv = options(file, out, task=None, prior="past", demonstrations=2)
+    script = Path(mimicgen_tasks.__file__)
+    path = os.pathsep.join(map(str, (script.parents[1], tmp_path / "site")))
+    command, env = [sys.executable, str(script), *argv], os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(command, env=env, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (row,), (task,) = stored(out), described(out, "tasks")
+    assert (row["task"], row["data"]) == ("stack_d0", "source")
+    assert (task["demonstrations"], task["steps"]) == (2, 50)
