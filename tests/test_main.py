@@ -157,6 +157,8 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
         ("--encoder small", "--encoder belong to --obs image"),
         ("--chunk 0", "chunk_length"),
         ("--observation-keys state", "--observation-keys belongs to --dataset lerobot:"),
+        ("--observation-keys state --dataset lerobot:. --actions absolute", "--demonstrations alone"),
+        ("--observation-keys action --dataset lerobot:.", "and not the action"),
     ],
 )
 def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, message):

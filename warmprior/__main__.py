@@ -6,7 +6,7 @@ import argparse
 import importlib
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -159,6 +159,10 @@ def _tasks(options: Train) -> list[Task]:
     place = str(data.dataset)
     if not place.startswith(LEROBOT):
         raise ValueError("--observation-keys belongs to --dataset lerobot:FOLDER or lerobot:USER/NAME")
+    if replace(data, dataset=None, demonstrations=()) != DataOptions():
+        raise ValueError("--observation-keys goes with --dataset and --demonstrations alone")
+    if "action" in keys or len(set(keys)) < len(keys):
+        raise ValueError(f"--observation-keys names each feature once, and not the action: {' '.join(keys)}")
     steps = lerobot_steps(place.removeprefix(LEROBOT), keys)
     if (first := data.first("ph")) is not None:
         steps = steps[steps["episode"] < first]

@@ -94,8 +94,8 @@ class Registered:
         plain, resolved = (bool, int, float, str), dict(self._arguments)
         for name, value in self._arguments.items():
             kept = getattr(self, name, None)
-            # A number that was given stays: what the constructor made of it, it would make again.
-            if isinstance(kept, plain) and (not isinstance(value, plain) or kept == value):
+            # What was given stays: what the constructor made of it, it would make again.
+            if isinstance(kept, plain) and (value is None or (isinstance(value, plain) and kept == value)):
                 resolved[name] = kept
         return resolved
 

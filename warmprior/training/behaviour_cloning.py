@@ -197,13 +197,18 @@ class BehaviourCloning:
         self.losses: list[tuple[int, float]] = []
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
-            "config": asdict(config) | {"betas": list(config.betas)},
+            "config": asdict(config) | {"betas": list(config.betas), "weighting": self.loss_module.weighting},
             "prior": actor.prior.config() | fixed_identity(actor.prior),
             "start": None if actor.start is None else actor.start.config() | fixed_identity(actor.start),
             "coupling": coupling_identity(coupling),
             "network": network_identity(actor.network),
             "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
-            "policy": {"observation_steps": observation_steps, "clip": actor.ode.clip},
+            "policy": {
+                "observation_steps": observation_steps,
+                "clip": actor.ode.clip,
+                "max_nfe": actor.ode.max_nfe,
+                "normalizer": fixed_identity(actor.normalizer),  # data in other units may look alike
+            },
             "format": STATE_FORMAT,
         }
         torch.manual_seed(config.seed)

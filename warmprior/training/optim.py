@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim.swa_utils import AveragedModel
 
 from warmprior.modules.compiled import uncompiled
 from warmprior.modules.network import VelocityNetwork
@@ -116,9 +117,14 @@ def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
     """
     if not 0.0 <= rate < 1.0:
         raise ValueError(f"the EMA rate must be in [0, 1), got {rate}")
-    averaged = _Average(network, multi_avg_fn=get_ema_multi_avg_fn(rate))
+    averaged = _Average(network, multi_avg_fn=partial(_move, rate=rate))
     averaged.module.eval()
     return averaged.requires_grad_(False)
+
+
+def _move(averaged: list[Tensor], current: list[Tensor], _: Tensor, *, rate: float) -> None:
+    # No closure, as PyTorch's own is: policies that hold an average are pickled.
+    torch._foreach_lerp_(averaged, current, 1 - rate)
 
 
 class _Average(AveragedModel):

@@ -147,6 +147,11 @@ class Task:
             KeyError: naming what the data lack.
             ValueError: if an entry has another shape, or is not finite.
         """
+        if data.ndim != 1:
+            raise ValueError(
+                f"the demonstrations of {name} must be flat steps, TensorDict(steps, [N]), got the batch "
+                f"size {tuple(data.shape)}"
+            )
         missing = [key for key in (OBSERVATION, ACTION, EPISODE) if key not in list(data.keys())]
         if missing:
             raise KeyError(f"the demonstrations of {name} lack {missing}: they have {list(data.keys())}")

@@ -143,6 +143,7 @@ def train_policy(
         :func:`~warmprior.policy_transforms` makes the environment that it acts in.
 
     Raises:
+        TypeError: if the demonstrations or the prior are something else.
         KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
         ValueError: if the demonstrations have another form, or the folder holds another training.
@@ -165,6 +166,13 @@ def train_policy(
         >>> env.rollout(3, actor)["vla_action", "chunk"].shape
         torch.Size([3, 4, 1])
     """
+    if not isinstance(demonstrations, (Task, TensorDictBase)):
+        raise TypeError(
+            f"train_policy takes a TensorDict of steps or a Task, got {type(demonstrations).__name__}; "
+            "warmprior.data reads files"
+        )
+    if not isinstance(prior, Prior):
+        raise TypeError(f"the prior is an object such as PastPrior(8), got {prior!r}")
     task = demonstrations
     if not isinstance(task, Task):
         task = Task.of("demonstrations", task)
@@ -174,6 +182,8 @@ def train_policy(
         raise ValueError("processes that train together need a directory that all of them see")
     with ExitStack() as stack:
         stack.enter_context(torch_threads(1 if on_cpu else None))
+        # The training seeds PyTorch's global generator, and gives it back as it was.
+        stack.enter_context(torch.random.fork_rng([] if on_cpu else [torch.device(device)]))
         if logger is not None:  # a process may end without the exit handlers that some loggers write in
             stack.enter_context(closing(logger))  # type: ignore[type-var]
         if directory is None:

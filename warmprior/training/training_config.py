@@ -80,6 +80,8 @@ class TrainingConfig:
             value = getattr(self, name)
             if value is not None and value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
+        if self.seed >= 2**62:  # others are counted from it
+            raise ValueError(f"seed must be below 2**62, got {self.seed}")
         for name, low in (("learning_rate", ">"), ("eps", ">"), ("weight_decay", ">=")):
             value = getattr(self, name)
             if not (math.isfinite(value) and (value > 0 or (value == 0 and low == ">="))):

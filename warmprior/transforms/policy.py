@@ -33,7 +33,7 @@ def policy_transforms(
     delay: int | None = None,
     gamma: float = 1.0,
     see_history: bool | None = None,
-    observation_key: NestedKey = keys.OBSERVATION,
+    observation_key: NestedKey | None = None,
     action_key: NestedKey = keys.ACTION,
     chunk_key: NestedKey | None = None,
     success: NestedKey = keys.SUCCESS,
@@ -52,19 +52,19 @@ def policy_transforms(
             used: the environment serves every policy with a prior of the same.
 
     Keyword Args:
-        normalizer: the normaliser of the training data; the policy's by default. None if the environment is
-            normalised already.
+        normalizer: the normaliser of the training data; the policy's by default. Give the policy's prior in
+            place of the policy if the environment is normalised already.
         actions: between the policy's actions, in raw units, and the environment's, such as
             :class:`AbsoluteActions`; a copy of it is used. None if they are the same.
         images: makes observations with images, such as :class:`CameraImages`; a copy of it is used.
         observation_steps: ``To``; those of the policy's network by default, or 2.
         execute: actions executed per decision; all ``H`` by default, with a ``delay`` as many as predictions
             allow.
-        delay: control steps until a chunk takes effect, see :class:`InferenceDelay`; 0 for
-            :class:`~warmprior.RealTimeChunking` without one. By default none is written.
+        delay: control steps until a chunk takes effect, see :class:`InferenceDelay`. By default 0 for a
+            policy with :class:`~warmprior.RealTimeChunking`, and otherwise none is written.
         gamma: discount per control step inside a chunk.
         see_history: whether the network sees the last actions; as the policy's does by default.
-        observation_key: as for :class:`~warmprior.WarmPriorActor`, also for the following.
+        observation_key: the policy's by default, also for the following.
         action_key: the single action that the environment takes.
         chunk_key: the chunk.
         success: the environment's key for whether the task is solved, which counts at any step of a chunk.
@@ -92,6 +92,10 @@ def policy_transforms(
         prior = policy.prior
         normalizer = policy.normalizer if normalizer is None else normalizer
         chunk_key = policy.chunk_key if chunk_key is None else chunk_key
+        if delay is None and policy.ode.guidance is not None:
+            delay = 0  # guidance reads what is left of the chunk before
+        if observation_key is None and policy.in_keys[0] != keys.CONDITIONED:
+            observation_key = policy.in_keys[0]
         if see_history is None:
             see_history = policy.in_keys[0] == keys.CONDITIONED
         if observation_steps is None:
@@ -100,6 +104,7 @@ def policy_transforms(
         raise TypeError(f"policy_transforms takes a WarmPriorActor or a Prior, got {type(prior).__name__}")
     observation_steps = 2 if observation_steps is None else observation_steps
     chunk_key = keys.CHUNK if chunk_key is None else chunk_key
+    observation_key = keys.OBSERVATION if observation_key is None else observation_key
     if normalizer is not None and action_key not in normalizer.keys:
         raise ValueError(
             f"the normaliser has {normalizer.keys}, and not the environment's action {action_key!r}: "

@@ -18,7 +18,7 @@ from torch import Tensor
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from lerobot_policy_warmprior.modeling_warm_flow import WarmFlowPolicy
 from lerobot_policy_warmprior.processor_warm_flow import make_warm_flow_pre_post_processors
-from warmprior import keys
+from warmprior import PreconditionedNetwork, keys
 from warmprior.envs import TASKS
 from warmprior.envs.description import environment_name
 from warmprior.io.script import run_script
@@ -99,6 +99,7 @@ def export_policy(folder: str | Path, out: str | Path) -> Path:
         prior=",".join([prior.name, *(f"{k}={json.dumps(v)}" for k, v in options.items())]),
         nfe=actor.ode.nfe,
         network=json.dumps(network.config()),
+        precondition=isinstance(network, PreconditionedNetwork),
         device="cpu",
         push_to_hub=False,
     )

@@ -7,9 +7,10 @@ from collections import deque
 from typing import Any
 
 import torch
-from lerobot.configs.types import NormalizationMode
+from lerobot.configs.types import FeatureType, NormalizationMode
 from lerobot.policies.pretrained import PreTrainedPolicy
 from lerobot.policies.utils import populate_queues
+from lerobot.processor import NormalizerProcessorStep, TransitionKey
 from tensordict import TensorDict
 from torch import Tensor, nn
 
@@ -17,7 +18,6 @@ from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from warmprior import (
     ChiTransformer,
     FlowMatchingLoss,
-    Normalizer,
     PreconditionedNetwork,
     Prior,
     VelocityNetwork,
@@ -86,8 +86,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
                 num_heads=config.num_heads,
                 dropout=config.dropout,
             )
-            if config.precondition:
-                network = self._preconditioned(network, prior, dataset_meta)
+        if config.precondition and not isinstance(network, PreconditionedNetwork):
+            network = self._preconditioned(network, prior, dataset_meta)
         # What the data span is [-1, 1]; nothing beyond it is executed, nor remembered. In other units than
         # those of the extremes it is not known.
         spans = config.normalization_mapping.get("ACTION") == NormalizationMode.MIN_MAX
@@ -111,11 +111,13 @@ class WarmFlowPolicy(PreTrainedPolicy):
                 "choose that, or --policy.precondition=false"
             )
         steps = lerobot_steps(dataset_meta.root, self.config.observed)
-        low, high = (torch.as_tensor(dataset_meta.stats["action"][end]).float() for end in ("min", "max"))
-        normalizer = Normalizer({keys.ACTION: low}, {keys.ACTION: high})
+        # LeRobot's own arithmetic: a dimension that never changes is -1.
+        features = {keys.ACTION: self.config.action_feature}
+        norm = NormalizerProcessorStep(features, {FeatureType.ACTION: mode}, stats=dataset_meta.stats)
+        steps[keys.ACTION] = norm({TransitionKey.ACTION: steps[keys.ACTION]})[TransitionKey.ACTION]
         return precondition(
             network,
-            normalizer.normalize(steps),
+            steps,
             prior,
             observation_steps=self.config.n_obs_steps,
             withhold=self.config.cold_probability,
