@@ -44,7 +44,7 @@ def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp
     lengths = LENGTHS * 2
     check_transitions(training, lengths=lengths)
     assert 90 <= training.steps < 90 + len(lengths) * H
-    # The warm-up's residuals are the prior's, and then the agent's: the actors were told.
+    # The warm-up's residuals are the prior's, and then the agent's: the actors received its weights.
     drawn = training.buffer[:]["prior", "delta"]
     executed = training.buffer[:]["next", "executed_steps"].reshape(-1, len(lengths)).sum(1)
     warm = len(lengths) * int((executed.cumsum(0) - executed < 40).sum())

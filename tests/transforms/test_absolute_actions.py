@@ -90,7 +90,7 @@ def test_far_targets_are_approached_at_full_speed(position, here, target, now):
 
 
 class Gripper(EnvBase):
-    """Moves exactly as it is told, from a start that its seed decides."""
+    """Moves exactly as its action says, from a start that its seed decides."""
 
     def __init__(self, horizon=HORIZON, seed=0):
         super().__init__(batch_size=[])
