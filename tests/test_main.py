@@ -187,6 +187,8 @@ def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
     assert main([*words.split(), "--hidden-dim", "8", "--out", str(tmp_path / "out")]) == 0
     actor = load_policy(capsys.readouterr().out.strip())
     assert (actor.network.observation_dim, actor.network.action_dim) == (5, 4)
+    assert main([*words.split(), "--demonstrations", "3", "--out", str(tmp_path / "out")]) == 2
+    assert "cups holds 2" in capsys.readouterr().err
 
 
 def test_demonstrations_replace_no_file(tmp_path, capsys):

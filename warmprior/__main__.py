@@ -165,6 +165,8 @@ def _tasks(options: Train) -> list[Task]:
         raise ValueError(f"--observation-keys names each feature once, and not the action: {' '.join(keys)}")
     steps = lerobot_steps(place.removeprefix(LEROBOT), keys)
     if (first := data.first("ph")) is not None:
+        if first > (there := len(steps["episode"].unique())):
+            raise ValueError(f"--demonstrations {first}: {data.dataset} holds {there}")
         steps = steps[steps["episode"] < first]
     return [Task.of(name_of_place(place), steps)]
 

@@ -183,7 +183,8 @@ def train_policy(
     with ExitStack() as stack:
         stack.enter_context(torch_threads(1 if on_cpu else None))
         # The training seeds PyTorch's global generator, and gives it back as it was.
-        stack.enter_context(torch.random.fork_rng([] if on_cpu else [torch.device(device)]))
+        on_gpu = torch.device(device).type == "cuda"
+        stack.enter_context(torch.random.fork_rng([torch.device(device)] if on_gpu else []))
         if logger is not None:  # a process may end without the exit handlers that some loggers write in
             stack.enter_context(closing(logger))  # type: ignore[type-var]
         if directory is None:

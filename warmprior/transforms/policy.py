@@ -89,22 +89,20 @@ def policy_transforms(
     """
     prior = policy
     if isinstance(policy, WarmPriorActor):
-        prior = policy.prior
-        normalizer = policy.normalizer if normalizer is None else normalizer
-        chunk_key = policy.chunk_key if chunk_key is None else chunk_key
-        if delay is None and policy.ode.guidance is not None:
-            delay = 0  # guidance reads what is left of the chunk before
-        if observation_key is None and policy.in_keys[0] != keys.CONDITIONED:
-            observation_key = policy.in_keys[0]
-        if see_history is None:
-            see_history = policy.in_keys[0] == keys.CONDITIONED
+        prior, observed = policy.prior, policy.in_keys[0]
+        sees_history = observed == keys.CONDITIONED  # made of the observation under its usual key
+        normalizer = normalizer or policy.normalizer
+        chunk_key = chunk_key or policy.chunk_key
+        observation_key = observation_key or (None if sees_history else observed)
+        see_history = sees_history if see_history is None else see_history
         if observation_steps is None:
             observation_steps = getattr(uncompiled(policy.network), "observation_steps", None)
+        if delay is None and policy.ode.guidance is not None:
+            delay = 0  # guidance reads what is left of the chunk before
     if not isinstance(prior, Prior):
         raise TypeError(f"policy_transforms takes a WarmPriorActor or a Prior, got {type(prior).__name__}")
     observation_steps = 2 if observation_steps is None else observation_steps
-    chunk_key = keys.CHUNK if chunk_key is None else chunk_key
-    observation_key = keys.OBSERVATION if observation_key is None else observation_key
+    observation_key, chunk_key = observation_key or keys.OBSERVATION, chunk_key or keys.CHUNK
     if normalizer is not None and action_key not in normalizer.keys:
         raise ValueError(
             f"the normaliser has {normalizer.keys}, and not the environment's action {action_key!r}: "
