@@ -1,6 +1,6 @@
 """What the columns of rows and tables mean: one definition each, with the format of their numbers.
 
-A report lists below its tables what their columns mean, and `docs/benchmarks.md` shows them all.
+A report lists below its tables what their columns mean.
 Rows are those of `results.jsonl` and `curvature.jsonl`; a table has means over training seeds.
 """
 

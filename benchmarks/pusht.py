@@ -47,13 +47,17 @@ def task(options: DataOptions) -> Task:
     return Task.of("pusht", steps, make_env, success="is_success", measures={"coverage": "max"}, film_rate=10)
 
 
-# All human demonstrations, unless --demonstrations says how many.
+# All human demonstrations, unless --demonstrations says how many. On 25,650 steps of theirs the usual 10,000
+# iterations stop early: at one step the Gaussian source scores 0.59 after them, and 0.78 after these.
 HUMAN = {"data": {"task": ("pusht:task",), "demonstrations": ()}}
+LONGER = {"training": {"iterations": 22_500}}
 
 
 @script("pusht.py", together=True)
 def main(argv: list[str] | None) -> None:
-    presets = {name: with_parts(preset, **HUMAN) for name, preset in PRESETS.items()}
+    presets = {
+        name: with_parts(p, **HUMAN | ({} if name == "paper" else LONGER)) for name, p in PRESETS.items()
+    }
     run(argv, presets, "pusht", __doc__)
 
 
