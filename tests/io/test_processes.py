@@ -87,12 +87,14 @@ def test_an_error_and_a_dead_process_end_all_others(tmp_path, job, error, said):
 
 
 HELD = """
+import signal
 import sys
 from functools import partial
 from pathlib import Path
 from tests.io.test_processes import sleep
 from warmprior.io.processes import working
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may start its background ignoring it
     with working(2, None) as call:
         futures = [call(partial(sleep, Path(sys.argv[1]) / "x")) for _ in range(2)]
         futures[0].result()
