@@ -30,6 +30,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "delay": ("d", "control steps until a chunk takes effect"),
     "guidance": ("", "rtc: guided by Real-Time Chunking"),
     "algorithm": ("", "how the agent learns"),
+    "centre": ("", "of the agent's box: the mean of the source, or zero"),
     "delta": ("g", "half the width of the agent's box"),
     "environment_steps": ("d", "control steps that the agent has learnt from"),
     "evaluation": ("", "base: the frozen policy; greedy or stochastic: the agent"),

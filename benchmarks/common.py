@@ -24,7 +24,16 @@ from filelock import FileLock
 from learned_sources import Learner, learn
 from measures import held_out, measured
 from methods import Method
-from options import Evaluation, MeasuredOptions, Options, Run
+from options import (
+    Evaluation,
+    MeasuredOptions,
+    Options,
+    Run,
+    check_single,
+    check_typed,
+    stored_options,
+    with_parts,
+)
 from report import read_rows
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.record.loggers import get_logger
@@ -271,7 +280,14 @@ def train(policy: Policy) -> None:
 
 def clock(status: Path) -> float | None:
     """The processor time in a status file, if there is one."""
-    return read_json(status)["seconds"] if status.exists() else None
+    if not status.exists():
+        return None
+    try:
+        return float(read_json(status)["seconds"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(
+            f"{status} is damaged: remove it, and the time before is not counted ({error})"
+        ) from error
 
 
 def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
@@ -323,44 +339,38 @@ def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
 
 def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
     """Observations that no policy was trained on, where there are some, and what they are in words."""
-    task, steps = policy.task(), policy.network.observation_steps
-    return held_out(options, facts_of(task), task.normalizer, policy.method.chunk_length, steps, task.data)
+    return held_out(options, policy.task(), policy.method.chunk_length, policy.network.observation_steps)
 
 
-def trained_actors(policies: Sequence[Policy]) -> dict[Method, dict[int, WarmPriorActor]]:
+def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict[int, WarmPriorActor]]:
     """The last policies by method and seed; a method of which a seed failed would not compare."""
     seeds = {policy.training.seed for policy in policies}
     found: dict[Method, dict[int, WarmPriorActor]] = {}
     for policy in policies:
         if policy.is_trained:
-            actor = policy.load().to(policy.run.device)
-            found.setdefault(policy.method, {})[policy.training.seed] = actor
+            found.setdefault(policy.method, {})[policy.training.seed] = policy.load().to(device)
     return {method: actors for method, actors in found.items() if actors.keys() == seeds}
 
 
-def finished_policies(
-    run: Path, device: str
-) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
-    """Of a finished run of one task: the task's facts, and the last policies by method and seed."""
-    paths = run / "results.jsonl", run / "tasks.json"
-    if not all(path.is_file() for path in paths):
-        raise FileNotFoundError(f"--run {run}: it has no results.jsonl; name a run of robomimic.py")
-    tasks = read_json(paths[1])
-    policies = {row["policy"]: row for row in read_lines(paths[0])}
-    actors: dict[Method, dict[int, WarmPriorActor]] = {}
-    variants: dict[tuple[str, str], set[Any]] = {}
-    for name, row in policies.items():
-        text = ",".join(filter(None, (row["prior"], row["options"])))
-        method = Method(text, row["chunk"], row["sigma"])
-        path = policy_path(run.resolve().parent / "policies" / name, row["iterations"])
-        if not path.is_dir():
-            raise FileNotFoundError(f"{path} is missing: finish the run with --resume --out {run}")
-        actors.setdefault(method, {})[row["seed"]] = load_policy(path, device=device)
-        same = row["sigma"], row["chunk"], row["iterations"]
-        variants.setdefault((method.name, method.options), set()).add(same)
-    if len(tasks) > 1 or any(len(found) > 1 for found in variants.values()):
-        raise ValueError(f"--run {run}: name a run of one task and style, with one sigma and chunk length")
-    return tasks[0], actors
+def finished_policies(run: Path, options: Options, **sources: Any) -> list[Policy]:
+    """The policies of a finished run of one task, found by the options of the run; its data are read again.
+
+    `sources` replace some of its options.
+    """
+    stored = stored_options(Options, run, None)
+    check_typed(stored, run, (*options.sources.prior, *options.data.task))
+    if options.data.task not in ((), stored.data.task):
+        raise ValueError(f"--run {run} is of {' '.join(stored.data.task)}: leave out --task")
+    stored = with_parts(stored, run={"out": run}, sources=sources)
+    check_single(stored, "task", "data", "chunk", "sigma")
+    policies = policies_of(stored)
+    for policy in policies:
+        if not policy.is_trained:
+            raise FileNotFoundError(
+                f"--run {run} has no trained policy {policy}: finish it with --resume --out {run}, or name "
+                f"its methods: --prior {' '.join(stored_options(Options, run, None).sources.prior)}"
+            )
+    return policies
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from common import (
@@ -19,7 +18,7 @@ from common import (
     trained_actors,
     write_rows,
 )
-from measures import RATIOS, held_out, straightness
+from measures import RATIOS, straightness
 from options import (
     PRESETS,
     FinishedRun,
@@ -47,11 +46,6 @@ class CurvatureOptions(MeasuredOptions):
     policies: FinishedRun = None  # a finished run of robomimic.py, whose policies to take instead of training
     coordinate: int = 0  # of the action, in flow_paths.png
 
-    def check(self) -> None:
-        super().check()
-        if self.policies is not None and self.data.task:
-            raise ValueError("--run names the policies, and with them the task: leave out --task")
-
     @property
     def name(self) -> str:
         """Of the output folder."""
@@ -67,22 +61,15 @@ def main(argv: list[str] | None) -> None:
         raise ValueError("none of these policies has a flow: compare gaussian, past or preview")
     with started(options, "curvature") as out:
         run = options.policies
-        if run is None:
-            policies = policies_of(options)
-            task = facts_of(policies[0].task())
-            observations, source = observations_of(options, policies[0])
-        else:
-            task, actors = finished_policies(run, options.run.device)
-            first: Any = next(iter(next(iter(actors.values())).values()))
-            lengths = first.prior.chunk_length, first.network.observation_steps
-            observations, source = held_out(options, task, first.normalizer, *lengths)
+        policies = policies_of(options) if run is None else finished_policies(run, options)
         # Before the training: what cannot be measured is better known now.
+        observations, source = observations_of(options, policies[0])
         width = observations.data["action"].shape[-1]
         if not 0 <= options.coordinate < width:
             raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
         if run is None:
             train_all(options, policies)
-            actors = trained_actors(policies)
+        task, actors = facts_of(policies[0].task()), trained_actors(policies, options.run.device)
         measured = straightness(actors, observations, n_steps=options.steps, draws=options.draws)
         rows = write_rows(out / "curvature.jsonl", measured)
 

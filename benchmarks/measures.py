@@ -16,7 +16,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from tqdm import tqdm
 
-from warmprior import Normalizer, Prior, WarmPriorActor
+from warmprior import Prior, WarmPriorActor
 from warmprior.data import generate_demonstrations
 from warmprior.diagnostics import (
     SharedObservations,
@@ -30,6 +30,7 @@ from warmprior.diagnostics import (
     source_leak,
 )
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history, sees_history
+from warmprior.training import Task
 from warmprior.training.task import read_like
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
@@ -108,31 +109,25 @@ def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
 
 
 def held_out(
-    options: MeasuredOptions,
-    facts: Mapping[str, Any],
-    normalizer: Normalizer | None,
-    chunk_length: int,
-    observation_steps: int,
-    own: TensorDictBase | None = None,
+    options: MeasuredOptions, task: Task, chunk_length: int, observation_steps: int
 ) -> tuple[SharedObservations, str]:
     """Observations that no policy of a task was trained on, and what they are in words.
 
-    A task of one's own has none: its training data, if given as `own`.
+    A task of one's own has none: its training data.
     """
     place: Path | str
-    name, device, count = facts["task"], options.run.device, options.observations
+    facts, device, count = task.facts, options.run.device, options.observations
+    given = options.validation
     generator = torch.Generator().manual_seed(0)
-    if normalizer is None or "file" not in facts:
-        if own is None:
-            raise ValueError(f"{name} is a task of one's own: name it with --task in place of --run")
-        if options.validation is not None:
-            raise ValueError(f"--validation belongs to robosuite's tasks, and {name} is none")
-        shared = SharedObservations(own.to(device), chunk_length, observation_steps=observation_steps)
+    if task.normalizer is None or "file" not in facts:
+        if given is not None:
+            raise ValueError(f"--validation belongs to robosuite's tasks, and {task.name} is none")
+        shared = SharedObservations(task.data.to(device), chunk_length, observation_steps=observation_steps)
         if len(shared) > count:
             shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
         return shared, "the TRAINING demonstrations (not held out)"
-    if options.validation is not None:
-        place, words = options.validation, ""
+    if given is not None:
+        place, words = given, ""
     elif facts.get("source") != "scripted":
         raise ValueError(
             f"these policies are trained on demonstrations of {facts['file']}: add --validation "
@@ -142,11 +137,11 @@ def held_out(
         # As many as the training demonstrations suggest, with room to spare.
         usable = 0.8 * (facts["steps"] / facts["demonstrations"] - chunk_length)
         episodes = max(20, int(-(-count // max(1.0, min(50.0, usable)))))
-        place = generate_demonstrations(name, facts["data"], episodes, HELD_OUT_SEED)
+        place = generate_demonstrations(task.name, task.style, episodes, HELD_OUT_SEED)
         words = f"{episodes} newly generated demonstrations"
-    data, called = read_like(place, name, facts)
+    data, called = read_like(place, task.name, facts)
     # A copy: the data are normalised on the CPU, the policy may live elsewhere.
-    data = copy.deepcopy(normalizer).to("cpu").normalize(data).to(device)
+    data = copy.deepcopy(task.normalizer).to("cpu").normalize(data).to(device)
     shared = SharedObservations(
         data, chunk_length, observation_steps=observation_steps, count=count, generator=generator
     )

@@ -36,6 +36,16 @@ from warmprior.rl import has_anchor
 from warmprior.training import TrainingConfig
 
 
+class ColdPrior(GaussianPrior):
+    """N(0, I) for a policy that predicts `chunks` chunks per executed one."""
+
+    name = "cold"
+
+    def __init__(self, chunk_length: int, chunks: int) -> None:
+        super().__init__(chunk_length)
+        self.prediction_chunks = chunks
+
+
 class PointPrior(GaussianPrior):
     """The source of a regression: the point 0, and nothing is drawn."""
 

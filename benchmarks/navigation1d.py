@@ -123,7 +123,8 @@ def main(argv: list[str] | None) -> None:
         observations = SharedObservations(policies[0].task().data, options.sources.chunk[0])
         flows = []
         for seed in options.seeds:  # the source samples belong to the seed
-            actors = trained_actors([p for p in policies if p.training.seed == seed])
+            mine = [policy for policy in policies if policy.training.seed == seed]
+            actors = trained_actors(mine, options.run.device)
             flows += straightness(actors, observations, draws=4, seed=seed)
         curvatures = write_rows(out / "curvature.jsonl", flows)
         text = table(labelled(rows), ["method", "nfe"], JUDGED, beside(options, Options()))

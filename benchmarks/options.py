@@ -11,15 +11,16 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from glob import escape
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
 from methods import Method
+from pydantic import TypeAdapter
 
 from warmprior.data.opening import check_place, name_of_place, resolved_place
 from warmprior.io.distributed import check_batch, check_device, from_leader, launched, rank
@@ -310,11 +311,7 @@ def parse[O: Options](
                 f"{out} was started with other values of {', '.join(changed)}: leave these out, or choose "
                 "another --out"
             )
-        # What a file says is not imported: only what was typed, or what the script itself takes.
-        known = (*argv, *base.sources.prior, *base.data.task)
-        for name in (*stored.sources.prior, *stored.data.task):
-            if ":" in name and name not in known:
-                raise ValueError(f"{out} uses {name}: name it again, with --prior or --task as before")
+        check_typed(stored, out, (*argv, *base.sources.prior, *base.data.task))
     name = options.run.logger
     if name in ("tensorboard", "wandb") and find_spec(name) is None:
         raise ImportError(f"--logger {name} needs the package {name}: pip install it")
@@ -389,35 +386,36 @@ def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> Iterator[
             yield "--run" if name == "policies" else "--" + name.replace("_", "-")
 
 
-def stored_options[O: Options](kind: type[O], out: Path, study: str) -> O:
-    """The options of the run in a folder."""
+def stored_options[O: Options](kind: type[O], out: Path, study: str | None) -> O:
+    """The options of the run in a folder, of one study or any."""
     path = out / "options.json"
     if not path.is_file():
-        raise ValueError(f"--resume: there is no run in {out}; name its folder with --out")
+        raise ValueError(f"there is no run in {out}: name its folder")
     stored = read_json(path)
     theirs = stored.get("study") if isinstance(stored, dict) else None
-    if theirs != study:
+    if study not in (None, theirs):
         raise ValueError(
             f"{out} holds a run of {theirs}: continue it with that script, or choose another --out"
         )
     try:
-        return from_record(kind, stored["options"])
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        options = from_record(kind, stored["options"])
+        if changed := sorted(set(differences(recorded(options), stored["options"]))):
+            raise ValueError(f"it differs in {', '.join(changed)}")
+    except (AttributeError, KeyError, ValueError) as error:
         raise ValueError(f"{path} is damaged, or of another version: {error}") from error
+    return options
 
 
-def from_record[T](kind: type[T], tree: Mapping[str, Any]) -> T:
-    """The inverse of :func:`recorded`."""
-    hints, values = get_type_hints(kind), {}
-    for name, value in tree.items():
-        if is_dataclass(hints[name]):
-            value = from_record(hints[name], value)  # type: ignore[arg-type]
-        elif isinstance(value, list):
-            value = tuple(value)
-        elif isinstance(value, str) and Path in get_args(hints[name]):
-            value = Path(value)
-        values[name] = value
-    return kind(**values)
+def from_record[O: Options](kind: type[O], tree: Mapping[str, Any]) -> O:
+    """The inverse of :func:`recorded`; a value of another type is refused."""
+    return TypeAdapter(kind).validate_json(json.dumps(tree), strict=True)
+
+
+def check_typed(stored: Options, out: Path, known: Sequence[str]) -> None:
+    """What a file says is not imported: only what was typed, or what the script itself takes."""
+    for name in (*stored.sources.prior, *stored.data.task):
+        if ":" in name and name not in known:
+            raise ValueError(f"{out} uses {name}: name it again, with --prior or --task as before")
 
 
 def script(name: str, together: bool = False) -> Callable[[Callable[..., object]], Callable[..., int]]:

@@ -29,7 +29,7 @@ from common import (
     trained_actors,
     write_rows,
 )
-from methods import Method
+from methods import ColdPrior, Method
 from navigation1d import NAVIGATION_PRESETS
 from options import (
     PRESETS,
@@ -56,8 +56,7 @@ from warmprior.envs import GoalNavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.files import read_json
-from warmprior.modules.registry import options_of
-from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining, has_anchor
+from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 from warmprior.training import DataOptions, parallel_env
 from warmprior.training.options import check_counts
 from warmprior.training.threads import torch_threads
@@ -68,7 +67,7 @@ TOY = "navigation"
 # The recipe of an agent, without what the options that all experiments share say. On a command line they have
 # a prefix: gradient steps, say, are those of behaviour cloning in all experiments.
 HINTS = get_type_hints(PriorSpaceConfig)
-SHARED = ("algorithm", "seed", "nfe", "evaluation_episodes")
+SHARED = ("algorithm", "seed", "nfe", "evaluation_episodes", "delta")
 AgentOptions: Any = make_dataclass(
     "AgentOptions",
     [
@@ -81,15 +80,46 @@ AgentOptions: Any = make_dataclass(
 )
 
 
+Algorithm = Literal["dsrl-na", "dsrl-sac"]
+
+
+@dataclass(frozen=True)
+class Arm:
+    """How an agent learns around the frozen policies of a method."""
+
+    method: Method
+    algorithm: str
+    centre: str  # of its box: the mean of the source, or zero
+    delta: float | None  # half its box
+
+    def __str__(self) -> str:
+        source = ",".join(filter(None, (self.method.name, self.method.options)))
+        around = " around zero" if self.centre == "zero" and self.method.has_anchor else ""
+        box = "" if self.delta is None else f", delta {self.delta:g}"
+        return f"{self.algorithm} {source}{around}{box}"
+
+    def policy(self, actor: WarmPriorActor) -> WarmPriorActor:
+        """The policy as the agent sees it: around zero its source is cold, and its field as it was."""
+        if self.centre == "mean" or not self.method.has_anchor:
+            return actor
+        prior = actor.prior
+        if actor.start is not None or prior.history_length != prior.chunk_length:
+            raise ValueError(f"--centre zero: the source of {self.method.name} has a centre of its own")
+        return actor.replace(prior=ColdPrior(prior.chunk_length, prior.prediction_chunks))
+
+
 @dataclass(frozen=True)
 class AgentsOptions(Options):
     """A comparison of agents; the frozen policies are those of a comparison of sources."""
 
     policies: FinishedRun = None  # a finished run of robomimic.py, whose policies to take instead of training
     rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
-    algorithm: tuple[Literal["dsrl-na", "dsrl-sac"], ...] = ("dsrl-na",)  # of the agents' learning
+    algorithm: tuple[Algorithm, ...] = ("dsrl-na",)  # of the agents' learning
+    warm_algorithm: tuple[Algorithm, ...] = ()  # of those around a mean (default: as --algorithm)
+    # Of policies whose source has a mean: where their agents search, around it or, as a control, around zero.
+    centre: tuple[Literal["mean", "zero"], ...] = ("mean",)
+    delta: tuple[float, ...] = ()  # half the agents' boxes (default: 0.5 around a mean, 1.5 around zero)
     horizon: int | None = None  # time limit in control steps (default: the task's)
-    base_delta: float | None = None  # half the box around zero, without --rl.delta (default: 1.5)
     num_envs: int = 4  # parallel environments of an agent
     threads: int | None = None  # of a training; in small networks more than one wait for each other
     # Ray actors that collect, with num-envs environments each, with --engine ray (default: none, the training
@@ -123,21 +153,27 @@ class AgentsOptions(Options):
         for method in self.sources.methods():
             if not method.is_flow:
                 raise ValueError(f"--prior {method.name} is no flow: there is no source space to act in")
-            for algorithm in self.algorithm:
-                self.agent(method.has_anchor, algorithm, 0)
+            for arm in self.arms(method):
+                self.agent(arm, 0)
 
-    def agent(self, anchored: bool, algorithm: str, seed: int) -> PriorSpaceConfig:
-        """The recipe of one agent, around an anchor or around zero."""
+    def arms(self, method: Method) -> list[Arm]:
+        """The agents that learn around a method's policies."""
+        centres = self.centre if method.has_anchor else ("zero",)
+        algorithms = self.warm_algorithm if method.has_anchor else ()
+        parts = product(algorithms or self.algorithm, centres, self.delta or (None,))
+        return [Arm(method, *part) for part in parts]
+
+    def agent(self, arm: Arm, seed: int) -> PriorSpaceConfig:
+        """The recipe of one agent."""
         shared: Mapping[str, Any] = asdict(self.rl)
         own: dict[str, Any] = {
-            "algorithm": algorithm,
+            "algorithm": arm.algorithm,
             "seed": seed,
             "nfe": self.evaluation.nfe[0],
             "evaluation_episodes": self.evaluation.episodes,
-            "backup_entropy": shared["backup_entropy"] or algorithm == "dsrl-sac",
+            "backup_entropy": shared["backup_entropy"] or arm.algorithm == "dsrl-sac",
+            "delta": arm.delta,
         }
-        if shared["delta"] is None and not anchored:
-            own["delta"] = self.base_delta
         return PriorSpaceConfig(**{**shared, **own})
 
 
@@ -164,12 +200,14 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
         ),
         threads=1,
     ),
-    # The navigation toy with a goal, three seeds: about two minutes.
+    # The navigation toy with a goal, three seeds: agents around the mean and around zero, in two boxes.
     "unit": AgentsOptions(
         data=DataOptions(task=(TOY,)),
         network=TOY_PRESET.network,
         training=replace(TOY_PRESET.training, iterations=800, save_every=800, cold_probability=0.0),
         sources=Sources(prior=("past",)),
+        centre=("mean", "zero"),
+        delta=(0.5, 1.5),
         evaluation=Evaluation(seeds=3, episodes=128, nfe=(2,)),
         rl=AgentOptions(
             environment_steps=12_000,
@@ -190,14 +228,15 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
         num_envs=32,
         threads=1,
     ),
-    # DSRL's hyper-parameters per task, three seeds: needs a GPU.
+    # Fig. 7's four agents with DSRL's hyper-parameters per task, three seeds: needs a GPU. As in DSRL,
+    # success does not end the episode. The paper's policies have 3,000 epochs; these have Table 3's.
     "paper": study(
         AgentsOptions,
         PRESETS["paper"],
-        sources=Sources(chunk=(4,)),
-        evaluation=Evaluation(seeds=3, episodes=200, nfe=(1,)),
-        # Success ends the episode here, unlike in DSRL: entropy in the targets would pay for not solving it.
-        rl=AgentOptions(environment_steps=1_000_000, backup_entropy=False, evaluate_every=50_000),
+        algorithm=("dsrl-na", "dsrl-sac"),
+        warm_algorithm=("dsrl-na",),
+        evaluation=Evaluation(seeds=3, episodes=200, nfe=(1,), play_on=True),
+        rl=AgentOptions(environment_steps=1_000_000, evaluate_every=50_000),
     ),
 }
 
@@ -216,14 +255,7 @@ BY_TASK: dict[tuple[str, str], dict[str, Any]] = {
         "rl": {"gamma": 0.999, "warmup_steps": 32_000},
         "horizon": 400,
     },
-    # DSRL's own choice there is SAC.
-    ("paper", "transport"): {
-        "rl": {"hidden_dim": 128, "warmup_steps": 640_000},
-        "sources": {"chunk": (8,)},
-        "horizon": 800,
-        "base_delta": 1.0,
-        "algorithm": ("dsrl-na", "dsrl-sac"),
-    },
+    ("paper", "transport"): {"rl": {"hidden_dim": 128, "warmup_steps": 640_000}, "horizon": 800},
 }
 
 
@@ -250,26 +282,15 @@ def frozen_policies(
     if run is None:
         policies = policies_of(options)
         train_all(options, policies)
-        return facts_of(policies[0].task()), trained_actors(policies)
-    task, actors = finished_policies(run, options.run.device)
-    if options.data.task not in ((), (task["task"],)):
-        raise ValueError(f"--run {run} is of {task['task']}, not of {options.data.task[0]}")
-    found = {}
-    for text in options.sources.prior:
-        # What is not typed is as the method of the run has it.
-        sigma_typed = "sigma" in options_of(text)
-        asked = [
-            own for own in actors if own == Method(text, own.chunk_length, None if sigma_typed else own.sigma)
-        ]
-        if not asked:
-            known = "; ".join(map(str, actors))
-            raise ValueError(f"--run {run} has policies of {known}, none of {text}")
-        group = actors[asked[0]]
+    else:
+        policies = finished_policies(run, options, prior=options.sources.prior)
+    actors = trained_actors(policies, options.run.device)
+    for method, group in actors.items():
         if missing := sorted(set(options.seeds) - group.keys()):
-            print(f"--run has {len(group)} seeds of {text}: agents {missing} share policies")
+            print(f"--run has {len(group)} seeds of {method.text}: agents {missing} share policies")
         several = list(group.values())
-        found[asked[0]] = {s: group.get(s, several[s % len(several)]) for s in options.seeds}
-    return task, found
+        actors[method] = {s: group.get(s, several[s % len(several)]) for s in options.seeds}
+    return facts_of(policies[0].task()), actors
 
 
 def environment(options: AgentsOptions, actor: WarmPriorActor) -> Callable[[int], EnvBase]:
@@ -306,18 +327,18 @@ def encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
 def learn(
     options: AgentsOptions,
     actor: WarmPriorActor,
-    algorithm: str,
+    arm: Arm,
     seed: int,
-    folder: Path,
-    name: str,
+    out: Path,
 ) -> PriorSpaceTraining:
     """Train an agent, or continue it where it was interrupted."""
+    actor, name = arm.policy(actor), f"{arm}, seed {seed}"
     encoders = encoding(actor)  # one that sees images reads their features, as the agent does
     training = PriorSpaceTraining(
         actor.replace(observation_key=encoders[0].out_keys[0]) if encoders else actor,
         environment(options, actor),
-        options.agent(has_anchor(actor), algorithm, seed),
-        folder,
+        options.agent(arm, seed),
+        out / slug(name.replace(" ", "-")),
         evaluation_seed=EVALUATION_SEED,
         description=name,
         collectors=options.collectors,
@@ -336,30 +357,33 @@ def main(argv: list[str] | None) -> None:
         task, frozen = frozen_policies(options)
         path = out / "results.jsonl"
         rows, failures = stored_rows(path), []
-        for seed, algorithm, method in product(options.seeds, options.algorithm, frozen):
-            source = ",".join(filter(None, (method.name, method.options)))
-            name, actor = f"{algorithm} {source}, seed {seed}", frozen[method][seed]
-            folder = out / f"{algorithm}-{slug(source)}-seed{seed}"
+        arms = [arm for method in frozen for arm in options.arms(method)]
+        for seed, arm in product(options.seeds, sorted(arms, key=lambda arm: arm.algorithm)):
+            actor = frozen[arm.method][seed]
             facts: dict[str, Any] = {
                 "task": task["task"],
                 "data": task["data"],
                 **{space: task[space] for space in ("actions", "obs") if space in task},
-                "algorithm": algorithm,
-                **method.facts,
+                "algorithm": arm.algorithm,
+                **arm.method.facts,
+                "centre": arm.centre if arm.method.has_anchor else "",
+                "delta": options.agent(arm, seed).box(arm.policy(actor)),
                 "nfe": options.evaluation.nfe[0],
                 "seed": seed,
             }
             try:
-                training = learn(options, actor, algorithm, seed, folder, name)
+                training = learn(options, actor, arm, seed, out)
             except FloatingPointError as error:  # no reason to keep the other agents from learning
-                failures.append(f"{name}: {error}")
+                failures.append(f"{arm}, seed {seed}: {error}")
                 continue
             rows = [row for row in rows if not facts.items() <= row.items()]
-            rows += [{**facts, "delta": training.decoder.delta, **point} for point in training.curve]
+            rows += [{**facts, **point} for point in training.curve]
             write_rows(path, rows)
         if not rows:
             raise FloatingPointError("; ".join(failures))
         found = labelled(write_rows(path, rows))
+        if found.groupby("method")["delta"].nunique().max() > 1:
+            found["method"] += ", delta " + found.delta.map("{:g}".format)
         title = f"{problem_title(task)}, NFE {options.evaluation.nfe[0]}"
         draw(found, out / "curves.png", title, options.rl.warmup_steps)
         agents = ["algorithm", "method", "evaluation"]

@@ -67,6 +67,7 @@ def labelled(rows: DataFrame, *apart: str) -> DataFrame:
         parts = [label(row["prior"], text_of(row, "options"))]
         if guided:
             parts = ["RTC"] if row["prior"] == "gaussian" else [f"RTC + {parts[0]}"]
+        parts += ["around zero"] if text_of(row, "centre") == "zero" else []
         parts += [f"sigma {row['sigma']:g}"] if by_sigma and "sigma" not in apart else []
         methods.append(", ".join([*parts, *([f"H {row['chunk']}"] if several else [])]))
         problems.append(problem_title(row) if text_of(row, "task") else "")

@@ -57,7 +57,7 @@ def main(argv: list[str] | None) -> None:
         # Before the hours of training: what cannot be measured on is better known now.
         observations, source = observations_of(options, policies[0])
         rows, failures = compare(options, policies)
-        actors = trained_actors(policies)
+        actors = trained_actors(policies, options.run.device)
         flow = straightness(actors, observations, n_steps=options.steps, draws=options.draws)
         curvatures = write_rows(out / "curvature.jsonl", flow)
         title = f"{policies[0].task().title}, NFE {options.evaluation.nfe[0]}"

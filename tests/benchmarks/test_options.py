@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import json
 import re
@@ -74,13 +75,22 @@ def test_a_run_continues_with_its_options_and_refuses_others(tmp_path, monkeypat
             read(*resume, *words.split(), out=out)
     with pytest.raises(ValueError, match="holds a run: add --resume"):
         read(out=out)
-    with pytest.raises(ValueError, match=r"--resume: there is no run in .*empty"):
+    with pytest.raises(ValueError, match=r"there is no run in .*empty"):
         read(*resume, out=tmp_path / "empty")
     with pytest.raises(ValueError, match="holds a run of a-study: continue it with that script"):
         parse(PRESETS, [*resume, "--out", str(out)], "sigma", None)
-    (out / "options.json").write_text('{"study": "a-study", "options": {"tusk": {}}}')
-    with pytest.raises(ValueError, match=r"options\.json"):
-        read(*resume, out=out)
+    stored = json.loads((out / "options.json").read_text())
+    for part, name, value, why in (
+        ("training", "iterations", "many", "valid integer"),
+        ("evaluation", "nfe", [1, "two"], "valid integer"),
+        ("run", "tusk", 1, "differs in --tusk"),
+        ("training", "iterations", -1, "at least 1"),
+    ):
+        damaged = copy.deepcopy(stored)
+        damaged["options"][part][name] = value
+        (out / "options.json").write_text(json.dumps(damaged))
+        with pytest.raises(ValueError, match=rf"options\.json is damaged[^$]*{why}"):
+            read(*resume, out=out)
 
 
 def test_numbers_of_demonstrations_are_of_presets_only_where_they_are_generated(tmp_path):

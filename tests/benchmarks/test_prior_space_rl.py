@@ -17,7 +17,11 @@ import prior_space_rl as benchmark
 import robomimic
 from options import parse
 
+from warmprior import VelocityMLP, WarmPriorActor
+from warmprior.rl import has_anchor
+
 TINY = {"iterations": 20, "rl__updates": 1, "episodes": 4, "num_envs": 4, "logger": "none", "envs": 1}
+TINY |= {"centre": "mean", "delta": 0.5}
 SHORT = {"rl__environment_steps": 500, "rl__warmup_steps": 200, "rl__evaluate_every": 300}
 BOTH = ("dsrl-na", "dsrl-sac")
 
@@ -95,30 +99,55 @@ def test_resume_goes_on_where_it_stopped(toy, tmp_path, monkeypatch):
         benchmark.main(unit(tmp_path, seeds=1))
     assert len(calls) == 4 and not (tmp_path / "results.jsonl").exists()
     with pytest.raises(ValueError, match="other values of --delta"):
-        read(f"--resume --out {tmp_path} --rl.delta 0.7")
+        read(f"--resume --out {tmp_path} --delta 0.7")
     assert benchmark.main(["--resume", "--out", str(tmp_path)]) == 0
     rows = stored(tmp_path)
     assert len(rows) == len(expected) == 5 and rows[:3] == expected[:3]
     assert rows[-1]["environment_steps"] >= 500
 
 
+@pytest.mark.parametrize(("prior", "length"), [("past", 8), ("preview", 16)])
+def test_around_zero_the_source_is_what_the_agent_says(prior, length):
+    """The control: the field is the policy's, and a_0 = Delta wherever the mean was."""
+    recipe = read(f"--preset unit --prior {prior} --delta 1.5 --centre mean zero")
+    (method,) = recipe.sources.methods()
+    network = VelocityMLP(1, 9, length, observation_steps=1, hidden_dim=8)
+    actor = WarmPriorActor(network, method.prior(), nfe=1)
+    around_mean, around_zero = (arm.policy(actor) for arm in recipe.arms(method))
+    assert around_mean is actor and has_anchor(actor)
+    assert around_zero.network is network and not has_anchor(around_zero)
+    anchors = [
+        benchmark.toy(policy, 2, 0).rollout(2)["prior", "anchor"] for policy in (around_mean, around_zero)
+    ]
+    assert anchors[0].shape == anchors[1].shape == (2, 2, length, 1)
+    assert anchors[0].any() and not anchors[1].any()
+
+
 def test_papers_recipes():
     """DSRL's table of hyper-parameters; its choice for Transport is SAC."""
     known = {
-        "can": (0.99, 20, 24_000, 2048, 300, 4, 1.5),
-        "square": (0.999, 20, 32_000, 2048, 400, 4, 1.5),
-        "transport": (0.99, 20, 640_000, 128, 800, 8, 1.0),
+        "can": (0.99, 20, 24_000, 2048, 300),
+        "square": (0.999, 20, 32_000, 2048, 400),
+        "transport": (0.99, 20, 640_000, 128, 800),
     }
     for task, values in known.items():
         recipe = read(f"--preset paper --task {task} --download")
-        base, config = (recipe.agent(anchored, "dsrl-na", 0) for anchored in (False, True))
-        found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
-        assert (*found, recipe.horizon, *recipe.sources.chunk, base.delta or 1.5) == values
-        assert config.delta is None  # the paper's 0.5
-        assert not config.backup_entropy and recipe.agent(True, "dsrl-sac", 3).backup_entropy
-        assert recipe.algorithm == (BOTH if task == "transport" else BOTH[:1])
+        arms = [arm for method in recipe.sources.methods() for arm in recipe.arms(method)]
+        names = ("gaussian", "gaussian", "past", "preview")
+        assert [(arm.method.name, arm.algorithm) for arm in arms] == list(
+            zip(names, (*BOTH, "dsrl-na", "dsrl-na"), strict=True)
+        )
+        assert [arm.centre for arm in arms] == ["zero", "zero", "mean", "mean"]
+        assert recipe.sources.chunk == (8,) and recipe.evaluation.play_on
+        for arm in arms:
+            config = recipe.agent(arm, 0)
+            found = (config.gamma, config.updates, config.warmup_steps, config.hidden_dim)
+            assert (*found, recipe.horizon) == values
+            assert config.delta is None  # the paper's: 0.5 around a mean, 1.5 around zero
+            assert config.backup_entropy  # of both baselines alike
     # Options of the command line stand above those of the task.
-    config = read("--preset paper --task square --rl.gamma 0.9 --nfe 9").agent(True, "dsrl-na", 0)
+    recipe = read("--preset paper --task square --rl.gamma 0.9 --nfe 9")
+    config = recipe.agent(recipe.arms(recipe.sources.methods()[-1])[0], 0)
     assert (config.gamma, config.nfe) == (0.9, 9)
 
 
@@ -135,15 +164,15 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
             (actors[0].prior.name, getattr(actors[0].prior, "correlation", 0.0)) for actors in found.values()
         ]
 
-    # What is not typed is as the method of the run has it.
-    assert frozen("past,correlation=0.50,sigma=0.3 past") == [("past", 0.5), ("past", 0.0)]
+    own = "past,sigma=0.3"
+    assert frozen(f"past,correlation=0.50,sigma=0.3 {own}") == [("past", 0.5), ("past", 0.0)]
     for priors in ("past,sigma=0.5", "preview"):
-        with pytest.raises(ValueError, match=f"none of {priors}"):
+        with pytest.raises(FileNotFoundError, match=f"name its methods: --prior gaussian {own}"):
             frozen(priors)
     few = {"rl__environment_steps": 60, "rl__warmup_steps": 30, "rl__evaluate_every": 60, "episodes": 1}
-    argv = command_line(run=run, out=out, horizon=20, seeds=2, prior="past", num_envs=1, **few)
+    argv = command_line(run=run, out=out, horizon=20, seeds=2, prior=own, num_envs=1, **few)
     assert benchmark.main(argv) == 0
-    assert "--run has 1 seeds of past: agents [1] share policies" in capsys.readouterr().out
+    assert "--run has 1 seeds of past,sigma=0.3: agents [1] share policies" in capsys.readouterr().out
     first, second = agents(stored(out)).values()
     assert {row["seed"] for row in second} == {1} and first[-1]["task"] == "lift"
     assert 60 <= first[-1]["environment_steps"] < 68

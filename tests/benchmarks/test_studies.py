@@ -57,7 +57,7 @@ def test_curvature_of_a_finished_run_trains_nothing(finished, dataset, validatio
     path.rename(path.with_name("away"))
     said = refused(curvature.main, command_line(run=finished, **measured(tmp_path / "no", dataset)), capsys)
     path.with_name("away").rename(path)
-    assert "is missing: finish the run" in said
+    assert "has no trained policy" in said
 
 
 def test_sigma_study(finished, dataset, validation):
