@@ -3,15 +3,14 @@
 python benchmarks/navigation1d.py                      # all policies, one seed, a few minutes
 python benchmarks/navigation1d.py --seeds 5
 python benchmarks/navigation1d.py --chunk 1            # a decision at every step
-python benchmarks/navigation1d.py --preset wide        # the paper's network and iterations
+python benchmarks/navigation1d.py --preset paper       # the paper's width and iterations, five seeds
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import pandas as pd
 import torch
@@ -19,20 +18,18 @@ from common import Policy, policies_of, trained_actors, write_rows
 from measures import straightness
 from options import Evaluation, Options, Sources, check_single, parse, script, started
 from plots import plot_flow_paths, plot_navigation
-from report import labelled, table, write_report
-from robomimic import beside, train_all
+from report import labelled, table, unlike, write_report
+from robomimic import train_all
 
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.training import NetworkOptions, TrainingConfig, judge_navigation, play_navigation
+from warmprior.training.training_config import PAPER
 
 JUDGED = [  # columns of the table
     *("switch_rate", "commit_rate", "collision_rate", "route_entropy", "distance", "jump_ratio"),
     *("shifted_collision_rate", "shifted_distance"),
 ]
 STEPS = 32  # half of an episode: the longest chunk
-
-# The paper's Algorithm 1 withholds no history; PreviewPrior says why small sigma needs it.
-WITHHELD = 0.1
 
 
 @dataclass(frozen=True)
@@ -51,21 +48,33 @@ class NavigationOptions(Options):
             raise ValueError(f"--chunk must be at most {STEPS}, got {self.sources.chunk[0]}")
 
 
-def preset(width: int, **training: Any) -> NavigationOptions:
-    """All sources, with a network of a width and its recipe."""
-    return NavigationOptions(
-        network=NetworkOptions(hidden_dim=width, observation_steps=1),
-        training=TrainingConfig(batch_size=256, weighting="velocity", cold_probability=WITHHELD, **training),
-        sources=Sources(("gaussian", "regression", "history", "past", "preview"), (4,), (0.1, 0.5)),
-        evaluation=Evaluation(episodes=256, nfe=(9, 1)),
-    )
-
+SOURCES = Sources(("gaussian", "regression", "history", "past", "preview"), (4,), (0.1, 0.5))
+PLAYED = Evaluation(episodes=256, nfe=(9, 1))
 
 NAVIGATION_PRESETS = {
     # All policies in a few minutes on two cores.
-    "quick": preset(128, iterations=3_000, learning_rate=2e-3, warmup_ratio=0.0, save_every=3_000),
-    # The paper's network and iterations: hours on a CPU.
-    "wide": preset(1024, iterations=50_000, learning_rate=1e-4, warmup_ratio=0.2),
+    "quick": NavigationOptions(
+        network=NetworkOptions(hidden_dim=128, observation_steps=1),
+        training=TrainingConfig(
+            iterations=3_000,
+            batch_size=256,
+            learning_rate=2e-3,
+            warmup_ratio=0.0,
+            save_every=3_000,
+            weighting="velocity",
+            # The paper's Algorithm 1 withholds no history; PreviewPrior says why small sigma needs it.
+            cold_probability=0.1,
+        ),
+        sources=SOURCES,
+        evaluation=PLAYED,
+    ),
+    # The paper's width, iterations and batch size, and no preconditioning: hours on a CPU.
+    "paper": NavigationOptions(
+        network=NetworkOptions(hidden_dim=1024, precondition=False, observation_steps=1),
+        training=replace(PAPER, iterations=50_000, batch_size=256, checkpoints=1),
+        sources=SOURCES,
+        evaluation=replace(PLAYED, seeds=5),
+    ),
 }
 
 
@@ -127,7 +136,7 @@ def main(argv: list[str] | None) -> None:
             actors = trained_actors(mine, options.run.device)
             flows += straightness(actors, observations, draws=4, seed=seed)
         curvatures = write_rows(out / "curvature.jsonl", flows)
-        text = table(labelled(rows), ["method", "nfe"], JUDGED, beside(options, Options()))
+        text = table(labelled(rows), ["method", "nfe"], JUDGED, unlike(options, NAVIGATION_PRESETS["paper"]))
         flow = labelled(curvatures[curvatures["mean"] == "training"])
         text += "\n" + table(flow, ["method"], ["kappa_executed", "relative_executed"])
         # Before the pictures, which are the lesser loss: the trainings took the time.

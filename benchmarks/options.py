@@ -90,7 +90,7 @@ class Evaluation:
 class Run:
     """Where and how to compute."""
 
-    # The budget that the other options start from: quick, cpu or paper; navigation1d.py has quick and wide,
+    # The budget that the other options start from: quick, cpu or paper; navigation1d.py has quick and paper,
     # prior_space_rl.py quick, unit and paper.
     preset: str = "quick"
     out: Path | None = None  # output folder (default: a numbered one under runs/)

@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 from columns import COLUMNS, column, definitions
 from methods import label
+from options import IMAGES, Options, with_parts
 from pandas import DataFrame, Series
 from paper import paper_success
 
@@ -290,6 +292,34 @@ def success_report(found: DataFrame, top_k: int, notes: Sequence[str] = (), sour
         )
     keys = [name for name in ("problem", "delay", "nfe", "method") if name in found]
     return f"{markdown(frame, listed)}\n{table(found, keys, SHOWN)}"
+
+
+# What differs from run to run, or is in the first lines of a report.
+NO_RECIPE = {"task", "data", "dataset", "download", "force_download", "demonstrations"}
+NO_RECIPE |= {"seed", "seeds", "episodes", "nfe", "save_every", "log_every"}
+
+
+def unlike(options: Options, paper: Options) -> list[str]:
+    """What a table says of the recipe where it is not the paper's; it is the same for all sources."""
+    if options.data.obs == "image":
+        paper = with_parts(paper, **IMAGES["paper"], data={"obs": "image"})
+
+    def recipe(one: Options) -> dict[str, Any]:
+        parts = (one.data, one.network, one.training, one.evaluation)
+        values = {name: value for part in parts for name, value in asdict(part).items()}
+        values["weighting"] = one.training.weighting or (
+            "standardised" if one.network.precondition else "velocity"
+        )
+        return {name: value for name, value in values.items() if name not in NO_RECIPE}
+
+    theirs = recipe(paper)
+    found = [
+        f"{name.replace('_', ' ')} {value} ({theirs[name]})"
+        for name, value in recipe(options).items()
+        if value != theirs[name]
+    ]
+    words = "; ".join(found)
+    return [f"Unlike the paper (its own in parentheses), for all sources: {words}."] if found else []
 
 
 def write_report(out: Path, short: str, full: str, frame: DataFrame, failures: Sequence[str] = ()) -> None:

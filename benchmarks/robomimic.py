@@ -34,9 +34,9 @@ from common import (
 )
 from jobs import Jobs
 from methods import Method
-from options import PRESETS, Evaluation, Options, parse, script, started, with_parts
+from options import PRESETS, Evaluation, Options, parse, script, started
 from pictures import draw
-from report import success_report, summary, terminal_table, write_report
+from report import success_report, summary, terminal_table, unlike, write_report
 
 from warmprior.io.distributed import go_on_alone, rank, world_size
 from warmprior.io.files import write_atomic
@@ -65,7 +65,7 @@ def run(
         top_k = options.evaluation.top_k
         results = summary(rows, top_k)
         source = policies[0].task().facts.get("source")
-        notes = beside(options, presets["paper"]) + smaller(options, presets["paper"])
+        notes = unlike(options, presets["paper"])
         full = success_report(results, top_k, notes, source)
         try:
             write_report(out, terminal_table(results, top_k), full, results, failures)
@@ -192,38 +192,6 @@ def submit(
     for cell, seeds in product(cells, batches(evaluation)):
         more = {"then": partial(played, cell), **after}
         jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, seeds, **more)
-
-
-def beside(options: Options, usual: Options) -> list[str]:
-    """What a table says of options that are not the usual ones, such as the paper's."""
-    parts = {
-        "data": ("actions", "obs", "cameras", "image_size", "fast_rendering"),
-        "network": ("precondition", "encoder", "crop_size", "share_encoder"),
-        "training": ("times", "objective", "weighting", "self_distillation", "precision"),
-        "evaluation": ("grid",),
-    }
-    mine, theirs = in_force(options), in_force(usual)
-    given = [
-        f"--{name.replace('_', '-')} {value}"
-        for part, names in parts.items()
-        for name in names
-        if (value := getattr(getattr(mine, part), name)) != getattr(getattr(theirs, part), name)
-    ]
-    return [f"Beside the paper, for all sources: {', '.join(given)}."] if given else []
-
-
-def in_force(options: Options) -> Options:
-    """Options with the weighting that follows from the network, where none is given."""
-    weighting = "standardised" if options.network.precondition else "velocity"
-    return with_parts(options, training={"weighting": options.training.weighting or weighting})
-
-
-def smaller(options: Options, paper: Options) -> list[str]:
-    """What a table says of a smaller budget than the paper's."""
-    same = options.network.network == paper.network.network and options.network.hidden_dim is None
-    if same and options.training.iterations >= paper.training.iterations:
-        return []
-    return ["Network and training budget are smaller than the paper's."]
 
 
 @script("robomimic.py", together=True)

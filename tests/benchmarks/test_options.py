@@ -18,7 +18,7 @@ import prior_space_rl
 import real_time_chunking
 import sigma
 from options import PRESETS, from_record, parse, recorded, started, study
-from robomimic import beside, smaller
+from report import unlike
 
 STUDIES = (budget.BudgetOptions, real_time_chunking.DelayOptions)
 EVERY = [
@@ -108,13 +108,17 @@ def test_numbers_of_demonstrations_are_of_presets_only_where_they_are_generated(
 
 def test_tables_name_what_is_not_the_papers():
     plain = read("--preset", "paper")
-    assert beside(plain, PRESETS["paper"]) == [] == smaller(plain, PRESETS["paper"])
+    assert unlike(plain, PRESETS["paper"]) == []
     words = "--times u-shaped --objective l1 --self-distillation 0.5 --grid dense-jump"
-    (line,) = beside(read("--preset", "paper", *words.split()), PRESETS["paper"])
-    assert all(given in line for given in words.replace(" --", "|--").split("|"))
+    (line,) = unlike(read("--preset", "paper", *words.split()), PRESETS["paper"])
+    changed = "times u-shaped (uniform); objective l1 (velocity); self distillation 0.5 (0.0)"
+    assert line.endswith(f": {changed}; grid dense-jump (uniform).")
     # The weighting is that in force, which follows from the network where none is given.
-    (line,) = beside(read(), PRESETS["paper"])
-    assert "--weighting standardised" in line and "None" not in line and smaller(read(), PRESETS["paper"])
+    (line,) = unlike(read(), PRESETS["paper"])
+    for words in ("weighting standardised (velocity)", "network mlp (chi_transformer)", "(200000)"):
+        assert words in line
+    (line,) = unlike(read("--obs", "image", "--encoder", "small"), PRESETS["paper"])
+    assert "obs" not in line and "image size 48 (84)" in line
 
 
 @pytest.mark.parametrize("script", ["robomimic", "prior_space_rl", "real_time_chunking"])
