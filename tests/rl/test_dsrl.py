@@ -118,7 +118,7 @@ def test_losses_by_hand(prior_class, options, delta):
     assert not out["entropy"].requires_grad and not out["td_error"].requires_grad
 
 
-@pytest.mark.parametrize("distribution", ["normal", "clipped", "uniform"])
+@pytest.mark.parametrize("distribution", ["normal", "clipped", "truncated", "uniform"])
 def test_distillation_by_hand(distribution):
     """Head by head, online action critics at decoded draws; the gradient is the noise critics' alone."""
     generator = torch.Generator().manual_seed(2)

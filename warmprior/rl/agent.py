@@ -101,6 +101,7 @@ class PriorSpaceAgent:
                 backup=config.backup,
                 discount="decision",
                 noise_critic_steps=config.noise_critic_steps,
+                distillation=config.distillation,
                 backup_entropy=config.backup_entropy,
                 bootstrap_timeouts=config.bootstrap_timeouts,
                 alpha_init=config.alpha_init,

@@ -8,6 +8,7 @@ from typing import Literal
 
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.anchor import has_anchor
+from warmprior.rl.residual import ResidualDistribution
 from warmprior.rl.checks import check_counts, check_positive
 
 __all__ = ["PriorSpaceConfig"]
@@ -26,6 +27,8 @@ class PriorSpaceConfig:
         nfe: network evaluations per decoded chunk.
         updates: updates per vector step (one decision of every parallel environment).
         noise_critic_steps: distillation updates per vector step, DSRL-NA only.
+        distillation: where the noise critic learns, see ResidualSampler, DSRL-NA only; by default in the
+            clipped source around a mean, and in the whole source around zero.
         batch_size: transitions per update.
         learning_rate: of actor, critics and temperature.
         tau: of the target critics' averaging.
@@ -68,6 +71,7 @@ class PriorSpaceConfig:
     nfe: int = 1
     updates: int = 20
     noise_critic_steps: int = 10
+    distillation: ResidualDistribution | None = None
     batch_size: int = 256
     learning_rate: float = 3e-4
     tau: float = 0.005
@@ -91,6 +95,8 @@ class PriorSpaceConfig:
             raise ValueError(f"backup must be 'min' or 'mean', got {self.backup!r}")
         if self.algorithm == "dsrl-sac" and (self.backup, self.backup_entropy) != ("min", True):
             raise ValueError("dsrl-sac has backup='min' and backup_entropy=True; leave them out")
+        if self.algorithm == "dsrl-sac" and self.distillation is not None:
+            raise ValueError("dsrl-sac has no noise critic: leave distillation out")
         for name in ("target_entropy", "reward_offset"):
             if not math.isfinite(getattr(self, name)):
                 raise ValueError(f"{name} must be a finite number, got {getattr(self, name)}")

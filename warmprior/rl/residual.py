@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch.nn.init import trunc_normal_
 
 from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.rl.decoder import PriorDecoder
 
 __all__ = ["ResidualSampler"]
 
-ResidualDistribution = Literal["normal", "clipped", "uniform"]
+ResidualDistribution = Literal["normal", "clipped", "truncated", "uniform"]
 
 
 class ResidualSampler(TensorDictModuleBase):
@@ -29,6 +30,7 @@ class ResidualSampler(TensorDictModuleBase):
     ===============  =============================================================================
     ``"normal"``     :math:`\sigma \varepsilon`, the training prior; may leave the agent's box
     ``"clipped"``    the same, clipped to :math:`[-\delta, \delta]`
+    ``"truncated"``  the same, drawn again until it lies in :math:`[-\delta, \delta]`
     ``"uniform"``    :math:`U[-\delta, \delta]`
     ===============  =============================================================================
 
@@ -77,9 +79,10 @@ class ResidualSampler(TensorDictModuleBase):
             distribution = "clipped" if sigma > 0 else "uniform"
         elif distribution is None:
             distribution = "normal"
-        if distribution not in ("normal", "clipped", "uniform"):
+        if distribution not in get_args(ResidualDistribution):
             raise ValueError(
-                f"the distribution must be 'normal', 'clipped' or 'uniform', got {distribution!r}"
+                "the distribution must be 'normal', 'clipped', 'truncated' or 'uniform', got "
+                f"{distribution!r}"
             )
         if distribution != "uniform" and not (sigma > 0 and math.isfinite(sigma)):
             raise ValueError(
@@ -100,6 +103,9 @@ class ResidualSampler(TensorDictModuleBase):
         like = {"dtype": anchor.dtype, "device": anchor.device, "generator": self.generator}
         if self.distribution == "uniform":
             delta = (2.0 * torch.rand(anchor.shape, **like) - 1.0) * self.delta
+        elif self.distribution == "truncated":
+            box = (-self.delta, self.delta)
+            delta = trunc_normal_(torch.empty_like(anchor), 0.0, self.sigma, *box, generator=self.generator)
         else:
             delta = self.sigma * torch.randn(anchor.shape, **like)
         if self.distribution == "clipped":
