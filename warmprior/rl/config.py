@@ -8,8 +8,8 @@ from typing import Literal
 
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.rl.anchor import has_anchor
-from warmprior.rl.residual import ResidualDistribution
 from warmprior.rl.checks import check_counts, check_positive
+from warmprior.rl.residual import ResidualDistribution
 
 __all__ = ["PriorSpaceConfig"]
 
