@@ -31,7 +31,7 @@ from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, WarmPriorAc
 from warmprior.io.files import digest_of
 from warmprior.modules.prior import Source
 from warmprior.modules.registry import find, options_of
-from warmprior.objectives import Coupling, OTCoupling, ReflowCoupling
+from warmprior.objectives import BridgeCoupling, Coupling, OTCoupling, ReflowCoupling
 from warmprior.rl import has_anchor
 from warmprior.training import TrainingConfig
 
@@ -92,6 +92,7 @@ METHODS: dict[str, Composition] = {
     "history": Composition("History", "#6a51a3", sees_history=True),
     "regression": Composition("Regression", "#b8860b", PointPrior, regresses=True),
     "ot": Composition("OT-CFM", "#2ca02c", coupling=OTCoupling),
+    "bridge": Composition("SB-CFM", "#98df8a", coupling=BridgeCoupling),
     "reflow": Composition("2-rectified flow", "#17becf", coupling=reflow, teacher="gaussian"),
     "step": Composition("STEP", "#00695c", start=ForecastStart),
     "cvae": Composition("CVAE source", "#c51b7d", CVAEPrior),
@@ -230,7 +231,7 @@ class Method:
     @property
     def pairs_in_batch(self) -> bool:
         """Whether the windows of a batch are paired, so that it needs two of them."""
-        return self.parts.coupling is OTCoupling
+        return self.parts.coupling in (OTCoupling, BridgeCoupling)
 
     @property
     def needs_vector(self) -> bool:

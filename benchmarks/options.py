@@ -40,9 +40,9 @@ Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
 class Sources:
     """The methods to compare."""
 
-    # By name (gaussian, past, preview, forecast, history, regression, ot, reflow, step, cvae, a2a, leap) or,
-    # your own, as package.module:Class, which Python has to find (PYTHONPATH); options follow as in
-    # preview,correlation=0.5. Gains are over the first.
+    # By name (gaussian, past, preview, forecast, history, regression, ot, bridge, reflow, step, cvae, a2a,
+    # leap) or, your own, as package.module:Class, which Python has to find (PYTHONPATH); options follow as
+    # in preview,correlation=0.5. Gains are over the first.
     prior: tuple[str, ...] = ("gaussian", "past", "preview")
     chunk: tuple[int, ...] = (8,)  # chunk lengths H
     sigma: tuple[float, ...] = ()  # noise of the warm priors, a policy each (default: past 0.5, preview 1.0)

@@ -9,6 +9,7 @@ name; parts of them need the extra ``warmprior[sim]``.
 from importlib.metadata import version
 
 from warmprior.modules import (
+    BridgeInterpolant,
     ChiTransformer,
     GaussianPrior,
     ImageEncoder,
@@ -69,6 +70,7 @@ __all__ = [
     "ActionHistory",
     "ActionWindow",
     "BoxTanhNormal",
+    "BridgeInterpolant",
     "CameraImages",
     "ChiTransformer",
     "ChunkStep",

@@ -80,7 +80,7 @@ def test_history_is_withheld_from_those_alone_that_remember():
     remember = {name for name in METHODS if Method(name, H).recipe(training).cold_probability}
     assert remember == {"past", "preview", "forecast", "history", "step", "a2a"}
     vector = {name for name in METHODS if Method(name, H).needs_vector}
-    assert vector == {"forecast", "ot", "step", "cvae", "leap"}
+    assert vector == {"forecast", "ot", "bridge", "step", "cvae", "leap"}
     assert not Method("ot,observation_weight=0", H).needs_vector
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import permutations
 
 import pytest
@@ -13,6 +14,7 @@ from torch import nn
 
 from tests.objectives.test_flow_matching import actor_for, sample
 from warmprior import (
+    BridgeInterpolant,
     FlowMatchingLoss,
     GaussianPrior,
     SourceMoments,
@@ -20,7 +22,7 @@ from warmprior import (
     WarmPriorActor,
     window_replay_buffer,
 )
-from warmprior.objectives import OTCoupling, ReflowCoupling
+from warmprior.objectives import BridgeCoupling, OTCoupling, ReflowCoupling
 
 pytest.importorskip("scipy")
 
@@ -55,6 +57,49 @@ def test_dear_observations_leave_everything_in_its_place():
     # Groups of at most 256, of nearly one size: each half is paired within itself.
     assert set(free[150:, 0, 0].tolist()) == set(a0[150:, 0, 0].tolist())
     assert float((free - a1).square().mean()) < 0.5 * float((a0 - a1).square().mean())
+
+
+def gaussian_bridge(s0, s1, sigma):
+    """Covariance of the ends of the Schroedinger bridge of N(0, s0^2) and N(m, s1^2) (Bunne et al., 2023)."""
+    return (math.sqrt(4 * s0**2 * s1**2 + sigma**4) - sigma**2) / 2
+
+
+@pytest.mark.parametrize("sigma", [0.3, 1.0])
+def test_bridge_of_gaussians(sigma):
+    """Pairs, path and velocity against the closed form of the bridge."""
+    s0, s1, mean = 1.0, 0.5, 2.0
+    torch.manual_seed(0)
+    a0 = s0 * torch.randn(256 * 100, 1, 1)
+    a1 = mean + s1 * torch.randn(256 * 100, 1, 1)
+    couple = BridgeCoupling(sigma, observation_weight=0.0)
+    source, target = couple(a0, a1)
+    assert target is a1
+    expected = gaussian_bridge(s0, s1, sigma)
+    found = torch.cov(torch.stack([source.flatten(), target.flatten()]))
+    # The plan of 256 pairs is close to that of the distributions.
+    assert found[0, 1].item() == pytest.approx(expected, abs=0.02)
+    assert found[0, 0].item() == pytest.approx(s0**2, abs=0.04)
+
+    # Var(a_t), and the slope of the velocity on a_t, are those of the bridge's own flow.
+    def variance(t):
+        return (1 - t) ** 2 * s0**2 + t**2 * s1**2 + 2 * t * (1 - t) * expected + sigma**2 * t * (1 - t)
+
+    for t in (0.2, 0.5, 0.9):
+        point, velocity = couple.interpolant(source, target, torch.full((len(source),), t))
+        both = torch.cov(torch.stack([point.flatten(), velocity.flatten()]))
+        slope = (variance(t + 1e-4) - variance(t - 1e-4)) / 2e-4 / 2 / variance(t)
+        assert both[0, 0].item() == pytest.approx(variance(t), rel=0.04)
+        assert (both[0, 1] / both[0, 0]).item() == pytest.approx(slope, abs=0.05)
+
+
+def test_the_loss_takes_the_path_of_the_coupling():
+    actor = actor_for(GaussianPrior(H))
+    loss = FlowMatchingLoss(actor, coupling=BridgeCoupling(0.2, observation_weight=0.0))
+    assert loss.interpolant.config() == BridgeInterpolant(0.2).config()
+    with pytest.raises(ValueError, match="straight path"):
+        FlowMatchingLoss(actor, coupling=BridgeCoupling(0.2), objective="l1")
+    with pytest.raises(ValueError, match="sigma must be a finite number > 0"):
+        BridgeCoupling(0.0)
 
 
 def demonstrations():

@@ -4,6 +4,7 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.chi_transformer import ChiTransformer
 from warmprior.modules.encoder import ImageEncoder, imagenet_weights, load_imagenet
 from warmprior.modules.interpolant import (
+    BridgeInterpolant,
     Interpolant,
     LinearInterpolant,
     PolynomialInterpolant,
@@ -22,6 +23,7 @@ from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.modules.vision import VisionNetwork
 
 __all__ = [
+    "BridgeInterpolant",
     "ChiTransformer",
     "GaussianPrior",
     "ImageEncoder",

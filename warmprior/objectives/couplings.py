@@ -14,8 +14,9 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
+from warmprior.modules.interpolant import BridgeInterpolant
 
-__all__ = ["Coupling", "OTCoupling", "ReflowCoupling"]
+__all__ = ["BridgeCoupling", "Coupling", "OTCoupling", "ReflowCoupling"]
 
 Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
 """Pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, each chunk ``[*B, P, d_a]``.
@@ -73,8 +74,6 @@ class OTCoupling:
         self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase | None = None
     ) -> tuple[Tensor, Tensor]:
         """Permute the sources within the batch."""
-        from scipy.optimize import linear_sum_assignment
-
         source, target = a0.reshape(-1, *a0.shape[-2:]), a1.reshape(-1, *a1.shape[-2:])
         if len(source) < 2:
             raise ValueError("optimal transport pairs within a batch: it needs at least 2 windows")
@@ -91,9 +90,64 @@ class OTCoupling:
             if isinstance(observation, Tensor) and self.observation_weight:
                 seen = observation.reshape(len(source), -1)[group]
                 cost = cost + self.observation_weight * _squared_distances(seen, seen)
-            order = torch.as_tensor(linear_sum_assignment(cost.double().cpu().numpy())[1])
-            paired.append(source[group][order.to(source.device)])
+            paired.append(source[group][self.assigned(cost.double().cpu()).to(source.device)])
         return torch.cat(paired).view_as(a0), a1
+
+    def assigned(self, cost: Tensor) -> Tensor:
+        """The source of every target, by the cost of the pairs ``[n, n]``, float64 on the CPU."""
+        from scipy.optimize import linear_sum_assignment
+
+        return torch.as_tensor(linear_sum_assignment(cost.numpy())[1])
+
+
+class BridgeCoupling(OTCoupling):
+    r"""SB-CFM: source and data are paired as in the Schroedinger bridge of Brownian motion.
+
+    Every target draws its source from the entropic plan of the batch,
+
+    .. math::
+        \pi_{ij} \propto u_i v_j \exp\left(- c_{ij} / 2 \sigma^2\right), \qquad
+        c_{ij} = \|a_0^i - a_1^j\|^2 + w \|o^i - o^j\|^2,
+
+    with uniform marginals (Tong et al., 2024, Prop. 3.4), and the path between them is a Brownian bridge,
+    :class:`~warmprior.BridgeInterpolant`, which the loss takes from here. At small ``sigma`` this is
+    :class:`OTCoupling`, at a large one pairs are as they come.
+
+    Args:
+        sigma: of the Brownian motion at ``t = 1``, > 0, in normalised action units.
+        observation_weight: ``w``, see :class:`OTCoupling`.
+
+    Raises:
+        ValueError: as :class:`OTCoupling`, or if ``sigma`` is not a finite number > 0.
+
+    See Also:
+        :class:`~warmprior.objectives.OTCoupling`: the limit without noise.
+
+    Examples:
+        >>> import torch
+        >>> couple = BridgeCoupling(sigma=0.1, observation_weight=0.0)
+        >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
+        >>> [x.flatten().tolist() for x in couple(a0, a1)], couple.interpolant
+        ([[1.0, 0.0], [5.0, 4.0]], BridgeInterpolant(sigma=0.1))
+    """
+
+    ROUNDS: ClassVar[int] = 50  # of Sinkhorn's iteration
+
+    def __init__(self, sigma: float = 0.5, observation_weight: float = 10.0) -> None:
+        super().__init__(observation_weight)
+        self.interpolant = BridgeInterpolant(sigma)
+
+    def config(self) -> dict[str, Any]:
+        """What it depends on."""
+        return {**super().config(), "name": "bridge", "sigma": self.interpolant.sigma}
+
+    def assigned(self, cost: Tensor) -> Tensor:
+        """Drawn from the plan by PyTorch's global generator, which a training seeds."""
+        log_plan = -cost / (2 * self.interpolant.sigma**2)
+        for _ in range(self.ROUNDS):
+            log_plan = log_plan - log_plan.logsumexp(0, keepdim=True)
+            log_plan = log_plan - log_plan.logsumexp(1, keepdim=True)
+        return torch.multinomial(log_plan.exp(), 1).squeeze(1)
 
 
 def _squared_distances(x: Tensor, y: Tensor) -> Tensor:

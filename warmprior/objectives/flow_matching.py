@@ -236,6 +236,8 @@ class FlowMatchingLoss(LossModule):
         self.self_distillation = float(self_distillation)
         self.__dict__["teacher"] = teacher  # no part of this module: it is another's to save
         built_for = getattr(actor_network.network, "interpolant", None)
+        # A coupling may come with a path of its own.
+        interpolant = interpolant or getattr(coupling, "interpolant", None)
         if interpolant is None:
             interpolant = LinearInterpolant() if built_for is None else built_for
         elif built_for is not None and built_for.config() != interpolant.config():
@@ -342,7 +344,7 @@ class FlowMatchingLoss(LossModule):
         self, a0: Tensor, a1: Tensor, t: Tensor, observation: Tensor | TensorDictBase
     ) -> Tensor:
         """Error at times ``t`` ``[*B]`` of the path, ``[*B, P, d_a]``."""
-        a_t, velocity = self.interpolant(a0, a1, t)
+        a_t, velocity = self.interpolant(a0, a1, t, self.generator)
         field = velocity_field(self.velocity_network, observation)
         predicted = field(t.reshape(-1), a_t.reshape(-1, *a1.shape[-2:]))
         return self._distance(predicted.reshape(a1.shape), velocity, t)

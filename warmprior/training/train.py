@@ -81,6 +81,7 @@ def new_policy(
             coupling=coupling,
             withhold=training.cold_probability,
             rest=copy.deepcopy(task.rest),
+            interpolant=getattr(coupling, "interpolant", None),
         )
     return WarmPriorActor(
         velocity,
