@@ -59,19 +59,9 @@ def _root(dataset: str | Path, files: Sequence[str] = ("meta/*",), revision: str
 
 
 def find_lerobot(dataset: str | Path, *, revision: str | None = None, **options: Any) -> LeRobotIndex:
-    """Read what describes a LeRobotDataset; of one in the hub nothing else is fetched.
+    """Read what describes a LeRobotDataset, by :func:`~warmprior.data.lerobot_index.read_lerobot_index`.
 
-    Args:
-        dataset: its folder, or its repository in the hub.
-
-    Keyword Args:
-        revision: of a repository, see :func:`~warmprior.data.download_lerobot`.
-        options: of :func:`~warmprior.data.lerobot_index.read_lerobot_index`.
-
-    Raises:
-        FileNotFoundError: if there is no such dataset.
-        DatasetError: if it is not as it should be.
-        OSError: if a download fails.
+    Of one in the hub nothing else is fetched; ``OSError`` if that fails.
     """
     return read_lerobot_index(_root(dataset, revision=revision), **options)
 
@@ -85,12 +75,7 @@ def fetch_lerobot(dataset: str | Path, *, revision: str | None = None, **options
 
 
 class _Columns:
-    """The numbers of a dataset's features: one file at a time, of it each column that is asked for, once.
-
-    Args:
-        root: the dataset's folder.
-        metadata: see :func:`~warmprior.data.lerobot_index.read_metadata`.
-    """
+    """The numbers of a dataset's features: one file at a time, of it each column that is asked for, once."""
 
     def __init__(self, root: Path, metadata: Any) -> None:
         self.root, self.metadata = root, metadata
@@ -144,11 +129,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 class LeRobotReader(DemonstrationReader):
-    """The values of a dataset.
-
-    Args:
-        index: what is selected.
-    """
+    """The values of a dataset."""
 
     def __init__(self, index: LeRobotIndex) -> None:
         self.index = index

@@ -78,23 +78,13 @@ def check_place(place: str | Path, option: str) -> None:
 
 
 def name_of_place(place: str | Path) -> str:
-    """A short name: that of the file without its ending, of the folder, or of the repository.
-
-    Examples:
-        >>> name_of_place("data/square.hdf5"), name_of_place("lerobot:user/square")
-        ('square', 'square')
-    """
+    """A short name: that of the file without its ending, of the folder, or of the repository."""
     dataset = _lerobot(place)
     return Path(place).stem if dataset is None else Path(dataset).resolve().name
 
 
 def resolved_place(place: Path) -> str:
-    """The same place as seen from any working directory.
-
-    Examples:
-        >>> resolved_place(Path("lerobot:user/square"))
-        'lerobot:user/square'
-    """
+    """The same place as seen from any working directory."""
     dataset = _lerobot(place)
     if dataset is None:
         return str(place.resolve())
@@ -143,29 +133,15 @@ class Demonstrations(ABC):
 
     @abstractmethod
     def index(self, **options: Any) -> DatasetIndex:
-        """What is there.
-
-        Args:
-            options: ``image_keys``, ``demos`` and so on of
-                :func:`~warmprior.data.hdf5.read_index`.
-        """
+        """What is there; options (``image_keys``, ``demos`` and so on) as of ``read_index``."""
 
     @abstractmethod
     def replay(self, **options: Any) -> DemonstrationReplay:
-        """Read them.
-
-        Args:
-            options: those of :class:`RobomimicExperienceReplay` after ``root``.
-        """
+        """Read them; options as of :class:`RobomimicExperienceReplay`."""
 
     @abstractmethod
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        """SHA-256 of the contents.
-
-        Args:
-            image_keys: the images that are used.
-            demos: how many demonstrations are used; all if ``None``.
-        """
+        """SHA-256 of the contents, as far as these images and that many demonstrations are used."""
 
     @abstractmethod
     def with_images(self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool) -> Self:
@@ -173,25 +149,13 @@ class Demonstrations(ABC):
 
         Those that are there are compared with the simulator's; others are rendered where states are known.
 
-        Args:
-            cameras: of the simulator.
-            size: side of images to render.
-
-        Keyword Args:
-            demos: how many of them are used; all if ``None``.
-            fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-
         Raises:
             DatasetError: if the images show something else than the simulator, or cannot be rendered.
         """
 
 
 class RobomimicFile(Demonstrations):
-    """The demonstrations of an HDF5 file.
-
-    Args:
-        path: of the file.
-    """
+    """The demonstrations of an HDF5 file."""
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -222,12 +186,7 @@ class RobomimicFile(Demonstrations):
 
 
 class LeRobotFolder(Demonstrations):
-    """The demonstrations of a LeRobotDataset.
-
-    Args:
-        dataset: its folder, or its repository in the hub.
-        env_args: see :func:`open_demonstrations`.
-    """
+    """The demonstrations of a LeRobotDataset: its folder, or its repository in the hub."""
 
     def __init__(self, dataset: str, env_args: Mapping[str, Any] | None = None) -> None:
         self.dataset, self.env_args = dataset, env_args

@@ -328,19 +328,7 @@ def _with_cameras(env_args: Mapping[str, Any], illustrator: _Illustrator) -> dic
 
 
 def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) -> None:
-    """Compare the first images of a file with what the simulator shows there.
-
-    Args:
-        path: a robomimic file with images.
-        image_keys: their names.
-        fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-
-    Raises:
-        DatasetError: if they are upside down, or show something else, or the file says that they were
-            rendered in the other quality.
-        ValueError: if the simulator has no such camera.
-        RuntimeError: if nothing here can render.
-    """
+    """Compare the first images of a file with the simulator's, see :func:`compare_first_images`."""
     index = read_index(path, image_keys=image_keys)
     first = f"data/{index.demos[0]}"
     with open_robomimic(path) as file:
@@ -367,21 +355,12 @@ def compare_first_images(
     fast: bool,
     advice: str,
 ) -> None:
-    """Compare images of one state with what the simulator shows there.
+    """Compare images of one state, uint8 ``[size, size, 3]`` by name, with what the simulator shows there.
 
-    Args:
-        index: of the demonstrations.
-        images: by name, uint8 ``[size, size, 3]``.
-
-    Keyword Args:
-        state: of the simulator; without, nothing is compared, with a warning.
-        rendering: how the images were rendered, where that is known.
-        fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-        advice: what to do about images that show something else.
+    Without the state nothing is compared, with a warning.
 
     Raises:
-        DatasetError: if they are upside down, or show something else, or were rendered in the other
-            quality.
+        DatasetError: if they are upside down, or show something else, or were rendered in the other quality.
         ValueError: if the simulator has no such camera.
         RuntimeError: if nothing here can render.
     """

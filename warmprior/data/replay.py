@@ -36,13 +36,9 @@ class DemonstrationReader(ABC):
 
     @abstractmethod
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows of one array of a demo, and check them.
+        """Read rows from ``first`` on of one array of a demo into ``out``, ``[rows, width]``, and check them.
 
-        Args:
-            demo: its name.
-            key: ``"actions"``, ``"rewards"`` or ``"obs/<key>"``.
-            out: ``[rows, width]`` floating-point memory to fill; may be a strided view.
-            first: the row of the demo that goes to the first row of ``out``.
+        The array is ``"actions"``, ``"rewards"`` or ``"obs/<key>"``; ``out`` may be a strided view.
 
         Raises:
             DatasetError: if a value is not finite or absurdly large, or cannot be read.
@@ -50,16 +46,7 @@ class DemonstrationReader(ABC):
 
     @abstractmethod
     def images(self, demo: str, key: str, out: Tensor) -> None:
-        """Read the first images of a demo, channels first.
-
-        Args:
-            demo: its name.
-            key: of the images.
-            out: uint8 ``[rows, 3, size, size]``, to fill.
-
-        Raises:
-            DatasetError: if they cannot be read.
-        """
+        """Read the first images of a demo into uint8 ``[rows, 3, size, size]``."""
 
     @abstractmethod
     def name(self, demo: str, key: str) -> str:
@@ -67,18 +54,7 @@ class DemonstrationReader(ABC):
 
 
 def check_storage(storage: str, device: torch.device | str) -> torch.device:
-    """Refuse a place for the data that there is not.
-
-    Args:
-        storage: ``"memory"`` or ``"memmap"``.
-        device: of the tensors.
-
-    Returns:
-        The device.
-
-    Raises:
-        ValueError: if ``storage`` is unknown or does not fit ``device``.
-    """
+    """The device, where it and the kind of storage go together; a ``ValueError`` otherwise."""
     if storage not in ("memory", "memmap"):
         raise ValueError(f"storage must be 'memory' or 'memmap', got {storage!r}")
     device = torch.device(device)

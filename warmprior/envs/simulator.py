@@ -63,38 +63,14 @@ def _without_warnings() -> Iterator[None]:
 
 
 def import_robosuite() -> ModuleType:
-    """Import robosuite without its start-up warnings.
-
-    Returns:
-        The module ``robosuite``.
-
-    Raises:
-        ImportError: if robosuite is not installed.
-
-    Examples:
-        >>> import_robosuite().__version__  # doctest: +SKIP
-        '1.5.1'
-    """
+    """The module ``robosuite``, without its start-up warnings."""
     with _without_warnings():
         return require("robosuite", "sim")
 
 
 @contextlib.contextmanager
 def isolated_numpy_seed(seed: int) -> Iterator[None]:
-    """Seed the global generators that robosuite's samplers use, and restore them afterwards.
-
-    Args:
-        seed: any integer; taken modulo ``2**32``.
-
-    Examples:
-        >>> np.random.seed(1)
-        >>> with isolated_numpy_seed(5):
-        ...     inside = np.random.rand()
-        >>> outside = np.random.rand()
-        >>> np.random.seed(1)
-        >>> bool(outside == np.random.rand())
-        True
-    """
+    """Seed the global generators that robosuite's samplers use; they are restored afterwards."""
     numpy_state, python_state = np.random.get_state(), random.getstate()
     np.random.seed(seed % 2**32)
     random.seed(seed)
@@ -159,24 +135,13 @@ def _copy(value: Any) -> Any:
 def make_simulator(env_args: Mapping[str, Any]) -> Any:
     """Make a robosuite environment for stepping: no renderer, no time limit, cheap resets.
 
-    Frames are rendered on demand elsewhere, and time limits belong to the wrapper, so the options
-    of ``env_args`` that concern either are overridden. The model is loaded once
+    Frames are rendered on demand elsewhere, and time limits belong to the wrapper, so the options of
+    ``env_args`` (in the terms of robosuite 1.5) that concern either are overridden. The model is loaded once
     (``hard_reset=False``), under a fixed seed.
 
-    Args:
-        env_args: a robomimic description in the terms of robosuite 1.5.
-
-    Returns:
-        A ``robosuite.environments.base.MujocoEnv``.
-
     Raises:
-        ImportError: if robosuite is not installed, or MimicGen is not (see :func:`register_mimicgen`)
-            where the environment is one of its.
+        ImportError: if robosuite is not installed, or MimicGen is not where the environment is one of its.
         ValueError: if robosuite has no environment of that name.
-
-    Examples:
-        >>> make_simulator(task_env_args("lift")).action_dim  # doctest: +SKIP
-        7
     """
     robosuite = import_robosuite()
     name = env_args["env_name"]
@@ -202,20 +167,10 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
 
 
 def action_limits(env: Any) -> list[float]:
-    """List the largest magnitude of each entry of an environment's action.
+    """The largest magnitude of each entry of an environment's action.
 
     Deltas are fractions of the largest delta. Absolute poses are in metres and radians, and their
     limits only say what is worth sampling.
-
-    Args:
-        env: a robosuite environment.
-
-    Returns:
-        One number per entry of the action.
-
-    Examples:
-        >>> action_limits(make_simulator(task_env_args("lift")))  # doctest: +SKIP
-        [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
     """
     limits: list[float] = []
     for robot in env.robots:

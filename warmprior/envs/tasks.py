@@ -17,18 +17,7 @@ _ARM_WIDTHS = {"eef_pos": 3, "eef_quat": 4, "gripper_qpos": 2}
 
 
 def low_dim_keys(arms: int) -> tuple[str, ...]:
-    """Name the observations that make up the state, in robomimic's order.
-
-    Args:
-        arms: number of arms.
-
-    Returns:
-        ``"object"``, then the pose and gripper of each arm.
-
-    Examples:
-        >>> low_dim_keys(1)
-        ('object', 'robot0_eef_pos', 'robot0_eef_quat', 'robot0_gripper_qpos')
-    """
+    """The observations that make up the state: ``object``, then each arm's pose and gripper."""
     return ("object", *(f"robot{i}_{key}" for i in range(arms) for key in _ARM_WIDTHS))
 
 

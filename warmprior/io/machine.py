@@ -24,15 +24,7 @@ PACKAGES = (
 
 
 def facts_of_machine(**more: Any) -> dict[str, Any]:
-    """Versions and hardware, as files of results keep them.
-
-    Args:
-        more: about the hardware.
-
-    Examples:
-        >>> sorted(facts_of_machine(device="cpu"))
-        ['hardware', 'versions']
-    """
+    """Versions and hardware, as files of results keep them."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

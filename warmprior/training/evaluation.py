@@ -222,16 +222,7 @@ def _acting(policy: TensorDictModuleBase, seed: int, nfe: int | None) -> Iterato
 def acting_in_episode(
     policy: TensorDictModuleBase, seed: int, *, nfe: int | None = None, policy_seed: int = 0
 ) -> Iterator[Act]:
-    """A policy with the noise that belongs to an episode, see :func:`play_episode`.
-
-    Args:
-        policy: as for :func:`evaluate`.
-        seed: of the environment, at least 0.
-
-    Keyword Args:
-        nfe: as for :func:`evaluate`.
-        policy_seed: of the policy's random draws, at least 0.
-    """
+    """A policy with the noise that belongs to an episode, see :func:`play_episode`."""
     for name, value in (("the seed", seed), ("policy_seed", policy_seed)):
         if value < 0:
             raise ValueError(f"{name} must be at least 0, got {value}")

@@ -210,14 +210,7 @@ def record_filmstrip(
 
 
 def check_video(path: Path) -> None:
-    """Refuse what :func:`record_video` could not write, before anything is played.
-
-    Raises:
-        ValueError: if the name does not end in .mp4.
-        ImportError: if PyAV is missing.
-        RuntimeError: if nothing on this machine can render.
-        OSError: if the folder cannot be written to.
-    """
+    """Refuse, before any episode, a film that could not be written here or has another ending than .mp4."""
     if path.suffix != ".mp4":
         raise ValueError(f"{path} must end in .mp4: films have no other format")
     require("av", "lerobot")

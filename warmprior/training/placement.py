@@ -103,11 +103,7 @@ class Prefetch:
         return self._state
 
     def restore(self, state: Tensor) -> None:
-        """Go on from a state that :meth:`state` gave.
-
-        Args:
-            state: of the generator.
-        """
+        """Go on from a state that :meth:`state` gave."""
         self.close()
         self._generator.set_state(state)
         self._state = state

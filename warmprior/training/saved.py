@@ -107,8 +107,7 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
     """JSON-serialisable description of everything but the weights.
 
     Raises:
-        TypeError: if the network is not a :class:`VelocityNetwork`, or an option of the network, the
-            prior or the normaliser cannot be written as JSON.
+        TypeError: if the network is not a :class:`VelocityNetwork`, or an option cannot be written as JSON.
     """
     network = uncompiled(actor.network)
     if not isinstance(network, VelocityNetwork):

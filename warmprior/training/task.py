@@ -485,22 +485,13 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
 def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
     """The tasks that options name, checked: for each what :func:`load_task` takes, a name and a style.
 
-    Args:
-        options: which.
-
     Raises:
         ValueError: if the options do not go together.
 
     Examples:
-        >>> task_places(DataOptions(task=("lift", "can"), download=True))
-        [('lift', 'ph'), ('can', 'ph')]
         >>> task_places(DataOptions(task=("can", "tool_hang"), data=("ph", "mh"), download=True))
         Data: there are no official mh demonstrations of tool_hang.
         [('can', 'ph'), ('can', 'mh'), ('tool_hang', 'ph')]
-        >>> task_places(DataOptions(data=("core",)))
-        Traceback (most recent call last):
-            ...
-        ValueError: --data core is that of MimicGen's files: add --download, or --dataset FILE
     """
     options.check()
     names: Sequence[str | None] = options.task or (None if options.dataset else "square",)
