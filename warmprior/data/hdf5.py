@@ -17,14 +17,8 @@ import numpy as np
 
 from warmprior.data.hdf5_images import image_size
 from warmprior.data.hdf5_members import DatasetError, member, names, reading
-from warmprior.data.index import (
-    BLOCK,
-    DatasetIndex,
-    check_count,
-    check_env_args,
-    store_finite,
-    task_of_env,
-)
+from warmprior.data.index import BLOCK, DatasetIndex, check_count, check_env_args, store_finite
+from warmprior.envs.tasks import task_of_env
 from warmprior.io.extras import require
 
 if TYPE_CHECKING:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from warmprior.data.hdf5_members import DatasetError
-from warmprior.envs.tasks import TASKS, TaskSpec
+from warmprior.envs.tasks import TaskSpec
 
-__all__ = ["BLOCK", "DatasetIndex", "check_count", "check_env_args", "store_finite", "task_of_env"]
+__all__ = ["BLOCK", "DatasetIndex", "check_count", "check_env_args", "store_finite"]
 
 BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
 LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
@@ -73,11 +72,6 @@ def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
         if not (isinstance(env_args, dict) and isinstance(env_args.get(key), kind)):
             raise DatasetError(f"{what} lacks {key}, or it is not a {kind.__name__}")
     return env_args
-
-
-def task_of_env(env_args: Mapping[str, Any]) -> TaskSpec | None:
-    """The task of :data:`warmprior.envs.TASKS` that uses an environment, or ``None``."""
-    return next((t for t in TASKS.values() if t.env_name == env_args["env_name"]), None)
 
 
 def check_count(path: Path, demos: int | None, available: int) -> None:

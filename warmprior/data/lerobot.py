@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from warmprior.data.lerobot_index import (
     read_metadata,
     vector_widths,
 )
-from warmprior.data.replay import DemonstrationReader, DemonstrationReplay, check_storage
+from warmprior.data.replay import DemonstrationReader, DemonstrationReplay
 from warmprior.io.extras import require
 from warmprior.io.hub import is_repository
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
@@ -236,11 +236,7 @@ class LeRobotExperienceReplay(DemonstrationReplay):
             are many.
         absolute_actions: see :class:`RobomimicExperienceReplay`; of numbers that were rounded to
             float32.
-        storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``.
-        scratch_dir: folder of the memory maps; temporary files if ``None``.
-        device: device of the tensors; ``"cpu"`` for ``"memmap"``.
-        **kwargs: further arguments of :class:`~torchrl.data.TensorDictReplayBuffer`, such as
-            ``batch_size``, ``sampler``, ``transform``, ``prefetch`` or ``generator``.
+        **kwargs: see :class:`RobomimicExperienceReplay`.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
@@ -272,12 +268,8 @@ class LeRobotExperienceReplay(DemonstrationReplay):
         observation_keys: Sequence[str] | None = None,
         image_keys: Sequence[str] = (),
         absolute_actions: bool = False,
-        storage: Literal["memory", "memmap"] = "memory",
-        scratch_dir: str | Path | None = None,
-        device: torch.device | str = "cpu",
         **kwargs: Any,
     ) -> None:
-        device = check_storage(storage, device)
         index = fetch_lerobot(
             dataset,
             revision=revision,
@@ -293,9 +285,6 @@ class LeRobotExperienceReplay(DemonstrationReplay):
             nullcontext(LeRobotReader(index)),
             described=f"{index.path / DESCRIPTION}: env_args" if index.described else "env_args",
             absolute_actions=absolute_actions,
-            storage=storage,
-            scratch_dir=scratch_dir,
-            device=device,
             **kwargs,
         )
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from warmprior.data.hdf5_members import DatasetError
-from warmprior.data.index import DatasetIndex, check_count, check_env_args, task_of_env
-from warmprior.envs.tasks import TaskSpec
+from warmprior.data.index import DatasetIndex, check_count, check_env_args
+from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, read_json
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +26,7 @@ from warmprior.envs.tasks import TaskSpec
 from warmprior.io.memory import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 
-__all__ = ["DemonstrationReader", "DemonstrationReplay", "check_storage"]
+__all__ = ["DemonstrationReader", "DemonstrationReplay"]
 
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
 
@@ -51,16 +51,6 @@ class DemonstrationReader(ABC):
     @abstractmethod
     def name(self, demo: str, key: str) -> str:
         """What errors call an array of a demo, with the file that holds it."""
-
-
-def check_storage(storage: str, device: torch.device | str) -> torch.device:
-    """The device, where it and the kind of storage go together; a ``ValueError`` otherwise."""
-    if storage not in ("memory", "memmap"):
-        raise ValueError(f"storage must be 'memory' or 'memmap', got {storage!r}")
-    device = torch.device(device)
-    if storage == "memmap" and device.type != "cpu":
-        raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
-    return device
 
 
 def _allocate(
@@ -240,13 +230,17 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         reader: AbstractContextManager[DemonstrationReader],
         *,
         described: str,
-        absolute_actions: bool,
-        storage: Literal["memory", "memmap"],
-        scratch_dir: str | Path | None,
-        device: torch.device | str,
+        absolute_actions: bool = False,
+        storage: Literal["memory", "memmap"] = "memory",
+        scratch_dir: str | Path | None = None,
+        device: torch.device | str = "cpu",
         **kwargs: Any,
     ) -> None:
-        device = check_storage(storage, device)
+        if storage not in ("memory", "memmap"):
+            raise ValueError(f"storage must be 'memory' or 'memmap', got {storage!r}")
+        device = torch.device(device)
+        if storage == "memmap" and device.type != "cpu":
+            raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
         action_dim = index.action_dim
         self._env_args: dict[str, Any] = {}
         if index.env_args or absolute_actions:
@@ -280,33 +274,23 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         """The file or folder that was read."""
         return self._index.path
 
-    def _check_described(self) -> None:
-        if not self._index.env_args:
+    def _described(self, env_args: Mapping[str, Any]) -> dict[str, Any]:
+        if not env_args:
             raise ValueError(f"{self.path} does not say which environment it was recorded in")
+        return modernize_env_args(env_args)
 
     @property
     def env_args(self) -> dict[str, Any]:
         """The environment of the data, for robosuite 1.5, fit for the actions as they are stored.
 
-        A copy; see :func:`warmprior.envs.modernize_env_args`.
-
-        Raises:
-            ValueError: if it is unknown.
+        A copy; see :func:`warmprior.envs.modernize_env_args`. A ``ValueError`` if it is unknown.
         """
-        self._check_described()
-        return modernize_env_args(self._env_args)
+        return self._described(self._env_args)
 
     @property
     def recorded_env_args(self) -> dict[str, Any]:
-        """The environment of the data, for robosuite 1.5, fit for the actions as they were recorded.
-
-        That is what :attr:`env_args` is where the actions are not absolute.
-
-        Raises:
-            ValueError: if it is unknown.
-        """
-        self._check_described()
-        return modernize_env_args(self._index.env_args)
+        """The same, fit for the actions as they were recorded, where those that are stored are absolute."""
+        return self._described(self._index.env_args)
 
     @property
     def task(self) -> TaskSpec | None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-__all__ = ["EVALUATION_SEED", "STYLES", "TASKS", "TaskSpec", "get_task", "low_dim_keys"]
+__all__ = ["EVALUATION_SEED", "STYLES", "TASKS", "TaskSpec", "get_task", "low_dim_keys", "task_of_env"]
 
 #: Simulator seed of the first evaluation episode. Demonstrations are generated from smaller ones,
 #: so a policy is never evaluated on an initial state it was trained on.
@@ -152,3 +154,8 @@ def get_task(name: str) -> TaskSpec:
     if name not in TASKS:
         raise ValueError(f"unknown task {name!r}; choose one of {', '.join(TASKS)}")
     return TASKS[name]
+
+
+def task_of_env(env_args: Mapping[str, Any]) -> TaskSpec | None:
+    """The task of :data:`TASKS` that uses an environment, or ``None``."""
+    return next((task for task in TASKS.values() if task.env_name == env_args["env_name"]), None)
