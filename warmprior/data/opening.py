@@ -98,20 +98,16 @@ def open_demonstrations(place: str | Path, env_args: Mapping[str, Any] | None = 
         place: an HDF5 file, or ``lerobot:`` and a folder or repository.
         env_args: of the environment, for a LeRobotDataset that does not describe its own.
 
-
     See Also:
         - :class:`~warmprior.data.opening.Demonstrations`: what it returns.
         - :func:`~warmprior.data.opening.check_place`: looks first, and reads nothing.
 
     Examples:
-        >>> found = open_demonstrations("lerobot:user/square")  # nothing is fetched yet
-        >>> type(found).__name__, found.name
-        ('LeRobotFolder', 'lerobot:square')
-        >>> open_demonstrations("data/square.hdf5").name
-        'square.hdf5'
+        >>> open_demonstrations("lerobot:user/square").name  # nothing is fetched yet
+        'lerobot:square'
     """
     dataset = _lerobot(place)
-    return RobomimicFile(place) if dataset is None else LeRobotFolder(dataset, env_args)
+    return _RobomimicFile(place) if dataset is None else _LeRobotFolder(dataset, env_args)
 
 
 class Demonstrations(ABC):
@@ -154,63 +150,51 @@ class Demonstrations(ABC):
         """
 
 
-class RobomimicFile(Demonstrations):
-    """The demonstrations of an HDF5 file."""
-
+class _RobomimicFile(Demonstrations):
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.name = self.path.name
 
     def index(self, **options: Any) -> DatasetIndex:
-        """What is there."""
         return read_index(self.path, **options)
 
     def replay(self, **options: Any) -> RobomimicExperienceReplay:
-        """Read them."""
         return RobomimicExperienceReplay(self.path, **options)
 
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        """SHA-256 of the whole file."""
         return file_digest(self.path)
 
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
-    ) -> RobomimicFile:
-        """This file, or one with its states rendered."""
+    ) -> _RobomimicFile:
         from warmprior.data.render import compare_images, render_demonstrations
 
         if set(cameras) <= set(self.index(demos=demos).cameras):
             compare_images(self.path, [f"{camera}_image" for camera in cameras], fast)
             return self
-        return RobomimicFile(render_demonstrations(self.path, cameras, size, demos=demos, fast=fast))
+        return _RobomimicFile(render_demonstrations(self.path, cameras, size, demos=demos, fast=fast))
 
 
-class LeRobotFolder(Demonstrations):
-    """The demonstrations of a LeRobotDataset: its folder, or its repository in the hub."""
-
+class _LeRobotFolder(Demonstrations):
     def __init__(self, dataset: str, env_args: Mapping[str, Any] | None = None) -> None:
         self.dataset, self.env_args = dataset, env_args
         self.name = f"{LEROBOT}{name_of_place(LEROBOT + dataset)}"
 
     def index(self, **options: Any) -> LeRobotIndex:
-        """What is there."""
         return find_lerobot(self.dataset, env_args=self.env_args, **options)
 
     def _fetched(self, **options: Any) -> LeRobotIndex:
         return fetch_lerobot(self.dataset, env_args=self.env_args, **options)
 
     def replay(self, **options: Any) -> LeRobotExperienceReplay:
-        """Read them."""
         return LeRobotExperienceReplay(self.dataset, env_args=self.env_args, **options)
 
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        """SHA-256 of the files that are read."""
         return self._fetched(image_keys=image_keys, demos=demos).digest()
 
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
-    ) -> LeRobotFolder:
-        """This dataset, whose images are compared with the simulator's; none can be rendered."""
+    ) -> _LeRobotFolder:
         from warmprior.data.render import compare_first_images
 
         keys = [f"{camera}_image" for camera in cameras]
