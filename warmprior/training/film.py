@@ -149,8 +149,9 @@ def record_filmstrip(
     if video is not None and (size < 2 or size % 2):  # the encoder takes pixels two by two
         raise ValueError(f"the side of a video must be an even number of pixels, got {size}")
     success = options.pop("success", SUCCESS)
-    frame: Callable[[Any, int], np.ndarray] = _resized
-    quick: Callable[[Any, int], np.ndarray] = _resized
+    frame: Callable[[Any, int], np.ndarray]
+    quick: Callable[[Any, int], np.ndarray]
+    frame = quick = _resized
     if env is None:
         require_rendering()
         env = environment_of(actor, **options)
@@ -158,11 +159,9 @@ def record_filmstrip(
         look = loop.state
         # In full quality a film, of a picture per control step, would take ten times as long as the episode.
         renderer, nq = EnvRenderers(loop.env, fast=True), loop.env.sim.model.nq
-        frame = lambda state, size: simulator.render_frame(size=size, state=state)  # noqa: E731
-        quick = (
-            lambda state, size: renderer.render(  # noqa: E731
-                simulator.cameras[0], size, size, state[1 : 1 + nq]
-            )
+        frame, quick = (
+            lambda state, size: simulator.render_frame(size=size, state=state),
+            lambda state, size: renderer.render(simulator.cameras[0], size, size, state[1 : 1 + nq]),
         )
         rate = rate or round(1 / loop.env.control_timestep)
     else:
