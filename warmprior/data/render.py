@@ -6,8 +6,7 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -138,7 +137,7 @@ def render_demonstrations(
             ) as bar,
         ):
             call(_Illustrator.check).result()  # before hours are spent
-            for future in as_completed([call(_Render(demo)) for demo in missing]):
+            for future in as_completed([call(partial(_Illustrator.render, demo=demo)) for demo in missing]):
                 future.result()
                 bar.update()
         write_atomic(out, lambda temporary: _write(temporary, illustrator, kept))
@@ -211,6 +210,20 @@ class _Illustrator:
         for camera in self.cameras:
             self.renderer.render(camera, self.positions(self.index.demos[0])[0])
 
+    def render(self, demo: str) -> None:
+        """Render all images of a demo."""
+        positions = self.positions(demo)
+        images = {
+            f"{camera}_image": np.stack([self.renderer.render(camera, q) for q in positions])
+            for camera in self.cameras
+        }
+
+        def write(path: Path) -> None:
+            with open(path, "wb") as file:
+                np.savez_compressed(file, **images)  # type: ignore[arg-type]
+
+        write_atomic(self.part(demo), write)
+
     def compare(self, state: np.ndarray, images: Mapping[str, np.ndarray], name: str, advice: str) -> None:
         """Compare images of a state, by camera, with the simulator's."""
         model = self.renderer.model
@@ -239,35 +252,6 @@ class _Illustrator:
                     f"{name}: the images of {camera} {view} ({as_stored:.0f} of 255 off on average). "
                     f"Policies would see other ones in evaluation: {advice}"
                 )
-
-
-@dataclass(frozen=True)
-class _Render:
-    demo: str
-
-    def __call__(self, illustrator: _Illustrator) -> None:
-        positions = illustrator.positions(self.demo)
-        images = {
-            f"{camera}_image": np.stack([illustrator.renderer.render(camera, q) for q in positions])
-            for camera in illustrator.cameras
-        }
-
-        def write(path: Path) -> None:
-            with open(path, "wb") as file:
-                np.savez_compressed(file, **images)  # type: ignore[arg-type]
-
-        write_atomic(illustrator.part(self.demo), write)
-
-
-@dataclass(frozen=True)
-class _Compare:
-    state: np.ndarray
-    images: Mapping[str, np.ndarray]
-    name: str
-    advice: str
-
-    def __call__(self, illustrator: _Illustrator) -> None:
-        illustrator.compare(self.state, self.images, self.name, self.advice)
 
 
 def _rendering(file: Any) -> dict[str, Any] | None:
@@ -380,4 +364,5 @@ def compare_first_images(
     illustrator = _Illustrator(index, tuple(by_camera), index.image_size, fast, path)
     # In a process of its own: one that has rendered cannot fork others that do.
     with working(1, illustrator) as call:
-        call(_Compare(state, by_camera, str(path), advice)).result()
+        compare = partial(_Illustrator.compare, state=state, images=by_camera, name=str(path), advice=advice)
+        call(compare).result()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import random
 import warnings
@@ -116,7 +117,7 @@ def task_env_args(task: str) -> dict[str, Any]:
         "reward_shaping": False,
         "controller_configs": {
             "type": "BASIC",
-            "body_parts": {"right": {key: _copy(value) for key, value in _ARM_CONTROLLER.items()}},
+            "body_parts": {"right": copy.deepcopy(_ARM_CONTROLLER)},
         },
     }
     if is_mimicgen(spec.env_name):
@@ -124,12 +125,6 @@ def task_env_args(task: str) -> dict[str, Any]:
     if spec.arms == 2:
         kwargs["env_configuration"] = "opposed"
     return {"env_name": spec.env_name, "env_version": "1.5.1", "type": 1, "env_kwargs": kwargs}
-
-
-def _copy(value: Any) -> Any:
-    if isinstance(value, dict):
-        return dict(value)
-    return list(value) if isinstance(value, list) else value
 
 
 def make_simulator(env_args: Mapping[str, Any]) -> Any:

@@ -38,13 +38,7 @@ JSON_BYTES = 2**28  # the largest results file is a hundredth of that
 
 
 def save_file(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | None = None) -> None:
-    """Write a safetensors file. (Imported here: ``import warmprior`` does not need the package.)
-
-    Tensors that share memory, such as tied weights, are written once each.
-
-    Raises:
-        OSError: if the file cannot be written.
-    """
+    """Write a safetensors file; tensors that share memory, such as tied weights, are written once each."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file as save
 

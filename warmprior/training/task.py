@@ -131,17 +131,9 @@ class Task:
     ) -> Self:
         """A task of your own, from raw demonstrations; the normaliser is fitted to them.
 
-        Args:
-            name: see above.
-            data: contiguous steps ``[N]`` in raw units: ``"observation"`` ``[N, d_o]``, ``"action"``
-                ``[N, d_a]`` and ``"episode"``, an integer ``[N]``.
-            make_env: see above; without one, policies are trained and not played.
-
-        Keyword Args:
-            style: see above.
-            success: see above.
-            measures: see above.
-            film_rate: see above.
+        Arguments are the attributes, but for the data: contiguous steps ``[N]`` in raw units, with
+        ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]`` and ``"episode"``, an integer ``[N]``.
+        Without ``make_env`` policies are trained and not played.
 
         Raises:
             KeyError: naming what the data lack.
