@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -21,6 +22,13 @@ from warmprior.io.workers import start_method  # noqa: E402
 # Timings on a shared machine say nothing: no test fails for being slow once.
 hypothesis.settings.register_profile("shared-machine", deadline=None)
 hypothesis.settings.load_profile("shared-machine")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forks_copy_little():
+    """Let garbage collectors of forks leave alone what was there before: they would copy all of it to look at."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
