@@ -26,6 +26,8 @@ SHOWN_ALONE = {
     "warmprior.modules.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",
     "warmprior.envs.mimicgen.register_mimicgen": "needs a package that is not on the package index",
+    "warmprior.io.processes.fresh_processes": "starts a process, for seconds",
+    "warmprior.io.processes.working": "starts a process, for seconds",
     "warmprior.io.ray_cluster.ray_cluster": "starts a cluster",
     "warmprior.rl.ray_collection.ray_rounds": "starts a cluster",
     "warmprior.lerobot.LeRobotActor": "needs a policy of LeRobot",

@@ -30,7 +30,7 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
         :func:`~warmprior.io.processes.working`: jobs on a state that the processes keep.
 
     Examples:
-        >>> with fresh_processes(1) as executor:
+        >>> with fresh_processes(1) as executor:  # doctest: +SKIP
         ...     executor.submit(pow, 2, 3).result()
         8
     """
@@ -82,7 +82,7 @@ def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]],
     Examples:
         >>> from functools import partial
         >>> from operator import add
-        >>> with working(1, 40) as call:
+        >>> with working(1, 40) as call:  # doctest: +SKIP
         ...     call(partial(add, 2)).result()
         42
     """
