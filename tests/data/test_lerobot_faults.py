@@ -172,7 +172,7 @@ def test_bad_images_are_named(root, name):
 
 def test_bad_options(root):
     with pytest.raises(ValueError, match="'disk'"):
-        LeRobotExperienceReplay("user/never-fetched", storage="disk")
+        LeRobotExperienceReplay(root, storage="disk")
     with pytest.raises(FileNotFoundError, match=r"no meta/info\.json there"):
         LeRobotExperienceReplay(root / "absent")
     with pytest.raises(DatasetError, match="there are 3 demonstrations, fewer than the 4"):
