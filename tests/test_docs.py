@@ -163,18 +163,7 @@ def built(tmp_path_factory) -> Path:
     run_all = ["-D", "sphinx_gallery_conf.run_stale_examples=True"]
     apart = ["-d", str(tmp_path_factory.mktemp("doctrees"))]
     subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "sphinx",
-            "-W",
-            "--keep-going",
-            "-q",
-            *run_all,
-            *apart,
-            str(DOCS),
-            str(out),
-        ],
+        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", *run_all, *apart, str(DOCS), str(out)],
         check=True,
     )
     return out

@@ -9,17 +9,7 @@ from pathlib import Path
 
 import warmprior
 
-OPTIONAL = (
-    "robosuite",
-    "lerobot",
-    "h5py",
-    "matplotlib",
-    "scipy",
-    "numba",
-    "gymnasium",
-    "mujoco",
-    "tyro",
-)
+OPTIONAL = ("robosuite", "lerobot", "h5py", "matplotlib", "scipy", "numba", "gymnasium", "mujoco", "tyro")
 
 BLOCK = """
 import sys

@@ -115,11 +115,7 @@ def test_a_broken_file_is_refused_and_does_not_stay_in_the_way(hub, content, tmp
     [
         (download_robomimic, ["stack"], "choose one of lift, can, square, transport, tool_hang"),
         (download_robomimic, ["lift", "mg"], "'mg' data; it has: ph, mh"),
-        (
-            download_mimicgen,
-            ["square"],
-            r"\(download_robomimic has square\); choose one of stack_d0",
-        ),
+        (download_mimicgen, ["square"], r"\(download_robomimic has square\); choose one of stack_d0"),
         (download_mimicgen, ["coffee_d0", "ph"], "no official 'ph' data; it has: source, core"),
     ],
 )

@@ -18,11 +18,7 @@ import h5py
 
 from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
-from warmprior.data import (
-    DatasetError,
-    RobomimicExperienceReplay,
-    render_demonstrations,
-)
+from warmprior.data import DatasetError, RobomimicExperienceReplay, render_demonstrations
 from warmprior.data import render as render_module
 from warmprior.data.render import compare_images
 from warmprior.envs import RobosuiteEnv, rendering_backend

@@ -33,11 +33,7 @@ def policy(function, prior=None, seed=0, **options):
 def batch(n=5, length=H, d_a=D_A, **extra):
     torch.manual_seed(1)
     data = TensorDict(
-        {
-            "observation": torch.randn(n, 1, 4),
-            "history": cold_history([n], min(H, length), length, d_a),
-        },
-        [n],
+        {"observation": torch.randn(n, 1, 4), "history": cold_history([n], min(H, length), length, d_a)}, [n]
     )
     return data.update(extra)
 

@@ -75,12 +75,7 @@ def _compiled():
 
 
 @pytest.mark.parametrize(
-    "network",
-    [
-        lambda: Tied(2, 3, 4, hidden_dim=8),
-        _compiled,
-    ],
-    ids=["tied", "compiled"],
+    "network", [lambda: Tied(2, 3, 4, hidden_dim=8), _compiled], ids=["tied", "compiled"]
 )
 def test_users_networks_are_saved_resumed_and_loaded(tmp_path, network):
     def build():

@@ -190,10 +190,7 @@ def test_damage_is_noticed(tmp_path, damage):
     ("change", "said"),
     [
         (lambda t, c: t.pop(ACTION), f"{ACTION} is missing"),
-        (
-            lambda t, c: t.update({ACTION: torch.ones(9)}),
-            rf"{ACTION} is \(9,\) of torch.float32, not",
-        ),
+        (lambda t, c: t.update({ACTION: torch.ones(9)}), rf"{ACTION} is \(9,\) of torch.float32, not"),
         (lambda t, c: c["network"].update(name="evil:Net"), "unknown"),
         (lambda t, c: c["actor"].update(nfe=0), "nfe"),
         (lambda t, c: c.pop("prior"), "KeyError"),

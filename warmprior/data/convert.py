@@ -18,14 +18,7 @@ from tqdm import tqdm
 from warmprior.data.hdf5 import open_robomimic, read_index, read_masks
 from warmprior.data.hdf5_members import DatasetError, member
 from warmprior.data.index import DatasetIndex
-from warmprior.data.lerobot_index import (
-    DESCRIPTION,
-    REWARD,
-    SUCCESS,
-    action_names,
-    layout_of,
-    state_names,
-)
+from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
@@ -179,11 +172,7 @@ def _write(
         storage="memmap" if images else "memory",
     ).data
     dataset = datasets.LeRobotDataset.create(
-        f"local/{root.name}",
-        fps,
-        _features(index, layout, images),
-        root=root,
-        use_videos=images == "video",
+        f"local/{root.name}", fps, _features(index, layout, images), root=root, use_videos=images == "video"
     )
     numbers = {
         "action": data[ACTION],
@@ -197,11 +186,7 @@ def _write(
         numbers[feature] = torch.cat([parts[key] for key in widths], -1)
     rows = np.cumsum([0, *index.lengths])
     bar = tqdm(
-        pairwise(rows),
-        f"convert {index.path.stem}",
-        len(index.lengths),
-        unit="demo",
-        disable=not progress,
+        pairwise(rows), f"convert {index.path.stem}", len(index.lengths), unit="demo", disable=not progress
     )
     with quietly():
         try:

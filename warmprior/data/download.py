@@ -29,11 +29,7 @@ MIMICGEN_REPOSITORY = "amandlek/mimicgen_datasets"
 
 
 def download_robomimic(
-    task: str,
-    style: str = "ph",
-    *,
-    root: str | Path | None = None,
-    force: bool = False,
+    task: str, style: str = "ph", *, root: str | Path | None = None, force: bool = False
 ) -> Path:
     """Download an official low-dimensional file, unless it is there already.
 
@@ -73,11 +69,7 @@ def download_robomimic(
 
 
 def download_mimicgen(
-    task: str,
-    style: str = "source",
-    *,
-    root: str | Path | None = None,
-    force: bool = False,
+    task: str, style: str = "source", *, root: str | Path | None = None, force: bool = False
 ) -> Path:
     """Download an official file of MimicGen, unless it is there already.
 
@@ -188,12 +180,7 @@ def _check_official(task: str, style: str, *, mimicgen: bool) -> None:
         raise ValueError(f"{task} has no official {style!r} data; it has: {known}")
 
 
-def _download(
-    name: str,
-    repositories: Sequence[str],
-    root: str | Path | None,
-    force: bool,
-) -> Path:
+def _download(name: str, repositories: Sequence[str], root: str | Path | None, force: bool) -> Path:
     """Fetch and check a file of the first repository that delivers it."""
     hub = require("huggingface_hub", "sim")
     require("h5py", "sim")

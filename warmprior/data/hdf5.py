@@ -24,14 +24,7 @@ from warmprior.io.extras import require
 if TYPE_CHECKING:
     import h5py
 
-__all__ = [
-    "DatasetError",
-    "open_robomimic",
-    "read_env_args",
-    "read_index",
-    "read_masks",
-    "read_rows",
-]
+__all__ = ["DatasetError", "open_robomimic", "read_env_args", "read_index", "read_masks", "read_rows"]
 
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."

@@ -102,10 +102,7 @@ class _Columns:
             arrow = require("pyarrow", "lerobot")
             parquet = require("pyarrow.parquet", "lerobot")
             table = parquet.read_table(self.root / self._file, columns=[name])
-            column, width = (
-                table.column(name).combine_chunks(),
-                self.metadata.features[name]["shape"][0],
-            )
+            column, width = (table.column(name).combine_chunks(), self.metadata.features[name]["shape"][0])
             if hasattr(column, "flatten") and arrow.types.is_nested(column.type):
                 # The cast refuses rows of another length.
                 column = column.cast(arrow.list_(column.type.value_type, width)).flatten()
@@ -290,9 +287,7 @@ class LeRobotExperienceReplay(DemonstrationReplay):
 
 
 def lerobot_steps(
-    dataset: str | Path,
-    observation_keys: Sequence[str] = ("observation.state",),
-    action_key: str = "action",
+    dataset: str | Path, observation_keys: Sequence[str] = ("observation.state",), action_key: str = "action"
 ) -> TensorDict:
     """Read the steps of a LeRobotDataset of any robot, in raw units.
 

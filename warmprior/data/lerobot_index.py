@@ -248,10 +248,7 @@ def read_lerobot_index(
         elif not described:
             observation_keys = [key for key in (ENVIRONMENT_STATE, ROBOT_STATE) if key in columns]
     arms = range(min(widths["action"] // 7, 2)) if poses else ()
-    for key in [
-        *observation_keys,
-        *(f"robot{a}_eef_{end}" for a in arms for end in ("pos", "quat")),
-    ]:
+    for key in [*observation_keys, *(f"robot{a}_eef_{end}" for a in arms for end in ("pos", "quat"))]:
         if key not in columns:
             raise DatasetError(
                 f"{root}: there is no observation {key!r} among {', '.join(columns)}: choose others with "

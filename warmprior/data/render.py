@@ -21,14 +21,7 @@ from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer, require_rendering
 from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
 from warmprior.io.extras import require
-from warmprior.io.files import (
-    cache_folder,
-    check_writable,
-    digest_of,
-    exclusive,
-    file_digest,
-    write_atomic,
-)
+from warmprior.io.files import cache_folder, check_writable, digest_of, exclusive, file_digest, write_atomic
 from warmprior.io.processes import working
 from warmprior.io.workers import available_cores
 
@@ -356,8 +349,7 @@ def compare_first_images(
         )
     if state is None:
         warnings.warn(
-            f"{path} holds no states: its images could not be compared with the simulator's",
-            stacklevel=2,
+            f"{path} holds no states: its images could not be compared with the simulator's", stacklevel=2
         )
         return
     by_camera = {key.removesuffix("_image"): image for key, image in images.items()}

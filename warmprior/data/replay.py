@@ -113,11 +113,7 @@ def _reserve(mapped: Any) -> None:
 
 
 def _read_absolute(
-    reader: DemonstrationReader,
-    demo: str,
-    out: np.ndarray,
-    output_max: Tensor,
-    base_rotation: Tensor,
+    reader: DemonstrationReader, demo: str, out: np.ndarray, output_max: Tensor, base_rotation: Tensor
 ) -> None:
     arms = len(base_rotation)
     for first in range(0, len(out), BLOCK):

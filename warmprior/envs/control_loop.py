@@ -22,14 +22,7 @@ __all__ = ["ControlLoop", "StepLoop"]
 
 Observations = dict[str, np.ndarray]
 
-OBJECT_POSES = {
-    "Lift",
-    "NutAssemblySquare",
-    "PickPlaceCan",
-    "Stack",
-    "ToolHang",
-    "TwoArmTransport",
-}
+OBJECT_POSES = {"Lift", "NutAssemblySquare", "PickPlaceCan", "Stack", "ToolHang", "TwoArmTransport"}
 """Environments whose ``"object"`` observation follows from positions alone."""
 
 
@@ -164,11 +157,7 @@ class ControlLoop(StepLoop):
     def _bind(self) -> None:
         super()._bind()
         nv = self._model.nv
-        self._mass, self._jacp, self._jacr = (
-            np.zeros((nv, nv)),
-            np.zeros((3, nv)),
-            np.zeros((3, nv)),
-        )
+        self._mass, self._jacp, self._jacr = (np.zeros((nv, nv)), np.zeros((3, nv)), np.zeros((3, nv)))
         self._substeps = int(self.env.control_timestep / self.env.model_timestep)
         data = self._data
         self._site_pos, self._site_mat = data.site_xpos, data.site_xmat.reshape(-1, 3, 3)

@@ -90,9 +90,7 @@ def robosuite_parts(
     return partial(RobosuiteEnv, **options), transforms
 
 
-def environment_parts(
-    actor: WarmPriorActor,
-) -> tuple[Callable[..., RobosuiteEnv], Callable[[], Compose]]:
+def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv], Callable[[], Compose]]:
     """What builds the environment that a policy was made for, and what builds the policy's transforms.
 
     Functions of further options of :class:`RobosuiteEnv`, and of nothing. A ``ValueError`` if the policy

@@ -78,12 +78,7 @@ class Arm:
         ctrl[self.fingers] = self.finger_middle + self.finger_range * fingers
 
     def remembered(
-        self,
-        jacp: np.ndarray,
-        jacr: np.ndarray,
-        mass: np.ndarray,
-        qvel: np.ndarray,
-        qpos: np.ndarray,
+        self, jacp: np.ndarray, jacr: np.ndarray, mass: np.ndarray, qvel: np.ndarray, qpos: np.ndarray
     ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """Replace the simulator's values by those that the controller measured during the reset.
 

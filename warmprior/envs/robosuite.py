@@ -16,12 +16,7 @@ from warmprior import keys
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import EnvRenderers, require_rendering
-from warmprior.envs.simulator import (
-    action_limits,
-    import_robosuite,
-    make_simulator,
-    task_env_args,
-)
+from warmprior.envs.simulator import action_limits, import_robosuite, make_simulator, task_env_args
 from warmprior.envs.tasks import STYLES, task_of_env
 from warmprior.envs.tasks import low_dim_keys as default_keys
 

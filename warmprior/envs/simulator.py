@@ -17,13 +17,7 @@ from warmprior.envs.mimicgen import is_mimicgen, register_mimicgen
 from warmprior.envs.tasks import get_task
 from warmprior.io.extras import require
 
-__all__ = [
-    "action_limits",
-    "import_robosuite",
-    "isolated_numpy_seed",
-    "make_simulator",
-    "task_env_args",
-]
+__all__ = ["action_limits", "import_robosuite", "isolated_numpy_seed", "make_simulator", "task_env_args"]
 
 # Sizes drawn when a model is loaded (Lift's cube, Transport's hammer) must be the same in every
 # process, or the same seed would mean different episodes.
@@ -115,10 +109,7 @@ def task_env_args(task: str) -> dict[str, Any]:
         "camera_widths": 84,
         "lite_physics": True,
         "reward_shaping": False,
-        "controller_configs": {
-            "type": "BASIC",
-            "body_parts": {"right": copy.deepcopy(_ARM_CONTROLLER)},
-        },
+        "controller_configs": {"type": "BASIC", "body_parts": {"right": copy.deepcopy(_ARM_CONTROLLER)}},
     }
     if is_mimicgen(spec.env_name):
         del kwargs["lite_physics"]  # some of its tasks refuse the argument

@@ -104,12 +104,7 @@ TASKS: dict[str, TaskSpec] = {
             700,
             1100,
             41,
-            cameras=(
-                "shouldercamera0",
-                "shouldercamera1",
-                "robot0_eye_in_hand",
-                "robot1_eye_in_hand",
-            ),
+            cameras=("shouldercamera0", "shouldercamera1", "robot0_eye_in_hand", "robot1_eye_in_hand"),
         ),
         TaskSpec(
             "tool_hang",

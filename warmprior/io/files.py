@@ -226,8 +226,7 @@ def exclusive(directory: Path) -> Iterator[None]:
             ) from None
         except OSError as error:
             warnings.warn(
-                f"{directory} cannot be locked ({error}): let one process at a time use it",
-                stacklevel=3,
+                f"{directory} cannot be locked ({error}): let one process at a time use it", stacklevel=3
             )
         yield
     finally:

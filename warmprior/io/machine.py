@@ -11,16 +11,7 @@ import torch
 
 __all__ = ["facts_of_machine"]
 
-PACKAGES = (
-    "warmprior",
-    "torch",
-    "torchrl",
-    "tensordict",
-    "robosuite",
-    "mujoco",
-    "numpy",
-    "lerobot",
-)
+PACKAGES = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "numpy", "lerobot")
 
 
 def facts_of_machine(**more: Any) -> dict[str, Any]:

@@ -57,10 +57,7 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
 
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return require("loky", "sim").ProcessPoolExecutor(
-        max_workers=count,
-        env={**threads, **(env or {})},
-        initializer=begin,
-        initargs=(os.getpid(),),
+        max_workers=count, env={**threads, **(env or {})}, initializer=begin, initargs=(os.getpid(),)
     )
 
 

@@ -10,14 +10,7 @@ from functools import cache
 
 import torch
 
-__all__ = [
-    "WorkerError",
-    "available_cores",
-    "end_with_parent",
-    "start_method",
-    "stop_forking",
-    "worker_died",
-]
+__all__ = ["WorkerError", "available_cores", "end_with_parent", "start_method", "stop_forking", "worker_died"]
 
 _forks = True
 

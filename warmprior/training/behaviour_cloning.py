@@ -250,11 +250,7 @@ class BehaviourCloning:
         self.iteration += 1
         return loss.detach()
 
-    def run(
-        self,
-        description: str | None = "train",
-        progress: Callable[[int], object] | None = None,
-    ) -> None:
+    def run(self, description: str | None = "train", progress: Callable[[int], object] | None = None) -> None:
         """Train to the end.
 
         Args:
@@ -367,8 +363,7 @@ class BehaviourCloning:
         averaged = cast(Any, self.ema.module)
         prior = self.actor.prior
         return self.actor.replace(
-            network=averaged["network"],
-            prior=averaged["prior"] if isinstance(prior, nn.Module) else prior,
+            network=averaged["network"], prior=averaged["prior"] if isinstance(prior, nn.Module) else prior
         )
 
     def _save(self) -> None:
@@ -414,10 +409,7 @@ class BehaviourCloning:
         self.losses = [(i, float(loss)) for i, loss in facts["losses"]]
         self.schedule.last_epoch = self.iteration
         for group, base, factor in zip(
-            self.optimizer.param_groups,
-            self.schedule.base_lrs,
-            self.schedule.lr_lambdas,
-            strict=True,
+            self.optimizer.param_groups, self.schedule.base_lrs, self.schedule.lr_lambdas, strict=True
         ):
             group["lr"] = base * factor(self.iteration)
         self._running = list(tensors["running"].to(self.generator.device))

@@ -107,9 +107,7 @@ class _StridedEnv(ParallelEnv):
 
 
 def parallel_env(
-    make_env: Callable[..., EnvBase],
-    make_transforms: Callable[[], Compose],
-    num_envs: int,
+    make_env: Callable[..., EnvBase], make_transforms: Callable[[], Compose], num_envs: int
 ) -> ParallelEnv:
     """Environments in worker processes, with the policy's transforms inside the workers.
 

@@ -72,12 +72,7 @@ def _check_format(path: Path, config: Any) -> None:
         )
 
 
-def _folder(
-    place: str | Path,
-    *,
-    revision: str | None = None,
-    token: str | None = None,
-) -> Path:
+def _folder(place: str | Path, *, revision: str | None = None, token: str | None = None) -> Path:
     """Where the files of a policy lie, fetched from the hub if need be."""
     path = Path(place)
     if path.exists() or not (isinstance(place, str) and is_repository(place)):

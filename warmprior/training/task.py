@@ -34,15 +34,7 @@ from warmprior.training.identity import data_digest
 from warmprior.training.options import DataOptions, is_simulated
 from warmprior.transforms.absolute_actions import AbsoluteActions
 
-__all__ = [
-    "Task",
-    "find_tasks",
-    "load_task",
-    "navigation_task",
-    "read_like",
-    "robosuite_task",
-    "task_places",
-]
+__all__ = ["Task", "find_tasks", "load_task", "navigation_task", "read_like", "robosuite_task", "task_places"]
 
 
 @dataclass(frozen=True)

@@ -12,13 +12,7 @@ from typing import Any
 from torchrl._utils import logger
 from tqdm import tqdm
 
-from warmprior.data.scripted.episode import (
-    PLANS,
-    Episode,
-    expert_loop,
-    operator_of,
-    run_episode,
-)
+from warmprior.data.scripted.episode import PLANS, Episode, expert_loop, operator_of, run_episode
 from warmprior.data.scripted.operators import OPERATORS
 from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs.control_loop import ControlLoop
