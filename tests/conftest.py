@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 import hypothesis
 import pytest
@@ -16,11 +18,19 @@ import torch
 # forked after that would wait for threads that it lacks: so before it is imported.
 torch.set_num_threads(1)
 
+from tests.processes import here  # noqa: E402
 from warmprior.io.workers import start_method  # noqa: E402
 
 # Timings on a shared machine say nothing: no test fails for being slow once.
 hypothesis.settings.register_profile("shared-machine", deadline=None)
 hypothesis.settings.load_profile("shared-machine")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def forks_copy_little():
+    """Let the garbage collectors of forks leave alone what was there: to look at it copies it."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +51,8 @@ def lift_demonstrations(tmp_path_factory):
 
     folder = tmp_path_factory.getbasetemp()
     folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
-    with FileLock(folder / "demonstrations.lock"):
+    generate = "warmprior.data.scripted.generate"
+    with FileLock(folder / "demonstrations.lock"), patch(f"{generate}.working", here):
         return generate_demonstrations(
             "lift", n=3, cache_dir=folder / "demonstrations", workers=1, progress=False
         )

@@ -6,6 +6,8 @@ import functools
 import gc
 import multiprocessing
 import traceback
+from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
 
 from warmprior.io.workers import end_with_parent
@@ -51,3 +53,18 @@ def apart(function):
         return result
 
     return call
+
+
+@contextmanager
+def here(count, state):
+    """:func:`~warmprior.io.processes.working` in this process, where others would take seconds to start."""
+
+    def call(job):
+        future = Future()
+        try:
+            future.set_result(job(state))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+    yield call

@@ -26,6 +26,8 @@ SHOWN_ALONE = {
     "warmprior.modules.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",
     "warmprior.envs.mimicgen.register_mimicgen": "needs a package that is not on the package index",
+    "warmprior.io.processes.fresh_processes": "starts a process, for seconds",
+    "warmprior.io.processes.working": "starts a process, for seconds",
     "warmprior.io.ray_cluster.ray_cluster": "starts a cluster",
     "warmprior.rl.ray_collection.ray_rounds": "starts a cluster",
     "warmprior.lerobot.LeRobotActor": "needs a policy of LeRobot",
@@ -161,18 +163,7 @@ def built(tmp_path_factory) -> Path:
     run_all = ["-D", "sphinx_gallery_conf.run_stale_examples=True"]
     apart = ["-d", str(tmp_path_factory.mktemp("doctrees"))]
     subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "sphinx",
-            "-W",
-            "--keep-going",
-            "-q",
-            *run_all,
-            *apart,
-            str(DOCS),
-            str(out),
-        ],
+        [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", *run_all, *apart, str(DOCS), str(out)],
         check=True,
     )
     return out

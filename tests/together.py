@@ -9,6 +9,7 @@ import torch
 import torch.multiprocessing
 
 from warmprior.io.distributed import joined
+from warmprior.io.workers import start_method
 
 
 def _run(number, processes, port, job, folder):
@@ -30,4 +31,6 @@ def together(job, folder, processes=2, join=True):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    return torch.multiprocessing.spawn(_run, (processes, port, job, folder), nprocs=processes, join=join)
+    return torch.multiprocessing.start_processes(
+        _run, (processes, port, job, folder), processes, join, start_method=start_method()
+    )

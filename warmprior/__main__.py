@@ -17,14 +17,7 @@ from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import make
-from warmprior.training import (
-    DataOptions,
-    NetworkOptions,
-    Task,
-    TrainingConfig,
-    find_tasks,
-    train_policy,
-)
+from warmprior.training import DataOptions, NetworkOptions, Task, TrainingConfig, find_tasks, train_policy
 from warmprior.training.behaviour_cloning import policy_path
 
 
@@ -96,12 +89,7 @@ def evaluate(args: argparse.Namespace) -> None:
     )
     if args.video is not None:
         outcome = record_video(
-            actor,
-            args.video,
-            seed=args.first_seed,
-            nfe=nfe,
-            policy_seed=args.policy_seed,
-            **options,
+            actor, args.video, seed=args.first_seed, nfe=nfe, policy_seed=args.policy_seed, **options
         )
         print(f"{args.video}: episode {args.first_seed}, {'' if outcome else 'not '}solved")
 

@@ -35,16 +35,9 @@ def _check_width(value: Tensor, width: int, what: str) -> None:
 
 
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
-    """Turn ``(x, y, z, w)`` quaternions into rotation matrices.
+    """Turn ``(x, y, z, w)`` quaternions ``[..., 4]`` into rotation matrices ``[..., 3, 3]``.
 
-    Args:
-        quaternion: ``[..., 4]``; normalised here, so any non-zero length will do.
-
-    Returns:
-        ``[..., 3, 3]``.
-
-    Raises:
-        ValueError: if the last dimension is not 4.
+    They are normalised here, so any non-zero length will do.
 
     Examples:
         >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 1.0, 1.0])).round(decimals=3)
@@ -63,59 +56,20 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 
 
 def rotvec_to_matrix(rotvec: Tensor) -> Tensor:
-    """Turn rotation vectors (axis times angle in radians) into rotation matrices.
-
-    Args:
-        rotvec: ``[..., 3]`` in radians.
-
-    Returns:
-        ``[..., 3, 3]``.
-
-    Raises:
-        ValueError: if the last dimension is not 3.
-        ImportError: if scipy is not installed.
-
-    Examples:
-        >>> rotvec_to_matrix(torch.zeros(3))
-        tensor([[1., 0., 0.],
-                [0., 1., 0.],
-                [0., 0., 1.]])
-    """
+    """Turn rotation vectors (axis times angle in radians) ``[..., 3]`` into matrices ``[..., 3, 3]``."""
     _check_width(rotvec, 3, "a rotation vector")
     return _by_scipy("from_rotvec", rotvec, "as_matrix", (3,))
 
 
 def matrix_to_rotvec(matrix: Tensor) -> Tensor:
-    """Turn rotation matrices into rotation vectors of length at most pi.
-
-    Args:
-        matrix: ``[..., 3, 3]`` rotation matrices.
-
-    Returns:
-        ``[..., 3]`` in radians.
-
-    Raises:
-        ValueError: if the last dimensions are not ``(3, 3)``.
-
-    Examples:
-        >>> half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
-        >>> matrix_to_rotvec(half_turn)
-        tensor([3.1416, 0.0000, 0.0000])
-    """
+    """Turn rotation matrices ``[..., 3, 3]`` into rotation vectors ``[..., 3]`` of length at most pi."""
     if matrix.shape[-2:] != (3, 3):
         raise ValueError(f"a rotation matrix needs shape [..., 3, 3], got {matrix.shape}")
     return _by_scipy("from_matrix", matrix, "as_rotvec", (3, 3))
 
 
 def _by_scipy(read: str, value: Tensor, write: str, form: tuple[int, ...]) -> Tensor:
-    """What scipy's ``Rotation`` makes of one form of rotations, without gradients.
-
-    Args:
-        read: the class method that takes the form.
-        value: ``[..., *form]``.
-        write: the method that gives the other.
-        form: the shape of one rotation.
-    """
+    """What scipy's ``Rotation`` makes of one form of rotations, ``[..., *form]``, without gradients."""
     rotations = require("scipy.spatial.transform", "sim").Rotation
     flat = value.detach().reshape(-1, *form).cpu().double().numpy()
     found = torch.from_numpy(getattr(getattr(rotations, read)(flat), write)()).to(value)
@@ -123,21 +77,7 @@ def _by_scipy(read: str, value: Tensor, write: str, form: tuple[int, ...]) -> Te
 
 
 def matrix_to_rotation_6d(matrix: Tensor) -> Tensor:
-    """Keep the first two rows of rotation matrices.
-
-    Args:
-        matrix: ``[..., 3, 3]`` rotation matrices.
-
-    Returns:
-        ``[..., 6]``.
-
-    Raises:
-        ValueError: if the last dimensions are not ``(3, 3)``.
-
-    Examples:
-        >>> matrix_to_rotation_6d(torch.eye(3))
-        tensor([1., 0., 0., 0., 1., 0.])
-    """
+    """Keep the first two rows of rotation matrices ``[..., 3, 3]``: ``[..., 6]``."""
     if matrix.shape[-2:] != (3, 3):
         raise ValueError(f"a rotation matrix needs shape [..., 3, 3], got {matrix.shape}")
     return matrix[..., :2, :].flatten(-2)
@@ -146,15 +86,7 @@ def matrix_to_rotation_6d(matrix: Tensor) -> Tensor:
 def rotation_6d_to_matrix(rotation_6d: Tensor) -> Tensor:
     """Turn any six numbers into the rotation matrix they mean, by Gram-Schmidt.
 
-    Args:
-        rotation_6d: ``[..., 6]``, two rows that need be neither of unit length nor orthogonal, but
-            not parallel.
-
-    Returns:
-        ``[..., 3, 3]``.
-
-    Raises:
-        ValueError: if the last dimension is not 6.
+    The two rows in ``[..., 6]`` need be neither of unit length nor orthogonal, but not parallel.
 
     Examples:
         >>> rotation_6d_to_matrix(torch.tensor([2.0, 0.0, 0.0, 1.0, 3.0, 0.0]))

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from warmprior.io.scheduling import scheduled_as_before
+from warmprior.data.convert import quietly
 
 WIDTHS = {"observation.environment_state": 10, "observation.state": 9, "action": 7}
 """Those of lift."""
@@ -60,7 +60,7 @@ def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, see
                 written[name].append(value)
             frame |= {name: scene(episode, step) for name in cameras}
             dataset.add_frame(frame | {"task": "lift"})
-        with scheduled_as_before():
+        with quietly():
             dataset.save_episode()
     dataset.finalize()
     return {name: np.stack(values) for name, values in written.items()}

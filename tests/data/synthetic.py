@@ -10,6 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from warmprior.envs.simulator import task_env_args
 from warmprior.envs.tasks import get_task
 
 OSC_14 = {
@@ -60,23 +61,8 @@ def env_args_14(task: str) -> dict[str, Any]:
 
 def env_args_15(task: str, frame: str = "world") -> dict[str, Any]:
     """The ``env_args`` of a robomimic file recorded with robosuite 1.5."""
-    meta = env_args_14(task)
-    arm = {k: v for k, v in OSC_14.items() if k not in ("damping", "damping_limits")}
-    del arm["control_delta"]
-    arm |= {
-        "damping_ratio": 1,
-        "damping_ratio_limits": [0, 10],
-        "input_type": "delta",
-        "input_ref_frame": frame,
-        "gripper": {"type": "GRIP"},
-    }
-    meta["env_version"] = "1.5.1"
-    meta["env_kwargs"] |= {
-        "controller_configs": {"type": "BASIC", "body_parts": {"right": arm}},
-        "lite_physics": True,
-    }
-    if get_task(task).arms == 2:
-        meta["env_kwargs"]["env_configuration"] = "opposed"
+    meta = task_env_args(task)
+    meta["env_kwargs"]["controller_configs"]["body_parts"]["right"]["input_ref_frame"] = frame
     return meta
 
 

@@ -71,10 +71,7 @@ def test_both_buffers_hold_the_same(converted, options):
     path, folders = converted
     theirs, mine = (
         kind(place, **options)
-        for kind, place in (
-            (RobomimicExperienceReplay, path),
-            (LeRobotExperienceReplay, folders["image"]),
-        )
+        for kind, place in ((RobomimicExperienceReplay, path), (LeRobotExperienceReplay, folders["image"]))
     )
     assert not equal(mine.data, theirs.data)
     assert mine.env_args == theirs.env_args and mine.task is theirs.task

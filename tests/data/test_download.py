@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from collections import Counter
 
 import pytest
@@ -12,7 +11,7 @@ from warmprior.data.download import REPOSITORIES, download_mimicgen, download_ro
 
 pytest.importorskip("huggingface_hub")
 
-FIRST, MIRROR = REPOSITORIES
+FIRST = REPOSITORIES[0]
 FILE = "v1.5/square/ph/low_dim_v15.hdf5"
 
 
@@ -26,7 +25,6 @@ class Hub(Loopback):
     def __init__(self) -> None:
         self.files: dict[tuple[str, str], tuple[int, bytes]] = {}
         self.missing = "RepoNotFound"
-        self.delay = 0.0
         self.sent: dict[str, bytes] = {}  # by repository, instead of what is announced
         self.requests: Counter[tuple[str, str]] = Counter()
         super().__init__()
@@ -47,7 +45,6 @@ class Hub(Loopback):
         announced, content = found
         digest = hashlib.sha256(content).hexdigest()
         content = self.sent.get(repository, content)
-        time.sleep(self.delay if body else 0.0)
         request.send_response(200)
         request.send_header("ETag", f'"{digest}"')
         request.send_header("X-Repo-Commit", "a" * 40)
@@ -63,8 +60,8 @@ class Hub(Loopback):
 
 @pytest.fixture
 def hub(monkeypatch):
-    reachable(monkeypatch)
     server = Hub()
+    reachable(monkeypatch, server.address)
     yield server
     server.close()
 
@@ -78,14 +75,13 @@ def content(tmp_path_factory) -> bytes:
 
 def test_is_fetched_once(hub, content, tmp_path):
     hub.put(FIRST, content)
-    options = {"root": tmp_path, "endpoint": hub.address}
-    path = download_robomimic("square", **options)
-    assert download_robomimic("square", **options) == path
+    path = download_robomimic("square", root=tmp_path)
+    assert download_robomimic("square", root=tmp_path) == path
     assert hub.requests["GET", FIRST] == 1
-    download_robomimic("square", force=True, **options)
+    download_robomimic("square", force=True, root=tmp_path)
     assert hub.requests["GET", FIRST] == 2
     hub.close()  # what is there serves without a connection
-    assert download_robomimic("square", **options) == path
+    assert download_robomimic("square", root=tmp_path) == path
 
 
 BROKEN = {
@@ -104,26 +100,14 @@ def test_a_broken_file_is_refused_and_does_not_stay_in_the_way(hub, content, tmp
             hub.sent[repository] = change(content)
         else:
             hub.put(repository, change(content), len(content) if announced else None)
-    options = {"root": tmp_path, "endpoint": hub.address}
     with pytest.raises(OSError, match=rf"(?s){said}.*force=True"):
-        download_robomimic("square", **options)
+        download_robomimic("square", root=tmp_path)
     hub.sent = {}
     hub.put(FIRST, content)
-    path = download_robomimic("square", **options)
+    path = download_robomimic("square", root=tmp_path)
     assert path.read_bytes() == content
     path.write_bytes(change(content))  # on the disk, afterwards
-    assert download_robomimic("square", **options).read_bytes() == content
-
-
-def test_a_server_that_never_ends_is_left(hub, content, tmp_path, monkeypatch):
-    monkeypatch.setattr("warmprior.io.hub.LIMIT_SECONDS", 2.0)
-    hub.put(FIRST, content)
-    hub.put(MIRROR, content)
-    hub.delay = 8.0
-    started = time.monotonic()
-    with pytest.raises(OSError, match=r"TimeoutError: .*2 s"):
-        download_robomimic("square", root=tmp_path, endpoint=hub.address)
-    assert time.monotonic() - started < 6
+    assert download_robomimic("square", root=tmp_path).read_bytes() == content
 
 
 @pytest.mark.parametrize(
@@ -131,15 +115,11 @@ def test_a_server_that_never_ends_is_left(hub, content, tmp_path, monkeypatch):
     [
         (download_robomimic, ["stack"], "choose one of lift, can, square, transport, tool_hang"),
         (download_robomimic, ["lift", "mg"], "'mg' data; it has: ph, mh"),
-        (
-            download_mimicgen,
-            ["square"],
-            r"\(download_robomimic has square\); choose one of stack_d0",
-        ),
+        (download_mimicgen, ["square"], r"\(download_robomimic has square\); choose one of stack_d0"),
         (download_mimicgen, ["coffee_d0", "ph"], "no official 'ph' data; it has: source, core"),
     ],
 )
 def test_unknown_task_or_style_asks_nobody(hub, download, args, said):
     with pytest.raises(ValueError, match=said):
-        download(*args, endpoint=hub.address)
+        download(*args)
     assert not hub.requests

@@ -117,8 +117,5 @@ def test_corrupt_values(tmp_path):
         raw.seek(offset)
         raw.write(b"\x01\x02\x03")
     read_index(path)
-    with (
-        h5py.File(path) as file,
-        pytest.raises(DatasetError, match=r"data/demo_0/actions cannot be read"),
-    ):
+    with h5py.File(path) as file, pytest.raises(DatasetError, match=r"data/demo_0/actions cannot be read"):
         read_rows(file, "demo_0", "actions", np.empty((12, 7)))

@@ -80,10 +80,7 @@ ALIEN = {"format": 1, "env_args": {"env_name": "Lift", "env_kwargs": {}}}
 STATE = {"object": ["observation.environment_state", 0, 10]}
 
 META = {
-    "v2": (
-        info(lambda i: i.update(codebase_version="v2.1")),
-        ["2.1", "convert_dataset_v21_to_v30"],
-    ),
+    "v2": (info(lambda i: i.update(codebase_version="v2.1")), ["2.1", "convert_dataset_v21_to_v30"]),
     "no JSON": (cut("meta/info.json"), ["LeRobot cannot read", "again"]),
     "no episodes": (without(EPISODES), ["no meta/episodes/*/*.parquet", "finalize()"]),
     "other fps": (info(lambda i: i.update(fps=30)), ["fps is 30", "Lift", "20 Hz", "resample"]),
@@ -139,11 +136,7 @@ def test_bad_values_stop_the_load(root, name):
 
 
 IMAGES = {
-    "missing camera": (
-        "front_image",
-        None,
-        ["no images 'front_image'", "agentview_image", "--images"],
-    ),
+    "missing camera": ("front_image", None, ["no images 'front_image'", "agentview_image", "--images"]),
     "not square": ("agentview_image", feature(CAMERA, shape=[32, 16, 3]), ["only square"]),
     "other size": (
         "agentview_image",
@@ -172,7 +165,7 @@ def test_bad_images_are_named(root, name):
 
 def test_bad_options(root):
     with pytest.raises(ValueError, match="'disk'"):
-        LeRobotExperienceReplay("user/never-fetched", storage="disk")
+        LeRobotExperienceReplay(root, storage="disk")
     with pytest.raises(FileNotFoundError, match=r"no meta/info\.json there"):
         LeRobotExperienceReplay(root / "absent")
     with pytest.raises(DatasetError, match="there are 3 demonstrations, fewer than the 4"):

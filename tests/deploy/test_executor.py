@@ -175,17 +175,13 @@ def test_a_users_prior_has_the_mean_of_its_training_windows():
 def test_several_entries_raw_units_and_last_actions_that_networks_see():
     """An observation of entries; raw units on the robot's side; a network that sees the last actions."""
     raw = TensorDict(
-        {"observation": 3 * torch.rand(20, OBSERVATION_DIM) + 1, "action": 5 * torch.rand(20, 2)},
-        [20],
+        {"observation": 3 * torch.rand(20, OBSERVATION_DIM) + 1, "action": 5 * torch.rand(20, 2)}, [20]
     )
     normalizer = Normalizer.fit(raw)
     prior, width = GaussianPrior(4), HistoryObservation.width(4, ACTION_DIM)
     inside, outside = (
         AsyncExecutor(
-            actor(prior, width, observation_key=keys.CONDITIONED),
-            execute=3,
-            latency=1,
-            normalizer=n,
+            actor(prior, width, observation_key=keys.CONDITIONED), execute=3, latency=1, normalizer=n
         )
         for n in (None, normalizer)
     )

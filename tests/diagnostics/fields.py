@@ -33,13 +33,18 @@ def policy(function, prior=None, seed=0, **options):
 def batch(n=5, length=H, d_a=D_A, **extra):
     torch.manual_seed(1)
     data = TensorDict(
-        {
-            "observation": torch.randn(n, 1, 4),
-            "history": cold_history([n], min(H, length), length, d_a),
-        },
-        [n],
+        {"observation": torch.randn(n, 1, 4), "history": cold_history([n], min(H, length), length, d_a)}, [n]
     )
     return data.update(extra)
+
+
+def targets(prior, n, spread=1.0, loc=0.0, d_a=D_A):
+    """Windows of a prior with random targets around a mean; of a few, the first ends early."""
+    length = prior.prediction_length
+    target = loc + spread * torch.randn(n, length, d_a, generator=torch.Generator().manual_seed(0))
+    pad = torch.zeros(n, length, dtype=torch.bool)
+    pad[0, 1:] = n < 100
+    return batch(n, length, d_a, vla_action={"chunk": target}, action_is_pad=pad)
 
 
 def remember(data, loc, warm=True):

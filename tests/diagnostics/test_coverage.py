@@ -7,34 +7,21 @@ import math
 import pytest
 import torch
 from learned_sources import CVAEPrior
-from tensordict import TensorDict
 
-from tests.diagnostics.fields import remember
+from tests.diagnostics.fields import D_A, H, remember, targets
 from warmprior import PastPrior, PreviewPrior, VelocityMLP, WarmPriorActor
 from warmprior.diagnostics import source_coverage
-from warmprior.history import cold_history
 
-H, D_A, N = 3, 2, 20_000
+N = 20_000
 
 
 def actor(prior):
-    return WarmPriorActor(VelocityMLP(D_A, 1, prior.prediction_length, 1, hidden_dim=4), prior)
+    return WarmPriorActor(VelocityMLP(D_A, 4, prior.prediction_length, 1, hidden_dim=4), prior)
 
 
-def windows(prior, spread, warm=True):
-    g = torch.Generator().manual_seed(0)
-    p = prior.prediction_length
-    loc = torch.rand(N, p, D_A, generator=g)
-    data = TensorDict(
-        {
-            "observation": torch.zeros(N, 1, 1),
-            "vla_action": {"chunk": warm * loc + spread * torch.randn(N, p, D_A, generator=g)},
-            "action_is_pad": torch.zeros(N, p, dtype=torch.bool),
-            "history": cold_history([N], H, p, D_A),
-        },
-        [N],
-    )
-    return remember(data, loc, warm)
+def windows(prior, spread):
+    loc = torch.rand(N, prior.prediction_length, D_A, generator=torch.Generator().manual_seed(2))
+    return remember(targets(prior, N, spread, loc), loc)
 
 
 @pytest.mark.parametrize("level", [0.5, 0.9])
@@ -59,7 +46,7 @@ def test_only_executed_positions_inside_the_episode_count():
 
 
 def test_what_is_no_gaussian_has_none():
-    prior = CVAEPrior(H, widths=[D_A, 1, 1])
+    prior = CVAEPrior(H, widths=[D_A, 4, 1])
     assert math.isnan(source_coverage(actor(prior), windows(prior, 1.0)))
     with pytest.raises(ValueError, match=r"level must be in \(0, 1\)"):
         source_coverage(actor(PastPrior(H)), windows(PastPrior(H), 1.0), level=1.0)

@@ -8,49 +8,25 @@ import pytest
 import torch
 from learned_sources import CVAEPrior, ForecastPrior
 from tensordict import TensorDict
-from torch import nn
 
-from tests.diagnostics.fields import remember
-from warmprior import PastPrior, PreviewPrior, WarmPriorActor
+from tests.diagnostics.fields import D_A, H, policy, remember, targets
+from warmprior import PastPrior, PreviewPrior
 from warmprior.diagnostics import mean_error, mean_revision
-from warmprior.history import cold_history
-
-H, D_A = 2, 3
 
 
-class Still(nn.Module):
+def still(t, a, observation):
     """Predicts its source."""
-
-    def __init__(self):
-        super().__init__()
-        self.weight = nn.Parameter(torch.zeros(1))
-
-    def forward(self, t, a, observation):
-        return torch.zeros_like(a)
+    return torch.zeros_like(a)
 
 
-def windows(prior, n=6, warm=True):
-    g = torch.Generator().manual_seed(0)
-    p = prior.prediction_length
-    pad = torch.zeros(n, p, dtype=torch.bool)
-    pad[0, 1:] = True
-    values = [torch.randn(n, p, D_A, generator=g) for _ in range(2)]
-    data = TensorDict(
-        {
-            "observation": torch.zeros(n, 1, 1),
-            "vla_action": {"chunk": values[0]},
-            "action_is_pad": pad,
-            "history": cold_history([n], H, p, D_A),
-        },
-        [n],
-    )
-    return remember(data, values[1], warm)
+def windows(prior, warm=True):
+    return remember(targets(prior, 6), torch.randn(6, prior.prediction_length, D_A), warm)
 
 
 @pytest.mark.parametrize("prior", [PastPrior(H, sigma=0.0), PreviewPrior(H, sigma=0.3)])
 def test_only_warm_positions_inside_the_episode_count(prior):
     batch = windows(prior)
-    found = mean_error(WarmPriorActor(Still(), prior), batch, nfe=1)
+    found = mean_error(policy(still, prior), batch, nfe=1)
     difference = (batch["history", "forecast"] - batch["vla_action", "chunk"])[:, :H]
     squares = [float(difference[i, p].square().mean()) for i in range(6) for p in range(H) if i or not p]
     assert found.target == pytest.approx(math.sqrt(sum(squares) / len(squares)))
@@ -60,15 +36,15 @@ def test_only_warm_positions_inside_the_episode_count(prior):
 
 def test_the_mean_is_that_of_the_source():
     """Of a learned one wherever it is, and none where it is no Gaussian."""
-    prior = ForecastPrior(H, widths=[D_A, 1, 1])
+    prior = ForecastPrior(H, widths=[D_A, 4, 1])
     batch = windows(prior, warm=False)
     mean = prior.distribution(batch["history"], batch["observation"]).loc
     counted = ~batch["action_is_pad"].unsqueeze(-1)
     squared = ((mean - batch["vla_action", "chunk"]).square() * counted).sum() / counted.sum() / D_A
-    found = mean_error(WarmPriorActor(Still(), prior), batch, nfe=1)
+    found = mean_error(policy(still, prior), batch, nfe=1)
     assert found.target == pytest.approx(float(squared.sqrt()))
-    other = CVAEPrior(H, widths=[D_A, 1, 1])
-    found = mean_error(WarmPriorActor(Still(), other), windows(other), nfe=1)
+    other = CVAEPrior(H, widths=[D_A, 4, 1])
+    found = mean_error(policy(still, other), windows(other), nfe=1)
     assert math.isnan(found.target)
 
 

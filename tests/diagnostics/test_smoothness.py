@@ -27,10 +27,7 @@ def rollout_of(chunks, steps, done=None):
 
 @settings(max_examples=50, deadline=None)
 @given(
-    rows=st.integers(1, 3),
-    decisions=st.integers(2, 6),
-    horizon=st.integers(1, 4),
-    seed=st.integers(0, 10**6),
+    rows=st.integers(1, 3), decisions=st.integers(2, 6), horizon=st.integers(1, 4), seed=st.integers(0, 10**6)
 )
 def test_against_loops(rows, decisions, horizon, seed):
     rng = random.Random(seed)

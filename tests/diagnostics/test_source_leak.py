@@ -112,11 +112,7 @@ def test_data_spread_against_loops(data):
             for p in range(min(int(length[i]), int(length[j]))):
                 squares += ((target[i, p] - target[j, p]) ** 2 / 2).tolist()
     result = source_leak(
-        policy(passing(0.5)),
-        rows,
-        neighbours=neighbours,
-        episodes=torch.tensor(episodes),
-        nfes=(1,),
+        policy(passing(0.5)), rows, neighbours=neighbours, episodes=torch.tensor(episodes), nfes=(1,)
     )
     expected = math.sqrt(sum(squares) / len(squares))
     assert result[1].data_spread == pytest.approx(expected, rel=1e-4)

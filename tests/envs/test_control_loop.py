@@ -45,9 +45,7 @@ def test_agrees_with_env_step(task):
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{"input_ref_frame": "base"}, {"input_type": "absolute"}],
-    ids=["base frame", "absolute"],
+    "changes", [{"input_ref_frame": "base"}, {"input_type": "absolute"}], ids=["base frame", "absolute"]
 )
 def test_agrees_for_other_inputs(changes):
     env_args = task_env_args("lift")

@@ -42,11 +42,7 @@ def test_demonstrations_avoid_the_obstacles_on_both_sides():
 
 
 @settings(max_examples=60, deadline=None)
-@given(
-    x=st.floats(-0.99, 0.9),
-    width=st.floats(0.01, 1.0),
-    y=st.tuples(st.floats(-1, 1), st.floats(-1, 1)),
-)
+@given(x=st.floats(-0.99, 0.9), width=st.floats(0.01, 1.0), y=st.tuples(st.floats(-1, 1), st.floats(-1, 1)))
 def test_collision_of_a_segment_against_dense_points(x, width, y):
     share = torch.linspace(0, 1, 20_001, dtype=torch.float64)
     px, py = x + share * width, y[0] + share * (y[1] - y[0])
@@ -75,8 +71,7 @@ def test_episode_executes_the_heights_and_reports_collisions(chunk):
     torch.manual_seed(0)
     heights = torch.cat([navigation_heights(), torch.zeros(1, 64), 0.6 * torch.randn(5, 64)])
     env = TransformedEnv(
-        NavigationEnv(batch_size=[12]),
-        policy_transforms(GaussianPrior(chunk), observation_steps=1),
+        NavigationEnv(batch_size=[12]), policy_transforms(GaussianPrior(chunk), observation_steps=1)
     )
     rollout = env.rollout(1000, heights_policy(heights, chunk))
     assert rollout.shape == (12, math.ceil(64 / chunk))

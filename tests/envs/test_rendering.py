@@ -15,7 +15,6 @@ from tests.processes import apart
 from warmprior.envs import RobosuiteEnv, rendering_backend
 from warmprior.envs.rendering import CameraRenderer, require_rendering
 from warmprior.envs.simulator import import_robosuite, task_env_args
-from warmprior.io.processes import working
 
 pytestmark = pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
 
@@ -77,10 +76,6 @@ def test_a_state_is_rendered_as_it_was_when_present(lift):
     assert lift.render_frame(size=(8, 24)).shape == (8, 24, 3)
 
 
-def shown(env, state=None):
-    return env.render_frame("agentview", 16).astype(int).sum()
-
-
 @apart
 def test_a_process_forked_from_one_that_has_rendered_says_so(lift):
     """Instead of waiting for OpenGL's threads, which are not there, for ever."""
@@ -90,17 +85,3 @@ def test_a_process_forked_from_one_that_has_rendered_says_so(lift):
             apart(partial(lift.render_frame, size=size))()
     # What is forked but does not render is none of its business.
     assert apart(partial(sum, [1, 2]))() == 3
-
-
-@apart
-def test_workers_of_a_process_that_has_rendered_render(lift):
-    """They are started afresh."""
-    expected = shown(lift)
-    with working(1, None) as call:
-        assert call(fresh_image).result() == expected
-
-
-def fresh_image(state):
-    env = RobosuiteEnv("lift")
-    env.reset()
-    return shown(env)

@@ -101,11 +101,7 @@ def make_demonstrations(folder: Path) -> None:
                 values = demo[key][()]
                 del demo[key]
                 demo.create_dataset(
-                    key,
-                    data=values,
-                    chunks=(4, *values.shape[1:]),
-                    compression="gzip",
-                    fletcher32=True,
+                    key, data=values, chunks=(4, *values.shape[1:]), compression="gzip", fletcher32=True
                 )
 
 
@@ -113,13 +109,7 @@ def make_demonstrations(folder: Path) -> None:
 def _external_storage(file, name, folder, rng):
     shape = file[name].shape
     (folder / "other").write_bytes(bytes(8 * int(np.prod(shape))))
-    _new(
-        file,
-        name,
-        shape=shape,
-        dtype="f8",
-        external=[(str(folder / "other"), 0, h5py.h5f.UNLIMITED)],
-    )
+    _new(file, name, shape=shape, dtype="f8", external=[(str(folder / "other"), 0, h5py.h5f.UNLIMITED)])
 
 
 def _external_link(file, name, folder, rng):
@@ -201,16 +191,7 @@ def _loop(file, name, folder, rng):
 
 REFUSED = (
     *(_external_storage, _external_link, _virtual, _never_written, _many_rows, _huge_chunk),
-    *(
-        _all_with_many_rows,
-        _group,
-        _empty,
-        _another_type,
-        _another_shape,
-        _missing,
-        _bad_value,
-        _loop,
-    ),
+    *(_all_with_many_rows, _group, _empty, _another_type, _another_shape, _missing, _bad_value, _loop),
 )
 
 
@@ -253,10 +234,7 @@ def mutate_demonstrations(folder: Path, rng: np.random.Generator) -> Case:
                 name = f"data/demo_{rng.choice([0, 2])}/{rng.choice(KEYS)}"
                 how, must_refuse = f"{change.__name__[1:]} {name}", True
                 change(file, name, folder, rng)
-    options = {
-        "filter_key": "train" if masked else None,
-        "absolute_actions": bool(rng.random() < 0.3),
-    }
+    options = {"filter_key": "train" if masked else None, "absolute_actions": bool(rng.random() < 0.3)}
 
     def load() -> Outcome:
         replay = RobomimicExperienceReplay(path, **options)

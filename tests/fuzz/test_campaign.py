@@ -54,6 +54,7 @@ def test_cases_repeat(tmp_path, subject):
         assert first == again
 
 
+@pytest.mark.slow
 def test_a_short_campaign():
     # In a process of its own, as always: a fork of this one could wait for locks that threads of other
     # libraries held when it was made.

@@ -43,12 +43,16 @@ class Loopback:
         self.thread.join()
 
 
-def reachable(monkeypatch) -> None:
-    """Let the hub's client go to the loopback interface."""
+def reachable(monkeypatch, address: str) -> None:
+    """Let the hub's client go to a server of the loopback interface."""
     for name in ("http_proxy", "https_proxy", "all_proxy"):
         monkeypatch.delenv(name, raising=False)
         monkeypatch.delenv(name.upper(), raising=False)
-    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
+    constants = "huggingface_hub.constants."
+    monkeypatch.setattr(constants + "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants + "ENDPOINT", address)
+    template = address + "/{repo_id}/resolve/{revision}/{filename}"
+    monkeypatch.setattr(constants + "HUGGINGFACE_CO_URL_TEMPLATE", template)
 
 
 class Repository:
@@ -190,17 +194,14 @@ def _etag(content: bytes) -> str:
 @contextmanager
 def model_hub(monkeypatch, cache):
     """A hub for the client, which has an empty cache and no token of its own."""
-    reachable(monkeypatch)
+    server = ModelHub()
+    reachable(monkeypatch, server.address)
     for name in ("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN"):
         monkeypatch.delenv(name, raising=False)
     constants = "huggingface_hub.constants."
     monkeypatch.setattr(constants + "HF_HUB_DISABLE_XET", True)  # files go by git-lfs's protocol
     monkeypatch.setattr(constants + "HF_HUB_CACHE", str(cache / "hub"))
     monkeypatch.setattr(constants + "HF_TOKEN_PATH", str(cache / "no_token"))
-    server = ModelHub()
-    monkeypatch.setattr(constants + "ENDPOINT", server.address)
-    template = server.address + "/{repo_id}/resolve/{revision}/{filename}"
-    monkeypatch.setattr(constants + "HUGGINGFACE_CO_URL_TEMPLATE", template)
     try:
         yield server
     finally:

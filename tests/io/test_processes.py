@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -9,7 +10,6 @@ import sys
 import time
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from pathlib import Path
 
 import pytest
 
@@ -18,8 +18,6 @@ pytest.importorskip("loky")
 from tests.processes import ended
 from warmprior.io.processes import working
 from warmprior.io.workers import WorkerError
-
-ROOT = Path(__file__).parents[2]
 
 
 def facts(state):
@@ -57,69 +55,57 @@ def sleepers(folder, count):
     return [int(path.name) for path in folder.iterdir()]
 
 
-def test_every_process_has_one_thread_and_a_state_of_its_own():
+def test_every_process_has_one_thread_and_a_state_of_its_own_and_an_error_ends_all(tmp_path):
     state = []
-    with working(2, state) as call:
+    with pytest.raises(FloatingPointError, match="the loss became nan"), working(2, state) as call:
         found = [call(partial(remember, i)).result() for i in range(6)]
         pid, threads, _ = call(facts).result()
+        call(partial(sleep, tmp_path / "x"))
+        pids = sleepers(tmp_path, 1)
+        call(fail).result()
     assert state == [] and threads == "1" and os.getpid() != pid
     for process in {pid for pid, _ in found}:
         seen = [numbers for pid, numbers in found if pid == process]
         assert all(numbers == seen[-1][: len(numbers)] for numbers in seen)
     assert sorted(numbers[-1] for _, numbers in found) == list(range(6))
-    wait_for(lambda: ended(pid))
+    wait_for(lambda: all(map(ended, [pid, *pids])), 20)
 
 
-@pytest.mark.parametrize(
-    ("job", "error", "said"),
-    [
-        (fail, FloatingPointError, "the loss became nan"),
-        (kill_oneself, WorkerError, "one of 2 workers died.*memory.*--envs"),
-    ],
-)
-def test_an_error_and_a_dead_process_end_all_others(tmp_path, job, error, said):
-    with pytest.raises(error, match=said) as raised, working(2, None) as call:
+def test_a_dead_process_ends_all_others(tmp_path):
+    said = "one of 2 workers died.*memory.*--envs"
+    with pytest.raises(WorkerError, match=said) as raised, working(2, None) as call:
         call(partial(sleep, tmp_path / "x"))
         pids = sleepers(tmp_path, 1)
-        call(job).result()
-    assert job is fail or isinstance(raised.value.__cause__, BrokenProcessPool)
+        call(kill_oneself).result()
+    assert isinstance(raised.value.__cause__, BrokenProcessPool)
     wait_for(lambda: all(map(ended, pids)), 20)
 
 
-HELD = """
-import signal
-import sys
-from functools import partial
-from pathlib import Path
-from tests.io.test_processes import sleep
-from warmprior.io.processes import working
-if __name__ == "__main__":
+def hold(folder, errors):
+    """What a script does that lets a process work."""
+    os.setsid()
+    os.dup2(os.open(errors, os.O_WRONLY | os.O_CREAT), 2)
+    sys.stderr = os.fdopen(2, "w", closefd=False)  # not pytest's
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may start its background ignoring it
-    with working(2, None) as call:
-        futures = [call(partial(sleep, Path(sys.argv[1]) / "x")) for _ in range(2)]
-        futures[0].result()
-"""
+    with working(1, None) as call:
+        call(partial(sleep, folder / "x")).result()
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
 def test_processes_end_with_whoever_started_them(tmp_path, how):
     """However that ends; a terminal sends SIGINT to all of them."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", HELD, str(tmp_path)],
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-    pids = sleepers(tmp_path, 2)
+    (tmp_path / "work").mkdir()
+    errors = tmp_path / "errors"
+    holder = multiprocessing.get_context("fork").Process(target=hold, args=(tmp_path / "work", errors))
+    holder.start()
+    pids = sleepers(tmp_path / "work", 1)
     time.sleep(1.0)
     assert not any(map(ended, pids))
-    os.killpg(process.pid, how) if how == signal.SIGINT else process.kill()
-    _, errors = process.communicate(timeout=60)
+    os.killpg(holder.pid, how) if how == signal.SIGINT else holder.kill()
+    holder.join(60)
     wait_for(lambda: all(map(ended, pids)), 20)
     if how == signal.SIGINT:
-        assert errors.count("KeyboardInterrupt") == 1
+        assert errors.read_text().count("KeyboardInterrupt") == 1
 
 
 FAKED = """

@@ -15,6 +15,7 @@ from warmprior.io.ray_cluster import check_ray, ray_cluster
 pytest.importorskip("ray")
 
 
+@pytest.mark.slow  # the benchmarks compute on a cluster
 @apart
 def test_machines_look_for_modules_where_this_process_does(ray_address, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)

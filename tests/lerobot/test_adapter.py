@@ -120,10 +120,7 @@ def test_withheld_histories_start_cold(policy):
     batch, t = windows("pi05", 64, LENGTH), torch.ones(64)  # at the source
     for probability, cold in ((0.0, 0), (1.0, 64), (0.5, None)):
         adapter = WarmPriorAdapter(
-            made,
-            PastPrior(LENGTH, sigma=0.0),
-            cold_probability=probability,
-            generator=generator(),
+            made, PastPrior(LENGTH, sigma=0.0), cold_probability=probability, generator=generator()
         )
         with watch("pi05", made) as seen, at_times("pi05", made, t):
             adapter.loss(dict(batch))
@@ -139,11 +136,7 @@ def test_sigma_in_units_of_the_data(policy):
     made = policy("xvla")  # raw units
     std = torch.linspace(0.1, 3.0, ACTION)
     adapter = WarmPriorAdapter(
-        made,
-        PastPrior(LENGTH, sigma=0.5),
-        sigma_unit="std",
-        action_std=std,
-        generator=generator(),
+        made, PastPrior(LENGTH, sigma=0.5), sigma_unit="std", action_std=std, generator=generator()
     )
     loc = torch.full((500, LENGTH, ACTION), 2.0)
     warm, cold = (window_history(loc, torch.full((500, 1), steps), loc, LENGTH) for steps in (LENGTH, 0))
@@ -184,10 +177,7 @@ def pipelines(made, stats):
     config = made.config
     parts = {"norm_map": config.normalization_mapping, "stats": stats}
     features = {**config.input_features, **config.output_features}
-    before = [
-        RelativeActionsProcessorStep(enabled=True),
-        NormalizerProcessorStep(features=features, **parts),
-    ]
+    before = [RelativeActionsProcessorStep(enabled=True), NormalizerProcessorStep(features=features, **parts)]
     after = [UnnormalizerProcessorStep(features=config.output_features, **parts)]
     return PolicyProcessorPipeline(steps=before), PolicyProcessorPipeline(steps=after)
 

@@ -31,12 +31,7 @@ def executing(prior, count, first=1):
 
 def test_a_history_moves_by_what_was_executed():
     memory = executing(PreviewPrior(3), 2)
-    expected = {
-        "actions": [0, 1, 2],
-        "steps": [2],
-        "forecast": [3, 4, 5, 6, 0, 0],
-        "forecast_steps": [4],
-    }
+    expected = {"actions": [0, 1, 2], "steps": [2], "forecast": [3, 4, 5, 6, 0, 0], "forecast_steps": [4]}
     assert row(memory.decide(2)) == expected
     assert row(memory.decide(2)) == expected  # a decision without a chunk does not count
     memory.record(chunk(11, 6))

@@ -264,10 +264,7 @@ def test_the_flow_policy_remembers(found):
     policy.actor.sampler.register_forward_hook(
         lambda module, args, out: sources.append(out["prior", "noise"])
     )
-    batch = {
-        "observation.state": torch.randn(2, 3),
-        "observation.environment_state": torch.randn(2, 2),
-    }
+    batch = {"observation.state": torch.randn(2, 3), "observation.environment_state": torch.randn(2, 2)}
     actions = torch.stack([policy.select_action(dict(batch)) for _ in range(9)], 1)
     assert len(sources) == 3
     assert torch.equal(sources[1], actions[:, :4]) and torch.equal(sources[2], actions[:, 4:8])

@@ -13,6 +13,7 @@ import torch
 
 STATE, ACTION, PADDED, LENGTH, STEPS = 6, 7, 12, 8, 4
 CAMERA = "observation.images.top"
+SIZES = {"chunk_size": LENGTH, "n_action_steps": LENGTH, "max_state_dim": 8, "max_action_dim": PADDED}
 
 
 def installed() -> str | None:
@@ -51,10 +52,7 @@ def make_smolvla(kind: Any = None, config: Any = None, **options: Any) -> Any:
 
     chosen = {
         **features(),
-        "chunk_size": LENGTH,
-        "n_action_steps": LENGTH,
-        "max_state_dim": 8,
-        "max_action_dim": PADDED,
+        **SIZES,
         "resize_imgs_with_padding": (64, 64),
         "num_vlm_layers": 2,
         "num_steps": STEPS,
@@ -108,10 +106,7 @@ def make_pi(family: str, kind: Any = None, config: Any = None, **options: Any) -
     name = family.upper()
     chosen = {
         **features(),
-        "chunk_size": LENGTH,
-        "n_action_steps": LENGTH,
-        "max_state_dim": 8,
-        "max_action_dim": PADDED,
+        **SIZES,
         "num_inference_steps": STEPS,
         "image_resolution": (64, 64),
         "dtype": "float32",
@@ -206,15 +201,7 @@ def make_groot(**options: Any) -> Any:
             head = self.action_head
             return head.get_action(self._seen(inputs), head.prepare_input(inputs), options)
 
-    chosen = {
-        **features(),
-        "chunk_size": LENGTH,
-        "n_action_steps": LENGTH,
-        "max_state_dim": 8,
-        "max_action_dim": PADDED,
-        "use_bf16": False,
-        **options,
-    }
+    chosen = {**features(), **SIZES, "use_bf16": False, **options}
     create = mock.patch.object(modeling_groot.GrootPolicy, "_create_groot_model", lambda self: Model())
     with create:
         return modeling_groot.GrootPolicy(GrootConfig(**chosen))
@@ -264,15 +251,7 @@ def make_groot_n15(**options: Any) -> Any:
     sizes = groot_n1.GR00TN15Config(
         backbone_cfg={}, action_head_cfg=head, action_horizon=LENGTH, action_dim=PADDED
     )
-    chosen = {
-        **features(),
-        "chunk_size": LENGTH,
-        "n_action_steps": LENGTH,
-        "max_state_dim": 8,
-        "max_action_dim": PADDED,
-        "use_bf16": False,
-        **options,
-    }
+    chosen = {**features(), **SIZES, "use_bf16": False, **options}
     model = groot_n1.GR00TN15
 
     def built(*args: Any, **kwargs: Any) -> Any:

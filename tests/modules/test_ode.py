@@ -31,11 +31,7 @@ class Counting(nn.Module):
 
 def batch(*shape):
     return TensorDict(
-        {
-            "prior": {"noise": torch.randn(*shape, 4, 2)},
-            "observation": torch.randn(*shape, 2, 3),
-        },
-        shape,
+        {"prior": {"noise": torch.randn(*shape, 4, 2)}, "observation": torch.randn(*shape, 2, 3)}, shape
     )
 
 

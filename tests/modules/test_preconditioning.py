@@ -202,9 +202,7 @@ def test_padded_positions_do_not_count():
 
 @pytest.mark.parametrize("path", PATHS, ids=lambda path: path.name)
 @pytest.mark.parametrize(
-    "prior",
-    [PreviewPrior(2, sigma=0.0), PastPrior(2, sigma=0.0), GaussianPrior(2)],
-    ids=str,
+    "prior", [PreviewPrior(2, sigma=0.0), PastPrior(2, sigma=0.0), GaussianPrior(2)], ids=str
 )
 def test_degenerate_ends_stay_finite(prior, path):
     """A constant action, a source without noise, a source that is its target: no NaN, no explosion."""

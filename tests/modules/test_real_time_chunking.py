@@ -74,8 +74,7 @@ def test_the_official_formula(t):
         x = a[row : row + 1]
         jacobian = torch.autograd.functional.jacobian(clean, x).view(P * D, P * D)
         weights = torch.tensor(
-            [reference_weight("exp", i, int(delay[row]), int(left[row])) for i in range(P)],
-            dtype=a.dtype,
+            [reference_weight("exp", i, int(delay[row]), int(left[row])) for i in range(P)], dtype=a.dtype
         )
         error = weights[:, None] * (y[row] - clean(x)[0])
         inverse_r2 = (t**2 + (1 - t) ** 2) / (1 - t) ** 2
@@ -94,9 +93,7 @@ def test_without_the_jacobian_it_is_lerobots(time):
     velocity = network()
     a, y, *_ = batch()
     config = rtc.RTCConfig(
-        prefix_attention_schedule=RTCAttentionSchedule.LINEAR,
-        max_guidance_weight=10.0,
-        execution_horizon=7,
+        prefix_attention_schedule=RTCAttentionSchedule.LINEAR, max_guidance_weight=10.0, execution_horizon=7
     )
     with torch.no_grad():
         theirs = rtc.RTCProcessor(config).denoise_step(a, y, 3, time, lambda x: -velocity(at(1 - time, x), x))

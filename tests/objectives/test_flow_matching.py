@@ -94,18 +94,11 @@ def test_training_of_algorithm_one(prior_class, interpolant):
         torch.Generator().manual_seed(2),
         COEFFICIENTS[interpolant],
     )
-    expected = {
-        "none": errors * counted,
-        "sum": errors[counted].sum(),
-        "mean": errors[counted].mean(),
-    }
+    expected = {"none": errors * counted, "sum": errors[counted].sum(), "mean": errors[counted].mean()}
     gradients = torch.autograd.grad(expected["mean"], list(actor.network.parameters()))
     for reduction, value in expected.items():
         loss = FlowMatchingLoss(
-            actor,
-            interpolant=interpolant(),
-            reduction=reduction,
-            generator=torch.Generator().manual_seed(2),
+            actor, interpolant=interpolant(), reduction=reduction, generator=torch.Generator().manual_seed(2)
         )
         out = loss(batch)["loss_flow_matching"]
         torch.testing.assert_close(out, value, rtol=1e-4, atol=1e-5)
@@ -207,10 +200,7 @@ def test_missing_key(missing):
 @pytest.mark.parametrize(
     ("made_for", "said"),
     [
-        (
-            PreviewPrior(H),
-            r"\('vla_action', 'chunk'\) has 6 positions, but Past.* predicts 3: make",
-        ),
+        (PreviewPrior(H), r"\('vla_action', 'chunk'\) has 6 positions, but Past.* predicts 3: make"),
         (PastPrior(H - 1), r"has 2 positions, but PastPrior.* predicts 3: make the windows"),
     ],
 )

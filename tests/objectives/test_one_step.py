@@ -8,13 +8,7 @@ import pytest
 import torch
 
 from tests.objectives.test_flow_matching import actor_for, sample
-from warmprior import (
-    FlowMatchingLoss,
-    GaussianPrior,
-    PastPrior,
-    PolynomialInterpolant,
-    PreviewPrior,
-)
+from warmprior import FlowMatchingLoss, GaussianPrior, PastPrior, PolynomialInterpolant, PreviewPrior
 from warmprior.modules import StartPoint
 
 H = 3

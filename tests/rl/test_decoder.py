@@ -39,10 +39,7 @@ def batch(prior, *shape):
     return TensorDict(
         {
             "observation": torch.randn(*shape, TO, D_O),
-            "prior": {
-                "anchor": torch.randn(chunk),
-                "delta": torch.rand(chunk) - 0.5,
-            },
+            "prior": {"anchor": torch.randn(chunk), "delta": torch.rand(chunk) - 0.5},
         },
         shape,
     )

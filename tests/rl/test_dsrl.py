@@ -89,8 +89,7 @@ def test_losses_by_hand(prior_class, options, delta):
         residual, log_prob = squashed(actor, after, delta)
         chunk = decode(loss, after["observation"], after["prior", "anchor"] + residual)
         v = combine(
-            torch.stack([value(c, OBSERVATION=after["observation"], CHUNK=chunk) for c in q_target]),
-            0,
+            torch.stack([value(c, OBSERVATION=after["observation"], CHUNK=chunk) for c in q_target]), 0
         )
         if options.get("backup_entropy", True):
             v = v - alpha * log_prob

@@ -7,13 +7,7 @@ import torch
 from tensordict.nn import TensorDictSequential
 
 from tests.rl.dsrl_parts import D_A, D_O, TO, H, batch, build, make_decoder
-from warmprior import (
-    DSRLNALoss,
-    PastPrior,
-    keys,
-    make_prior_space_actor,
-    make_prior_space_critic,
-)
+from warmprior import DSRLNALoss, PastPrior, keys, make_prior_space_actor, make_prior_space_critic
 
 
 @pytest.mark.parametrize(

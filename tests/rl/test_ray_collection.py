@@ -34,10 +34,7 @@ def test_a_buffer_says_which_policy_acts():
 def test_actors_collect_what_is_so_by_hand_and_follow_the_agent(ray_address, tmp_path):
     actor = make_actor(PastPrior(H, sigma=0.01))
     training = make_training(
-        tmp_path,
-        actor,
-        warmup_steps=40,
-        collection={"collectors": 2, "ray_address": ray_address},
+        tmp_path, actor, warmup_steps=40, collection={"collectors": 2, "ray_address": ray_address}
     )
     fresh = {name: value.clone() for name, value in training.agent.state().items()}
     training.run()

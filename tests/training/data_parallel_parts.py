@@ -14,12 +14,7 @@ from warmprior import PastPrior, PreconditionedNetwork, SourceMoments
 from warmprior.io.distributed import rank
 
 STEPS = dataclasses.replace(
-    CONFIG,
-    iterations=20,
-    learning_rate=1e-3,
-    save_every=5,
-    checkpoints=1,
-    cold_probability=0.0,
+    CONFIG, iterations=20, learning_rate=1e-3, save_every=5, checkpoints=1, cold_probability=0.0
 )
 
 

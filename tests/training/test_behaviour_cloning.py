@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
-import os
+import multiprocessing
 import signal
-import subprocess
-import sys
+import threading
 import time
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,58 +18,71 @@ from warmprior.training import TrainingConfig, load_policy, make_optimizer
 from warmprior.training.checkpoint import load_state
 from warmprior.training.training_config import PAPER
 
+LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}
+"""Options beside Algorithm 1's; the average is the teacher."""
 
-def test_the_loop_by_hand(tmp_path):
+
+@pytest.mark.parametrize("options", [{}, LATER], ids=["algorithm 1", "later"])
+def test_the_loop_by_hand(tmp_path, options):
     """Sample, loss, AdamW at the scheduled rate, EMA: written out with PyTorch's own parts."""
-    config = dataclasses.replace(CONFIG, iterations=12, checkpoints=1, warmup_ratio=0.25)
+    config = dataclasses.replace(
+        CONFIG, iterations=12, checkpoints=1, warmup_ratio=0.25, ema_rate=0.9, **options
+    )
     network = VelocityMLP(2, 3, 4, hidden_dim=8)
-    start = {name: value.clone() for name, value in network.state_dict().items()}
+    other, average = copy.deepcopy(network), copy.deepcopy(network)
     cloning = training(tmp_path, config, actor=actor_for(network=network))
     cloning.run()
 
-    other = VelocityMLP(2, 3, 4, hidden_dim=8)
-    other.load_state_dict(start)
     actor = actor_for(network=other)
     generator = torch.Generator().manual_seed(config.seed)
     buffer = window_replay_buffer(dataset(), actor.prior, batch_size=16, withhold=0.25, generator=generator)
-    loss = FlowMatchingLoss(actor, generator=generator)
+    loss = FlowMatchingLoss(actor, generator=generator, teacher=average, **options)
     optimizer = make_optimizer(other, learning_rate=config.learning_rate)
-    average, losses = None, []
+    losses = []
     for step in range(12):
         progress = (step - 3) / 9
         factor = (step + 1) / 3 if step < 3 else 0.5 * (1 + torch.tensor(progress * torch.pi).cos())
         for group in optimizer.param_groups:
             group["lr"] = float(config.learning_rate * factor)
-        value = loss(buffer.sample())["loss_flow_matching"]
+        found = loss(buffer.sample())
+        value = sum(found[key] for key in loss.out_keys)
         losses.append(value.item())
         optimizer.zero_grad()
         value.backward()
         optimizer.step()
-        now = {name: p.detach().clone() for name, p in other.named_parameters()}
-        average = now if average is None else {n: 0.995 * average[n] + 0.005 * now[n] for n in now}
+        with torch.no_grad():
+            for mean, now in zip(average.parameters(), other.parameters(), strict=True):
+                mean.copy_(now if step == 0 else 0.9 * mean + 0.1 * now)
     for name, value in other.state_dict().items():
         torch.testing.assert_close(cloning.actor.network.state_dict()[name], value)
     kept = load_policy(cloning.policy_path(12)).network
-    for name, p in kept.named_parameters():
-        torch.testing.assert_close(p.detach(), average[name])
+    for name, value in average.state_dict().items():
+        torch.testing.assert_close(kept.state_dict()[name], value)
     assert [i for i, _ in cloning.losses] == [10, 12]
     assert cloning.losses[0][1] == pytest.approx(sum(losses[:10]) / 10, rel=1e-4)
     assert cloning.losses[1][1] == pytest.approx(sum(losses[10:]) / 2, rel=1e-4)
 
 
-@pytest.mark.parametrize("stop", [6, 7, 23])
-def test_stopping_anywhere_changes_nothing(tmp_path, stop):
+@pytest.mark.parametrize(
+    ("stop", "recipe", "options"),
+    [(6, {}, {}), (7, {}, {}), (23, {}, {}), (23, {}, {"prefetch": True}), (16, LATER, {})],
+)
+def test_stopping_anywhere_changes_nothing(tmp_path, stop, recipe, options):
     """Without a kill: an exception in the middle of the loop, then a new object."""
-    whole = training(tmp_path / "whole")
+    config = dataclasses.replace(CONFIG, **recipe)
+    whole = training(tmp_path / "whole", config, **options)
     whole.run()
-    part = training(tmp_path / "part")
+    part = training(tmp_path / "part", config, **options)
     run_until(part, stop)
     torch.rand(100)  # whatever else uses the global generator in between
-    again = training(tmp_path / "part")
+    again = training(tmp_path / "part", config, **options)
     assert again.iteration == max(i for i in (0, 7, 14, 20, 21, 28, 35) if i <= stop)
     again.run()
     assert same(weights(again), weights(whole))
     assert again.losses == whole.losses
+    states = [load_state(tmp_path / name / "state.safetensors")[0] for name in ("whole", "part")]
+    assert same(*states) and ("rng/windows" in states[0]) == ("prefetch" in options)
+    assert not [t for t in threading.enumerate() if t.name.startswith("prefetch")]
     for i in (20, 40):
         one, two = whole.policy_path(i), again.policy_path(i)
         for name in ("config.json", "model.safetensors"):
@@ -88,33 +100,14 @@ def test_a_finished_training_stays_as_it_is(tmp_path):
     assert (tmp_path / "state.safetensors").read_bytes() == before
 
 
-SCRIPT = """
-import sys, torch
-torch.set_num_threads(1)
-from tests.training.test_behaviour_cloning import killed_training
-killed_training(sys.argv[1], int(sys.argv[2])).run()
-"""
-
-
 def killed_training(folder, iterations):
     config = dataclasses.replace(CONFIG, iterations=iterations, save_every=3, checkpoints=5)
     return training(folder, config)
 
 
-def start_process(folder, iterations):
-    root = Path(__file__).parents[2]
-    return subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, str(folder), str(iterations)],
-        cwd=root,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-
-
 @pytest.mark.parametrize(
     ("iterations", "moments"),
-    [(250, (0.2,)), pytest.param(2000, (0.0, 0.31, 1.13, 2.2), marks=pytest.mark.slow)],
+    [(150, (0.2,)), pytest.param(2000, (0.0, 0.31, 1.13, 2.2), marks=pytest.mark.slow)],
 )
 def test_killed_and_resumed_is_bitwise_the_same(tmp_path, iterations, moments):
     """SIGKILL that long after the first save; saves are so frequent that many hit one."""
@@ -123,19 +116,20 @@ def test_killed_and_resumed_is_bitwise_the_same(tmp_path, iterations, moments):
     try:
         whole = killed_training(tmp_path / "whole", iterations)
         whole.run()
-        folder = tmp_path / "killed"
+        folder, context = tmp_path / "killed", multiprocessing.get_context("fork")
         reached = 0
         for moment in moments:
-            process = start_process(folder, iterations)
+            process = context.Process(target=lambda: killed_training(folder, iterations).run(None))
+            process.start()
             deadline = time.monotonic() + 120
-            while time.monotonic() < deadline and process.poll() is None:
+            while time.monotonic() < deadline and process.is_alive():
                 if _iteration(folder) > reached:
                     break
                 time.sleep(0.02)
             time.sleep(moment)
-            process.send_signal(signal.SIGKILL)
-            process.wait(30)
-            assert process.returncode == -signal.SIGKILL, "finished before it was killed"
+            process.kill()
+            process.join(30)
+            assert process.exitcode == -signal.SIGKILL, "finished before it was killed"
             reached = _iteration(folder)
         assert 0 < reached < iterations
         again = killed_training(folder, iterations)

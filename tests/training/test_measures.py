@@ -34,9 +34,7 @@ class Saying(EnvBase):
         super().__init__(device="cpu", batch_size=[])
         flag = {"dtype": torch.bool, "shape": (1,)}
         self.observation_spec = Composite(
-            observation=Unbounded((1,)),
-            won=Categorical(2, **flag),
-            **{name: Unbounded((1,)) for name in HOW},
+            observation=Unbounded((1,)), won=Categorical(2, **flag), **{name: Unbounded((1,)) for name in HOW}
         )
         self.action_spec = Unbounded((ACTION_DIM,))
         self.reward_spec = Unbounded((1,))

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import threading
-
 import pytest
 import torch
 
-from tests.training.cloning_parts import run_until, same, training, weights
-from warmprior.training.checkpoint import load_state
 from warmprior.training.placement import Prefetch
 
 
@@ -40,18 +36,3 @@ def test_an_error_of_the_thread_is_told_where_the_batch_is_asked_for():
 
     with pytest.raises(OSError, match="the disk is gone"):
         Prefetch(failing, torch.Generator())()
-
-
-@pytest.mark.parametrize("stop", [23])
-def test_stopping_changes_nothing(tmp_path, stop):
-    whole = training(tmp_path / "whole", prefetch=True)
-    whole.run(None)
-    part = training(tmp_path / "part", prefetch=True)
-    run_until(part, stop)
-    again = training(tmp_path / "part", prefetch=True)
-    assert again.iteration == stop // 7 * 7
-    again.run(None)
-    assert same(weights(again), weights(whole)) and again.losses == whole.losses
-    one, two = (load_state(tmp_path / n / "state.safetensors")[0] for n in ("whole", "part"))
-    assert same(one, two) and "rng/windows" in one
-    assert not [t for t in threading.enumerate() if t.name.startswith("prefetch")]

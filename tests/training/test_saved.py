@@ -136,7 +136,8 @@ def test_weights_of_any_precision_come_back_bit_by_bit(tmp_path, dtype, parts):
 # ------------------------------------------------------------------------------- what cannot be saved
 
 
-def test_an_interrupted_save_leaves_the_old_policy(tmp_path, monkeypatch):
+@pytest.mark.parametrize("where", ["os.replace", "warmprior.training.checkpoint.save_file", "os.fsync"])
+def test_a_full_disk_leaves_the_old_policy(tmp_path, monkeypatch, where):
     """Overwriting a policy must not leave new weights beside an old configuration."""
     saved(tmp_path)
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
@@ -144,9 +145,10 @@ def test_an_interrupted_save_leaves_the_old_policy(tmp_path, monkeypatch):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("warmprior.training.checkpoint.save_file", full)
-    with pytest.raises(OSError, match=str(tmp_path)):
+    monkeypatch.setattr(where, full)
+    with pytest.raises(OSError, match=f"cannot write {tmp_path}.*No space left"):
         saved(tmp_path, PastPrior(H, sigma=0.7))
+    monkeypatch.undo()
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
@@ -188,10 +190,7 @@ def test_damage_is_noticed(tmp_path, damage):
     ("change", "said"),
     [
         (lambda t, c: t.pop(ACTION), f"{ACTION} is missing"),
-        (
-            lambda t, c: t.update({ACTION: torch.ones(9)}),
-            rf"{ACTION} is \(9,\) of torch.float32, not",
-        ),
+        (lambda t, c: t.update({ACTION: torch.ones(9)}), rf"{ACTION} is \(9,\) of torch.float32, not"),
         (lambda t, c: c["network"].update(name="evil:Net"), "unknown"),
         (lambda t, c: c["actor"].update(nfe=0), "nfe"),
         (lambda t, c: c.pop("prior"), "KeyError"),

@@ -35,10 +35,7 @@ def actor():
 def chunk(actor):
     generator = torch.Generator().manual_seed(1)
     data = TensorDict(
-        {
-            "observation": torch.randn(4, 2, 5, generator=generator),
-            "history": random_history(actor.prior, 4),
-        },
+        {"observation": torch.randn(4, 2, 5, generator=generator), "history": random_history(actor.prior, 4)},
         [4],
     )
     return actor(data, generator=generator)["vla_action", "chunk"]

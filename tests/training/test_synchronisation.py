@@ -59,11 +59,7 @@ CASES = {
         dataset(),
         preconditioned(PastPrior(4, correlation=0.5)),
     ),
-    "learned": lambda: (
-        CONFIG,
-        dataset(),
-        actor_for(ForecastPrior(4, widths=[2, 3, 2]), mlp()),
-    ),
+    "learned": lambda: (CONFIG, dataset(), actor_for(ForecastPrior(4, widths=[2, 3, 2]), mlp())),
     "images": lambda: (CONFIG, *with_images()),
 }
 

@@ -6,13 +6,7 @@ import torch
 
 from warmprior import PastPrior
 from warmprior.modules import PreconditionedNetwork
-from warmprior.training import (
-    NetworkOptions,
-    TrainingConfig,
-    navigation_task,
-    new_policy,
-    train_policy,
-)
+from warmprior.training import NetworkOptions, TrainingConfig, navigation_task, new_policy, train_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
 CONFIG = TrainingConfig(iterations=8, batch_size=16, checkpoints=2, save_every=2)

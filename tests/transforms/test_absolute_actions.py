@@ -79,10 +79,7 @@ def test_far_targets_are_approached_at_full_speed(position, here, target, now):
         return  # half a turn may go either way
     matrix = target.as_matrix()
     action = np.concatenate([position, 3 * matrix[0], matrix[1] - 2 * matrix[0], [7.0]])
-    data = {
-        "action": torch.from_numpy(action),
-        "eef_pose": torch.from_numpy(pose_of(here, now))[None],
-    }
+    data = {"action": torch.from_numpy(action), "eef_pose": torch.from_numpy(pose_of(here, now))[None]}
     found = AbsoluteActions(SCALE).inv(TensorDict(data))["action"].numpy()
     move = np.subtract(position, here) / SCALE[:3]
     expected = np.concatenate([move, turn / SCALE[3:], [7.0]]).clip(-1, 1)

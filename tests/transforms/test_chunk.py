@@ -113,13 +113,7 @@ def test_wrong_chunk_length(length):
 
 @pytest.mark.parametrize(
     ("horizon", "options"),
-    [
-        (3, {"execute": 4}),
-        (3, {"execute": 0}),
-        (3, {"prediction_length": 2}),
-        (0, {}),
-        (-1, {"execute": 1}),
-    ],
+    [(3, {"execute": 4}), (3, {"execute": 0}), (3, {"prediction_length": 2}), (0, {}), (-1, {"execute": 1})],
 )
 def test_bad_lengths(horizon, options):
     with pytest.raises(ValueError, match="need 1 <= execute <= chunk_length <= prediction_length"):

@@ -6,14 +6,7 @@ from functools import partial
 
 import pytest
 import torch
-from torchrl.envs import (
-    ActionScaling,
-    Compose,
-    ObservationNorm,
-    SerialEnv,
-    StepCounter,
-    TransformedEnv,
-)
+from torchrl.envs import ActionScaling, Compose, ObservationNorm, SerialEnv, StepCounter, TransformedEnv
 
 from tests.toy_env import ACTION_DIM, CountingEnv
 from warmprior import ChunkStep, ObservationStack

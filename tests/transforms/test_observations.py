@@ -61,10 +61,7 @@ class CameraEnv(CountingEnv):
 NAMES = {
     "image": {},
     "nested": {},
-    "named": {
-        "observation_key": ("sensors", "low", "joints"),
-        "chunk_key": "plan",
-    },
+    "named": {"observation_key": ("sensors", "low", "joints"), "chunk_key": "plan"},
 }
 
 

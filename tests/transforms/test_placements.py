@@ -26,10 +26,7 @@ LENGTHS = (7, 4)  # neither is a multiple of H: both end inside a chunk, at diff
 
 def transforms(prior, execute):
     chunk = ChunkStep(
-        prior.chunk_length,
-        execute=execute,
-        prediction_length=prior.prediction_length,
-        gamma=GAMMA,
+        prior.chunk_length, execute=execute, prediction_length=prior.prediction_length, gamma=GAMMA
     )
     return Compose(StepCounter(), chunk, ActionHistory(H), InitTracker())
 

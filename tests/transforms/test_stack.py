@@ -19,8 +19,7 @@ def test_equals_cat_frames_on_a_single_environment(steps):
     theirs = TransformedEnv(
         CountingEnv(6),
         Compose(
-            UnsqueezeTransform(-2, in_keys=["observation"]),
-            CatFrames(steps, dim=-2, in_keys=["observation"]),
+            UnsqueezeTransform(-2, in_keys=["observation"]), CatFrames(steps, dim=-2, in_keys=["observation"])
         ),
     )
     check_env_specs(ours)

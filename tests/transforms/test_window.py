@@ -9,13 +9,7 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data.replay_buffers.samplers import SliceSampler
 
-from warmprior import (
-    ActionWindow,
-    PastPrior,
-    PreviewPrior,
-    WithheldHistory,
-    window_replay_buffer,
-)
+from warmprior import ActionWindow, PastPrior, PreviewPrior, WithheldHistory, window_replay_buffer
 from warmprior.transforms.window import check_finite
 
 

@@ -18,21 +18,13 @@ from tqdm import tqdm
 from warmprior.data.hdf5 import open_robomimic, read_index, read_masks
 from warmprior.data.hdf5_members import DatasetError, member
 from warmprior.data.index import DatasetIndex
-from warmprior.data.lerobot_index import (
-    DESCRIPTION,
-    REWARD,
-    SUCCESS,
-    action_names,
-    layout_of,
-    state_names,
-)
+from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
-from warmprior.io.scheduling import scheduled_as_before
 from warmprior.keys import ACTION, OBSERVATION, STATE
 
-__all__ = ["convert_robomimic"]
+__all__ = ["convert_robomimic", "quietly"]
 
 KINDS = ("image", "video")
 VIDEO_SIZE = 32  # of the least side; the AV1 encoder ends the process at smaller ones
@@ -180,11 +172,7 @@ def _write(
         storage="memmap" if images else "memory",
     ).data
     dataset = datasets.LeRobotDataset.create(
-        f"local/{root.name}",
-        fps,
-        _features(index, layout, images),
-        root=root,
-        use_videos=images == "video",
+        f"local/{root.name}", fps, _features(index, layout, images), root=root, use_videos=images == "video"
     )
     numbers = {
         "action": data[ACTION],
@@ -198,13 +186,9 @@ def _write(
         numbers[feature] = torch.cat([parts[key] for key in widths], -1)
     rows = np.cumsum([0, *index.lengths])
     bar = tqdm(
-        pairwise(rows),
-        f"convert {index.path.stem}",
-        len(index.lengths),
-        unit="demo",
-        disable=not progress,
+        pairwise(rows), f"convert {index.path.stem}", len(index.lengths), unit="demo", disable=not progress
     )
-    with _quiet(), scheduled_as_before():
+    with quietly():
         try:
             for start, stop in bar:
                 for row in range(start, stop):
@@ -250,16 +234,19 @@ def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Without the bar and the banner that LeRobot's libraries print for every episode."""
+def quietly() -> Iterator[None]:
+    """Without the bars and banners of LeRobot's libraries, and without the priority of its AV1 encoder.
+
+    That gives a process of the superuser real-time priority, and with it all workers that are started later:
+    beside them everything else on the machine stands still.
+    """
     utils = require("lerobot.utils.utils", "lerobot")
-    before = os.environ.get("SVT_LOG")
-    os.environ["SVT_LOG"] = "1"  # of the AV1 encoder: errors alone
+    linux = hasattr(os, "sched_setscheduler")
+    scheduled = (os.sched_getscheduler(0), os.sched_getparam(0)) if linux else None
     try:
+        os.environ.setdefault("SVT_LOG", "1")  # of the encoder's messages errors alone
         with utils.SuppressProgressBars():
             yield
     finally:
-        if before is None:
-            del os.environ["SVT_LOG"]
-        else:
-            os.environ["SVT_LOG"] = before
+        if scheduled is not None and os.sched_getscheduler(0) != scheduled[0]:
+            os.sched_setscheduler(0, *scheduled)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from warmprior.envs.mimicgen import is_mimicgen
 from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
-from warmprior.io.hub import deadline, snapshot, until
 
 __all__ = [
     "MIMICGEN_REPOSITORY",
@@ -31,12 +29,7 @@ MIMICGEN_REPOSITORY = "amandlek/mimicgen_datasets"
 
 
 def download_robomimic(
-    task: str,
-    style: str = "ph",
-    *,
-    root: str | Path | None = None,
-    endpoint: str | None = None,
-    force: bool = False,
+    task: str, style: str = "ph", *, root: str | Path | None = None, force: bool = False
 ) -> Path:
     """Download an official low-dimensional file, unless it is there already.
 
@@ -48,7 +41,6 @@ def download_robomimic(
         task: ``lift``, ``can``, ``square``, ``transport`` or ``tool_hang``.
         style: ``"ph"`` (one proficient operator) or ``"mh"`` (six operators).
         root: the folder under which to keep the file; by default the hub client's cache.
-        endpoint: address of the hub or of a server like it; by default the hub client's own.
         force: download again even if the file is there.
 
     Returns:
@@ -73,16 +65,11 @@ def download_robomimic(
     """
     _check_official(task, style, mimicgen=False)
     name = f"v1.5/{task}/{style}/low_dim_v15.hdf5"
-    return _download(name, REPOSITORIES, root, endpoint, force)
+    return _download(name, REPOSITORIES, root, force)
 
 
 def download_mimicgen(
-    task: str,
-    style: str = "source",
-    *,
-    root: str | Path | None = None,
-    endpoint: str | None = None,
-    force: bool = False,
+    task: str, style: str = "source", *, root: str | Path | None = None, force: bool = False
 ) -> Path:
     """Download an official file of MimicGen, unless it is there already.
 
@@ -94,7 +81,6 @@ def download_mimicgen(
         task: ``stack_d0``, ``coffee_d0`` or ``threading_d0``.
         style: ``"source"`` (ten human demonstrations) or ``"core"`` (a thousand that MimicGen made of them).
         root: the folder under which to keep the file; by default the hub client's cache.
-        endpoint: address of the hub or of a server like it; by default the hub client's own.
         force: download again even if the file is there.
 
     Returns:
@@ -116,7 +102,7 @@ def download_mimicgen(
     _check_official(task, style, mimicgen=True)
     # The human demonstrations belong to the task, those made of them to a variant of it.
     name = task.removesuffix("_d0") if style == "source" else task
-    return _download(f"{style}/{name}.hdf5", (MIMICGEN_REPOSITORY,), root, endpoint, force)
+    return _download(f"{style}/{name}.hdf5", (MIMICGEN_REPOSITORY,), root, force)
 
 
 LEROBOT_VERSION = "v3.0"
@@ -158,13 +144,12 @@ def download_lerobot(
         return home / repository
     revision = LEROBOT_VERSION if revision is None else revision
     try:
-        return snapshot(
+        found = require("huggingface_hub", "lerobot").snapshot_download(
             repository,
-            files,
             repo_type="dataset",
             revision=revision,
             cache_dir=home / "hub",
-            extra="lerobot",
+            allow_patterns=list(files),
         )
     except Exception as error:  # the client's errors share no base class
         reason = str(error).strip() or "no message"
@@ -174,6 +159,7 @@ def download_lerobot(
             "it with python -m lerobot.scripts.convert_dataset_v21_to_v30. A folder fetched by other means "
             "can be given by its path."
         ) from error
+    return Path(found)
 
 
 def _check_official(task: str, style: str, *, mimicgen: bool) -> None:
@@ -194,25 +180,13 @@ def _check_official(task: str, style: str, *, mimicgen: bool) -> None:
         raise ValueError(f"{task} has no official {style!r} data; it has: {known}")
 
 
-def _download(
-    name: str,
-    repositories: Sequence[str],
-    root: str | Path | None,
-    endpoint: str | None,
-    force: bool,
-) -> Path:
+def _download(name: str, repositories: Sequence[str], root: str | Path | None, force: bool) -> Path:
     """Fetch and check a file of the first repository that delivers it."""
     hub = require("huggingface_hub", "sim")
     require("h5py", "sim")
     failures: list[str] = []
-    latest = deadline()
     for repository in repositories:
-        where = {
-            "repo_id": repository,
-            "filename": name,
-            "repo_type": "dataset",
-            "endpoint": endpoint,
-        }
+        where = {"repo_id": repository, "filename": name, "repo_type": "dataset"}
 
         def fetch(anew: bool, where: dict[str, Any] = where) -> Path:
             path = Path(hub.hf_hub_download(**where, local_dir=root, force_download=anew))
@@ -223,11 +197,11 @@ def _download(
         # underneath, and OSError for a broken connection, a full disk or a short file.
         try:
             try:
-                return until(latest, partial(fetch, force))
+                return fetch(force)
             except DatasetError:
                 if force:
                     raise
-                return until(latest, partial(fetch, True))
+                return fetch(True)
         except Exception as error:
             reason = str(error).strip() or "no message"
             failures.append(f"{repository}: {type(error).__name__}: {reason}")
@@ -253,7 +227,7 @@ def _check(path: Path, digest: str | None) -> None:
 def _published_digest(hub: Any, where: dict[str, Any]) -> str | None:
     """SHA-256 of a file at the hub; ``None`` if the hub cannot be reached or gives another kind."""
     try:
-        etag = hub.get_hf_file_metadata(hub.hf_hub_url(**where), endpoint=where["endpoint"]).etag
+        etag = hub.get_hf_file_metadata(hub.hf_hub_url(**where)).etag
     except Exception:  # without a connection, what is there has to do
         return None
     return etag if etag is not None and len(etag) == 64 else None

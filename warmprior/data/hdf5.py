@@ -17,27 +17,14 @@ import numpy as np
 
 from warmprior.data.hdf5_images import image_size
 from warmprior.data.hdf5_members import DatasetError, member, names, reading
-from warmprior.data.index import (
-    BLOCK,
-    DatasetIndex,
-    check_count,
-    check_env_args,
-    store_finite,
-    task_of_env,
-)
+from warmprior.data.index import BLOCK, DatasetIndex, check_count, check_env_args, store_finite
+from warmprior.envs.tasks import task_of_env
 from warmprior.io.extras import require
 
 if TYPE_CHECKING:
     import h5py
 
-__all__ = [
-    "DatasetError",
-    "open_robomimic",
-    "read_env_args",
-    "read_index",
-    "read_masks",
-    "read_rows",
-]
+__all__ = ["DatasetError", "open_robomimic", "read_env_args", "read_index", "read_masks", "read_rows"]
 
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
@@ -45,25 +32,11 @@ _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
 
 @contextmanager
 def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
-    """Open a robomimic file for reading.
-
-    Args:
-        path: the HDF5 file.
-
-    Yields:
-        The open ``h5py.File``, which has a group ``data`` with at least one demo.
+    """Open a robomimic file, whose group ``data`` has at least one demo, for reading.
 
     Raises:
         FileNotFoundError: if there is no such file.
         DatasetError: if it is not a complete HDF5 file or has no demos.
-        ImportError: if h5py is not installed.
-
-    Examples:
-        >>> with open_robomimic("nowhere.hdf5") as file:
-        ...     pass
-        Traceback (most recent call last):
-            ...
-        FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
     h5py = require("h5py", "sim")
     path = Path(path)
@@ -93,15 +66,7 @@ def _number(path: Path, name: str) -> int:
 
 
 def read_masks(path: str | Path) -> dict[str, set[str]]:
-    """The names of the demos in each mask of a robomimic file.
-
-    Args:
-        path: the HDF5 file.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        DatasetError: if a mask is no list of names.
-    """
+    """The names of the demos in each mask of a robomimic file."""
     with open_robomimic(path) as file:
         group, demos = member(file, "mask", "group"), len(names(file["data"]))
         known = [] if group is None else names(group)
@@ -161,22 +126,7 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
 
 
 def read_env_args(path: str | Path) -> dict[str, Any]:
-    """The environment that a robomimic file names, as the file has it.
-
-    Args:
-        path: the HDF5 file.
-
-    Returns:
-        A dict with at least ``env_name`` and ``env_kwargs``.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        DatasetError: if it is no robomimic file, or names no environment.
-
-    Examples:
-        >>> read_env_args("square.hdf5")["env_name"]  # doctest: +SKIP
-        'NutAssemblySquare'
-    """
+    """The environment that a robomimic file names, as the file has it: see :func:`check_env_args`."""
     with open_robomimic(path) as file:
         return _env_args(file, Path(path))
 
@@ -258,18 +208,9 @@ def read_index(
 ) -> DatasetIndex:
     """Check a robomimic file and say what it holds. No values are read.
 
-    Args:
-        path: the HDF5 file.
-        filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
-        observation_keys: the observations to read. By default those of the task, or, for an
-            unknown environment, ``object`` and each robot's pose and gripper as far as the file
-            has them.
-        image_keys: images to read as well.
-        poses: also require the hand pose of every arm, from which absolute actions are built.
-        demos: how many to take, the first ones by their numbers; all if ``None``.
-
-    Returns:
-        The selection.
+    Options as of :class:`~warmprior.data.RobomimicExperienceReplay`. By default the observations are those of
+    the task, or, for an unknown environment, ``object`` and each robot's pose and gripper as far as the file
+    has them; ``poses`` also requires the hand pose of every arm.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -277,11 +218,6 @@ def read_index(
             names absent demos, there are fewer demos than are to be taken, a key is missing, a demo is
             empty, or shapes disagree.
         ValueError: if no demos are to be taken.
-
-    Examples:
-        >>> index = read_index("square.hdf5", filter_key="train")  # doctest: +SKIP
-        >>> len(index.demos), index.action_dim  # doctest: +SKIP
-        (180, 7)
     """
     path = Path(path)
     if demos is not None and demos < 1:
@@ -343,18 +279,10 @@ def read_index(
 
 
 def read_rows(file: h5py.File, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-    """Read rows of one array of a demo into ``out``, block by block, and check them.
+    """Read and check rows, from ``first`` on, of one array of a demo, such as ``"obs/object"``.
 
-    Args:
-        file: the open file.
-        demo: the name of the demo.
-        key: path inside the demo, such as ``"actions"`` or ``"obs/object"``.
-        out: ``[rows, width]`` floating-point memory to fill; may be a strided view.
-        first: the row of the demo that goes to the first row of ``out``.
-
-    Raises:
-        DatasetError: if a value is not finite in the type of ``out`` or greater than
-            1e9, or the file cannot be read.
+    They go, block by block, to ``out`` ``[rows, width]``, which may be a strided view; see
+    :func:`store_finite` for errors.
     """
     name = f"data/{demo}/{key}"
     dataset = member(file, name, "dataset")

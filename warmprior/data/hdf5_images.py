@@ -19,20 +19,7 @@ _BLOCK_BYTES = 2**24
 
 
 def image_size(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) -> int:
-    """Side of the images of a demo, after checking that they are what they should be.
-
-    Args:
-        path: of the file.
-        demo: the demo.
-        keys: names of its images, such as ``"agentview_image"``.
-        steps: of the demo.
-
-    Returns:
-        The side in pixels, the same for all.
-
-    Raises:
-        DatasetError: if one is missing, is no image, or has another size or number of rows.
-    """
+    """Side in pixels of a demo's images, after checking that they are what they should be."""
     name, sizes = demo.name[1:], {}
     for key in keys:
         images = member(demo, f"obs/{key}", "dataset")
@@ -61,17 +48,7 @@ def image_size(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) ->
 
 
 def read_images(file: h5py.File, demo: str, key: str, out: Tensor) -> None:
-    """Read the images of a demo, channels first, block by block.
-
-    Args:
-        file: the open file.
-        demo: the name of the demo.
-        key: of the images.
-        out: uint8 ``[steps, 3, size, size]``, to fill.
-
-    Raises:
-        DatasetError: if they cannot be read.
-    """
+    """Read the images of a demo into uint8 ``[steps, 3, size, size]``, channels first, block by block."""
     name = f"data/{demo}/obs/{key}"
     images: Any = member(file, name, "dataset")
     rows = max(1, _BLOCK_BYTES // max(1, out[0].numel()))

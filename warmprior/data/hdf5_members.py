@@ -47,15 +47,7 @@ class DatasetError(ValueError):
 
 @contextmanager
 def reading(parent: h5py.Group, name: str) -> Iterator[None]:
-    """Name the file and the object in whatever goes wrong while HDF5 reads it.
-
-    Args:
-        parent: the group that holds the object.
-        name: its path below ``parent``.
-
-    Raises:
-        DatasetError: for any error inside.
-    """
+    """Name the file, and the object below ``parent``, in whatever goes wrong inside."""
     try:
         yield
     except DatasetError:
@@ -76,15 +68,7 @@ def names(group: h5py.Group) -> list[str]:
 def member(
     parent: h5py.Group, name: str, kind: Literal["group", "dataset"]
 ) -> h5py.Group | h5py.Dataset | None:
-    """Open a group or dataset that the file itself holds.
-
-    Args:
-        parent: where to start.
-        name: path below it.
-        kind: what it has to be.
-
-    Returns:
-        The object, or ``None`` if there is none.
+    """Open a group or dataset below ``parent`` that the file itself holds; ``None`` if there is none.
 
     Raises:
         DatasetError: if it is of another kind, lies in another file, or was declared without being

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from warmprior.data.hdf5_members import DatasetError
-from warmprior.envs.tasks import TASKS, TaskSpec
+from warmprior.envs.tasks import TaskSpec
 
-__all__ = ["BLOCK", "DatasetIndex", "check_count", "check_env_args", "store_finite", "task_of_env"]
+__all__ = ["BLOCK", "DatasetIndex", "check_count", "check_env_args", "store_finite"]
 
 BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
 LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
@@ -68,40 +67,15 @@ class DatasetIndex:
 
 
 def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
-    """Whether something read from a file describes an environment as robomimic does.
-
-    Args:
-        what: names it in errors.
-        env_args: as read.
-
-    Returns:
-        The same.
-
-    Raises:
-        DatasetError: if ``env_name`` or ``env_kwargs`` is missing, or of another type.
-    """
+    """Refuse what describes no environment as robomimic does: text ``env_name`` and a dict ``env_kwargs``."""
     for key, kind in (("env_name", str), ("env_kwargs", dict)):
         if not (isinstance(env_args, dict) and isinstance(env_args.get(key), kind)):
             raise DatasetError(f"{what} lacks {key}, or it is not a {kind.__name__}")
     return env_args
 
 
-def task_of_env(env_args: Mapping[str, Any]) -> TaskSpec | None:
-    """The task of :data:`warmprior.envs.TASKS` that uses an environment, or ``None``."""
-    return next((t for t in TASKS.values() if t.env_name == env_args["env_name"]), None)
-
-
 def check_count(path: Path, demos: int | None, available: int) -> None:
-    """Refuse to take more demonstrations than there are.
-
-    Args:
-        path: of the file or folder.
-        demos: how many to take; all if ``None``.
-        available: how many there are.
-
-    Raises:
-        DatasetError: if there are fewer.
-    """
+    """Refuse to take more demonstrations than there are."""
     if demos is not None and demos > available:
         raise DatasetError(
             f"{path}: there are {available} demonstrations, fewer than the {demos} to be taken: ask "
@@ -110,17 +84,11 @@ def check_count(path: Path, demos: int | None, available: int) -> None:
 
 
 def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advice: str) -> None:
-    """Copy numbers that were read, and check them as they are kept.
-
-    Args:
-        block: the numbers.
-        out: ``[rows, width]`` floating-point memory to fill; may be a strided view.
-        what: names them in errors.
-        first: number of the first row, in errors.
-        advice: what to do about a bad row.
+    """Copy numbers that were read to ``out``, ``[rows, width]``, and check them as they are kept.
 
     Raises:
-        DatasetError: if a value is not finite in the type of ``out``, or greater than 1e9.
+        DatasetError: if a value is not finite in the type of ``out``, or greater than 1e9; it names ``what``,
+            counts rows from ``first`` on, and ends with the advice.
     """
     with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
         out[...] = block.reshape(out.shape)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +27,7 @@ from warmprior.data.lerobot_index import (
     read_metadata,
     vector_widths,
 )
-from warmprior.data.replay import DemonstrationReader, DemonstrationReplay, check_storage
+from warmprior.data.replay import DemonstrationReader, DemonstrationReplay
 from warmprior.io.extras import require
 from warmprior.io.hub import is_repository
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
@@ -59,19 +59,9 @@ def _root(dataset: str | Path, files: Sequence[str] = ("meta/*",), revision: str
 
 
 def find_lerobot(dataset: str | Path, *, revision: str | None = None, **options: Any) -> LeRobotIndex:
-    """Read what describes a LeRobotDataset; of one in the hub nothing else is fetched.
+    """Read what describes a LeRobotDataset, by :func:`~warmprior.data.lerobot_index.read_lerobot_index`.
 
-    Args:
-        dataset: its folder, or its repository in the hub.
-
-    Keyword Args:
-        revision: of a repository, see :func:`~warmprior.data.download_lerobot`.
-        options: of :func:`~warmprior.data.lerobot_index.read_lerobot_index`.
-
-    Raises:
-        FileNotFoundError: if there is no such dataset.
-        DatasetError: if it is not as it should be.
-        OSError: if a download fails.
+    Of one in the hub nothing else is fetched; ``OSError`` if that fails.
     """
     return read_lerobot_index(_root(dataset, revision=revision), **options)
 
@@ -85,12 +75,7 @@ def fetch_lerobot(dataset: str | Path, *, revision: str | None = None, **options
 
 
 class _Columns:
-    """The numbers of a dataset's features: one file at a time, of it each column that is asked for, once.
-
-    Args:
-        root: the dataset's folder.
-        metadata: see :func:`~warmprior.data.lerobot_index.read_metadata`.
-    """
+    """The numbers of a dataset's features: one file at a time, of it each column that is asked for, once."""
 
     def __init__(self, root: Path, metadata: Any) -> None:
         self.root, self.metadata = root, metadata
@@ -117,10 +102,7 @@ class _Columns:
             arrow = require("pyarrow", "lerobot")
             parquet = require("pyarrow.parquet", "lerobot")
             table = parquet.read_table(self.root / self._file, columns=[name])
-            column, width = (
-                table.column(name).combine_chunks(),
-                self.metadata.features[name]["shape"][0],
-            )
+            column, width = (table.column(name).combine_chunks(), self.metadata.features[name]["shape"][0])
             if hasattr(column, "flatten") and arrow.types.is_nested(column.type):
                 # The cast refuses rows of another length.
                 column = column.cast(arrow.list_(column.type.value_type, width)).flatten()
@@ -144,11 +126,7 @@ def _reading(path: Path) -> Iterator[None]:
 
 
 class LeRobotReader(DemonstrationReader):
-    """The values of a dataset.
-
-    Args:
-        index: what is selected.
-    """
+    """The values of a dataset."""
 
     def __init__(self, index: LeRobotIndex) -> None:
         self.index = index
@@ -255,11 +233,7 @@ class LeRobotExperienceReplay(DemonstrationReplay):
             are many.
         absolute_actions: see :class:`RobomimicExperienceReplay`; of numbers that were rounded to
             float32.
-        storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``.
-        scratch_dir: folder of the memory maps; temporary files if ``None``.
-        device: device of the tensors; ``"cpu"`` for ``"memmap"``.
-        **kwargs: further arguments of :class:`~torchrl.data.TensorDictReplayBuffer`, such as
-            ``batch_size``, ``sampler``, ``transform``, ``prefetch`` or ``generator``.
+        **kwargs: see :class:`RobomimicExperienceReplay`.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
@@ -291,12 +265,8 @@ class LeRobotExperienceReplay(DemonstrationReplay):
         observation_keys: Sequence[str] | None = None,
         image_keys: Sequence[str] = (),
         absolute_actions: bool = False,
-        storage: Literal["memory", "memmap"] = "memory",
-        scratch_dir: str | Path | None = None,
-        device: torch.device | str = "cpu",
         **kwargs: Any,
     ) -> None:
-        device = check_storage(storage, device)
         index = fetch_lerobot(
             dataset,
             revision=revision,
@@ -312,17 +282,12 @@ class LeRobotExperienceReplay(DemonstrationReplay):
             nullcontext(LeRobotReader(index)),
             described=f"{index.path / DESCRIPTION}: env_args" if index.described else "env_args",
             absolute_actions=absolute_actions,
-            storage=storage,
-            scratch_dir=scratch_dir,
-            device=device,
             **kwargs,
         )
 
 
 def lerobot_steps(
-    dataset: str | Path,
-    observation_keys: Sequence[str] = ("observation.state",),
-    action_key: str = "action",
+    dataset: str | Path, observation_keys: Sequence[str] = ("observation.state",), action_key: str = "action"
 ) -> TensorDict:
     """Read the steps of a LeRobotDataset of any robot, in raw units.
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from warmprior.data.hdf5_members import DatasetError
-from warmprior.data.index import DatasetIndex, check_count, check_env_args, task_of_env
-from warmprior.envs.tasks import TaskSpec
+from warmprior.data.index import DatasetIndex, check_count, check_env_args
+from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, read_json
 
@@ -73,10 +73,9 @@ class LeRobotIndex(DatasetIndex):
         )
 
     def digest(self) -> str:
-        """SHA-256 of the contents that can be read: names and bytes of their files.
+        """SHA-256 of what can be read: all files of numbers, and those of the images that are selected.
 
-        These are all numbers, however few episodes are selected of a file, and the images that are. What
-        LeRobot or the hub keeps beside (statistics, a card, a cache) does not count.
+        What LeRobot or the hub keeps beside (statistics, a card, a cache) does not count.
         """
         meta = ("meta/info.json", DESCRIPTION, "meta/episodes/*/*.parquet")
         files = {path for pattern in meta for path in self.path.glob(pattern)}
@@ -85,13 +84,7 @@ class LeRobotIndex(DatasetIndex):
 
 
 def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = None) -> str:
-    """The file, below the dataset's folder, that holds an episode's numbers or one of its videos.
-
-    Args:
-        metadata: see :func:`read_metadata`.
-        episode: its row of ``meta/episodes``.
-        video: the feature; the file of the numbers if ``None``.
-    """
+    """The file, below the dataset's folder, that holds an episode's numbers, or its video of a feature."""
     part = "data" if video is None else f"videos/{video}"
     numbers = {f"{n}_index": episode[f"{part}/{n}_index"] for n in ("chunk", "file")}
     template = metadata.data_path if video is None else metadata.video_path
@@ -104,16 +97,9 @@ def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = 
 def read_metadata(root: Path) -> Any:
     """Let LeRobot read what describes a dataset in a folder; the hub is never asked.
 
-    Args:
-        root: the dataset's folder.
-
-    Returns:
-        A ``LeRobotDatasetMetadata``.
-
     Raises:
         FileNotFoundError: if there is no dataset.
         DatasetError: if it is empty or not whole, or LeRobot cannot read it.
-        ImportError: if lerobot is not installed.
     """
     if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
@@ -143,12 +129,7 @@ def read_metadata(root: Path) -> Any:
 
 
 def vector_widths(features: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
-    """The widths of the features that are vectors of numbers.
-
-    Examples:
-        >>> vector_widths({"action": {"dtype": "float32", "shape": (7,)}})
-        {'action': 7}
-    """
+    """The widths of the features that are vectors of numbers."""
     return {
         name: feature["shape"][0]
         for name, feature in features.items()
@@ -191,15 +172,7 @@ def state_names(widths: Mapping[str, int]) -> list[str]:
 
 
 def layout_of(widths: Mapping[str, int]) -> dict[str, dict[str, int]]:
-    """Which feature of a converted dataset holds each observation of robomimic, and their widths.
-
-    Args:
-        widths: of the observations.
-
-    Examples:
-        >>> layout_of({"robot0_eef_pos": 3, "object": 10})
-        {'observation.environment_state': {'object': 10}, 'observation.state': {'robot0_eef_pos': 3}}
-    """
+    """Which feature of a converted dataset holds each observation of robomimic, and their widths."""
     robots = {key: width for key, width in widths.items() if key.startswith("robot")}
     others = {key: width for key, width in widths.items() if key not in robots}
     layout = {ENVIRONMENT_STATE: others, ROBOT_STATE: robots}
@@ -275,10 +248,7 @@ def read_lerobot_index(
         elif not described:
             observation_keys = [key for key in (ENVIRONMENT_STATE, ROBOT_STATE) if key in columns]
     arms = range(min(widths["action"] // 7, 2)) if poses else ()
-    for key in [
-        *observation_keys,
-        *(f"robot{a}_eef_{end}" for a in arms for end in ("pos", "quat")),
-    ]:
+    for key in [*observation_keys, *(f"robot{a}_eef_{end}" for a in arms for end in ("pos", "quat"))]:
         if key not in columns:
             raise DatasetError(
                 f"{root}: there is no observation {key!r} among {', '.join(columns)}: choose others with "

@@ -78,23 +78,13 @@ def check_place(place: str | Path, option: str) -> None:
 
 
 def name_of_place(place: str | Path) -> str:
-    """A short name: that of the file without its ending, of the folder, or of the repository.
-
-    Examples:
-        >>> name_of_place("data/square.hdf5"), name_of_place("lerobot:user/square")
-        ('square', 'square')
-    """
+    """A short name: that of the file without its ending, of the folder, or of the repository."""
     dataset = _lerobot(place)
     return Path(place).stem if dataset is None else Path(dataset).resolve().name
 
 
 def resolved_place(place: Path) -> str:
-    """The same place as seen from any working directory.
-
-    Examples:
-        >>> resolved_place(Path("lerobot:user/square"))
-        'lerobot:user/square'
-    """
+    """The same place as seen from any working directory."""
     dataset = _lerobot(place)
     if dataset is None:
         return str(place.resolve())
@@ -108,20 +98,16 @@ def open_demonstrations(place: str | Path, env_args: Mapping[str, Any] | None = 
         place: an HDF5 file, or ``lerobot:`` and a folder or repository.
         env_args: of the environment, for a LeRobotDataset that does not describe its own.
 
-
     See Also:
         - :class:`~warmprior.data.opening.Demonstrations`: what it returns.
         - :func:`~warmprior.data.opening.check_place`: looks first, and reads nothing.
 
     Examples:
-        >>> found = open_demonstrations("lerobot:user/square")  # nothing is fetched yet
-        >>> type(found).__name__, found.name
-        ('LeRobotFolder', 'lerobot:square')
-        >>> open_demonstrations("data/square.hdf5").name
-        'square.hdf5'
+        >>> open_demonstrations("lerobot:user/square").name  # nothing is fetched yet
+        'lerobot:square'
     """
     dataset = _lerobot(place)
-    return RobomimicFile(place) if dataset is None else LeRobotFolder(dataset, env_args)
+    return _RobomimicFile(place) if dataset is None else _LeRobotFolder(dataset, env_args)
 
 
 class Demonstrations(ABC):
@@ -143,29 +129,15 @@ class Demonstrations(ABC):
 
     @abstractmethod
     def index(self, **options: Any) -> DatasetIndex:
-        """What is there.
-
-        Args:
-            options: ``image_keys``, ``demos`` and so on of
-                :func:`~warmprior.data.hdf5.read_index`.
-        """
+        """What is there; options (``image_keys``, ``demos`` and so on) as of ``read_index``."""
 
     @abstractmethod
     def replay(self, **options: Any) -> DemonstrationReplay:
-        """Read them.
-
-        Args:
-            options: those of :class:`RobomimicExperienceReplay` after ``root``.
-        """
+        """Read them; options as of :class:`RobomimicExperienceReplay`."""
 
     @abstractmethod
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        """SHA-256 of the contents.
-
-        Args:
-            image_keys: the images that are used.
-            demos: how many demonstrations are used; all if ``None``.
-        """
+        """SHA-256 of the contents, as far as these images and that many demonstrations are used."""
 
     @abstractmethod
     def with_images(self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool) -> Self:
@@ -173,85 +145,56 @@ class Demonstrations(ABC):
 
         Those that are there are compared with the simulator's; others are rendered where states are known.
 
-        Args:
-            cameras: of the simulator.
-            size: side of images to render.
-
-        Keyword Args:
-            demos: how many of them are used; all if ``None``.
-            fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-
         Raises:
             DatasetError: if the images show something else than the simulator, or cannot be rendered.
         """
 
 
-class RobomimicFile(Demonstrations):
-    """The demonstrations of an HDF5 file.
-
-    Args:
-        path: of the file.
-    """
-
+class _RobomimicFile(Demonstrations):
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.name = self.path.name
 
     def index(self, **options: Any) -> DatasetIndex:
-        """What is there."""
         return read_index(self.path, **options)
 
     def replay(self, **options: Any) -> RobomimicExperienceReplay:
-        """Read them."""
         return RobomimicExperienceReplay(self.path, **options)
 
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        """SHA-256 of the whole file."""
         return file_digest(self.path)
 
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
-    ) -> RobomimicFile:
-        """This file, or one with its states rendered."""
+    ) -> _RobomimicFile:
         from warmprior.data.render import compare_images, render_demonstrations
 
         if set(cameras) <= set(self.index(demos=demos).cameras):
             compare_images(self.path, [f"{camera}_image" for camera in cameras], fast)
             return self
-        return RobomimicFile(render_demonstrations(self.path, cameras, size, demos=demos, fast=fast))
+        return _RobomimicFile(render_demonstrations(self.path, cameras, size, demos=demos, fast=fast))
 
 
-class LeRobotFolder(Demonstrations):
-    """The demonstrations of a LeRobotDataset.
-
-    Args:
-        dataset: its folder, or its repository in the hub.
-        env_args: see :func:`open_demonstrations`.
-    """
-
+class _LeRobotFolder(Demonstrations):
     def __init__(self, dataset: str, env_args: Mapping[str, Any] | None = None) -> None:
         self.dataset, self.env_args = dataset, env_args
         self.name = f"{LEROBOT}{name_of_place(LEROBOT + dataset)}"
 
     def index(self, **options: Any) -> LeRobotIndex:
-        """What is there."""
         return find_lerobot(self.dataset, env_args=self.env_args, **options)
 
     def _fetched(self, **options: Any) -> LeRobotIndex:
         return fetch_lerobot(self.dataset, env_args=self.env_args, **options)
 
     def replay(self, **options: Any) -> LeRobotExperienceReplay:
-        """Read them."""
         return LeRobotExperienceReplay(self.dataset, env_args=self.env_args, **options)
 
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        """SHA-256 of the files that are read."""
         return self._fetched(image_keys=image_keys, demos=demos).digest()
 
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
-    ) -> LeRobotFolder:
-        """This dataset, whose images are compared with the simulator's; none can be rendered."""
+    ) -> _LeRobotFolder:
         from warmprior.data.render import compare_first_images
 
         keys = [f"{camera}_image" for camera in cameras]

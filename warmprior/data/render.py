@@ -6,8 +6,7 @@ import json
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import as_completed
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -22,14 +21,7 @@ from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer, require_rendering
 from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
 from warmprior.io.extras import require
-from warmprior.io.files import (
-    cache_folder,
-    check_writable,
-    digest_of,
-    exclusive,
-    file_digest,
-    write_atomic,
-)
+from warmprior.io.files import cache_folder, check_writable, digest_of, exclusive, file_digest, write_atomic
 from warmprior.io.processes import working
 from warmprior.io.workers import available_cores
 
@@ -138,7 +130,7 @@ def render_demonstrations(
             ) as bar,
         ):
             call(_Illustrator.check).result()  # before hours are spent
-            for future in as_completed([call(_Render(demo)) for demo in missing]):
+            for future in as_completed([call(partial(_Illustrator.render, demo=demo)) for demo in missing]):
                 future.result()
                 bar.update()
         write_atomic(out, lambda temporary: _write(temporary, illustrator, kept))
@@ -211,6 +203,20 @@ class _Illustrator:
         for camera in self.cameras:
             self.renderer.render(camera, self.positions(self.index.demos[0])[0])
 
+    def render(self, demo: str) -> None:
+        """Render all images of a demo."""
+        positions = self.positions(demo)
+        images = {
+            f"{camera}_image": np.stack([self.renderer.render(camera, q) for q in positions])
+            for camera in self.cameras
+        }
+
+        def write(path: Path) -> None:
+            with open(path, "wb") as file:
+                np.savez_compressed(file, **images)  # type: ignore[arg-type]
+
+        write_atomic(self.part(demo), write)
+
     def compare(self, state: np.ndarray, images: Mapping[str, np.ndarray], name: str, advice: str) -> None:
         """Compare images of a state, by camera, with the simulator's."""
         model = self.renderer.model
@@ -239,35 +245,6 @@ class _Illustrator:
                     f"{name}: the images of {camera} {view} ({as_stored:.0f} of 255 off on average). "
                     f"Policies would see other ones in evaluation: {advice}"
                 )
-
-
-@dataclass(frozen=True)
-class _Render:
-    demo: str
-
-    def __call__(self, illustrator: _Illustrator) -> None:
-        positions = illustrator.positions(self.demo)
-        images = {
-            f"{camera}_image": np.stack([illustrator.renderer.render(camera, q) for q in positions])
-            for camera in illustrator.cameras
-        }
-
-        def write(path: Path) -> None:
-            with open(path, "wb") as file:
-                np.savez_compressed(file, **images)  # type: ignore[arg-type]
-
-        write_atomic(illustrator.part(self.demo), write)
-
-
-@dataclass(frozen=True)
-class _Compare:
-    state: np.ndarray
-    images: Mapping[str, np.ndarray]
-    name: str
-    advice: str
-
-    def __call__(self, illustrator: _Illustrator) -> None:
-        illustrator.compare(self.state, self.images, self.name, self.advice)
 
 
 def _rendering(file: Any) -> dict[str, Any] | None:
@@ -328,19 +305,7 @@ def _with_cameras(env_args: Mapping[str, Any], illustrator: _Illustrator) -> dic
 
 
 def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) -> None:
-    """Compare the first images of a file with what the simulator shows there.
-
-    Args:
-        path: a robomimic file with images.
-        image_keys: their names.
-        fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-
-    Raises:
-        DatasetError: if they are upside down, or show something else, or the file says that they were
-            rendered in the other quality.
-        ValueError: if the simulator has no such camera.
-        RuntimeError: if nothing here can render.
-    """
+    """Compare the first images of a file with the simulator's, see :func:`compare_first_images`."""
     index = read_index(path, image_keys=image_keys)
     first = f"data/{index.demos[0]}"
     with open_robomimic(path) as file:
@@ -367,21 +332,12 @@ def compare_first_images(
     fast: bool,
     advice: str,
 ) -> None:
-    """Compare images of one state with what the simulator shows there.
+    """Compare images of one state, uint8 ``[size, size, 3]`` by name, with what the simulator shows there.
 
-    Args:
-        index: of the demonstrations.
-        images: by name, uint8 ``[size, size, 3]``.
-
-    Keyword Args:
-        state: of the simulator; without, nothing is compared, with a warning.
-        rendering: how the images were rendered, where that is known.
-        fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-        advice: what to do about images that show something else.
+    Without the state nothing is compared, with a warning.
 
     Raises:
-        DatasetError: if they are upside down, or show something else, or were rendered in the other
-            quality.
+        DatasetError: if they are upside down, or show something else, or were rendered in the other quality.
         ValueError: if the simulator has no such camera.
         RuntimeError: if nothing here can render.
     """
@@ -393,12 +349,12 @@ def compare_first_images(
         )
     if state is None:
         warnings.warn(
-            f"{path} holds no states: its images could not be compared with the simulator's",
-            stacklevel=2,
+            f"{path} holds no states: its images could not be compared with the simulator's", stacklevel=2
         )
         return
     by_camera = {key.removesuffix("_image"): image for key, image in images.items()}
     illustrator = _Illustrator(index, tuple(by_camera), index.image_size, fast, path)
     # In a process of its own: one that has rendered cannot fork others that do.
     with working(1, illustrator) as call:
-        call(_Compare(state, by_camera, str(path), advice)).result()
+        compare = partial(_Illustrator.compare, state=state, images=by_camera, name=str(path), advice=advice)
+        call(compare).result()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -26,7 +26,7 @@ from warmprior.envs.tasks import TaskSpec
 from warmprior.io.memory import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 
-__all__ = ["DemonstrationReader", "DemonstrationReplay", "check_storage"]
+__all__ = ["DemonstrationReader", "DemonstrationReplay"]
 
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
 
@@ -36,13 +36,9 @@ class DemonstrationReader(ABC):
 
     @abstractmethod
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows of one array of a demo, and check them.
+        """Read rows from ``first`` on of one array of a demo into ``out``, ``[rows, width]``, and check them.
 
-        Args:
-            demo: its name.
-            key: ``"actions"``, ``"rewards"`` or ``"obs/<key>"``.
-            out: ``[rows, width]`` floating-point memory to fill; may be a strided view.
-            first: the row of the demo that goes to the first row of ``out``.
+        The array is ``"actions"``, ``"rewards"`` or ``"obs/<key>"``; ``out`` may be a strided view.
 
         Raises:
             DatasetError: if a value is not finite or absurdly large, or cannot be read.
@@ -50,41 +46,11 @@ class DemonstrationReader(ABC):
 
     @abstractmethod
     def images(self, demo: str, key: str, out: Tensor) -> None:
-        """Read the first images of a demo, channels first.
-
-        Args:
-            demo: its name.
-            key: of the images.
-            out: uint8 ``[rows, 3, size, size]``, to fill.
-
-        Raises:
-            DatasetError: if they cannot be read.
-        """
+        """Read the first images of a demo into uint8 ``[rows, 3, size, size]``."""
 
     @abstractmethod
     def name(self, demo: str, key: str) -> str:
         """What errors call an array of a demo, with the file that holds it."""
-
-
-def check_storage(storage: str, device: torch.device | str) -> torch.device:
-    """Refuse a place for the data that there is not.
-
-    Args:
-        storage: ``"memory"`` or ``"memmap"``.
-        device: of the tensors.
-
-    Returns:
-        The device.
-
-    Raises:
-        ValueError: if ``storage`` is unknown or does not fit ``device``.
-    """
-    if storage not in ("memory", "memmap"):
-        raise ValueError(f"storage must be 'memory' or 'memmap', got {storage!r}")
-    device = torch.device(device)
-    if storage == "memmap" and device.type != "cpu":
-        raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
-    return device
 
 
 def _allocate(
@@ -147,11 +113,7 @@ def _reserve(mapped: Any) -> None:
 
 
 def _read_absolute(
-    reader: DemonstrationReader,
-    demo: str,
-    out: np.ndarray,
-    output_max: Tensor,
-    base_rotation: Tensor,
+    reader: DemonstrationReader, demo: str, out: np.ndarray, output_max: Tensor, base_rotation: Tensor
 ) -> None:
     arms = len(base_rotation)
     for first in range(0, len(out), BLOCK):
@@ -264,13 +226,17 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         reader: AbstractContextManager[DemonstrationReader],
         *,
         described: str,
-        absolute_actions: bool,
-        storage: Literal["memory", "memmap"],
-        scratch_dir: str | Path | None,
-        device: torch.device | str,
+        absolute_actions: bool = False,
+        storage: Literal["memory", "memmap"] = "memory",
+        scratch_dir: str | Path | None = None,
+        device: torch.device | str = "cpu",
         **kwargs: Any,
     ) -> None:
-        device = check_storage(storage, device)
+        if storage not in ("memory", "memmap"):
+            raise ValueError(f"storage must be 'memory' or 'memmap', got {storage!r}")
+        device = torch.device(device)
+        if storage == "memmap" and device.type != "cpu":
+            raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
         action_dim = index.action_dim
         self._env_args: dict[str, Any] = {}
         if index.env_args or absolute_actions:
@@ -304,33 +270,23 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         """The file or folder that was read."""
         return self._index.path
 
-    def _check_described(self) -> None:
-        if not self._index.env_args:
+    def _described(self, env_args: Mapping[str, Any]) -> dict[str, Any]:
+        if not env_args:
             raise ValueError(f"{self.path} does not say which environment it was recorded in")
+        return modernize_env_args(env_args)
 
     @property
     def env_args(self) -> dict[str, Any]:
         """The environment of the data, for robosuite 1.5, fit for the actions as they are stored.
 
-        A copy; see :func:`warmprior.envs.modernize_env_args`.
-
-        Raises:
-            ValueError: if it is unknown.
+        A copy; see :func:`warmprior.envs.modernize_env_args`. A ``ValueError`` if it is unknown.
         """
-        self._check_described()
-        return modernize_env_args(self._env_args)
+        return self._described(self._env_args)
 
     @property
     def recorded_env_args(self) -> dict[str, Any]:
-        """The environment of the data, for robosuite 1.5, fit for the actions as they were recorded.
-
-        That is what :attr:`env_args` is where the actions are not absolute.
-
-        Raises:
-            ValueError: if it is unknown.
-        """
-        self._check_described()
-        return modernize_env_args(self._index.env_args)
+        """The same, fit for the actions as they were recorded, where those that are stored are absolute."""
+        return self._described(self._index.env_args)
 
     @property
     def task(self) -> TaskSpec | None:

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from warmprior.data.download import download_robomimic
 from warmprior.data.hdf5 import open_robomimic, read_index, read_rows
 from warmprior.data.hdf5_images import read_images
-from warmprior.data.replay import DemonstrationReader, DemonstrationReplay, check_storage
+from warmprior.data.replay import DemonstrationReader, DemonstrationReplay
 from warmprior.envs.tasks import TASKS
 
 __all__ = ["RobomimicExperienceReplay"]
@@ -82,14 +81,9 @@ class RobomimicExperienceReplay(DemonstrationReplay):
             ``storage="memmap"`` where they are many.
         absolute_actions: turn the recorded pose deltas into absolute poses
             (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm.
-        storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``.
-        scratch_dir: folder of the memory maps; temporary files if ``None``.
-        device: device of the tensors; ``"cpu"`` for ``"memmap"``.
-        batch_size: steps per :meth:`sample`.
-        sampler: a TorchRL sampler; random with replacement by default.
-        transform: a TorchRL transform applied to each sample.
-        **kwargs: further arguments of :class:`~torchrl.data.TensorDictReplayBuffer`, such as
-            ``prefetch``, ``pin_memory`` or ``generator``.
+        **kwargs: those of :class:`~warmprior.data.replay.DemonstrationReplay`: ``storage``, ``scratch_dir``
+            and ``device``, and ``batch_size``, ``sampler``, ``transform``, ``prefetch``, ``pin_memory`` or
+            ``generator`` of TorchRL's.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -121,15 +115,8 @@ class RobomimicExperienceReplay(DemonstrationReplay):
         observation_keys: Sequence[str] | None = None,
         image_keys: Sequence[str] = (),
         absolute_actions: bool = False,
-        storage: Literal["memory", "memmap"] = "memory",
-        scratch_dir: str | Path | None = None,
-        device: torch.device | str = "cpu",
-        batch_size: int | None = None,
-        sampler: Any = None,
-        transform: Any = None,
         **kwargs: Any,
     ) -> None:
-        device = check_storage(storage, device)
         path = _locate(dataset, style, download, root)
         index = read_index(
             path,
@@ -144,11 +131,5 @@ class RobomimicExperienceReplay(DemonstrationReplay):
             _reader(path),
             described=f"{path}: data.attrs['env_args']",
             absolute_actions=absolute_actions,
-            storage=storage,
-            scratch_dir=scratch_dir,
-            device=device,
-            batch_size=batch_size,
-            sampler=sampler,
-            transform=transform,
             **kwargs,
         )

@@ -22,33 +22,15 @@ __all__ = ["ControlLoop", "StepLoop"]
 
 Observations = dict[str, np.ndarray]
 
-OBJECT_POSES = {
-    "Lift",
-    "NutAssemblySquare",
-    "PickPlaceCan",
-    "Stack",
-    "ToolHang",
-    "TwoArmTransport",
-}
+OBJECT_POSES = {"Lift", "NutAssemblySquare", "PickPlaceCan", "Stack", "ToolHang", "TwoArmTransport"}
 """Environments whose ``"object"`` observation follows from positions alone."""
 
 
 class StepLoop:
     """Steps a robosuite environment with ``env.step`` and reads robomimic's observations.
 
-    Args:
-        env: a robosuite environment. Its time limit is switched off: episodes end outside.
-        keys: observations to compute, in robomimic's names (``"object"`` for robosuite's
-            ``"object-state"``); ``None`` for all. What is not asked for is not computed.
-
-    Raises:
-        ValueError: if the environment has no observation of one of these names.
-
-    Examples:
-        >>> from warmprior.envs.simulator import make_simulator, task_env_args
-        >>> loop = StepLoop(make_simulator(task_env_args("lift")))  # doctest: +SKIP
-        >>> loop.reset(seed=3)["object"].shape  # doctest: +SKIP
-        (10,)
+    Its time limit is switched off: episodes end outside. Of the observations, in robomimic's names, only
+    ``keys`` are computed, all by default; a ``ValueError`` if there is none of a name.
     """
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
@@ -86,32 +68,17 @@ class StepLoop:
         self._arms = [Arm(self.env, robot) for robot in self.env.robots]
 
     def reset(self, seed: int) -> Observations:
-        """Start the episode that belongs to a seed, leaving the global generators as they were.
-
-        Args:
-            seed: any integer; the same one gives the same episode.
-
-        Returns:
-            The first observations, as :meth:`observations` gives them.
-        """
+        """Start the episode that belongs to a seed; the global generators stay as they were."""
         with isolated_numpy_seed(seed):
             self.env.reset()
         self._bind()
         return self._settled_observations()
 
     def set_state(self, state: np.ndarray) -> Observations:
-        """Put the simulation into a recorded state.
+        """Put the simulation into a recorded state, ``[1 + nq + nv]`` as of :meth:`state`; observe.
 
-        Args:
-            state: ``[1 + nq + nv]`` as :meth:`state` gives it. The gripper's internal command and
-                the solver's starting point are not part of it, so the continuation is close to the
-                recorded one but not identical.
-
-        Returns:
-            The observations there.
-
-        Raises:
-            ValueError: if the state has another length.
+        The gripper's internal command and the solver's starting point are not part of it, so the continuation
+        is close to the recorded one but not identical. A state of another length is a ``ValueError``.
         """
         if np.shape(state) != (1 + self._model.nq + self._model.nv,):
             raise ValueError(
@@ -140,13 +107,9 @@ class StepLoop:
         return self.observations(refresh=False), bool(self.env._check_success())
 
     def observations(self, refresh: bool = True) -> Observations:
-        """Read the observations.
+        """The observations, float64 under robomimic's names, ``"object"`` among them.
 
-        Args:
-            refresh: measure now, rather than return what the last step measured.
-
-        Returns:
-            float64 arrays under robomimic's names, ``"object"`` among them.
+        They are measured now, or with ``refresh=False`` those that the last step measured.
         """
         found = self.env._get_observations(force_update=refresh)
         return {key: np.atleast_1d(found[name]) for name, key in self._names.items()}
@@ -179,20 +142,7 @@ class ControlLoop(StepLoop):
 
     Supports fixed-base, one-handed arms under ``OSC_POSE`` with fixed impedance, uncoupled position
     and orientation and no interpolation: what robomimic and MimicGen use. Inputs may be deltas or
-    absolute, in the world or the base frame.
-
-    Args:
-        env: a robosuite environment.
-        keys: as for :class:`StepLoop`.
-
-    Raises:
-        ValueError: if a robot or its controller is of another kind, or an observation is missing.
-
-    Examples:
-        >>> from warmprior.envs.simulator import make_simulator, task_env_args
-        >>> loop = ControlLoop(make_simulator(task_env_args("lift")))  # doctest: +SKIP
-        >>> _ = loop.reset(seed=3)  # doctest: +SKIP
-        >>> observations, success = loop.step(np.zeros(7))  # doctest: +SKIP
+    absolute, in the world or the base frame. Any other robot or controller is a ``ValueError``.
     """
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
@@ -207,11 +157,7 @@ class ControlLoop(StepLoop):
     def _bind(self) -> None:
         super()._bind()
         nv = self._model.nv
-        self._mass, self._jacp, self._jacr = (
-            np.zeros((nv, nv)),
-            np.zeros((3, nv)),
-            np.zeros((3, nv)),
-        )
+        self._mass, self._jacp, self._jacr = (np.zeros((nv, nv)), np.zeros((3, nv)), np.zeros((3, nv)))
         self._substeps = int(self.env.control_timestep / self.env.model_timestep)
         data = self._data
         self._site_pos, self._site_mat = data.site_xpos, data.site_xmat.reshape(-1, 3, 3)
@@ -264,15 +210,9 @@ class ControlLoop(StepLoop):
     def look_back(self, states: Sequence[np.ndarray]) -> list[Observations]:
         """What the last steps' :meth:`step` would have observed, where it was left out (:meth:`advance`).
 
-        Only for observations that are poses: others are of contacts and velocities that are gone.
-
-        Args:
-            states: :meth:`state` after the last steps, one after the other; the last one is the current one.
-                The first one's observations may be wrong: sensors of objects relative to the gripper read
-                poses that were cached a step before.
-
-        Returns:
-            Observations, one per state.
+        Only for observations that are poses: others are of contacts and velocities that are gone. Takes
+        :meth:`state` after each of the last steps, the current one last. The first one's observations may be
+        wrong: sensors of objects relative to the gripper read poses that were cached a step before.
         """
         data, found = self._data, []
         for state in states:

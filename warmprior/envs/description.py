@@ -72,17 +72,10 @@ def environment_description(
 def robosuite_parts(
     description: Mapping[str, Any],
 ) -> tuple[Callable[..., RobosuiteEnv], dict[str, Transform]]:
-    """What builds the environment, and what turns it into one for a policy's actions and observations.
+    """A function of further options of :class:`RobosuiteEnv`, and the transforms next to it.
 
-    Args:
-        description: see :func:`environment_description`.
-
-    Returns:
-        A function of further options of :class:`RobosuiteEnv`, and the transforms that go next to the
-        environment, as arguments of :func:`~warmprior.policy_transforms`.
-
-    Raises:
-        ValueError: if the environment takes no pose deltas, from which absolute actions are made.
+    The latter are arguments of :func:`~warmprior.policy_transforms`. A ``ValueError`` if the environment
+    takes no pose deltas, from which absolute actions are made.
     """
     options: dict[str, Any] = dict(description["robosuite"])
     transforms: dict[str, Transform] = {}
@@ -97,19 +90,11 @@ def robosuite_parts(
     return partial(RobosuiteEnv, **options), transforms
 
 
-def environment_parts(
-    actor: WarmPriorActor,
-) -> tuple[Callable[..., RobosuiteEnv], Callable[[], Compose]]:
-    """What builds the environment that a policy was made for, and the policy's transforms.
+def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv], Callable[[], Compose]]:
+    """What builds the environment that a policy was made for, and what builds the policy's transforms.
 
-    Args:
-        actor: a policy, such as one that was loaded.
-
-    Returns:
-        Two functions, of further options of :class:`RobosuiteEnv` and of nothing.
-
-    Raises:
-        ValueError: if the policy keeps no description of an environment.
+    Functions of further options of :class:`RobosuiteEnv`, and of nothing. A ``ValueError`` if the policy
+    keeps no description of an environment.
     """
     description: Any = actor.environment
     if not _describes_robosuite(description):

@@ -24,12 +24,7 @@ from warmprior.rotation import (
     rotvec_to_matrix,
 )
 
-__all__ = [
-    "absolute_actions",
-    "absolute_to_env_action",
-    "delta_conventions",
-    "modernize_env_args",
-]
+__all__ = ["absolute_actions", "absolute_to_env_action", "delta_conventions", "modernize_env_args"]
 
 _ARMS = ("right", "left")
 _RENAMED = {"damping": "damping_ratio", "damping_limits": "damping_ratio_limits"}

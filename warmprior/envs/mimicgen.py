@@ -20,25 +20,12 @@ _SINGLE_ARM = "robosuite.environments.manipulation.single_arm_env"
 
 
 def is_mimicgen(env_name: str) -> bool:
-    """Whether an environment is one of MimicGen's, by its name: they end in a variant.
-
-    Examples:
-        >>> is_mimicgen("Stack_D0"), is_mimicgen("MugCleanup_O1"), is_mimicgen("Stack")
-        (True, True, False)
-    """
+    """Whether an environment is one of MimicGen's, by its name: they end in a variant, as ``Stack_D0``."""
     return re.search(r"_[DO]\d$", env_name) is not None
 
 
 def find_mimicgen() -> Path:
-    """The folder of NVlabs' package, found without running any of its code.
-
-    Raises:
-        ImportError: if the package is missing, or another one has its name.
-
-    Examples:
-        >>> find_mimicgen().name  # doctest: +SKIP
-        'mimicgen'
-    """
+    """The folder of NVlabs' package, found without running its code; an ``ImportError`` if there is none."""
     spec = find_spec("mimicgen")
     folders = [Path(folder) for folder in (spec and spec.submodule_search_locations) or ()]
     for folder in folders:

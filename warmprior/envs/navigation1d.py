@@ -173,10 +173,7 @@ class NavigationEnv(EnvBase):
     """Every seed starts the same episode, so each row plays whichever :func:`evaluate` expects."""
 
     def __init__(
-        self,
-        *,
-        batch_size: tuple[int, ...] | list[int] | torch.Size = (),
-        device: torch.device | str = "cpu",
+        self, *, batch_size: tuple[int, ...] | list[int] | torch.Size = (), device: torch.device | str = "cpu"
     ) -> None:
         super().__init__(device=device, batch_size=torch.Size(batch_size))
         shape = (*self.batch_size, 1)

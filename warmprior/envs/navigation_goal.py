@@ -65,10 +65,5 @@ class GoalNavigationEnv(NavigationEnv):
         success = out["success"] & ~failed
         done = out["done"] | failed
         return out.update(
-            {
-                "success": success,
-                "reward": success.to(height.dtype),
-                "done": done,
-                "terminated": done.clone(),
-            }
+            {"success": success, "reward": success.to(height.dtype), "done": done, "terminated": done.clone()}
         )

@@ -78,20 +78,13 @@ class Arm:
         ctrl[self.fingers] = self.finger_middle + self.finger_range * fingers
 
     def remembered(
-        self,
-        jacp: np.ndarray,
-        jacr: np.ndarray,
-        mass: np.ndarray,
-        qvel: np.ndarray,
-        qpos: np.ndarray,
+        self, jacp: np.ndarray, jacr: np.ndarray, mass: np.ndarray, qvel: np.ndarray, qpos: np.ndarray
     ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
         """Replace the simulator's values by those that the controller measured during the reset.
 
-        robosuite computes the first torques of an episode from these, although the joints have
-        been put in place since; so does this loop, to be equal to it.
-
-        Returns:
-            The pose of the grip site, and the velocities and positions of all joints.
+        robosuite computes the first torques of an episode from these, although the joints have been put in
+        place since; so does this loop. Returns the pose of the grip site, and velocities and positions of all
+        joints.
         """
         controller = self.controller
         positions, columns = self.constants[:2]
@@ -103,11 +96,7 @@ class Arm:
 
 
 def check_supported(env: Any) -> None:
-    """Check that every robot of an environment is of the kind that :class:`Arm` describes.
-
-    Raises:
-        ValueError: if one is not.
-    """
+    """Refuse robots that are not of the kind that :class:`Arm` describes."""
     for robot in env.robots:
         composite = robot.composite_controller
         parts = composite.part_controllers

@@ -66,12 +66,7 @@ def rendering_backend() -> str | None:
 
 
 def require_rendering() -> str:
-    """The backend that renders here.
-
-    Raises:
-        ImportError: if MuJoCo is missing.
-        RuntimeError: if none does; the message names the packages to install.
-    """
+    """The backend that renders here; a ``RuntimeError`` that names what to install if there is none."""
     backend = rendering_backend()
     if backend is None:
         require("mujoco", "sim")  # without which no backend could be tried
@@ -83,27 +78,15 @@ def require_rendering() -> str:
 
 
 class CameraRenderer:
-    """Renders the cameras of a MuJoCo model, from positions of its joints.
+    """Renders the cameras of a MuJoCo model, an ``MjModel``, from positions of its joints.
 
     It has a simulation of its own, in which nothing moves: an episode goes on as if nothing was rendered.
-
-    Args:
-        model: an ``mujoco.MjModel``.
-        height: of the images, in pixels.
-        width: of the images, in pixels.
-
-    Keyword Args:
-        fast: leave out reflections, shadows and the smoothing of edges, three to five times faster. The
-            images differ by 1 to 2 of 255 on average.
+    ``fast`` leaves out reflections, shadows and the smoothing of edges: three to five times faster, and the
+    images differ by 1 to 2 of 255 on average.
 
     Raises:
         ValueError: if images of this size are too large for OpenGL.
         RuntimeError: if no OpenGL backend works, or the process was forked from one that has rendered.
-
-    Examples:
-        >>> renderer = CameraRenderer(env.sim.model._model, 84, 84)  # doctest: +SKIP
-        >>> renderer.render("agentview", env.sim.data.qpos).shape  # doctest: +SKIP
-        (84, 84, 3)
     """
 
     def __init__(self, model: Any, height: int, width: int, *, fast: bool = False) -> None:
@@ -156,14 +139,7 @@ class CameraRenderer:
         self.close()
 
     def render(self, camera: str, qpos: np.ndarray) -> np.ndarray:
-        """The image of a camera.
-
-        Args:
-            camera: its name in the model.
-            qpos: positions of the joints, ``[nq]``.
-
-        Returns:
-            uint8 ``[height, width, 3]``, the right way up.
+        """The image of a camera, uint8 ``[height, width, 3]``, the right way up, at joints ``[nq]``.
 
         Raises:
             ValueError: if the model has no such camera.
@@ -208,28 +184,14 @@ def _close_all() -> None:
 
 
 class EnvRenderers:
-    """The renderers of a robosuite environment, made when they are needed.
-
-    Args:
-        env: the robosuite environment.
-
-    Keyword Args:
-        fast: see :class:`CameraRenderer`.
-    """
+    """The renderers of a robosuite environment, made when they are needed."""
 
     def __init__(self, env: Any, *, fast: bool = False) -> None:
         self.env, self.fast = env, fast
         self._made: dict[tuple[int, int], CameraRenderer] = {}
 
     def render(self, camera: str, height: int, width: int, qpos: np.ndarray | None = None) -> np.ndarray:
-        """The image of a camera, see :meth:`CameraRenderer.render`.
-
-        Args:
-            camera: its name, e.g. ``"agentview"``.
-            height: in pixels.
-            width: in pixels.
-            qpos: positions of the joints; the present ones by default.
-        """
+        """The image of a camera, see :meth:`CameraRenderer.render`; of the present state by default."""
         model = self.env.sim.model._model
         renderer = self._made.get((height, width))
         if renderer is None or renderer.model is not model:  # a reset may load another one

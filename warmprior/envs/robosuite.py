@@ -11,18 +11,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs.common import _EnvWrapper
-from torchrl.envs.utils import _classproperty
 
 from warmprior import keys
 from warmprior.envs.control_loop import ControlLoop, StepLoop
+from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import EnvRenderers, require_rendering
-from warmprior.envs.simulator import (
-    action_limits,
-    import_robosuite,
-    make_simulator,
-    task_env_args,
-)
-from warmprior.envs.tasks import STYLES, TASKS, TaskSpec, get_task
+from warmprior.envs.simulator import action_limits, import_robosuite, make_simulator, task_env_args
+from warmprior.envs.tasks import STYLES, task_of_env
 from warmprior.envs.tasks import low_dim_keys as default_keys
 
 __all__ = ["RobosuiteEnv", "RobosuiteWrapper"]
@@ -93,7 +88,6 @@ class RobosuiteWrapper(_EnvWrapper):
         torch.Size([3, 23])
     """
 
-    git_url = "https://github.com/ARISE-Initiative/robosuite"
     libname = "robosuite"
 
     def __init__(
@@ -141,11 +135,6 @@ class RobosuiteWrapper(_EnvWrapper):
         self._seed, self._offset, self._stride = seed, seed_offset, seed_stride
         self._episode, self._elapsed = 0, 0
         super().__init__(device=device, **kwargs)
-
-    @_classproperty
-    def available_envs(cls) -> list[str]:
-        """Names of the tasks that :class:`RobosuiteEnv` builds."""
-        return list(TASKS)
 
     @property
     def lib(self) -> Any:
@@ -361,19 +350,8 @@ class RobosuiteEnv(RobosuiteWrapper):
         style: of the data whose time limit applies: ``"ph"``, ``"mh"``, ``"source"`` or ``"core"``.
         horizon: time limit in control steps; ``None`` for the task's, or for an environment that is
             not in the table that of ``env_args["env_kwargs"]``, or else robosuite's own.
-        control_loop: as for the wrapper.
-        low_dim_keys: as for the wrapper.
-        from_pixels: as for the wrapper.
         camera: ``None`` for the task's first.
-        camera_size: as for the wrapper.
-        fast_rendering: as for the wrapper.
-        sim_state: as for the wrapper.
-        eef_pose: as for the wrapper.
-        seed: ``None`` for 0.
-        seed_offset: as for the wrapper.
-        seed_stride: as for the wrapper.
-        terminate_on_success: as for the wrapper.
-        device: as for the wrapper.
+        **options: further ones of :class:`RobosuiteWrapper`.
 
     Raises:
         ImportError: if robosuite is not installed, or MimicGen is not where the task is one of its.
@@ -396,55 +374,19 @@ class RobosuiteEnv(RobosuiteWrapper):
         env_args: Mapping[str, Any] | None = None,
         style: str = "ph",
         horizon: int | None = None,
-        control_loop: Literal["lean", "robosuite"] = "lean",
-        low_dim_keys: Sequence[str] | None = None,
-        from_pixels: bool = False,
         camera: str | Sequence[str] | None = None,
-        camera_size: int | tuple[int, int] = 84,
-        fast_rendering: bool = False,
-        sim_state: bool = False,
-        eef_pose: bool = False,
-        seed: int | None = None,
-        seed_offset: int = 0,
-        seed_stride: int = 1,
-        terminate_on_success: bool = True,
-        device: torch.device | str | None = None,
+        **options: Any,
     ) -> None:
         if (task is None) == (env_args is None):
             raise ValueError("give either task or env_args")
         if style not in STYLES:
             raise ValueError(f"style is one of {', '.join(STYLES)}, got {style!r}")
-        spec: TaskSpec | None
-        if env_args is None:
-            spec = get_task(str(task))
-            env_args = task_env_args(spec.name)
-        else:
-            from warmprior.envs.env_args import modernize_env_args
-
-            env_args = modernize_env_args(env_args)
-            by_name = {entry.env_name: entry for entry in TASKS.values()}
-            spec = by_name.get(env_args["env_name"])
-        if spec is not None:
-            horizon = spec.horizon(style) if horizon is None else horizon
-            camera = spec.cameras[0] if camera is None else camera
-        self.task = spec
-        super().__init__(
-            env_args=env_args,
-            horizon=horizon,
-            control_loop=control_loop,
-            low_dim_keys=low_dim_keys,
-            from_pixels=from_pixels,
-            camera="agentview" if camera is None else camera,
-            camera_size=camera_size,
-            fast_rendering=fast_rendering,
-            sim_state=sim_state,
-            eef_pose=eef_pose,
-            seed=seed or 0,
-            seed_offset=seed_offset,
-            seed_stride=seed_stride,
-            terminate_on_success=terminate_on_success,
-            device=device,
-        )
+        env_args = task_env_args(str(task)) if env_args is None else modernize_env_args(env_args)
+        self.task = task_of_env(env_args)
+        if self.task is not None:
+            horizon = self.task.horizon(style) if horizon is None else horizon
+            camera = self.task.cameras[0] if camera is None else camera
+        super().__init__(env_args=env_args, horizon=horizon, camera=camera or "agentview", **options)
 
     def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
         """The constructor has checked them."""

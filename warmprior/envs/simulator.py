@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import logging
 import random
 import warnings
@@ -16,13 +17,7 @@ from warmprior.envs.mimicgen import is_mimicgen, register_mimicgen
 from warmprior.envs.tasks import get_task
 from warmprior.io.extras import require
 
-__all__ = [
-    "action_limits",
-    "import_robosuite",
-    "isolated_numpy_seed",
-    "make_simulator",
-    "task_env_args",
-]
+__all__ = ["action_limits", "import_robosuite", "isolated_numpy_seed", "make_simulator", "task_env_args"]
 
 # Sizes drawn when a model is loaded (Lift's cube, Transport's hammer) must be the same in every
 # process, or the same seed would mean different episodes.
@@ -63,38 +58,14 @@ def _without_warnings() -> Iterator[None]:
 
 
 def import_robosuite() -> ModuleType:
-    """Import robosuite without its start-up warnings.
-
-    Returns:
-        The module ``robosuite``.
-
-    Raises:
-        ImportError: if robosuite is not installed.
-
-    Examples:
-        >>> import_robosuite().__version__  # doctest: +SKIP
-        '1.5.1'
-    """
+    """The module ``robosuite``, without its start-up warnings."""
     with _without_warnings():
         return require("robosuite", "sim")
 
 
 @contextlib.contextmanager
 def isolated_numpy_seed(seed: int) -> Iterator[None]:
-    """Seed the global generators that robosuite's samplers use, and restore them afterwards.
-
-    Args:
-        seed: any integer; taken modulo ``2**32``.
-
-    Examples:
-        >>> np.random.seed(1)
-        >>> with isolated_numpy_seed(5):
-        ...     inside = np.random.rand()
-        >>> outside = np.random.rand()
-        >>> np.random.seed(1)
-        >>> bool(outside == np.random.rand())
-        True
-    """
+    """Seed the global generators that robosuite's samplers use; they are restored afterwards."""
     numpy_state, python_state = np.random.get_state(), random.getstate()
     np.random.seed(seed % 2**32)
     random.seed(seed)
@@ -138,10 +109,7 @@ def task_env_args(task: str) -> dict[str, Any]:
         "camera_widths": 84,
         "lite_physics": True,
         "reward_shaping": False,
-        "controller_configs": {
-            "type": "BASIC",
-            "body_parts": {"right": {key: _copy(value) for key, value in _ARM_CONTROLLER.items()}},
-        },
+        "controller_configs": {"type": "BASIC", "body_parts": {"right": copy.deepcopy(_ARM_CONTROLLER)}},
     }
     if is_mimicgen(spec.env_name):
         del kwargs["lite_physics"]  # some of its tasks refuse the argument
@@ -150,33 +118,16 @@ def task_env_args(task: str) -> dict[str, Any]:
     return {"env_name": spec.env_name, "env_version": "1.5.1", "type": 1, "env_kwargs": kwargs}
 
 
-def _copy(value: Any) -> Any:
-    if isinstance(value, dict):
-        return dict(value)
-    return list(value) if isinstance(value, list) else value
-
-
 def make_simulator(env_args: Mapping[str, Any]) -> Any:
     """Make a robosuite environment for stepping: no renderer, no time limit, cheap resets.
 
-    Frames are rendered on demand elsewhere, and time limits belong to the wrapper, so the options
-    of ``env_args`` that concern either are overridden. The model is loaded once
+    Frames are rendered on demand elsewhere, and time limits belong to the wrapper, so the options of
+    ``env_args`` (in the terms of robosuite 1.5) that concern either are overridden. The model is loaded once
     (``hard_reset=False``), under a fixed seed.
 
-    Args:
-        env_args: a robomimic description in the terms of robosuite 1.5.
-
-    Returns:
-        A ``robosuite.environments.base.MujocoEnv``.
-
     Raises:
-        ImportError: if robosuite is not installed, or MimicGen is not (see :func:`register_mimicgen`)
-            where the environment is one of its.
+        ImportError: if robosuite is not installed, or MimicGen is not where the environment is one of its.
         ValueError: if robosuite has no environment of that name.
-
-    Examples:
-        >>> make_simulator(task_env_args("lift")).action_dim  # doctest: +SKIP
-        7
     """
     robosuite = import_robosuite()
     name = env_args["env_name"]
@@ -202,20 +153,10 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
 
 
 def action_limits(env: Any) -> list[float]:
-    """List the largest magnitude of each entry of an environment's action.
+    """The largest magnitude of each entry of an environment's action.
 
     Deltas are fractions of the largest delta. Absolute poses are in metres and radians, and their
     limits only say what is worth sampling.
-
-    Args:
-        env: a robosuite environment.
-
-    Returns:
-        One number per entry of the action.
-
-    Examples:
-        >>> action_limits(make_simulator(task_env_args("lift")))  # doctest: +SKIP
-        [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]
     """
     limits: list[float] = []
     for robot in env.robots:

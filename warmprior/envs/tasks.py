@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
-__all__ = ["EVALUATION_SEED", "STYLES", "TASKS", "TaskSpec", "get_task", "low_dim_keys"]
+__all__ = ["EVALUATION_SEED", "STYLES", "TASKS", "TaskSpec", "get_task", "low_dim_keys", "task_of_env"]
 
 #: Simulator seed of the first evaluation episode. Demonstrations are generated from smaller ones,
 #: so a policy is never evaluated on an initial state it was trained on.
@@ -17,18 +19,7 @@ _ARM_WIDTHS = {"eef_pos": 3, "eef_quat": 4, "gripper_qpos": 2}
 
 
 def low_dim_keys(arms: int) -> tuple[str, ...]:
-    """Name the observations that make up the state, in robomimic's order.
-
-    Args:
-        arms: number of arms.
-
-    Returns:
-        ``"object"``, then the pose and gripper of each arm.
-
-    Examples:
-        >>> low_dim_keys(1)
-        ('object', 'robot0_eef_pos', 'robot0_eef_quat', 'robot0_gripper_qpos')
-    """
+    """The observations that make up the state: ``object``, then each arm's pose and gripper."""
     return ("object", *(f"robot{i}_{key}" for i in range(arms) for key in _ARM_WIDTHS))
 
 
@@ -113,12 +104,7 @@ TASKS: dict[str, TaskSpec] = {
             700,
             1100,
             41,
-            cameras=(
-                "shouldercamera0",
-                "shouldercamera1",
-                "robot0_eye_in_hand",
-                "robot1_eye_in_hand",
-            ),
+            cameras=("shouldercamera0", "shouldercamera1", "robot0_eye_in_hand", "robot1_eye_in_hand"),
         ),
         TaskSpec(
             "tool_hang",
@@ -163,3 +149,8 @@ def get_task(name: str) -> TaskSpec:
     if name not in TASKS:
         raise ValueError(f"unknown task {name!r}; choose one of {', '.join(TASKS)}")
     return TASKS[name]
+
+
+def task_of_env(env_args: Mapping[str, Any]) -> TaskSpec | None:
+    """The task of :data:`TASKS` that uses an environment, or ``None``."""
+    return next((task for task in TASKS.values() if task.env_name == env_args["env_name"]), None)

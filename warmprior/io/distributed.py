@@ -91,19 +91,14 @@ def joined() -> Iterator[None]:
     try:
         yield
     finally:
-        _leave()
-
-
-def _leave() -> None:
-    if dist.is_initialized():
-        dist.destroy_process_group()
+        if dist.is_initialized():  # and not left already
+            dist.destroy_process_group()
 
 
 def from_leader[T](make: Callable[[], T]) -> T:
     """What the first process makes of something that the others must not, or might not, make alike.
 
-    Args:
-        make: called by the first process; its result has to be picklable.
+    The first process calls it; its result has to be picklable.
 
     Raises:
         SystemExit: in the others, if it fails in the first, which says why.
@@ -137,15 +132,11 @@ def leader_first() -> Iterator[None]:
         SystemExit: in the others, if it failed otherwise in the first, which says why.
 
     Examples:
-        >>> from pathlib import Path
-        >>> from tempfile import TemporaryDirectory
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "data.txt"
-        ...     with leader_first():  # what it writes is there for the others
-        ...         if not path.exists():
-        ...             _ = path.write_text("generated")
-        ...     path.read_text()
-        'generated'
+        >>> found = set()
+        >>> with leader_first():  # what it leaves, such as a file, is there for the others
+        ...     found.add("generated")
+        >>> found
+        {'generated'}
     """
     failure: list[BaseException | None] = [SystemExit(2)]
     try:
@@ -179,16 +170,14 @@ def go_on_alone() -> None:
     """
     ends = bool(rank())
     from_leader(int)  # all have arrived
-    _leave()
+    if dist.is_initialized():
+        dist.destroy_process_group()
     if ends:
         raise SystemExit(0)
 
 
 def check_batch(size: int) -> None:
-    """Whether a batch can be divided among the processes.
-
-    Args:
-        size: windows per step, of all processes.
+    """Whether a batch, of so many windows of all processes, can be divided among them.
 
     Raises:
         ValueError: if it cannot.
@@ -207,10 +196,7 @@ def check_batch(size: int) -> None:
 
 
 def check_device(device: str) -> None:
-    """Whether every process here has a device of a name, and it computes.
-
-    Args:
-        device: such as ``"cuda"``; of several processes each then takes one of its own.
+    """Whether every process here has a device of a name, such as ``"cuda"`` for one each, and it computes.
 
     Raises:
         ValueError: naming ``--device`` and what there is instead.

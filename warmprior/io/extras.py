@@ -10,24 +10,12 @@ __all__ = ["require"]
 
 
 def require(module: str, extra: str) -> ModuleType:
-    """Import an optional module, or say which extra of this package provides it.
+    """Import an optional module, or say in an ``ImportError`` which extra of this package provides it.
 
-    The module is looked up before it is imported, so an import error raised *inside* an installed
-    module is not mistaken for a missing one.
-
-    Args:
-        module: dotted name of the module, e.g. ``"h5py"``.
-        extra: the extra of this package that installs it, e.g. ``"sim"``.
-
-    Returns:
-        The imported module.
-
-    Raises:
-        ImportError: if the module is not installed.
+    It is looked up before it is imported, so an error raised *inside* an installed module is not mistaken for
+    a missing one.
 
     Examples:
-        >>> require("json", "sim").dumps([1])
-        '[1]'
         >>> require("no_such_module", "sim")
         Traceback (most recent call last):
             ...

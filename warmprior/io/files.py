@@ -38,13 +38,7 @@ JSON_BYTES = 2**28  # the largest results file is a hundredth of that
 
 
 def save_file(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] | None = None) -> None:
-    """Write a safetensors file. (Imported here: ``import warmprior`` does not need the package.)
-
-    Tensors that share memory, such as tied weights, are written once each.
-
-    Raises:
-        OSError: if the file cannot be written.
-    """
+    """Write a safetensors file; tensors that share memory, such as tied weights, are written once each."""
     from safetensors import SafetensorError
     from safetensors.torch import save_file as save
 
@@ -73,11 +67,7 @@ def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def check_regular(path: Path) -> None:
-    """Whether a path that exists can be opened: a pipe or a device may never answer.
-
-    Raises:
-        ValueError: if it is not a regular file.
-    """
+    """Refuse a path that exists and is no file: a pipe or a device may never answer."""
     if not path.is_file():
         raise ValueError(f"{path} is not a regular file; remove it, or choose another folder")
 
@@ -94,20 +84,12 @@ def digest_of(*parts: Any) -> str:
 
 
 def as_json(value: Any) -> Any:
-    """What is read back after writing a value as JSON: tuples become lists, keys text.
-
-    Raises:
-        TypeError: if JSON cannot hold the value.
-    """
+    """What is read back after writing a value as JSON: tuples become lists, keys text."""
     return json.loads(json.dumps(value))
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        ValueError: if it is no regular file or no JSON text, naming it.
-    """
+    """Read a JSON file; a ``ValueError`` that names it if it is none."""
     check_regular(path)
     if path.stat().st_size > JSON_BYTES:
         raise ValueError(f"{path} is not valid JSON of this library: it has {path.stat().st_size} bytes")
@@ -118,11 +100,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_lines(path: Path) -> list[dict[str, Any]]:
-    """Read a file of JSON objects, one per line.
-
-    Raises:
-        ValueError: naming the file and the line that is damaged.
-    """
+    """Read a file of JSON objects, one per line; a ``ValueError`` that names the line that is damaged."""
     check_regular(path)
     records = []
     for number, line in enumerate(path.read_bytes().splitlines(), 1):
@@ -201,11 +179,7 @@ def _remove(path: Path) -> None:
 
 
 def check_writable(directory: Path) -> None:
-    """Create a folder and prove that files can be written there.
-
-    Raises:
-        OSError: if not, naming the folder.
-    """
+    """Create a folder and prove that files can be written there, or raise an ``OSError`` that names it."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         # Without a name, where the system can: others may be trying the same folder.
@@ -252,8 +226,7 @@ def exclusive(directory: Path) -> Iterator[None]:
             ) from None
         except OSError as error:
             warnings.warn(
-                f"{directory} cannot be locked ({error}): let one process at a time use it",
-                stacklevel=3,
+                f"{directory} cannot be locked ({error}): let one process at a time use it", stacklevel=3
             )
         yield
     finally:
@@ -261,10 +234,6 @@ def exclusive(directory: Path) -> Iterator[None]:
 
 
 def cache_folder(cache_dir: str | Path | None = None) -> Path:
-    """Where generated and rendered files are kept.
-
-    Args:
-        cache_dir: if not ``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior``.
-    """
+    """Where generated files are kept: by default ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
     folder = cache_dir or os.environ.get("WARMPRIOR_CACHE") or Path.home() / ".cache" / "warmprior"
     return Path(folder).expanduser()

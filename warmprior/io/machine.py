@@ -11,28 +11,11 @@ import torch
 
 __all__ = ["facts_of_machine"]
 
-PACKAGES = (
-    "warmprior",
-    "torch",
-    "torchrl",
-    "tensordict",
-    "robosuite",
-    "mujoco",
-    "numpy",
-    "lerobot",
-)
+PACKAGES = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "numpy", "lerobot")
 
 
 def facts_of_machine(**more: Any) -> dict[str, Any]:
-    """Versions and hardware, as files of results keep them.
-
-    Args:
-        more: about the hardware.
-
-    Examples:
-        >>> sorted(facts_of_machine(device="cpu"))
-        ['hardware', 'versions']
-    """
+    """Versions and hardware, as files of results keep them."""
     versions = {"python": platform.python_version()}
     for package in PACKAGES:
         try:

@@ -14,12 +14,7 @@ _CONTROL_GROUP = Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int:
-    """Bytes that can be taken before the system, or this process's container, runs out.
-
-    Examples:
-        >>> available_memory() > 0
-        True
-    """
+    """Bytes that can be taken before the system, or this process's container, runs out."""
     free = int(psutil.virtual_memory().available)
     # psutil does not know the limit of a container. There is none where these are missing or say "max".
     with contextlib.suppress(OSError, ValueError):

@@ -26,15 +26,11 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
     They are no forks: nothing of this process, such as its threads, simulators and gradients, is in them.
     Ctrl-C is left to this process, and they end when it ends, however that happens.
 
-    Args:
-        count: of the processes.
-        env: environment variables of the processes.
-
     See Also:
         :func:`~warmprior.io.processes.working`: jobs on a state that the processes keep.
 
     Examples:
-        >>> with fresh_processes(1) as executor:
+        >>> with fresh_processes(1) as executor:  # doctest: +SKIP
         ...     executor.submit(pow, 2, 3).result()
         8
     """
@@ -61,10 +57,7 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
 
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return require("loky", "sim").ProcessPoolExecutor(
-        max_workers=count,
-        env={**threads, **(env or {})},
-        initializer=begin,
-        initargs=(os.getpid(),),
+        max_workers=count, env={**threads, **(env or {})}, initializer=begin, initargs=(os.getpid(),)
     )
 
 
@@ -74,12 +67,8 @@ def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]],
 
     Leaving the context with an error, such as Ctrl-C, ends all of them at once, whatever they do.
 
-    Args:
-        count: of the processes.
-        state: picklable; what a job changes in it stays in its process.
-
-    Yields:
-        A function of a job, which gives the future of ``job(state)``.
+    Yields a function of a job, which gives the future of ``job(state)``; both are picklable. What a job
+    changes in the state stays in its process.
 
     Raises:
         WorkerError: if a process dies.
@@ -90,7 +79,7 @@ def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]],
     Examples:
         >>> from functools import partial
         >>> from operator import add
-        >>> with working(1, 40) as call:
+        >>> with working(1, 40) as call:  # doctest: +SKIP
         ...     call(partial(add, 2)).result()
         42
     """

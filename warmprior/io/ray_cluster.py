@@ -92,11 +92,6 @@ def reason_of(text: bytes) -> str:
 def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str) -> None:
     """Refuse a machine with other versions: it might compute something else.
 
-    Args:
-        mine: of the driver, by package.
-        theirs: of the machine.
-        node: its name.
-
     Raises:
         WorkerError: naming the machine and both versions, a ``RuntimeError``.
 

@@ -21,15 +21,7 @@ class PartialFailure(RuntimeError):
     """Some of the work failed; the rest of it is done and written down."""
 
 
-ERRORS = (
-    ValueError,
-    KeyError,
-    OSError,
-    ImportError,
-    FloatingPointError,
-    WorkerError,
-    PartialFailure,
-)
+ERRORS = (ValueError, KeyError, OSError, ImportError, FloatingPointError, WorkerError, PartialFailure)
 """What a user can mend: reported without a traceback."""
 
 

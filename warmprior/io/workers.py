@@ -10,14 +10,7 @@ from functools import cache
 
 import torch
 
-__all__ = [
-    "WorkerError",
-    "available_cores",
-    "end_with_parent",
-    "start_method",
-    "stop_forking",
-    "worker_died",
-]
+__all__ = ["WorkerError", "available_cores", "end_with_parent", "start_method", "stop_forking", "worker_died"]
 
 _forks = True
 
@@ -58,9 +51,8 @@ def start_method() -> str:
 
 @cache
 def count_devices() -> None:
-    """Let autograd count devices now, where there is none.
+    """Let autograd count devices now, where there is none: at its first gradient, and in no fork after that.
 
-    It does so when it first computes a gradient, and refuses to work in forks from then on if there is one.
     Compiling anything, or fake tensors, let it see a GPU that is not there: it has to count before.
     """
     torch.ones((), requires_grad=True).backward()

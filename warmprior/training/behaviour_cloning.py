@@ -80,8 +80,8 @@ class BehaviourCloning:
         logger: a TorchRL logger for the loss, the learning rate and the speed.
         resume: continue from the folder's state if there is one; otherwise start over.
         compile: compile the velocity network with :func:`torch.compile`; on a GPU, as CUDA graphs.
-        prefetch: gather batches ahead in a thread, drawn by a generator of their own; by default where data
-            on the CPU train a network that is not.
+        prefetch: gather batches ahead in a thread, drawn by a generator of their own; always where data on
+            the CPU train a network that is not.
 
     Raises:
         ValueError: if a batch cannot be divided among the processes, the folder's
@@ -121,7 +121,7 @@ class BehaviourCloning:
         logger: Logger | None = None,
         resume: bool = True,
         compile: bool = False,
-        prefetch: bool | None = None,
+        prefetch: bool = False,
     ) -> None:
         check_saveable(actor)  # before hours are spent on what would be lost
         check_batch(config.batch_size)
@@ -138,11 +138,9 @@ class BehaviourCloning:
         home = data.device or torch.device("cpu")
         device = next((p.device for p in actor.network.parameters()), home)
         self.generator = torch.Generator(device).manual_seed(config.seed)
-        prefetch = home.type != device.type if prefetch is None else prefetch
-        # What is drawn ahead, or on another device, cannot be drawn by the generator of what follows.
-        apart = prefetch or home.type != device.type
         windows = self.generator
-        if apart:
+        if prefetch := prefetch or home.type != device.type:
+            # What is drawn ahead cannot be drawn by the generator of what follows.
             windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
         see_history = actor.in_keys[0] == CONDITIONED  # made of the data's observation
         observation_key = OBSERVATION if see_history else actor.in_keys[0]
@@ -157,7 +155,6 @@ class BehaviourCloning:
             observation_key=observation_key,
             chunk_key=actor.chunk_key,
         )
-        self._windows = windows if apart else None
         self._prefetch = Prefetch(self.replay_buffer.sample, windows, device=device) if prefetch else None
         #: The network, and the prior where it has weights as well.
         self.trained = nn.ModuleDict({"network": actor.network})
@@ -242,7 +239,7 @@ class BehaviourCloning:
         """
         if self._graphs:  # what the graphs of the last step have left may be overwritten
             torch.compiler.cudagraph_mark_step_begin()
-        batch = self.replay_buffer.sample() if self._prefetch is None else self._prefetch()
+        batch = self._prefetch() if self._prefetch else self.replay_buffer.sample()
         with self._precision():
             loss = self._loss(batch)
         self.optimizer.zero_grad()
@@ -253,11 +250,7 @@ class BehaviourCloning:
         self.iteration += 1
         return loss.detach()
 
-    def run(
-        self,
-        description: str | None = "train",
-        progress: Callable[[int], object] | None = None,
-    ) -> None:
+    def run(self, description: str | None = "train", progress: Callable[[int], object] | None = None) -> None:
         """Train to the end.
 
         Args:
@@ -370,8 +363,7 @@ class BehaviourCloning:
         averaged = cast(Any, self.ema.module)
         prior = self.actor.prior
         return self.actor.replace(
-            network=averaged["network"],
-            prior=averaged["prior"] if isinstance(prior, nn.Module) else prior,
+            network=averaged["network"], prior=averaged["prior"] if isinstance(prior, nn.Module) else prior
         )
 
     def _save(self) -> None:
@@ -379,31 +371,13 @@ class BehaviourCloning:
             **named("trained", module_tensors(self.trained)),
             **named("ema", module_tensors(self.ema)),
             **named("optimizer", snapshot_optimizer(self.optimizer)),
-            **named("rng", rng_tensors(self.generator) | self._windows_state()),
+            **named("rng", rng_tensors(self.generator)),
+            **({} if self._prefetch is None else {"rng/windows": self._prefetch.state()}),
             "running": torch.stack(self._running) if self._running else torch.empty(0),
         }
         facts = {"identity": self.identity, "iteration": self.iteration, "losses": self.losses}
         save_state(self.state_path, tensors, facts)
         self._restored = self.state_path.stat().st_mtime
-
-    def _windows_state(self) -> dict[str, Tensor]:
-        """Random state of the windows, where they are not drawn by the generator of the rest."""
-        if self._windows is None:
-            return {}
-        state = self._prefetch.state() if self._prefetch else self._windows.get_state()
-        return {"windows": state}
-
-    def _restore_windows(self, state: Tensor | None) -> None:
-        if self._windows is None:
-            return
-        if state is None:
-            # They were drawn by the generator of the rest, for the data lay on the device.
-            seed = WINDOWS_SEED + self.config.seed + self.iteration
-            state = torch.Generator(self._windows.device).manual_seed(seed).get_state()
-        if self._prefetch is not None:
-            self._prefetch.restore(state)
-        else:
-            self._windows.set_state(state)
 
     def _differ(self) -> None:
         """Draw apart from the other processes: windows, sources, times, dropout and crops."""
@@ -411,9 +385,8 @@ class BehaviourCloning:
             return
         torch.manual_seed(int(torch.randint(2**62, ())) + self.rank)
         self.generator.manual_seed(int(torch.randint(2**62, ())))
-        if self._windows is not None:
-            apart = torch.Generator(self._windows.device).manual_seed(int(torch.randint(2**62, ())))
-            self._restore_windows(apart.get_state())
+        if self._prefetch is not None:
+            self._prefetch.restore(int(torch.randint(2**62, ())))
 
     def _restore(self) -> None:
         """Continue from the folder's state, if there is one that is not continued already."""
@@ -436,16 +409,15 @@ class BehaviourCloning:
         self.losses = [(i, float(loss)) for i, loss in facts["losses"]]
         self.schedule.last_epoch = self.iteration
         for group, base, factor in zip(
-            self.optimizer.param_groups,
-            self.schedule.base_lrs,
-            self.schedule.lr_lambdas,
-            strict=True,
+            self.optimizer.param_groups, self.schedule.base_lrs, self.schedule.lr_lambdas, strict=True
         ):
             group["lr"] = base * factor(self.iteration)
         self._running = list(tensors["running"].to(self.generator.device))
         restore_rng(self.generator, select("rng", tensors))
-        if self._windows is not None:
-            self._restore_windows(tensors.get("rng/windows"))
+        if self._prefetch is not None:
+            # Where the data lay on the device before, windows were drawn by the generator of the rest.
+            seed = WINDOWS_SEED + self.config.seed + self.iteration
+            self._prefetch.restore(tensors.get("rng/windows", seed))
         self._differ()
 
 

@@ -160,11 +160,7 @@ def _use(actor: WarmPriorActor, repository: str) -> str:
         if not type(part).__module__.startswith("warmprior.")
     ]
     words = f"It needs classes of its author: import {' and '.join(own)} first.\n\n" if own else ""
-    lines = [
-        "from warmprior.training import load_policy",
-        "",
-        f'actor = load_policy("{repository}")',
-    ]
+    lines = ["from warmprior.training import load_policy", "", f'actor = load_policy("{repository}")']
     if environment_name(actor) is not None:
         lines.insert(1, "from warmprior.envs import environment_of")
         lines.append("environment_of(actor).rollout(100, actor)")

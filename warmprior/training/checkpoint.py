@@ -20,13 +20,7 @@ __all__ = ["load_state", "restore_optimizer", "save_state", "snapshot_optimizer"
 
 
 def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
-    """Write tensors and JSON-serialisable facts as one file.
-
-    Args:
-        path: the ``.safetensors`` file.
-        tensors: named tensors.
-        facts: anything else, stored as JSON in the file's header.
-    """
+    """Write tensors, and JSON-serialisable facts, as one ``.safetensors`` file."""
     stored = as_json(facts)
     cpu = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
     # One entry: the format keeps no order of several, and equal states have equal files.
@@ -38,11 +32,6 @@ def load_state(
     path: Path, what: str = "training state", advice: str = "Remove it to train again"
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read what :func:`save_state` wrote, once: what is checked is what is given back.
-
-    Args:
-        path: the file.
-        what: it holds, for the error.
-        advice: what to do about a damaged one, likewise.
 
     Raises:
         ValueError: if the file is damaged or was written by something else.
@@ -69,11 +58,7 @@ def _digest(facts: Any, tensors: Mapping[str, Tensor]) -> str:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Name the state in whatever its entries lead to when they are not as they were saved.
-
-    Raises:
-        ValueError: for any error inside.
-    """
+    """Name the state in a ``ValueError`` for whatever entries that are not as they were saved lead to."""
     try:
         yield
     except Exception as error:
@@ -84,11 +69,7 @@ def restoring(path: Path) -> Iterator[None]:
 
 
 def check_identity(path: Path, theirs: Any, mine: Mapping[str, Any]) -> None:
-    """Whether a stored state belongs to the training that wants to continue it.
-
-    Raises:
-        ValueError: naming the first part that differs.
-    """
+    """Refuse a state that belongs to another training, naming the first part that differs."""
     theirs = theirs if isinstance(theirs, dict) else {}
     for part, value in as_json(mine).items():
         if theirs.get(part) != value:

@@ -107,9 +107,7 @@ class _StridedEnv(ParallelEnv):
 
 
 def parallel_env(
-    make_env: Callable[..., EnvBase],
-    make_transforms: Callable[[], Compose],
-    num_envs: int,
+    make_env: Callable[..., EnvBase], make_transforms: Callable[[], Compose], num_envs: int
 ) -> ParallelEnv:
     """Environments in worker processes, with the policy's transforms inside the workers.
 
@@ -206,38 +204,21 @@ def watched(env: EnvBase) -> Iterator[None]:
 
 
 @contextmanager
-def _acting(policy: TensorDictModuleBase, seed: int, nfe: int | None) -> Iterator[Act]:
+def _acting(policy: TensorDictModuleBase, env: EnvBase, seed: int, nfe: int | None) -> Iterator[Act]:
     """A policy that draws from a seed, and so do environments; later draws stay as they were."""
+    policy.eval()
     options: dict[str, Any] = {} if nfe is None else {"nfe": nfe}
-    device = _device(policy)
+    # Policies without an agent, such as residuals drawn for a decoder, have buffers alone, or nothing.
+    home = env.device or torch.device("cpu")
+    tensors = chain(policy.parameters(), policy.buffers())
+    device = next((tensor.device for tensor in tensors), torch.device("cpu"))
     if "generator" in inspect.signature(policy.forward).parameters:
         options["generator"] = torch.Generator(device).manual_seed(seed)
         seed ^= 1  # environments draw something else
-    with torch.random.fork_rng([device] if device.type == "cuda" else []):
+    # The simulators need the cores; a policy's call is small, and its idle threads would spin.
+    with torch_threads(1), torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
-        yield lambda data: policy(data, **options)
-
-
-@contextmanager
-def acting_in_episode(
-    policy: TensorDictModuleBase, seed: int, *, nfe: int | None = None, policy_seed: int = 0
-) -> Iterator[Act]:
-    """A policy with the noise that belongs to an episode, see :func:`play_episode`.
-
-    Args:
-        policy: as for :func:`evaluate`.
-        seed: of the environment, at least 0.
-
-    Keyword Args:
-        nfe: as for :func:`evaluate`.
-        policy_seed: of the policy's random draws, at least 0.
-    """
-    for name, value in (("the seed", seed), ("policy_seed", policy_seed)):
-        if value < 0:
-            raise ValueError(f"{name} must be at least 0, got {value}")
-    noise_seed = np.random.SeedSequence((policy_seed, seed)).generate_state(1, np.uint64)
-    with torch_threads(1), _acting(policy, int(noise_seed[0]), nfe) as act:
-        yield act
+        yield lambda data: policy(data.to(device), **options).to(home)
 
 
 @torch.no_grad()
@@ -294,19 +275,19 @@ def play_episode(
     """
     if env.batch_size:
         raise ValueError(f"play_episode needs a single environment, got {env.batch_size}")
+    for name, value in (("the seed", seed), ("policy_seed", policy_seed)):
+        if value < 0:
+            raise ValueError(f"{name} must be at least 0, got {value}")
     _check_keys(env, success, measures or {})
     _check_units(policy, env)
-    policy.eval()
-    device = _device(policy)
-    home = env.device or torch.device("cpu")
-    chunk_key = _chunk_key(policy, env)
     tally = _Tally(success, measures or {})
-    with acting_in_episode(policy, seed, nfe=nfe, policy_seed=policy_seed) as act:
+    noise_seed = np.random.SeedSequence((policy_seed, seed)).generate_state(1, np.uint64)
+    with _acting(policy, env, int(noise_seed[0]), nfe) as act:
         env.set_seed(seed)
         data = env.reset()
         while True:
-            data = env.step(act(data.to(device)).to(home))
-            tally.add(data["next"], _decision(data, chunk_key))
+            data = env.step(act(data))
+            tally.add(data["next"], _decision(data, policy, env))
             if data["next", "done"].all():
                 return tally.episode(seed)
             data = env.step_mdp(data)
@@ -415,14 +396,10 @@ def _play_batched(
     num_envs = env.batch_size[0]
     _check_keys(env, success, measures)
     _check_units(policy, env)
-    policy.eval()
-    device = _device(policy)
     home = env.device or torch.device("cpu")
-    chunk_key = _chunk_key(policy, env)
     played = [0] * num_envs
     tallies = [_Tally(success, measures) for _ in played]
-    # The simulators need the cores; a policy's call is small, and its idle threads would spin.
-    with torch_threads(1), watched(env), _acting(policy, policy_seed, nfe) as act:
+    with watched(env), _acting(policy, env, policy_seed, nfe) as act:
         env.set_seed(seeds.start, static_seed=True)
         seed_row = _row_seeding(env)
         for i in range(min(num_envs, len(seeds))):
@@ -433,10 +410,10 @@ def _play_batched(
             active = torch.tensor([i + num_envs * played[i] < len(seeds) for i in range(num_envs)])
             if not active.all():
                 data.set("_step", active.to(home))
-            data = env.step(act(data.to(device)).to(home))
+            data = env.step(act(data))
             after = data["next"].select("done", success, keys.EXECUTED, *measures).cpu()
             done = after["done"].flatten() & active
-            decided = _decision(data, chunk_key)
+            decided = _decision(data, policy, env)
             for i in active.nonzero().flatten().tolist():
                 tallies[i].add(after[i], decided[i])
             for i in done.nonzero().flatten().tolist():
@@ -523,19 +500,10 @@ def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
                 )
 
 
-def _chunk_key(policy: TensorDictModuleBase, env: EnvBase) -> NestedKey:
-    """Where the policy writes its chunks; what the environment takes, if the policy does not tell."""
-    return policy.chunk_key if isinstance(policy, WarmPriorActor) else env.action_key
-
-
-def _device(policy: TensorDictModuleBase) -> torch.device:
-    # Policies without an agent, such as residuals drawn for a decoder, have buffers alone, or nothing.
-    tensors = chain(policy.parameters(), policy.buffers())
-    return next((tensor.device for tensor in tensors), torch.device("cpu"))
-
-
-def _decision(data: TensorDictBase, chunk_key: NestedKey) -> TensorDictBase:
+def _decision(data: TensorDictBase, policy: TensorDictModuleBase, env: EnvBase) -> TensorDictBase:
     """What :attr:`Episode.decisions` keeps of a step, on the CPU."""
+    # What the environment takes, if the policy does not tell where it writes its chunks.
+    chunk_key = policy.chunk_key if isinstance(policy, WarmPriorActor) else env.action_key
     late = [keys.DELAY, keys.FORECAST] if data.get(keys.DELAY, None) is not None else []
     kept = data.select(keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED), strict=False).cpu()
     return kept.set(keys.CHUNK, data[chunk_key].cpu())

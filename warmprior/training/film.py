@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,38 +40,20 @@ class _Recorder(Transform):
         return self._call(tensordict_reset)
 
 
-@dataclass(frozen=True)
-class _Played:
-    """An episode that :func:`play_episode` played, and how to show it.
+def _write(path: Path, pictures: Iterable[np.ndarray], size: int, rate: int) -> None:
+    """A film with as many pictures per second."""
+    av = require("av", "lerobot")
 
-    Attributes:
-        seen: what was kept after the reset and after every control step.
-        success: whether the task was solved.
-        frame: the picture of what was kept, uint8 ``[size, size, 3]``, for strips.
-        quick: the same for films, a frame per control step: in full quality they would take ten times as
-            long as the episode.
-    """
+    def write(temporary: Path) -> None:
+        with av.open(str(temporary), "w", format="mp4") as container:
+            stream = container.add_stream("h264", rate=rate)
+            stream.width = stream.height = size
+            stream.pix_fmt = "yuv420p"
+            for picture in pictures:
+                container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            container.mux(stream.encode())
 
-    seen: Sequence[Any]
-    success: bool
-    frame: Callable[[Any, int], np.ndarray]
-    quick: Callable[[Any, int], np.ndarray]
-
-    def write(self, path: Path, size: int, rate: int) -> None:
-        """A film of it, with as many control steps per second."""
-        av = require("av", "lerobot")
-
-        def write(temporary: Path) -> None:
-            with av.open(str(temporary), "w", format="mp4") as container:
-                stream = container.add_stream("h264", rate=rate)
-                stream.width = stream.height = size
-                stream.pix_fmt = "yuv420p"
-                for kept in self.seen:
-                    picture = av.VideoFrame.from_ndarray(self.quick(kept, size), format="rgb24")
-                    container.mux(stream.encode(picture))
-                container.mux(stream.encode())
-
-        write_atomic(path, write)
+    write_atomic(path, write)
 
 
 def _resized(image: np.ndarray, size: int) -> np.ndarray:
@@ -80,52 +62,17 @@ def _resized(image: np.ndarray, size: int) -> np.ndarray:
     return np.asarray(Image.fromarray(image).convert("RGB").resize((size, size)))
 
 
-@contextmanager
-def _played(
-    actor: WarmPriorActor,
-    seed: int,
-    nfe: int | None,
-    policy_seed: int,
-    env: TransformedEnv | None,
-    options: dict[str, Any],
-) -> Iterator[_Played]:
-    success = options.pop("success", SUCCESS)
-    frame: Callable[[Any, int], np.ndarray] = _resized
-    quick: Callable[[Any, int], np.ndarray] = _resized
-    if env is None:
-        require_rendering()
-        env = environment_of(actor, **options)
-        simulator, loop = env.base_env, env.base_env.loop
-        look = loop.state
-        frame = lambda state, size: simulator.render_frame(size=size, state=state)  # noqa: E731
-        renderer, nq = EnvRenderers(loop.env, fast=True), loop.env.sim.model.nq
-
-        def drawn(state: np.ndarray, size: int) -> np.ndarray:
-            return renderer.render(simulator.cameras[0], size, size, state[1 : 1 + nq])
-
-        quick = drawn
-    else:
-
-        def look() -> np.ndarray:
-            try:
-                picture = env.base_env.render()
-            except NotImplementedError:
-                picture = None
-            if picture is None:
-                raise ValueError(
-                    "the environment draws no pictures: make it with render_mode='rgb_array', or ask for "
-                    "no films (film_rate=None)"
-                )
-            return picture
-
-    # First, and so one of the transforms that run at every control step inside of a chunk.
-    recorder = _Recorder(look)
-    env.transform.insert(0, recorder)
+def _picture(env: Any) -> np.ndarray:
     try:
-        outcome = play_episode(actor, env, seed, nfe=nfe, policy_seed=policy_seed, success=success)
-        yield _Played(recorder.seen, outcome.success, frame, quick)
-    finally:
-        env.close()
+        picture = env.render()
+    except NotImplementedError:
+        picture = None
+    if picture is None:
+        raise ValueError(
+            "the environment draws no pictures: make it with render_mode='rgb_array', or ask for no films "
+            "(film_rate=None)"
+        )
+    return picture
 
 
 @dataclass(frozen=True)
@@ -199,25 +146,42 @@ def record_filmstrip(
             ...
         ValueError: the side of a video must be an even number of pixels, got 161
     """
-    if video is not None:
-        _check_size(size)
-    with _played(actor, seed, nfe, policy_seed, env, options) as played:
-        steps = np.unique(np.linspace(0, len(played.seen) - 1, frames).round().astype(int))
-        pictures = [played.frame(played.seen[step], size) for step in steps]
+    if video is not None and (size < 2 or size % 2):  # the encoder takes pixels two by two
+        raise ValueError(f"the side of a video must be an even number of pixels, got {size}")
+    success = options.pop("success", SUCCESS)
+    frame: Callable[[Any, int], np.ndarray]
+    quick: Callable[[Any, int], np.ndarray]
+    frame = quick = _resized
+    if env is None:
+        require_rendering()
+        env = environment_of(actor, **options)
+        simulator, loop = env.base_env, env.base_env.loop
+        look = loop.state
+        # In full quality a film, of a picture per control step, would take ten times as long as the episode.
+        renderer, nq = EnvRenderers(loop.env, fast=True), loop.env.sim.model.nq
+        frame, quick = (
+            lambda state, size: simulator.render_frame(size=size, state=state),
+            lambda state, size: renderer.render(simulator.cameras[0], size, size, state[1 : 1 + nq]),
+        )
+        rate = rate or round(1 / loop.env.control_timestep)
+    else:
+        look = partial(_picture, env.base_env)
+    # First, and so one of the transforms that run at every control step inside of a chunk.
+    recorder = _Recorder(look)
+    env.transform.insert(0, recorder)
+    try:
+        played = play_episode(actor, env, seed, nfe=nfe, policy_seed=policy_seed, success=success)
+        steps = np.unique(np.linspace(0, len(recorder.seen) - 1, frames).round().astype(int))
+        pictures = [frame(recorder.seen[step], size) for step in steps]
         if video is not None:
-            played.write(video, size, rate or _rate(actor))
+            _write(video, (quick(seen, size) for seen in recorder.seen), size, rate or 20)
+    finally:
+        env.close()
     return Filmstrip(pictures, steps.tolist(), played.success)
 
 
 def check_video(path: Path) -> None:
-    """Refuse what :func:`record_video` could not write, before anything is played.
-
-    Raises:
-        ValueError: if the name does not end in .mp4.
-        ImportError: if PyAV is missing.
-        RuntimeError: if nothing on this machine can render.
-        OSError: if the folder cannot be written to.
-    """
+    """Refuse, before any episode, a film that could not be written here or has another ending than .mp4."""
     if path.suffix != ".mp4":
         raise ValueError(f"{path} must end in .mp4: films have no other format")
     require("av", "lerobot")
@@ -237,8 +201,6 @@ def record_video(
 ) -> bool:
     """Play the episode of one seed and write it as an MP4, a frame per control step.
 
-    It is the very episode that :func:`play_episode` plays.
-
     Args:
         actor: a policy that keeps its environment's description.
         path: of the MP4.
@@ -248,7 +210,7 @@ def record_video(
         nfe: network evaluations per chunk; the policy's own by default.
         policy_seed: of the source samples.
         size: side of the picture in pixels, even.
-        options: further ones of :class:`~warmprior.envs.RobosuiteEnv`.
+        options: further ones of :func:`record_filmstrip`.
 
     Returns:
         Whether the task was solved.
@@ -267,19 +229,5 @@ def record_video(
             ...
         ValueError: the side of a video must be an even number of pixels, got 255
     """
-    _check_size(size)
-    with _played(actor, seed, nfe, policy_seed, None, options) as played:
-        played.write(path, size, _rate(actor))
-    return played.success
-
-
-def _check_size(size: int) -> None:
-    """Before the episode is played: the encoder takes pixels two by two."""
-    if size < 2 or size % 2:
-        raise ValueError(f"the side of a video must be an even number of pixels, got {size}")
-
-
-def _rate(actor: WarmPriorActor) -> int:
-    """Control steps per second."""
-    environment: Any = actor.environment
-    return round(environment["robosuite"]["env_args"]["env_kwargs"].get("control_freq", 20))
+    options |= {"nfe": nfe, "policy_seed": policy_seed, "size": size}
+    return record_filmstrip(actor, seed=seed, frames=1, video=path, **options).success

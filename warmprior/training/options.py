@@ -42,15 +42,7 @@ def is_simulated(task: str) -> bool:
 
 
 def check_counts(options: Any, *names: str) -> None:
-    """Refuse options that are no whole numbers of at least 1; ``None`` is fine.
-
-    Args:
-        options: the dataclass that holds them.
-        names: of its fields.
-
-    Raises:
-        ValueError: naming the option.
-    """
+    """Refuse options of a dataclass that are no whole numbers of at least 1; ``None`` is fine."""
     for name in names:
         value = getattr(options, name)
         for count in value if isinstance(value, tuple) else (value,):
@@ -205,15 +197,7 @@ class NetworkOptions:
         check_counts(self, "hidden_dim", "observation_steps", "crop_size")
 
     def check(self, data: DataOptions) -> None:
-        """Refuse options of images that cannot work, or have no effect.
-
-        Args:
-            data: what the network is trained on.
-
-        Raises:
-            ValueError: naming the option.
-            OSError: if ImageNet's weights are asked for and cannot be had.
-        """
+        """Refuse options of images that cannot work, or have no effect, and weights that cannot be had."""
         if data.obs == "state":
             usual = self.without_images() == self or self.encoder == "resnet18"
             if not usual or data.image_size != DataOptions().image_size:
@@ -243,13 +227,9 @@ class NetworkOptions:
         prediction_length: int,
         images: Mapping[str, int] | None = None,
     ) -> VelocityNetwork:
-        """A network with fresh weights.
+        """A network with fresh weights, for widths ``d_a`` and ``d_o`` (of the vector beside images).
 
-        Args:
-            action_dim: ``d_a``.
-            observation_dim: ``d_o``, that of the vector beside the images if there are some.
-            prediction_length: ``P``.
-            images: their names and sides in pixels.
+        Images are given by name, with their sides in pixels.
         """
         kind, width = _NETWORKS[self.network]
         options = {} if self.hidden_dim is None else {width: self.hidden_dim}

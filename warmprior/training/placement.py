@@ -102,13 +102,11 @@ class Prefetch:
         """State of the generator after the batch given last, as if none had been drawn ahead."""
         return self._state
 
-    def restore(self, state: Tensor) -> None:
-        """Go on from a state that :meth:`state` gave.
-
-        Args:
-            state: of the generator.
-        """
+    def restore(self, state: Tensor | int) -> None:
+        """Go on from a state that :meth:`state` gave, or begin at a seed."""
         self.close()
+        if isinstance(state, int):
+            state = torch.Generator(self._generator.device).manual_seed(state).get_state()
         self._generator.set_state(state)
         self._state = state
 

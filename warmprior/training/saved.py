@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Mapping
+from functools import partial
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
@@ -16,7 +17,7 @@ from torch import Tensor, nn
 
 from warmprior.io.extras import require
 from warmprior.io.files import as_json, read_json, write_atomic
-from warmprior.io.hub import deadline, is_repository, snapshot, until
+from warmprior.io.hub import is_repository
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled, without_compilation
 from warmprior.modules.network import VelocityNetwork
@@ -71,13 +72,7 @@ def _check_format(path: Path, config: Any) -> None:
         )
 
 
-def _folder(
-    place: str | Path,
-    *,
-    revision: str | None = None,
-    token: str | None = None,
-    endpoint: str | None = None,
-) -> Path:
+def _folder(place: str | Path, *, revision: str | None = None, token: str | None = None) -> Path:
     """Where the files of a policy lie, fetched from the hub if need be."""
     path = Path(place)
     if path.exists() or not (isinstance(place, str) and is_repository(place)):
@@ -87,14 +82,15 @@ def _folder(
                 f"revision={revision!r}"
             )
         return path
-    options: dict[str, Any] = {"token": token, "endpoint": endpoint}
+    hub = require("huggingface_hub", "sim")
+    fetch = partial(hub.snapshot_download, place, token=token)
     # The small file first: a repository of something else may be large.
-    folder = snapshot(place, [CONFIG], revision=revision, **options)
+    folder = Path(fetch(revision=revision, allow_patterns=[CONFIG]))
     if not (folder / CONFIG).exists():
         raise ValueError(f"{place} at the hub holds no policy of warmprior: it has no {CONFIG}")
     _check_format(folder / CONFIG, read_json(folder / CONFIG))
     # Of the same commit, whatever happens to the branch meanwhile.
-    return snapshot(place, [WEIGHTS], revision=folder.name, **options)
+    return Path(fetch(revision=folder.name, allow_patterns=[WEIGHTS]))
 
 
 def check_repository(name: str) -> None:
@@ -107,8 +103,7 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
     """JSON-serialisable description of everything but the weights.
 
     Raises:
-        TypeError: if the network is not a :class:`VelocityNetwork`, or an option of the network, the
-            prior or the normaliser cannot be written as JSON.
+        TypeError: if the network is not a :class:`VelocityNetwork`, or an option cannot be written as JSON.
     """
     network = uncompiled(actor.network)
     if not isinstance(network, VelocityNetwork):
@@ -243,7 +238,6 @@ def push_policy(
     revision: str | None = None,
     message: str = "Upload a policy of warmprior",
     token: str | None = None,
-    endpoint: str | None = None,
 ) -> str:
     """Save the policy in a repository of the Hugging Face hub, which is made if needed.
 
@@ -258,7 +252,6 @@ def push_policy(
         revision: branch; the main one by default.
         message: of the commit.
         token: with which to write; by default the hub client's own.
-        endpoint: address of the hub or of a server like it; by default the hub client's own.
 
     Returns:
         The commit, as ``revision`` of :func:`load_policy` takes it.
@@ -275,9 +268,12 @@ def push_policy(
         '0123456789abcdef0123456789abcdef01234567'
     """
     check_repository(repository)
-    api = require("huggingface_hub", "sim").HfApi(endpoint=endpoint, token=token)
-
-    def send(folder: Path) -> str:
+    api = require("huggingface_hub", "sim").HfApi(token=token)
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        save_policy(actor, folder)
+        if card is not None:
+            (folder / CARD).write_text(card)
         api.create_repo(repository, private=private, exist_ok=True)
         if private and not api.repo_info(repository).private:
             raise ValueError(
@@ -289,14 +285,7 @@ def push_policy(
         sent = api.upload_folder(
             repo_id=repository, folder_path=folder, commit_message=message, revision=revision
         )
-        return str(sent.oid)
-
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        save_policy(actor, folder)
-        if card is not None:
-            (folder / CARD).write_text(card)
-        return until(deadline(), lambda: send(folder))
+    return str(sent.oid)
 
 
 def load_policy(
@@ -307,7 +296,6 @@ def load_policy(
     generator: torch.Generator | None = None,
     revision: str | None = None,
     token: str | None = None,
-    endpoint: str | None = None,
 ) -> WarmPriorActor:
     """Load a policy that :func:`save_policy` or :func:`push_policy` wrote.
 
@@ -324,7 +312,6 @@ def load_policy(
         generator: source of randomness of the sampler.
         revision: branch, tag or commit of the repository; its main branch by default.
         token: for a private repository; by default the hub client's own.
-        endpoint: address of the hub or of a server like it; by default the hub client's own.
 
     Raises:
         FileNotFoundError: if there is none.
@@ -343,7 +330,7 @@ def load_policy(
         >>> load_policy("user/square-past")  # doctest: +SKIP
         WarmPriorActor(...)
     """
-    folder = _folder(directory, revision=revision, token=token, endpoint=endpoint)
+    folder = _folder(directory, revision=revision, token=token)
     tensors, config = _read(folder)
     try:
         actor = _filled(config, tensors)

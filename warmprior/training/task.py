@@ -34,15 +34,7 @@ from warmprior.training.identity import data_digest
 from warmprior.training.options import DataOptions, is_simulated
 from warmprior.transforms.absolute_actions import AbsoluteActions
 
-__all__ = [
-    "Task",
-    "find_tasks",
-    "load_task",
-    "navigation_task",
-    "read_like",
-    "robosuite_task",
-    "task_places",
-]
+__all__ = ["Task", "find_tasks", "load_task", "navigation_task", "read_like", "robosuite_task", "task_places"]
 
 
 @dataclass(frozen=True)
@@ -131,17 +123,9 @@ class Task:
     ) -> Self:
         """A task of your own, from raw demonstrations; the normaliser is fitted to them.
 
-        Args:
-            name: see above.
-            data: contiguous steps ``[N]`` in raw units: ``"observation"`` ``[N, d_o]``, ``"action"``
-                ``[N, d_a]`` and ``"episode"``, an integer ``[N]``.
-            make_env: see above; without one, policies are trained and not played.
-
-        Keyword Args:
-            style: see above.
-            success: see above.
-            measures: see above.
-            film_rate: see above.
+        Arguments are the attributes, but for the data: contiguous steps ``[N]`` in raw units, with
+        ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]`` and ``"episode"``, an integer ``[N]``.
+        Without ``make_env`` policies are trained and not played.
 
         Raises:
             KeyError: naming what the data lack.
@@ -485,22 +469,13 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
 def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
     """The tasks that options name, checked: for each what :func:`load_task` takes, a name and a style.
 
-    Args:
-        options: which.
-
     Raises:
         ValueError: if the options do not go together.
 
     Examples:
-        >>> task_places(DataOptions(task=("lift", "can"), download=True))
-        [('lift', 'ph'), ('can', 'ph')]
         >>> task_places(DataOptions(task=("can", "tool_hang"), data=("ph", "mh"), download=True))
         Data: there are no official mh demonstrations of tool_hang.
         [('can', 'ph'), ('can', 'mh'), ('tool_hang', 'ph')]
-        >>> task_places(DataOptions(data=("core",)))
-        Traceback (most recent call last):
-            ...
-        ValueError: --data core is that of MimicGen's files: add --download, or --dataset FILE
     """
     options.check()
     names: Sequence[str | None] = options.task or (None if options.dataset else "square",)

@@ -12,16 +12,7 @@ __all__ = ["torch_threads"]
 
 @contextmanager
 def torch_threads(number: int | None) -> Iterator[None]:
-    """Let PyTorch compute with as many threads, and with those of before afterwards.
-
-    Args:
-        number: of threads; ``None`` leaves it.
-
-    Examples:
-        >>> with torch_threads(1):
-        ...     torch.get_num_threads()
-        1
-    """
+    """Let PyTorch compute with as many threads (``None`` leaves them), and as before afterwards."""
     before = torch.get_num_threads()
     torch.set_num_threads(number or before)
     try:

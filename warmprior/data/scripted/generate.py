@@ -5,20 +5,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 from torchrl._utils import logger
+from tqdm import tqdm
 
-from warmprior.data.scripted.episode import (
-    PLANS,
-    Episode,
-    expert_loop,
-    operator_of,
-    run_episode,
-)
+from warmprior.data.scripted.episode import PLANS, Episode, expert_loop, operator_of, run_episode
 from warmprior.data.scripted.operators import OPERATORS
 from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs.control_loop import ControlLoop
@@ -75,7 +69,7 @@ def generate_demonstrations(
         The path of the complete file.
 
     Raises:
-        ImportError: if robosuite, h5py or tqdm is not installed.
+        ImportError: if robosuite or h5py is not installed.
         FileExistsError: if there is something at ``path``.
         ValueError: if the task is unknown or has no scripted expert, or an option is out of range.
         RuntimeError: if the experts fail too often to reach ``n``.
@@ -111,15 +105,12 @@ def generate_demonstrations(
     path = Path(path)
     if path.exists() and not overwrite:
         raise FileExistsError(f"{path} exists: choose another file, or replace it (overwrite, --overwrite)")
-    for module in ("h5py", "tqdm"):
-        require(module, "sim")
+    require("h5py", "sim")
     import_robosuite()
     workers = min(n, workers or available_cores())
     with (
         working(workers, _Player(task, style)) as call,
-        require("tqdm", "sim").tqdm(
-            total=n, desc=f"{task}/{style}", unit="demo", disable=not progress
-        ) as bar,
+        tqdm(total=n, desc=f"{task}/{style}", unit="demo", disable=not progress) as bar,
     ):
         model_file = call(_Player.model).result()
         write_robomimic(
@@ -154,7 +145,7 @@ def _successes(
             following = next((s for s in upcoming if wanted[operator_of(style, s)]), None)
             if following is None:
                 break
-            running.append(call(_Play(following)))
+            running.append(call(partial(_Player.play, seed=following)))
         if not running:
             raise RuntimeError(f"only {n - sum(wanted)} of {n} demonstrations succeeded in {played} episodes")
         episode = running.popleft().result()
@@ -180,10 +171,6 @@ class _Player:
         """The simulator's model as XML."""
         return str(self.loop.env.sim.model.get_xml())
 
-
-@dataclass(frozen=True)
-class _Play:
-    seed: int
-
-    def __call__(self, player: _Player) -> Episode:
-        return run_episode(player.loop, player.task, player.style, self.seed)
+    def play(self, seed: int) -> Episode:
+        """The episode of a seed."""
+        return run_episode(self.loop, self.task, self.style, seed)

@@ -72,12 +72,7 @@ def _read(value: np.ndarray | Live) -> np.ndarray:
 class ArmRunner:
     """Follows a plan's waypoints with one arm: proportional control, smoothed, with human noise.
 
-    Args:
-        loop: the environment's control loop.
-        arm: index of the arm.
-        plan: iterator over waypoints; it is advanced when a waypoint is reached, so it can look at
-            the scene before it decides on the next one.
-        person: who demonstrates.
+    The plan is advanced when a waypoint is reached: it can look at the scene before it decides on the next.
     """
 
     def __init__(self, loop: StepLoop, arm: int, plan: Plan, person: Demonstrator) -> None:

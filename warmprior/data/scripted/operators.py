@@ -57,17 +57,7 @@ OPERATORS = (
 
 
 class Demonstrator:
-    """An operator on one occasion: the habits, varied a little, and the randomness of the episode.
-
-    Args:
-        operator: whose habits.
-        rng: the episode's own generator; the same state gives the same demonstration.
-
-    Examples:
-        >>> someone = Demonstrator(SKILLED, np.random.default_rng(0))
-        >>> someone.pick([3, 1, 2], cost=float)
-        1
-    """
+    """An operator on one occasion: the habits, varied a little, and the randomness of the episode."""
 
     def __init__(self, operator: Operator, rng: np.random.Generator) -> None:
         self.rng = rng

@@ -53,15 +53,7 @@ def _wrist_allows(yaw: float, pos: np.ndarray) -> bool:
 
 
 def lift(loop: StepLoop, person: Demonstrator) -> list[Plan]:
-    """Lift the cube.
-
-    Args:
-        loop: the environment's control loop, just reset.
-        person: who demonstrates.
-
-    Returns:
-        One plan per arm.
-    """
+    """Lift the cube: a plan per arm, in a loop that was just reset."""
     return [_repeat(_try_lift, loop, person)]
 
 

@@ -37,15 +37,7 @@ _GIVER_YAW, _TAKER_YAW = np.pi / 2, -np.pi / 2
 
 
 def transport(loop: StepLoop, person: Demonstrator) -> list[Plan]:
-    """Move the hammer from one table to the other.
-
-    Args:
-        loop: the environment's control loop, just reset.
-        person: who demonstrates, with both arms.
-
-    Returns:
-        The giver's and the taker's plan.
-    """
+    """Move the hammer from one table to the other: the giver's and the taker's plan."""
     events: set[str] = set()
     return [_giver(loop, person, events), _taker(loop, person, events)]
 

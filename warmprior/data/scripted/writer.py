@@ -29,27 +29,10 @@ def write_robomimic(
     seed: int = 0,
     attributes: Mapping[str, Any] | None = None,
 ) -> int:
-    """Write episodes to a file that robomimic's own reader opens.
+    """Write episodes, one by one, to a file that robomimic's own reader opens; how many samples it has.
 
-    The file appears under its name when it is complete; an interrupted writer leaves none.
-
-    Args:
-        path: of the file; replaced if it exists.
-        episodes: consumed one by one.
-        env_args: robomimic's description of the environment.
-        model_file: the simulator's XML, the same for all episodes.
-        seed: of the random split into filter keys.
-        attributes: more attributes for the group ``data``.
-
-    Returns:
-        The number of samples.
-
-    Raises:
-        ImportError: if h5py is not installed.
-
-    Examples:
-        >>> write_robomimic(path, episodes, env_args=args, model_file=xml)  # doctest: +SKIP
-        9378
+    It appears under its name when it is complete; an interrupted writer leaves none. The seed is that of the
+    random split into filter keys; ``model_file`` is the simulator's XML, the same for all episodes.
     """
     h5py = require("h5py", "sim")
     steps: list[int] = []
