@@ -7,6 +7,7 @@ from importlib.metadata import version as _version
 from pathlib import Path as _Path
 
 from furo.navigation import get_navigation_tree
+from sphinx.ext.autodoc.typehints import record_typehints
 from sphinx.util.inspect import signature as _signature
 from sphinx.util.inspect import stringify_signature
 
@@ -49,6 +50,8 @@ autodoc_typehints_description_target = "documented"
 autodoc_inherit_docstrings = False
 # A dataclass field would otherwise be described twice: by its class and by itself.
 napoleon_use_ivar = True
+# Keyword arguments show their types as other parameters do.
+napoleon_custom_sections = [("Keyword Args", "Args")]
 toc_object_entries_show_parents = "hide"
 
 # The docstrings' examples are run by pytest.
@@ -82,8 +85,9 @@ def _one_download(app, docname, source):
 
 
 def _show_own_signature(app, what, name, obj, options, signature, return_annotation):
-    """Show what a class takes where a base class or metaclass hides it behind ``*args``."""
+    """Show what a class takes, with types, where a base class or metaclass hides it behind ``*args``."""
     if what == "class" and (signature or "").startswith("(*args"):
+        record_typehints(app, what, name, obj.__init__, options, signature, return_annotation)
         own = stringify_signature(
             _signature(obj.__init__, bound_method=True),
             show_annotation=False,

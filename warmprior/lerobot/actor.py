@@ -194,12 +194,9 @@ class LeRobotActor(TensorDictModuleBase):
         prior: the source distribution that it was trained with.
 
     Keyword Args:
-        names: see :class:`LeRobotFlow`.
-        preprocess: see :class:`LeRobotFlow`.
         std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it.
-        nfe: integration steps per chunk; the policy's own by default. Per call: ``actor(data, nfe=1)``.
         generator: source of randomness; per call: ``actor(data, generator=...)``.
-        kwargs: further arguments of :class:`LeRobotFlow`.
+        kwargs: further arguments of :class:`LeRobotFlow`, such as ``names``, ``preprocess`` and ``nfe``.
 
     Raises:
         ValueError: see :class:`WarmPriorAdapter`.

@@ -214,9 +214,16 @@ class GaussianPrior(Prior):
 
 
 class PastPrior(Prior):
-    r"""WP-Past: the mean is the last ``H`` executed actions, ``sigma`` 0.5 by default (Equation 2).
+    r"""WP-Past: the mean is the last ``H`` executed actions (Eq. 2).
 
-    Nothing is warm before ``H`` actions of the episode were executed. Arguments as of :class:`Prior`.
+    Nothing is warm before ``H`` actions of the episode were executed.
+
+    Args:
+        chunk_length: ``H``, the number of actions executed per decision.
+
+    Keyword Args:
+        sigma: standard deviation around the mean, 0.5 by default; see :class:`Prior`.
+        correlation: share of the noise's variance that the whole chunk has in common, 0 by default.
 
     See Also:
         :class:`~warmprior.HistoryObservation`: lets the network see the last actions instead.
@@ -241,7 +248,7 @@ class PastPrior(Prior):
 
 
 class PreviewPrior(Prior):
-    r"""WP-Preview: the mean is the policy's own earlier forecast of this chunk, ``sigma`` 1 by default.
+    r"""WP-Preview: the mean is the policy's own earlier forecast of this chunk.
 
     The network predicts ``P = 2H`` actions. In training the target's own first ``H`` actions stand in
     for a perfect forecast (Eq. 3); at decisions the mean is the previous prediction ``[k, k+H)``
@@ -252,7 +259,13 @@ class PreviewPrior(Prior):
         decision of every episode. :class:`~warmprior.WithheldHistory` repairs that; it matters for small
         ``sigma``.
 
-    Arguments as of :class:`Prior`.
+    Args:
+        chunk_length: ``H``, the number of actions executed per decision.
+
+    Keyword Args:
+        sigma: standard deviation around the mean, 1 by default; see :class:`Prior`.
+        correlation: share of the noise's variance that the forecast's ``H`` positions have in common, 0 by
+            default.
 
     Examples:
         >>> from warmprior.history import advance, cold_history

@@ -21,7 +21,7 @@ class BoxTanhNormal(TanhNormal):
     Args:
         loc: as for the parent.
         scale: as for the parent.
-        kwargs: as for the parent, ``low`` and ``high`` among them.
+        kwargs (Any): as for the parent, ``low`` and ``high`` among them.
 
     Examples:
         >>> import torch

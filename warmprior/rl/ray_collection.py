@@ -33,7 +33,7 @@ class WarmUpSwitch(TensorDictModuleBase):
         policy: acts then.
 
     Attributes:
-        learning: bool ``[]``.
+        learning (Tensor): bool ``[]``.
 
     See Also:
         - :func:`~warmprior.rl.ray_collection.ray_rounds`: collects with it.

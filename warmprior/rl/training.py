@@ -55,10 +55,10 @@ class PriorSpaceTraining:
         ray_address: of the cluster.
 
     Attributes:
-        agent: what learns; its ``policy`` is the agent followed by the decoder.
-        decoder: the frozen policy as a decoder.
-        steps: control steps so far, those of the warm-up included.
-        curve: the evaluations so far, see :meth:`run`.
+        agent (PriorSpaceAgent): what learns; its ``policy`` is the agent followed by the decoder.
+        decoder (PriorDecoder): the frozen policy as a decoder.
+        steps (int): control steps so far, those of the warm-up included.
+        curve (list[dict[str, Any]]): the evaluations so far, see :meth:`run`.
 
     Raises:
         ValueError: if the recipe does not suit the policy, or the folder's state belongs to another
