@@ -36,7 +36,7 @@ smartquotes = False  # options and messages are to be copied
 html_title = "warmprior"
 html_static_path = ["_static"]
 html_favicon = "_static/favicon.svg"
-html_css_files = ["gallery.css"]
+html_css_files = ["pages.css"]
 # Pictures come with the pages that show them, and not with the static files a second time.
 exclude_patterns = ["_build", "_templates", "tutorials/*.rst", "**.png"]
 
@@ -107,6 +107,22 @@ def _documented():
     return {name.rsplit(".", 1)[1]: name for names in found for name in names}
 
 
+def _link_names(app, docname, source):
+    """Link the public classes, and functions with ``()``, that Markdown names in code style."""
+
+    def link(found):
+        first, *rest = found[1].removesuffix("()").split(".")
+        if first not in _documented() or not (first[0].isupper() or found[1].endswith("()")):
+            return found[0]
+        return f"{{py:obj}}`{found[1]} <{'.'.join([_documented()[first], *rest])}>`"
+
+    if app.env.doc2path(docname).suffix == ".md":
+        parts = re.split(r"(^```.*?^```$)", source[0], flags=re.M | re.S)
+        text = r"(?<![`\[}])`([A-Za-z][\w.]*(?:\(\))?)`(?!`)"
+        parts[::2] = (re.sub(text, link, part) for part in parts[::2])
+        source[0] = "".join(parts)
+
+
 def _resolve_other_names(app, env, node, contnode):
     """Link what is named as another module has it, such as ``warmprior.modules.Prior``, or by itself."""
     parts = node["reftarget"].split(".")
@@ -150,6 +166,7 @@ def _keep_what_formulas_need(app, error):
 def setup(app):
     """Connect the handlers above."""
     app.connect("source-read", _one_download)
+    app.connect("source-read", _link_names)
     app.connect("autodoc-process-signature", _show_own_signature)
     app.connect("missing-reference", _resolve_other_names)
     app.connect("html-page-context", _fold_navigation, priority=900)
