@@ -37,7 +37,7 @@ def box(
     (x, y), (width, height) = place, size
     colors = {"fc": style.get("fc", "white"), "ec": style.get("ec", "0.3")}
     axis.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, lw=1.2, **colors))
-    axis.text(x, y, text, ha="center", va="center", fontsize=11, color=style.get("color", "black"))
+    axis.text(x, y, text, ha="center", va="center", fontsize=10.5, color=style.get("color", "black"))
 
 
 def flowchart() -> None:
@@ -67,8 +67,8 @@ def flowchart() -> None:
 
 def timeline() -> None:
     """Chart I: what each source knows when chunk B is decided."""
-    made, axis = canvas(7.6, 3.9)
-    start, unit = 15.0, 2.45  # where step 0 is, and how wide a step
+    made, axis = canvas(6.0, 3.9)
+    start, unit = 14.2, 1.84  # where step 0 is, and how wide a step
 
     def bar(row: float, first: int, last: int, text: str, **style: object) -> None:
         width = unit * (last - first)
@@ -76,7 +76,7 @@ def timeline() -> None:
 
     rows = {"executed": 31.0, "Gaussian source": 23.0, "WP-Past": 15.0, "WP-Preview": 7.0}
     for name, row in rows.items():
-        axis.text(0.8, row, name, va="center", fontsize=11)
+        axis.text(0.5, row, name, va="center", fontsize=10.5)
     for step in range(0, 25, 8):
         axis.text(start + unit * step, 36.4, str(step), ha="center", fontsize=10, color="0.3")
         axis.plot([start + unit * step] * 2, [3.5, 35.6], color="0.85", zorder=0)
@@ -84,13 +84,13 @@ def timeline() -> None:
     axis.plot([start + unit * 8] * 2, [3.5, 35.6], color="0.3", ls="--")
     axis.text(start + unit * 8, 1.0, "decision", ha="center", fontsize=10)
     bar(31, 0, 8, "chunk A", fc=LIGHT)
-    bar(31, 8, 16, "chunk B, to decide", fc="white")
-    bar(23, 8, 16, "mean 0, width 1", fc=GREY, ec=GREY, color="white")
+    bar(31, 8, 16, "chunk B,\nto decide", fc="white")
+    bar(23, 8, 16, "mean 0,\nwidth 1", fc=GREY, ec=GREY, color="white")
     bar(15, 0, 8, "remembered", fc=LIGHT)
     bar(15, 8, 16, "mean: chunk A,\nwidth 0.5", fc=BLUE, ec=BLUE, color="white")
-    bar(7, 0, 8, "predicted at\nstep 0, with A", fc=LIGHT)
-    bar(7, 8, 16, "mean: that forecast,\nwidth 1", fc=ORANGE, ec=ORANGE, color="white")
-    bar(7, 16, 24, "cold:\nmean 0, width 1", fc=GREY, ec=GREY, color="white")
+    bar(7, 0, 8, "forecast\nwith A", fc=LIGHT)
+    bar(7, 8, 16, "mean: forecast,\nwidth 1", fc=ORANGE, ec=ORANGE, color="white")
+    bar(7, 16, 24, "cold: mean 0,\nwidth 1", fc=GREY, ec=GREY, color="white")
     made.savefig(OUT / "timeline.png", dpi=110)
 
 
