@@ -101,7 +101,9 @@ class AsyncExecutor:
             if action_dim is None:
                 action_dim = getattr(actor.network, "action_dim", None)
         if prior is None or action_dim is None:
-            raise ValueError(f"{type(actor).__name__} does not tell: give prior and action_dim")
+            raise ValueError(
+                f"{type(actor).__name__} has no prior or action width: give prior and action_dim"
+            )
         if latency is not None:
             if pool is not None:
                 raise ValueError("a simulated latency computes in the calling thread: leave out pool")
@@ -257,8 +259,8 @@ class AsyncExecutor:
             self._pending, self._failed = None, True
             if self._executed < self._left:
                 warnings.warn(
-                    f"a decision failed ({error!r}): the {self._left - self._executed} actions that are left "
-                    "are executed, and the decision is tried again",
+                    f"a decision failed ({error!r}): executing the {self._left - self._executed} actions "
+                    "that are left, and trying again",
                     stacklevel=3,
                 )
                 return
@@ -279,10 +281,9 @@ class AsyncExecutor:
                 self._pending.exception(None if self._first else self.timeout)
             except NotDone as late:
                 raise TimeoutError(
-                    f"the next chunk is not there after {self._executed} control steps and {self.timeout} s: "
-                    f"all {self._executed} actions that the last one held for them are executed. Hold the "
-                    "robot and call again, execute fewer actions per decision, predict longer chunks, or "
-                    "make the policy faster"
+                    f"the next chunk is not ready after {self._executed} control steps and {self.timeout} s, "
+                    "and no action is left. Hold the robot and call again, execute fewer actions per "
+                    "decision, predict longer chunks, or make the policy faster"
                 ) from late
         self._collect()
 

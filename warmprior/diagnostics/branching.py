@@ -145,7 +145,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
     with torch.no_grad():
         source = prior.distribution(batch.get(keys.HISTORY), batch.get(keys.OBSERVATION, None))
     if type(source) is not Source:
-        raise ValueError(f"the bound is that of a Gaussian source, which {prior} is not")
+        raise ValueError(f"the bound needs a Gaussian source, and {prior} has another one")
     target, warm = batch.get(keys.CHUNK), source.warm
     pad = batch.get(keys.IS_PAD, None)
     counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)

@@ -99,8 +99,8 @@ class SharedObservations:
             raise ValueError(f"offset must be between 0 and {self.chunk_length}, got {offset}")
         if prior.chunk_length != self.chunk_length:
             raise ValueError(
-                f"policies compare at one chunk length only: these observations have H = "
-                f"{self.chunk_length}, {prior} has {prior.chunk_length}"
+                f"compare policies of one chunk length: these observations have H = {self.chunk_length}, "
+                f"{prior} has {prior.chunk_length}"
             )
         window = window_transforms(
             self.data, prior, observation_steps=self.observation_steps, see_history=see_history

@@ -205,5 +205,5 @@ def compare_smoothness(
     results = {name: smoothness(rollout, mode=mode) for name, rollout in rollouts.items()}
     executed = {name: result.executed for name, result in results.items()}
     if len(set(executed.values())) > 1:
-        raise ValueError(f"chunk boundaries compare at one number of executed actions only, got {executed}")
+        raise ValueError(f"compare policies that execute equally many actions per decision, got {executed}")
     return results

@@ -161,8 +161,8 @@ class LeRobotFlow(TensorDictModuleBase):
             unnamed = set(observation.keys()) - set(self.names)
             if unnamed:
                 raise ValueError(
-                    f"what are {', '.join(sorted(unnamed))} of the observation to LeRobot? Tell by names, "
-                    "such as names={'state': 'observation.state'}"
+                    f"LeRobot's names of {', '.join(sorted(unnamed))} are missing: give names, such as "
+                    "names={'state': 'observation.state'}"
                 )
             entries = {self.names[str(name)]: value for name, value in observation.items()}
         steps = self.policy.config.n_obs_steps

@@ -161,7 +161,7 @@ class WarmPriorAdapter:
             ValueError: if the window or its mask has another length, or noise is given.
         """
         if kwargs.get("noise") is not None:
-            raise ValueError("noise= is what the prior gives: leave it out")
+            raise ValueError("the prior gives noise=: leave it out")
         before, valid, target, is_pad = self._window(batch)
         a0, target = self.source.learn(
             before, valid, target, self.generator, self.coupling, self.cold_probability
@@ -310,8 +310,8 @@ class WarmPriorAdapter:
         ):
             if mask.shape != values.shape[:2]:
                 raise ValueError(
-                    f"{name} has shape {tuple(mask.shape)}, expected {tuple(values.shape[:2])}: it tells of "
-                    "every action of the window, those of the history included, whether it is padding"
+                    f"{name} has shape {tuple(mask.shape)}, expected {tuple(values.shape[:2])}: it marks "
+                    "padding among all actions of the window, those of the history included"
                 )
         return past, ~past_is_pad, actions[:, -length:], is_pad[:, -length:]
 

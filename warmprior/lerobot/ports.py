@@ -247,8 +247,8 @@ class OpenPiPort(FlowPort):
         """See :meth:`FlowPort.check`."""
         if getattr(policy.config, "adapt_to_pi_aloha", False):
             raise ValueError(
-                "adapt_to_pi_aloha=True gives actions in another space than the model's, and the source "
-                "would be around the wrong ones: convert the dataset instead, and turn it off"
+                "adapt_to_pi_aloha=True gives actions in another space than the model's, so the source "
+                "would have the wrong mean: convert the dataset instead, and turn it off"
             )
 
     @contextmanager
@@ -283,7 +283,7 @@ class OpenPiPort(FlowPort):
             def sampled(images: Any, *args: Any, **kwargs: Any) -> Tensor:
                 if kwargs.get("noise") is not None:
                     raise ValueError(
-                        "noise= is what the prior gives: leave it out, and put no second prior around a "
+                        "the prior gives noise=: leave it out, and put no second prior around a "
                         "policy that has one (warm_smolvla, warm_pi05)"
                     )
                 shape = torch.Size((images[0].shape[0], length, width))

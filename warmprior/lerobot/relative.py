@@ -61,7 +61,7 @@ class RelativeActions:
         """
         state = self._relative.get_cached_state()
         if state is None:
-            raise ValueError("run the preprocessor before the policy decides: it tells the state")
+            raise ValueError("run the preprocessor before the policy decides: it holds the state")
         # The last of several observations.
         return state.reshape(1, -1) if state.ndim == 1 else state[:, -1] if state.ndim == 3 else state
 

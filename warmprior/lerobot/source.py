@@ -77,7 +77,7 @@ class ChunkSource:
             prior.distribution(cold_history([1], *self._lengths, action_dim, device=device))
         except Exception as error:
             raise ValueError(
-                f"{prior} cannot be the source of a policy of LeRobot, where it is given the history and no "
+                f"{prior} cannot be the source of a policy of LeRobot, where it gets the history and no "
                 f"observation: {error}"
             ) from error
         if std is not None and not (

@@ -221,8 +221,7 @@ class ODEActor(TensorDictModuleBase):
             raise ValueError(f"clip has {len(clip)} bounds, but the network has {width} action dimensions")
         if guidance is not None and max_nfe == 1:
             raise ValueError(
-                "the network's field means something at t = 0 alone, and is no flow to guide: leave the "
-                "guidance out"
+                "the network is trained at t = 0 alone, which is no flow to guide: leave the guidance out"
             )
         self.network = network
         self.nfe = nfe

@@ -41,7 +41,9 @@ class Registered:
         elif not abstract:
             cls.name = name = cls.__dict__.get("name", cls.__name__)
             if not re.fullmatch(r"[\w.+-]+", name):
-                raise ValueError(f"the name of {cls.__name__} becomes that of files: {name!r} cannot")
+                raise ValueError(
+                    f"the name of {cls.__name__} appears in file names, which cannot hold {name!r}"
+                )
             taken = cls._classes.get(name, cls)
             # The same class again, as when a notebook's cell runs twice, replaces itself.
             if (taken.__module__, taken.__qualname__) != (cls.__module__, cls.__qualname__):
@@ -79,13 +81,13 @@ class Registered:
             TypeError: if JSON cannot hold an argument.
         """
         if "name" in self._arguments:
-            raise TypeError(f"{type(self).__name__} takes an argument called name: call it otherwise")
+            raise TypeError(f"{type(self).__name__} takes an argument called name: rename it")
         try:
             return json.loads(json.dumps({"name": self.name, **self._resolved()}, allow_nan=False))
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"{type(self).__name__} has an argument that cannot be saved ({error}): take numbers, text, "
-                "lists or dictionaries, and build the rest of them"
+                "lists or dictionaries, and build other objects from these"
             ) from error
 
     def _resolved(self) -> dict[str, Any]:

@@ -84,12 +84,11 @@ class PriorDecoder(TensorDictModuleBase):
         check_positive(delta=delta)
         if actor.ode.max_nfe == 1:
             raise ValueError(
-                "the policy is trained at t = 0 alone, and its field means nothing elsewhere: there is no "
-                "source space to act in"
+                "the policy is trained at t = 0 alone, so it has no flow from a source space to act in"
             )
         if actor.ode.guidance is not None:
             raise ValueError(
-                "an agent's residual alone decides what is decoded: take actor.replace(guidance=None)"
+                "the agent's residual alone must decide the chunk: take actor.replace(guidance=None)"
             )
         self.delta = float(delta)
         self.differentiable = differentiable

@@ -432,8 +432,8 @@ def _check_networks(
     high = getattr(box, "high", None)
     if high is not None and not torch.allclose(high, torch.full_like(high, decoder.delta)):
         raise ValueError(
-            f"the actor's residuals lie in a box of half side {float(high.max())}, the decoder's in one of "
-            f"{decoder.delta}: build the actor with delta=decoder.delta"
+            f"the actor's box has the half side {float(high.max())}, and the decoder's {decoder.delta}: "
+            "build the actor with delta=decoder.delta"
         )
     for name, critic, key in (
         ("qvalue_network", chunk_critic, decoder.chunk_key),

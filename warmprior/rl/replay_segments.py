@@ -18,7 +18,7 @@ __all__ = ["ReplaySegments"]
 class ReplaySegments:
     """A folder of safetensors files, one per save, with the transitions since the one before.
 
-    A segment counts only once :attr:`committed` counts it. If a process dies between writing a segment and its
+    A segment is valid once :attr:`committed` counts it. If a process dies between writing a segment and its
     training state, the next one replaces that segment.
 
     Args:

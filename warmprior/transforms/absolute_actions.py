@@ -148,7 +148,7 @@ class AbsoluteActions(Transform):
         leaf = actions[self.action_key]
         if leaf.shape[-1] != self.arms * _DELTA:
             raise ValueError(
-                f"AbsoluteActions of {self.arms} arm(s) is for actions of width {self.arms * _DELTA}, the "
+                f"AbsoluteActions of {self.arms} arm(s) needs actions of width {self.arms * _DELTA}, but the "
                 f"environment's have {leaf.shape[-1]}"
             )
         limit = torch.tensor(([_REACH] * 3 + [1.0] * 7) * self.arms, device=leaf.device)

@@ -34,19 +34,18 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
         raise ValueError(f"a delay is a whole number of control steps, at least 0, got {delay!r}")
     if length is not None and 2 * delay > length:
         raise ValueError(
-            f"a delay of {delay} control steps is too long for predictions of {length} actions, of which "
-            f"as many are executed, and as many more until the next ones take effect: at most {length // 2}. "
-            "Predict longer chunks, or make the policy faster"
+            f"a delay of {delay} control steps is too long for predictions of {length} actions: at most "
+            f"{length // 2}. Predict longer chunks, or make the policy faster"
         )
     if delay > execute:
         raise ValueError(
-            f"a delay of {delay} control steps does not go with {execute} actions per decision: need "
-            "0 <= delay <= execute, or the next decision is due before the last one took effect"
+            f"a delay of {delay} control steps does not fit {execute} actions per decision: need 0 <= delay "
+            "<= execute, or the next decision is due before the last one takes effect"
         )
     if length is not None and execute + delay > length:
         raise ValueError(
-            f"predictions of {length} actions do not reach {execute} executed ones and a delay of {delay} "
-            f"more: execute at most {length - delay} per decision, or predict longer chunks"
+            f"predictions of {length} actions do not reach {execute} executed ones and a delay of {delay}: "
+            f"execute at most {length - delay} per decision, or predict longer chunks"
         )
 
 

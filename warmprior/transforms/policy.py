@@ -105,8 +105,8 @@ def policy_transforms(
     observation_key, chunk_key = observation_key or keys.OBSERVATION, chunk_key or keys.CHUNK
     if normalizer is not None and action_key not in normalizer.keys:
         raise ValueError(
-            f"the normaliser has {normalizer.keys}, and not the environment's action {action_key!r}: "
-            "fit it to data that call the action so, or name the action with action_key"
+            f"the normaliser has {normalizer.keys}, but not the environment's action {action_key!r}: "
+            "fit it to data with that key, or name the action with action_key"
         )
     late: list[Transform] = []
     seen = [HistoryObservation(observation_key=observation_key)] if see_history else []

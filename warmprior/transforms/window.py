@@ -174,7 +174,7 @@ def _checked(
         raise ValueError(f"the data must be flat steps [N] with N > 0, got {tuple(data.shape)}")
     if action.ndim != 2 or not action.is_floating_point():
         raise ValueError(
-            f"an action is one vector of real numbers, {action_key!r} [N, d_a], got {tuple(action.shape)} of "
+            f"actions must be vectors of real numbers, {action_key!r} [N, d_a], got {tuple(action.shape)} of "
             f"{action.dtype}: flatten it, or convert it with .float()"
         )
     observations = {observation_key: observation}
