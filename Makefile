@@ -57,9 +57,10 @@ lint: install
 fuzz: install
 	$(BIN)/python -W ignore -m tests.fuzz $(ARGS)
 
-# The charts and the table of the results page, from docs/results.
+# The charts and the table of the results page, from docs/results; flowchart and timeline.
 results: install
 	$(BIN)/python docs/figures/results.py
+	$(BIN)/python docs/figures/diagrams.py
 
 docs: install
 	$(BIN)/sphinx-build -W -q -b html -d build/doctrees $(ARGS) docs docs/_build

@@ -7,6 +7,7 @@ from importlib.metadata import version as _version
 from pathlib import Path as _Path
 
 from furo.navigation import get_navigation_tree
+from sphinx.ext.autodoc.typehints import record_typehints
 from sphinx.util.inspect import signature as _signature
 from sphinx.util.inspect import stringify_signature
 
@@ -35,7 +36,7 @@ smartquotes = False  # options and messages are to be copied
 html_title = "warmprior"
 html_static_path = ["_static"]
 html_favicon = "_static/favicon.svg"
-html_css_files = ["gallery.css"]
+html_css_files = ["pages.css"]
 # Pictures come with the pages that show them, and not with the static files a second time.
 exclude_patterns = ["_build", "_templates", "tutorials/*.rst", "**.png"]
 
@@ -49,6 +50,8 @@ autodoc_typehints_description_target = "documented"
 autodoc_inherit_docstrings = False
 # A dataclass field would otherwise be described twice: by its class and by itself.
 napoleon_use_ivar = True
+# Keyword arguments show their types as other parameters do.
+napoleon_custom_sections = [("Keyword Args", "Args")]
 toc_object_entries_show_parents = "hide"
 
 # The docstrings' examples are run by pytest.
@@ -82,8 +85,9 @@ def _one_download(app, docname, source):
 
 
 def _show_own_signature(app, what, name, obj, options, signature, return_annotation):
-    """Show what a class takes where a base class or metaclass hides it behind ``*args``."""
+    """Show what a class takes, with types, where a base class or metaclass hides it behind ``*args``."""
     if what == "class" and (signature or "").startswith("(*args"):
+        record_typehints(app, what, name, obj.__init__, options, signature, return_annotation)
         own = stringify_signature(
             _signature(obj.__init__, bound_method=True),
             show_annotation=False,
@@ -101,6 +105,22 @@ def _documented():
         re.findall(r"^(?:   ~|\.\. py:data:: )(warmprior[\w.]+)$", page.read_text(), re.M) for page in pages
     )
     return {name.rsplit(".", 1)[1]: name for names in found for name in names}
+
+
+def _link_names(app, docname, source):
+    """Link the public classes, and functions with ``()``, that Markdown names in code style."""
+
+    def link(found):
+        first, *rest = found[1].removesuffix("()").split(".")
+        if first not in _documented() or not (first[0].isupper() or found[1].endswith("()")):
+            return found[0]
+        return f"{{py:obj}}`{found[1]} <{'.'.join([_documented()[first], *rest])}>`"
+
+    if app.env.doc2path(docname).suffix == ".md":
+        parts = re.split(r"(^```.*?^```$)", source[0], flags=re.M | re.S)
+        text = r"(?<![`\[}])`([A-Za-z][\w.]*(?:\(\))?)`(?!`)"
+        parts[::2] = (re.sub(text, link, part) for part in parts[::2])
+        source[0] = "".join(parts)
 
 
 def _resolve_other_names(app, env, node, contnode):
@@ -146,6 +166,7 @@ def _keep_what_formulas_need(app, error):
 def setup(app):
     """Connect the handlers above."""
     app.connect("source-read", _one_download)
+    app.connect("source-read", _link_names)
     app.connect("autodoc-process-signature", _show_own_signature)
     app.connect("missing-reference", _resolve_other_names)
     app.connect("html-page-context", _fold_navigation, priority=900)

@@ -1,4 +1,4 @@
-"""History: what the robot did and what it meant to do, as a value with one layout.
+"""History: what the robot did and what it planned to do, as a value with one layout.
 
 Training windows, environments, the executor and LeRobot's adapter write the same layout under
 :data:`warmprior.keys.HISTORY`, and a prior reads it (:meth:`Prior.mean`). So a mean is the same function of
@@ -37,7 +37,7 @@ ENTRIES = ("actions", "steps", "forecast", "forecast_steps")
 def cold_history(
     batch_size: Any, history_length: int, prediction_length: int, action_dim: int, **like: Any
 ) -> TensorDict:
-    """The history of robots that did nothing yet, with ``dtype`` and ``device`` as in ``torch.zeros``.
+    """The history of robots that have not acted yet, with ``dtype`` and ``device`` as in ``torch.zeros``.
 
     Examples:
         >>> cold_history([5], history_length=4, prediction_length=8, action_dim=2)["forecast"].shape
@@ -51,14 +51,14 @@ def cold_history(
 
 
 def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorDict:
-    """The history after some actions of a chunk were executed. Histories move here and nowhere else.
+    """The history after some actions of a chunk were executed. Nothing else moves a history.
 
-    Precisions stay those of the history. A row that executes nothing keeps its actions, and its forecast
-    becomes the chunk; whoever did not ask it (a partial step) puts its history back.
+    Dtypes stay those of the history. A row that executes nothing keeps its actions, and its forecast becomes
+    the chunk; after a partial step the caller puts the history of resting rows back.
 
     Args:
         history: before the decision, ``[*B]``.
-        chunk: what is executed of the decision, ``[*B, P, d_a]``.
+        chunk: the chunk being executed, ``[*B, P, d_a]``.
         executed: how many actions of it were executed, at most as many as are remembered, int64 ``[*B, 1]``.
 
     Raises:
@@ -118,7 +118,7 @@ def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: 
 
 
 def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
-    """The history with some rows cold: of new episodes, or of windows whose history is withheld.
+    """The history with some rows made cold: new episodes, or windows whose history is withheld.
 
     Args:
         history: ``[*B]``.

@@ -40,19 +40,19 @@ An observation with images has several entries, nested under :data:`OBSERVATION`
 :data:`STATE`, and images uint8 ``[*B, To, 3, h, w]`` under robomimic's names, such as
 ``"agentview_image"``.
 
-:data:`HISTORY` is what the robot did and meant to do (:mod:`warmprior.history`). Data, environments and
+:data:`HISTORY` is what the robot did and planned to do (:mod:`warmprior.history`). Data, environments and
 robots write it alike; the policy writes :data:`LOC`, :data:`WARM` and :data:`NOISE`. :data:`DELAY` is the
-number of control steps for which the last chunk goes on being executed while the next one is computed; 0
-where there is no last chunk.
+number of control steps during which the last chunk is still executed while the next one is computed; 0
+without a last chunk.
 
 In prior-space reinforcement learning :data:`ANCHOR` is the centre of the agent's box and :data:`DELTA` its
-action, so that the source is always ``noise = anchor + delta``. An environment that decodes by itself tells
-what it made of a step's action under ``("next", "decoded", "noise")`` and ``("next", "decoded", "chunk")``;
+action, so that the source is always ``noise = anchor + delta``. An environment that decodes by itself writes
+what it decoded under ``("next", "decoded", "noise")`` and ``("next", "decoded", "chunk")``;
 without ``"next"`` they are those of the step before.
 
 :data:`EEF_POSE` holds the grippers' rotations and, in the last column, positions in metres, both in the
-world. Environments tell it where the actions of policies are absolute poses, and :data:`SIM_STATE`, time,
-positions and velocities of the simulator, where policies see images, which are rendered from it.
+world. Environments write it if policies act by absolute poses. They write :data:`SIM_STATE`, the time,
+positions and velocities of the simulator, if policies see images, which are rendered from it.
 """
 
 from __future__ import annotations

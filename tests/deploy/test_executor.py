@@ -340,7 +340,7 @@ def test_chunks_that_no_robot_should_get():
         ({"latency": 5}, r"delay of 5.*too long for predictions of 8 actions.*at most 4"),
         ({"latency": 1.5}, "whole number of control steps"),
         ({"latency": 1, "pool": FakeClock([])}, "leave out pool"),
-        ({"prior": None}, "Told does not tell: give prior and action_dim"),
+        ({"prior": None}, "Told has no prior or action width: give prior and action_dim"),
     ],
 )
 def test_options_that_cannot_be(options, said):

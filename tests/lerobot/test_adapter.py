@@ -223,5 +223,5 @@ def test_batches_that_do_not_fit(policy):
     adapter.predict_action_chunk(observations("pi05", 2))
     with pytest.raises(ValueError, match="3 environments follow 2: call reset"):
         adapter.predict_action_chunk(observations("pi05", 3))
-    with pytest.raises(ValueError, match="noise= is what the prior gives"):
+    with pytest.raises(ValueError, match="the prior gives noise="):
         adapter.predict_action_chunk(observations("pi05", 2), noise=torch.zeros(2, LENGTH, 12))

@@ -103,7 +103,7 @@ def test_a_taken_name_is_refused():
 
 @pytest.mark.parametrize("name", ["two words", "a/b", ""])
 def test_a_name_that_no_file_can_have_is_refused(name):
-    with pytest.raises(ValueError, match="becomes that of files"):
+    with pytest.raises(ValueError, match="appears in file names"):
         type("Unnamed", (PastPrior,), {"name": name})
 
 

@@ -130,7 +130,7 @@ def test_gradient_of_the_residual_by_finite_differences():
 
 
 def test_regression_has_no_source_space():
-    with pytest.raises(ValueError, match=r"trained at t = 0 alone.* no source space to act in"):
+    with pytest.raises(ValueError, match=r"trained at t = 0 alone.* no flow from a source space"):
         PriorDecoder(make_actor(GaussianPrior(H), max_nfe=1), delta=0.5)
 
 

@@ -172,5 +172,5 @@ def test_windows_refuse_actions_that_are_no_vector_of_numbers(shape, dtype):
     actions = torch.zeros(shape, dtype=dtype)
     data = TensorDict({"observation": torch.zeros(9, 3), "action": actions}, [9])
     data["episode"] = torch.zeros(9, dtype=torch.int64)
-    with pytest.raises(ValueError, match=r"one vector of real numbers, 'action' \[N, d_a\], got \(9"):
+    with pytest.raises(ValueError, match=r"vectors of real numbers, 'action' \[N, d_a\], got \(9"):
         ActionWindow(data, H)

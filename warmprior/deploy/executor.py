@@ -1,4 +1,4 @@
-"""One action per control step, while the next chunk is computed beside."""
+"""One action per control step, while the next chunk is computed in parallel."""
 
 from __future__ import annotations
 
@@ -31,45 +31,43 @@ __all__ = ["AsyncExecutor"]
 
 
 class AsyncExecutor:
-    """Runs a policy beside a control loop: the next chunk is computed while this one is executed.
+    """Runs a policy beside a control loop: computes the next chunk while this one is executed. Every
+    ``execute`` control steps a decision begins in a thread, with the observation of that step. Until its
+    chunk is ready the robot continues the old one; the new one takes effect at the position that the robot
+    has reached. The largest delay of the last decisions is what the policy expects next (``("rtc",
+    "delay")``, for :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) holds the
+    executed actions and the rest of the chunk. :class:`~warmprior.InferenceDelay` does the same in
+    simulation: with ``latency`` the actions are equal.
 
-    Every ``execute`` control steps a decision is begun with the observation of that step, in a thread of its
-    own. Until its chunk is there the robot goes on with the one before; the new one then takes effect at
-    the position of the step that has been reached. How many steps that took is counted, and the largest of
-    the last decisions' is what the policy expects of the next (``("rtc", "delay")``, for
-    :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) holds what was executed, and
-    what is left of the chunk. All of it is what :class:`~warmprior.InferenceDelay` does in simulation: with
-    ``latency`` given, the actions are the same.
-
-    Only the first step of an episode waits for its chunk. Later ones wait at most ``timeout`` seconds, where
-    no action is left; :meth:`act` then raises ``TimeoutError``, and may be called again, with the robot held
-    meanwhile.
+    The first step of an episode waits for its chunk. Later, if no action is left, :meth:`act` waits for at
+    most ``timeout`` seconds and raises ``TimeoutError``: hold the robot, and call it again.
 
     Args:
-        actor: a :class:`~warmprior.WarmPriorActor`, or any module that reads what it needs of
-            ``"observation"`` (``("prior", "observation")``, if the last actions are to be in it),
-            ``"history"`` and ``("rtc", "delay")`` (see :mod:`warmprior.keys`), and writes a chunk
+        actor: a :class:`~warmprior.WarmPriorActor`, or any module that reads ``"observation"`` (``("prior",
+            "observation")`` for one that includes the last actions), ``"history"`` and ``("rtc", "delay")``
+            (see :mod:`warmprior.keys`), and writes a chunk
             ``[P, d_a]``; set to evaluation mode. It is called without batch dimensions, one call at a time.
 
     Keyword Args:
-        prior: of the policy, whose lengths alone are used; that of a :class:`~warmprior.WarmPriorActor` by
-            default.
-        execute: control steps from one decision to the next; by default all ``H``, or as many as a chunk
-            allows with ``delay``.
-        delay: control steps that decisions are expected to take until some were measured.
-        window: number of last decisions whose largest delay is expected of the next.
+        prior: the policy's prior, of which only the lengths matter; that of a
+            :class:`~warmprior.WarmPriorActor` by default.
+        execute: control steps from one decision to the next; by default ``H``, or as many as ``delay``
+            allows.
+        delay: expected delay in control steps until delays were measured.
+        window: how many last decisions to take the largest delay of.
         observation_steps: ``To``.
-        normalizer: between raw and normalised units, such as the actor's own; by default observations are
-            given, and actions handed out, as the policy has them.
+        normalizer: converts raw observations and actions, such as the actor's own; by default they are in the
+            policy's units.
         timeout: seconds to wait for a late chunk once no action is left; ``None`` for as long as it takes.
-        latency: simulate: chunks are computed in the calling thread, and take effect so many control steps
-            later.
+        latency: to simulate: chunks are computed in the calling thread and take effect this many control
+            steps later.
         pool: where to compute; by default in one thread, which :meth:`close` ends.
         action_dim: ``d_a``; that of the actor's network by default.
         chunk_key: where the policy writes its chunk; a :class:`~warmprior.WarmPriorActor`'s own by default.
 
     Raises:
-        ValueError: for numbers that do not go together, or what the actor does not tell and is not given.
+        ValueError: for numbers that do not fit each other, or a missing argument that the actor does not
+            provide.
 
     Examples:
         >>> import torch
@@ -103,7 +101,9 @@ class AsyncExecutor:
             if action_dim is None:
                 action_dim = getattr(actor.network, "action_dim", None)
         if prior is None or action_dim is None:
-            raise ValueError(f"{type(actor).__name__} does not tell: give prior and action_dim")
+            raise ValueError(
+                f"{type(actor).__name__} has no prior or action width: give prior and action_dim"
+            )
         if latency is not None:
             if pool is not None:
                 raise ValueError("a simulated latency computes in the calling thread: leave out pool")
@@ -139,7 +139,7 @@ class AsyncExecutor:
 
     @property
     def delays(self) -> tuple[int, ...]:
-        """Control steps that the last decisions took; those of first decisions are not counted."""
+        """Delays of the last decisions in control steps, without first decisions."""
         return tuple(self._delays)
 
     @property
@@ -148,9 +148,8 @@ class AsyncExecutor:
         return max(self._delays, default=self._expected)
 
     def reset(self) -> None:
-        """Begin another episode: nothing was executed, nothing is left, nothing is under way.
-
-        A decision that a thread has begun runs to its end unheard, and takes its draws from the generator.
+        """Begin another episode. A decision under way runs to its end, advances the generator and is
+        discarded.
         """
         pending: Future[Tensor] | None = getattr(self, "_pending", None)
         if pending is not None:
@@ -172,10 +171,10 @@ class AsyncExecutor:
             ``[d_a]``, on the CPU.
 
         Raises:
-            TimeoutError: if no action is left, and the next chunk is not there in time.
+            TimeoutError: if no action is left, and the next chunk is not ready in time.
             RuntimeError: after :meth:`close`.
-            Exception: whatever the policy raised, once no action is left. Until then, and at every further
-                call, another decision is tried.
+            Exception: the policy's own error, once no action is left. Until then, and at every further call,
+                the decision is tried again.
         """
         if self._closed:
             raise RuntimeError("the executor is closed")
@@ -186,7 +185,7 @@ class AsyncExecutor:
             self._collect()
         if self._executed >= self._usable:
             self._wait()
-            if self._failed:  # the history remembers no more than what is executed by now
+            if self._failed:  # the history remembers no more than what has been executed
                 self._decide()
                 self._collect()
         action = self._chunk[self._executed]
@@ -203,20 +202,20 @@ class AsyncExecutor:
     @property
     def _usable(self) -> int:
         """Actions that can be executed before another chunk is needed."""
-        # A forecast has to reach the P - H steps that it has in training.
+        # A forecast has to reach P - H steps, as in training.
         return self._left if self._pending is None else min(self._left, self.prior.chunk_length)
 
     def _see(self, observation: Tensor | TensorDictBase) -> None:
         if self._normalizer is not None:
             data = TensorDict({keys.OBSERVATION: observation})
             observation = self._normalizer.normalize(data)[keys.OBSERVATION]
-        observation = observation.clone()  # drivers may write the next one into the same memory
+        observation = observation.clone()  # drivers may reuse the memory for the next one
         self._frames.append(observation)
         while len(self._frames) < (self._frames.maxlen or 0):
             self._frames.append(observation)
 
     def _decide(self) -> None:
-        """Begin a decision; what is left of the chunk is at the positions of the new one from here on."""
+        """Begin a decision; the rest of the chunk moves to the positions of the new one."""
         if self._left:
             self._history = advance(self._history, self._chunk, torch.tensor([self._executed]))
             # Less than a whole chunk where the last decision failed.
@@ -253,15 +252,15 @@ class AsyncExecutor:
         return chunk.to(self._chunk)
 
     def _collect(self) -> None:
-        """Let the chunk under way take effect, if it is there."""
+        """Let the chunk under way take effect, if it is ready."""
         if self._pending is None or not self._pending.done():
             return
         if (error := self._pending.exception()) is not None:
             self._pending, self._failed = None, True
             if self._executed < self._left:
                 warnings.warn(
-                    f"a decision failed ({error!r}): the {self._left - self._executed} actions that are left "
-                    "are executed, and the decision is tried again",
+                    f"a decision failed ({error!r}): executing the {self._left - self._executed} actions "
+                    "that are left, and trying again",
                     stacklevel=3,
                 )
                 return
@@ -276,16 +275,15 @@ class AsyncExecutor:
             self._delays.append(self._executed)
 
     def _wait(self) -> None:
-        """Wait for the chunk under way: without it there is no action."""
+        """Wait for the chunk under way."""
         if self._pending is not None:
             try:
                 self._pending.exception(None if self._first else self.timeout)
             except NotDone as late:
                 raise TimeoutError(
-                    f"the next chunk is not there after {self._executed} control steps and {self.timeout} s: "
-                    f"all {self._executed} actions that the last one held for them are executed. Hold the "
-                    "robot and call again, execute fewer actions per decision, predict longer chunks, or "
-                    "make the policy faster"
+                    f"the next chunk is not ready after {self._executed} control steps and {self.timeout} s, "
+                    "and no action is left. Hold the robot and call again, execute fewer actions per "
+                    "decision, predict longer chunks, or make the policy faster"
                 ) from late
         self._collect()
 

@@ -23,14 +23,14 @@ def action_error(
 ) -> dict[int, float]:
     r"""Mean squared error of the executed actions on windows of demonstrations.
 
-    Its smallest value is reached by the conditional mean :math:`E[a_1 \mid a_0, o]`, which one step of
-    an exact field returns; samples of the data's own distribution have up to twice that error. So it
-    compares policies at one NFE, and not one policy at several.
+    The conditional mean :math:`E[a_1 \mid a_0, o]`, which one step of an exact field returns, has the
+    smallest error; samples from the data's own distribution have up to twice that. So compare policies at one
+    NFE, not one policy at several.
 
     Args:
         policy: the policy; its state stays as it is.
         windows: ``[*B]`` of the policy's own prior, normalised, see :class:`~warmprior.ActionWindow`;
-            for a fair error, ones that the policy was not trained on.
+            held-out ones for a fair error.
 
     Keyword Args:
         nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.

@@ -1,4 +1,4 @@
-"""Branching cost: how much of the flow-matching loss no network could remove, and what bounds it."""
+"""Branching cost: the part of the flow-matching loss that no network can remove, and its bound."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def branching_cost(
     split: int = 4096,
     generator: torch.Generator | None = None,
 ) -> TensorDict:
-    r"""Velocity error of a policy on data, which is the branching cost if its field is optimal.
+    r"""Velocity error of a policy on data: the branching cost, if its field is optimal.
 
     The branching cost (Theorem B.1) is the smallest possible flow-matching loss,
 
     .. math::
         B(o) = \int_0^1 E\left[\|A_1 - A_0 - E[A_1 - A_0 \mid A_t, o]\|^2 \mid o\right] dt,
 
-    here with the policy's :math:`v(t, A_t, o)` in place of the conditional expectation: an estimate from
-    above, on average over the data. (The form with :math:`(1-t)^{-2}` is equal and blows up
-    numerically.) Sums run over coordinates inside the episode, in squared normalised action units.
+    here with the policy's :math:`v(t, A_t, o)` in place of the conditional expectation, which overestimates
+    it on average over the data. (The equal form with :math:`(1-t)^{-2}` is numerically unstable.) Sums run
+    over coordinates inside the episode, in squared normalised action units.
 
     Args:
         policy: the policy.
@@ -108,9 +108,8 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
     .. math::
         B_W \le E\|P_W(A_1 - \mu)\|^2 + \sigma^2 d_W
 
-    on the warm coordinates inside the episode. The same argument on all coordinates treats a cold one
-    as ``mu = 0``, ``sigma = 1``; that is ``"total"``, the one to compare priors by. It orders bounds: the
-    branching cost itself may be far below.
+    on the warm coordinates inside the episode. ``"total"`` is the same on all coordinates, with ``mu = 0``
+    and ``sigma = 1`` on cold ones: compare priors by that. The branching cost itself may be far below.
 
     Args:
         batch: windows ``[*B]`` of the prior's lengths, see :func:`~warmprior.window_replay_buffer`.
@@ -146,7 +145,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
     with torch.no_grad():
         source = prior.distribution(batch.get(keys.HISTORY), batch.get(keys.OBSERVATION, None))
     if type(source) is not Source:
-        raise ValueError(f"the bound is that of a Gaussian source, which {prior} is not")
+        raise ValueError(f"the bound needs a Gaussian source, and {prior} has another one")
     target, warm = batch.get(keys.CHUNK), source.warm
     pad = batch.get(keys.IS_PAD, None)
     counted = torch.ones_like(warm) if pad is None else ~pad.unsqueeze(-1)

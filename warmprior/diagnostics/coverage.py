@@ -1,4 +1,4 @@
-"""Whether a source knows how far it is from the data."""
+"""Calibration: whether a source is as wide as its distance from the data."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ __all__ = ["source_coverage"]
 def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: float = 0.9) -> float:
     r"""Share of the target's coordinates inside the central interval of a Gaussian source.
 
-    A calibrated source covers ``level``. One that covers less is surer of its mean than it may be; one that
-    covers all is wider than it has to be, as N(0, I) is around normalised actions.
+    A calibrated source covers ``level``. One that covers less trusts its mean too much; one that covers
+    everything is too wide, as N(0, I) is around normalised actions.
 
     Args:
         policy: the policy, whose prior gives the source (:meth:`Prior.distribution`).
-        windows: ``[*B]`` of its prior with targets, see :meth:`SharedObservations.met`; for a fair coverage
-            of a source that has learnt, ones that it did not learn from.
+        windows: ``[*B]`` of its prior with targets, see :meth:`SharedObservations.met`; held-out ones for a
+            learned source.
 
     Keyword Args:
         level: of the interval :math:`\mu \pm z s`.

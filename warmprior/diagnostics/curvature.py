@@ -26,7 +26,7 @@ from warmprior.modules.ode import integrate
 __all__ = ["curvature"]
 
 NO_MOTION = 0.95
-"""Share of a zero field's loss from which on a field counts as not having learnt to move."""
+"""A field with at least this share of a zero field's loss counts as not having learnt to move."""
 
 
 def curvature(
@@ -45,22 +45,21 @@ def curvature(
     .. math::
         \kappa(o) = \int_0^1 \|\dot a_t - \bar v\|^2 dt, \qquad \bar v = \int_0^1 \dot a_t dt,
 
-    along the Euler sampler with ``n_steps`` steps, summed over coordinates. It shrinks with the length
-    of the transport, whatever the shape of the path, and a source nearer to the data has a shorter one:
-    read it beside ``"relative"``, which divides by :math:`\|\bar v\|^2`. The paper does not say whether a
-    prediction of ``2H`` counts whole; ``"..._executed"`` counts the executed positions alone.
+    along the Euler sampler with ``n_steps`` steps, summed over coordinates. It shrinks with the length of the
+    path, whatever its shape, and a source nearer to the data has shorter paths: compare ``"relative"``, which
+    divides by :math:`\|\bar v\|^2`. The paper does not say whether a prediction of ``2H`` counts whole;
+    ``"..._executed"`` counts the executed positions only.
 
-    Where the field predicts no motion, its tiny curvature is no sign of straightness: values are NaN,
-    with a warning, for observations whose mean velocity is below 1e-4 per coordinate; and for all, if
-    the batch has targets (windows do, rollouts do not) and the field's loss on the counted coordinates
-    is at least 0.95 of that of a field that is 0 everywhere. Positions past an episode's end do not
-    count.
+    A field that predicts no motion is not straight, though its curvature is tiny. So values are NaN, with a
+    warning, for observations whose mean velocity is below 1e-4 per coordinate. All are NaN if the batch has
+    targets (windows do, rollouts do not) and the field's loss is at least 0.95 of that of a zero field.
+    Positions past an episode's end do not count.
 
     Args:
         policy: the policy; its ``nfe`` and solver play no role.
         batch: ``[*B]`` with observation and history: windows of the policy's own lengths or a
             rollout. In windows WP-Preview's mean is the target itself; see
-            :func:`~warmprior.diagnostics.deployed_history` for the history that deployment meets.
+            :func:`~warmprior.diagnostics.deployed_history` for the history at deployment.
         n_steps: Euler steps.
 
     Keyword Args:
@@ -83,7 +82,7 @@ def curvature(
 
     See Also:
         - :func:`~warmprior.diagnostics.flow_paths`: the paths themselves.
-        - :func:`~warmprior.diagnostics.source_leak`: what the source's noise does to actions.
+        - :func:`~warmprior.diagnostics.source_leak`: how the source's noise reaches the actions.
 
     Examples:
         >>> import torch
@@ -104,7 +103,7 @@ def curvature(
     rows = windows.repeat(draws)
     parts = []
     with evaluation_mode(policy):
-        # All sources are drawn at once: how the batch is split must not change them.
+        # All sources are drawn at once, so that splitting the batch does not change them.
         generator = policy.sampler.generator if generator is None else generator
         a0 = policy.prior.sample(rows.history, rows.observation, generator)
         for i in range(0, len(rows), split):
@@ -155,10 +154,10 @@ def _flag_no_motion(
             "curvature is NaN",
             stacklevel=3,
         )
-    # In a rollout the chunk is the policy's own prediction, beside the source it came from.
+    # In a rollout the chunk is the policy's own prediction.
     if batch.get(keys.CHUNK, None) is None or batch.get(keys.NOISE, None) is not None:
         return
-    # A generator of its own, so that the check leaves the caller's stream of random numbers alone.
+    # A generator of its own, so that the check does not advance the caller's.
     generator = torch.Generator(out.device).manual_seed(0)
     cost = branching_cost(policy, batch, generator=generator, **options)
     for suffix in ("", "_executed"):

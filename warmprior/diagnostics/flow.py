@@ -1,4 +1,4 @@
-"""What the diagnostics of a policy's flow share: checked windows, sources and the field itself."""
+"""Common parts of the diagnostics: checked windows, sources and the field itself."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Windows:
         observation: what the network sees, ``[N, To, d_o]``.
         history: ``[N]``, see :mod:`warmprior.history`.
         loc: mean of the source, ``[N, P, d_a]``.
-        warm: where it is one, bool ``[N, P, 1]``.
+        warm: where the mean is known, bool ``[N, P, 1]``.
         counted: positions inside the episode, bool ``[N, P, 1]``.
         target: ``[N, P, d_a]``, if there is one.
     """
@@ -110,7 +110,7 @@ def sees_history(policy: WarmPriorActor) -> bool:
 
 
 def depends_on_history(policy: WarmPriorActor, windows: TensorDictBase) -> bool:
-    """Whether a policy's chunks depend on the history of windows ``[*B]``, whose images are encoded."""
+    """Whether a policy's chunks depend on the history of windows ``[*B]`` with encoded images."""
     sees = sees_history(policy) or policy.start is not None
     return sees or bool(flat_windows(policy, windows).warm.any())
 
@@ -122,10 +122,10 @@ def drawn(policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generat
 
 
 def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: int = 256) -> TensorDictBase:
-    """Windows with what the policy's network makes of observations that hold images.
+    """Windows whose images are encoded by the policy's network.
 
-    Diagnostics evaluate the network many times at the same observations, and look for near ones among them:
-    they take vectors. Windows of such observations are returned as they are.
+    Diagnostics evaluate the network many times at the same observations and compare observations, so they
+    take vectors. Windows without images are returned as they are.
 
     Args:
         policy: the policy.
@@ -171,9 +171,8 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
 
 
 def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
-    """Write what a network sees of the last actions anew, after the history has changed.
-
-    Observations with images have to be as they are, not encoded: the actions stand at their vector's end.
+    """Update the last actions in the observation after the history has changed. Images must not be encoded
+    yet: the actions stand at the end of the observation's vector.
 
     Raises:
         KeyError: if the windows lack what the network sees, or the history.
@@ -194,7 +193,7 @@ def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase
 
 
 def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
-    """The observations of a batch without the last actions that a network may see beside them."""
+    """The observations of a batch, without the last actions that some networks see beside them."""
     key = policy.in_keys[0]
     if sees_history(policy) and isinstance(batch.get(keys.OBSERVATION), Tensor):
         key = keys.OBSERVATION
@@ -202,7 +201,7 @@ def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
 
 
 def check_flow(policy: WarmPriorActor, steps: int) -> None:
-    """Refuse policies whose field means nothing along a whole path.
+    """Refuse policies whose field is not trained along a whole path.
 
     Raises:
         ValueError: if the policy is trained for fewer than ``steps`` network evaluations, or ``steps < 1``.
@@ -223,7 +222,7 @@ def field_of(policy: WarmPriorActor, observation: Tensor) -> Field:
 
 @contextmanager
 def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
-    """No dropout and no gradients, and every module's mode as before afterwards."""
+    """Without dropout and gradients; restores every module's mode afterwards."""
     modes = [(module, module.training) for module in policy.modules()]
     policy.eval()
     try:
@@ -253,7 +252,7 @@ def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
 
 
 def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, *, nfe: int, split: int) -> Tensor:
-    """The chunks ``[N, P, d_a]`` that windows ``[N]`` and sources lead to, ``split`` at a time.
+    """The chunks ``[N, P, d_a]`` from windows ``[N]`` and sources, ``split`` at a time.
 
     Raises:
         FloatingPointError: if one is NaN or infinite.
@@ -266,7 +265,7 @@ def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, *, nfe: in
 
 
 class RunningVariance:
-    """Mean and variance of tensors that arrive one by one, per element (Welford)."""
+    """Running mean and variance of tensors, per element (Welford)."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -282,5 +281,5 @@ class RunningVariance:
         return value
 
     def variance(self, *, unbiased: bool = False) -> Tensor:
-        """Squared deviations by their number, or by one less."""
+        """The variance, biased or not."""
         return self.deviations / (self.count - unbiased)

@@ -1,4 +1,4 @@
-"""Inference-time history shift: what a policy does when its memory is slightly wrong."""
+"""Inference-time history shift: a policy whose memory is slightly wrong."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ __all__ = ["HistoryShift"]
 
 
 class HistoryShift(TensorDictModuleBase):
-    """A policy whose history is disturbed at every decision: inference-time history shift.
-
-    Adds normal noise to the history's actions and forecast before the policy sees them. What the
-    environment remembers stays undisturbed.
+    """Disturbs a policy's history at every decision. Adds normal noise to the history's actions and forecast
+    before the policy sees them. The environment's own history stays as it is.
 
     Args:
         policy: the policy.
@@ -32,7 +30,7 @@ class HistoryShift(TensorDictModuleBase):
 
     See Also:
         - :func:`~warmprior.training.judge_navigation`: plays policies with and without it.
-        - :class:`~warmprior.PastPrior`: whose mean it disturbs.
+        - :class:`~warmprior.PastPrior`: a source whose mean it disturbs.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv

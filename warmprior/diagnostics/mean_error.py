@@ -1,4 +1,4 @@
-"""How far the mean that a decision starts from is from what was right, and from what is decided."""
+"""Distance of the source's mean from the right actions, and from the policy's prediction."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def mean_error(
 
     Args:
         policy: the policy; its state stays as it is.
-        windows: ``[*B]`` of the policy's own prior, with the mean that decisions meet
-            (:meth:`SharedObservations.deployed`); that of the training has no error for WP-Preview.
+        windows: ``[*B]`` of the policy's own prior, with the mean at deployment
+            (:meth:`SharedObservations.deployed`); WP-Preview's training mean has no error.
 
     Keyword Args:
         nfe: network evaluations of the prediction; the policy's own by default.
@@ -94,10 +94,9 @@ def mean_error(
 
 
 def mean_revision(rollout: TensorDictBase) -> float:
-    """Distance of the mean from what is then predicted, along rollouts.
-
-    Where it is larger than at demonstrated states (:attr:`MeanError.revision`), forecasts age worse where
-    the policy brings itself than where the demonstrations are.
+    """Distance of the mean from the policy's next prediction, along rollouts. If it is larger than at
+    demonstrated states (:attr:`MeanError.revision`), forecasts age worse in the states that the policy
+    reaches than in the demonstrations.
 
     Args:
         rollout: ``[D]`` decisions with what the policy wrote, see :class:`~warmprior.training.Episode`.

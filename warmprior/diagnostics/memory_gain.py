@@ -1,4 +1,4 @@
-"""Memory gain: how far a policy follows what it was doing, whatever it observes."""
+"""Memory gain: how far a policy follows its past, whatever it observes."""
 
 from __future__ import annotations
 
@@ -36,32 +36,31 @@ def memory_gain(
 ) -> dict[int, float]:
     r"""How much of a shift of the history reappears in the executed actions.
 
-    At the same observation and the same noise of the source, the history, all its actions and its forecast
-    alike, is moved by :math:`\pm\delta e`, with a random direction :math:`e` of unit length per window. The
-    gain is
+    At the same observation and source noise, all actions of the history and its forecast are moved by
+    :math:`\pm\delta e`, with a random unit direction :math:`e` per window. The gain is
 
     .. math::
         E\,\Big[e \cdot \frac{a_\tau(\mu + \delta e) - a_\tau(\mu - \delta e)}{2\delta}\Big]
 
     over windows, directions and the executed positions :math:`\tau` inside the episode: the slope of actions
-    by the mean, averaged over the dimensions. It is 0 for a policy that does not depend on what was done
-    before, 1 for one that repeats it, and less than 0 for one that undoes it. It is a property of the policy,
-    not a fault: the mean may know what the observation does not tell. But what demonstrations never contain,
-    an action of the policy's own that was wrong, is carried on by as much.
+    by the mean, averaged over the dimensions. It is 0 for a policy that ignores its past, 1 for one that
+    repeats it, and negative for one that undoes it. A gain is not a fault, since the mean may know what the
+    observation does not show. But a wrong action of the policy's own, which demonstrations never contain, is
+    carried on as well.
 
-    How the source's noise lowers it follows for an exact flow. If past and next actions are one height
-    that varies by :math:`s` at an observation, and :math:`V = \sigma^2 (\rho + (1 - \rho)/H)` is the variance
-    of the noise's average over the chunk, with a ``correlation`` of :math:`\rho`, it is
-    :math:`s^2 / (s^2 + V)` at one Euler step, a regression on the source, and :math:`s / \sqrt{s^2 + V}`,
-    which is more, at infinitely many.
+    The source's noise lowers the gain. Suppose that past and next actions are one height, which varies by
+    :math:`s` at an observation, and that the noise's average over the chunk has the variance :math:`V =
+    \sigma^2 (\rho + (1 - \rho)/H)`, with a ``correlation`` of :math:`\rho`. The gain of an exact flow is then
+    :math:`s^2 / (s^2 + V)` at one Euler step, and :math:`s / \sqrt{s^2 + V}`, which is more, at infinitely
+    many.
 
-    Windows without a history, as at a reset, do not count. Actions that a policy clips do not move: what
-    lies beyond its ``clip`` counts as 0. What is left of an old chunk for a policy's guidance stays as it is.
+    Windows without a history, as at a reset, do not count. Actions beyond the policy's ``clip`` count as 0.
+    The leftover that guides a policy stays as it is.
 
     Args:
         policy: the policy; its state stays as it is.
         windows: ``[*B]`` of the policy's own prior, normalised, see :class:`~warmprior.ActionWindow` and
-            :meth:`SharedObservations.windows`. Images may be encoded, unless the network sees the mean.
+            :meth:`SharedObservations.windows`. Images may be encoded, unless the network sees the history.
 
     Keyword Args:
         nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
@@ -75,9 +74,9 @@ def memory_gain(
 
     Raises:
         KeyError: if the windows lack a key.
-        ValueError: if the windows are empty, hold NaN or Inf, or belong to another prediction length, if
-            what a network sees of the mean is not what the windows' mean makes it, if ``shift`` or ``split``
-            is not positive, or the prior allows none of the NFEs.
+        ValueError: if the windows are empty, hold NaN or Inf, or belong to another prediction length, if the
+            observation's last actions differ from the history's, if ``shift`` or ``split`` is not positive,
+            or the prior allows none of the NFEs.
         FloatingPointError: if a prediction is NaN or infinite.
 
     See Also:
@@ -138,7 +137,7 @@ def memory_gain(
 
 
 def shifted(history: TensorDictBase, by: Tensor) -> TensorDictBase:
-    """A history whose real actions and forecast are moved, ``[*B]``; empty entries stay zero.
+    """A history with its real actions and forecast moved, ``[*B]``; empty entries stay zero.
 
     Args:
         history: ``[*B]``, see :mod:`warmprior.history`.

@@ -1,4 +1,4 @@
-"""Paths of a policy's flow, and the history that they start from at deployment."""
+"""Paths of a policy's flow, and the history at deployment."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def flow_paths(
 ) -> Tensor:
     """Integration paths of a policy's flow, from its source at ``t = 0`` on, for plots (Fig. 4).
 
-    Where a policy starts on the way (:class:`~warmprior.StartPoint`), these are not the paths that it takes.
+    A policy with a :class:`~warmprior.StartPoint` takes other paths than these.
 
     Args:
         policy: the policy.
@@ -77,15 +77,15 @@ def deployed_history(
     nfe: int | None = None,
     generator: torch.Generator | None = None,
 ) -> TensorDict:
-    """The history that deployment meets: made from the policy's own prediction one decision earlier.
+    """The history at deployment, from the policy's own prediction one decision earlier.
 
-    ``batch.update(deployed_history(policy, previous))`` replaces that of windows (and
-    :class:`~warmprior.HistoryObservation` makes the observation of a network that sees it anew).
+    ``batch.update(deployed_history(policy, previous))`` replaces that of windows. For a network that sees the
+    history, :class:`~warmprior.HistoryObservation` then updates the observation.
 
     Args:
         policy: the policy.
-        previous: windows ``[*B]`` of the decision before each window of interest, that is ``executed``
-            steps earlier in the same episode. Their own history is that of the training.
+        previous: windows ``[*B]`` of the decision before each window of interest, ``executed`` steps earlier
+            in the same episode, with the history of the training.
 
     Keyword Args:
         executed: actions executed between the two; ``H`` by default.

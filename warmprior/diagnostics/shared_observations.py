@@ -1,4 +1,4 @@
-"""The same observations for every policy, with the history that each of them meets."""
+"""The same observations for every policy, each with its own history."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = ["SharedObservations"]
 
 
 class SharedObservations:
-    """Observations from which policies of any prior (of one chunk length) get their windows.
+    """Observations that give policies of any prior (of one chunk length) their windows.
 
-    Only steps with ``H`` earlier ones in their episode are used, so that every history is complete.
+    It uses only steps with ``H`` earlier ones in their episode, so every history is complete.
 
     Args:
-        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`. For a fair curvature,
-            ones that no policy was trained on.
+        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`. Held-out ones for a fair
+            curvature.
         chunk_length: ``H``.
 
     Keyword Args:
@@ -83,7 +83,7 @@ class SharedObservations:
         """Windows with the history of the training.
 
         Args:
-            prior: for whose lengths.
+            prior: of which only the lengths matter.
             offset: how many steps earlier to cut them, at most ``H``.
 
         Keyword Args:
@@ -99,8 +99,8 @@ class SharedObservations:
             raise ValueError(f"offset must be between 0 and {self.chunk_length}, got {offset}")
         if prior.chunk_length != self.chunk_length:
             raise ValueError(
-                f"policies compare at one chunk length only: these observations have H = "
-                f"{self.chunk_length}, {prior} has {prior.chunk_length}"
+                f"compare policies of one chunk length: these observations have H = {self.chunk_length}, "
+                f"{prior} has {prior.chunk_length}"
             )
         window = window_transforms(
             self.data, prior, observation_steps=self.observation_steps, see_history=see_history
@@ -109,7 +109,7 @@ class SharedObservations:
         return window(TensorDict({keys.FRAME: frames}, [len(frames)]))
 
     def deployed(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Windows with the history that deployment meets: from the policy's own earlier prediction.
+        """Windows with the history at deployment, from the policy's own earlier prediction.
 
         Observations with images are encoded, see :func:`encoded_windows`.
 
@@ -126,7 +126,7 @@ class SharedObservations:
         return encoded_windows(policy, seen_anew(policy, windows))
 
     def met(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Windows as decisions meet them: :meth:`deployed`, if the policy depends on the history.
+        """Windows as at deployment: :meth:`deployed`, if the policy depends on the history.
 
         Args:
             policy: the policy.

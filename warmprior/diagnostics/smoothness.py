@@ -1,4 +1,4 @@
-"""How smoothly executed actions continue across chunk boundaries, on rollouts of any policy."""
+"""How smoothly executed actions continue across chunk boundaries."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Mode = int | Callable[[Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Smoothness of the executed actions; NaN where nothing was there to measure.
+    """Smoothness of the executed actions; NaN where there was nothing to measure.
 
     Attributes:
         boundary_jump: mean distance between the last action of a chunk and the first of the next.
@@ -55,7 +55,7 @@ class Smoothness:
 
     @property
     def jump_ratio(self) -> float:
-        """Boundary jump over inner jump; 1 for actions that do not know where chunks end."""
+        """Boundary jump over inner jump; 1 if chunk ends make no difference."""
         return self.boundary_jump / self.inner_jump if self.inner_jump else math.nan
 
 
@@ -65,7 +65,8 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     Args:
         rollout: ``[*B, D]`` decisions, time last, with ``("vla_action", "chunk")`` ``[*B, D, P, d_a]``,
             ``("next", "executed_steps")`` ``[*B, D, 1]`` and, if episodes end inside,
-            ``("next", "done")``; where chunks take effect late, also what :class:`InferenceDelay` tells.
+            ``("next", "done")``; where chunks take effect late, also the delay that :class:`InferenceDelay`
+            writes.
 
     Returns:
         The actions ``[*B, T, d_a]``, filled up with NaN where a row executed fewer than the longest;
@@ -102,7 +103,7 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     kept = position < steps  # [*B, D, K]
     decision = torch.arange(rollout.shape[-1], device=chunk.device)[:, None].expand_as(kept)
     delay = rollout.get(keys.DELAY, None)
-    if delay is not None:  # what was executed before a chunk took effect is of the decision before
+    if delay is not None:  # actions before a chunk took effect belong to the decision before
         decision = decision - (position < delay).long()
     ended = done.squeeze(-1).long()
     episode = (ended.cumsum(-1) - ended).unsqueeze(-1).expand_as(kept)
@@ -204,5 +205,5 @@ def compare_smoothness(
     results = {name: smoothness(rollout, mode=mode) for name, rollout in rollouts.items()}
     executed = {name: result.executed for name, result in results.items()}
     if len(set(executed.values())) > 1:
-        raise ValueError(f"chunk boundaries compare at one number of executed actions only, got {executed}")
+        raise ValueError(f"compare policies that execute equally many actions per decision, got {executed}")
     return results

@@ -25,24 +25,24 @@ from warmprior.modules.actor import WarmPriorActor
 __all__ = ["INNER_STEP_BOUND", "LEAK_BOUND", "SourceLeak", "source_leak"]
 
 LEAK_BOUND = 1.0
-"""Largest leak of a sampler that spreads like the data; what spreads more carries noise of its own."""
+"""Largest leak of a sampler that spreads like the data; a larger one adds noise."""
 
 INNER_STEP_BOUND = 1.3
-"""Largest inner step ratio that passes; sound policies are near 1 or, at few steps, smoother than data."""
+"""Largest inner step ratio of a sound policy, which is near 1 or, at few steps, below."""
 
 DISTANCES = 2**22
-"""Distances between observations that are held at a time: 16 MiB in single precision."""
+"""Distances between observations held at a time: 16 MiB in single precision."""
 
 
 @dataclass(frozen=True)
 class SourceLeak:
-    """What the source's noise does to the executed actions, in normalised action units.
+    """How the source's noise shows in the executed actions, in normalised action units.
 
     Attributes:
         nfe: network evaluations per chunk.
         spread: standard deviation of predictions over draws of the source at fixed observation and mean,
             root mean square over windows, positions and dimensions.
-        data_spread: the same of the targets at like observations.
+        data_spread: the same for the targets at similar observations.
         ratio_to_last: ``spread`` over that at the largest ``nfe`` measured.
         inner_step: mean distance between consecutive actions inside predicted chunks; NaN at ``H = 1``.
         data_inner_step: the same of the targets.
@@ -76,7 +76,7 @@ class SourceLeak:
 
     @property
     def warning(self) -> str | None:
-        """A sentence that names the bounds exceeded, ``None`` if none is.
+        """A sentence that names the exceeded bounds, or ``None``.
 
         Examples:
             >>> SourceLeak(1, 0.3, 0.2, 1.5, 0.11, 0.1).warning
@@ -107,24 +107,22 @@ def source_leak(
     split: int = 4096,
     generator: torch.Generator | None = None,
 ) -> dict[int, SourceLeak]:
-    r"""How far predictions spread over draws of the source, beside how far the data spread.
+    r"""How far predictions spread over draws of the source, relative to the data.
 
-    An exact sampler turns the source's noise into the data's variety, so at fixed observation and mean
-    it spreads at most like the targets at that observation: the leak is at most 1. A velocity network
-    that has not learnt to ignore the noise at ``t = 0`` hands it on to the actions, most of all at few
-    steps. With one step an exact field returns :math:`E[a_1 \mid a_0, o]`, which for a source independent
-    of the target, as the standard normal one is, does not depend on :math:`a_0`: its spread is 0.
-    WP-Preview's source tells about the target, WP-Past's wherever the history does, so theirs is not 0
-    but still at most the data's, by the law of total variance.
+    An exact sampler spreads at most like the targets at the same observation, so the leak is at most 1. A
+    velocity network that has not learnt to ignore the noise at ``t = 0`` passes it on to the actions, most of
+    all at few steps. With one step an exact field returns :math:`E[a_1 \mid a_0, o]`. For a standard normal
+    source, which is independent of the target, that does not depend on :math:`a_0`, and the spread is 0. A
+    warm source knows about the target, so its spread is not 0, but still at most the data's, by the law of
+    total variance.
 
-    The data's variance is half the mean squared difference between a window's target and those at the
-    nearest observations (Euclidean, all ``To`` steps), one in each of the nearest other episodes: steps
-    of one episode, or several of another one, would agree too well. It is conditioned on the observation
-    alone for every prior, because WP-Preview's training mean is cut from the target, given which nothing
-    would be left to spread. It therefore errs upwards: neighbours' observations differ, and a mean that
-    tells about the target leaves less to spread than the observation does. Several modes at one
-    observation spread far enough to hide a leak; noise between the actions of one chunk shows all the
-    same, as steps inside chunks that are longer than the data's.
+    The data's variance is half the mean squared difference between a window's target and those at the nearest
+    observations (Euclidean, all ``To`` steps), one in each of the nearest other episodes; steps of one
+    episode would agree too well. It is conditioned on the observation alone for every prior, because
+    WP-Preview's training mean is cut from the target. It therefore errs upwards: neighbours' observations
+    differ, and the mean is not taken into account. Several modes at one observation spread far enough to hide
+    a leak, but noise between the actions of one chunk still shows, as steps inside chunks that are longer
+    than the data's.
 
     Positions past the first ``H`` or past an episode's end do not count.
 
@@ -137,10 +135,9 @@ def source_leak(
     Keyword Args:
         nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
         draws: samples of the source per window, at least 2, the same ones for every NFE.
-        neighbours: windows that each one's target is compared with. More are further away.
+        neighbours: how many windows each target is compared with. More are further away.
         episodes: each window's episode, ``[*B]``, such as :attr:`SharedObservations.episodes`;
-            ``"episode"`` in the windows by default, and without that every window counts as an episode
-            of its own.
+            by default ``"episode"`` in the windows; without it every window counts as an episode.
         split: network batch size, for bounded memory; it changes nothing else.
         generator: source of randomness on the policy's device; by default one of its own with a fixed
             seed.
@@ -226,7 +223,7 @@ def _data_spread(
     squares = []
     for i in range(0, len(observation), size):
         s = slice(i, i + size)
-        # The faster form by matrix products loses the small distances, the ones that matter here.
+        # The faster form by matrix products loses small distances, which matter here.
         distance = torch.cdist(observation[s], observation, compute_mode="donot_use_mm_for_euclid_dist")
         taken = episodes[s, None] == episodes
         for _ in range(neighbours):

@@ -62,8 +62,8 @@ def probability_better(successes_a: int, episodes_a: int, successes_b: int, epis
         P(p_a > p_b) = \sum_{i=0}^{\alpha_a - 1} \frac{B(\alpha_b + i, \beta_a + \beta_b)}
             {(\beta_a + i)\, B(1 + i, \beta_a)\, B(\alpha_b, \beta_b)},
 
-    the distribution function of a beta negative binomial. Episodes of one training seed are independent;
-    those of several seeds pooled are not quite, and the probability is then too certain.
+    the distribution function of a beta negative binomial. Pooled episodes of several training seeds are not
+    quite independent; the probability is then too extreme.
 
     Args:
         successes_a: ``k`` of ``a``.
@@ -91,8 +91,8 @@ def probability_better(successes_a: int, episodes_a: int, successes_b: int, epis
 def top_k_mean(rates: Sequence[float], k: int) -> float:
     """Mean of the ``k`` largest rates (all of them, if there are fewer).
 
-    This is how the paper averages checkpoints. Choosing and reporting on the same episodes flatters
-    every method alike.
+    The paper averages checkpoints like this. Choosing and reporting on the same episodes flatters every
+    method alike.
 
     See Also:
         :func:`~warmprior.diagnostics.summarize_seeds`: over the seeds then.
@@ -109,8 +109,8 @@ def top_k_mean(rates: Sequence[float], k: int) -> float:
 def paired_probability_better(wins: int, losses: int) -> float:
     r"""Posterior probability that ``a`` beats ``b`` in an episode that only one of them solves.
 
-    Of the episodes that both play from the same seed, those with equal outcomes tell nothing about which
-    is better. Under a uniform prior the share of wins among the others is
+    Episodes from the same seed with equal outcomes do not say which is better. Under a uniform prior the
+    share of wins among the others is
     :math:`\mathrm{Beta}(w + 1, l + 1)`, which exceeds one half with probability
 
     .. math::
@@ -185,7 +185,7 @@ def summarize_seeds(values: Sequence[float]) -> SeedSummary:
 def exceeds_one_sigma(method: SeedSummary, base: SeedSummary) -> bool:
     """The paper's rule for a marked gain: non-overlapping one-sigma seed intervals (Table 1).
 
-    Always false with a single seed: it has no spread to compare with.
+    Always false with a single seed, which has no spread.
 
     See Also:
         - :func:`~warmprior.diagnostics.summarize_seeds`: makes what it compares.
@@ -209,9 +209,8 @@ def bootstrap_ratio(
 ) -> tuple[float, float, float]:
     """Ratio of two means over the same observations, with a percentile bootstrap interval.
 
-    Whole groups are drawn with replacement: neighbouring steps of an episode are much alike, and
-    intervals from single steps would be far too narrow. Observations where either value is NaN do
-    not count.
+    It draws whole groups with replacement: neighbouring steps of an episode are alike, and intervals from
+    single steps would be far too narrow. Observations where either value is NaN do not count.
 
     Args:
         numerator: ``[n]``.

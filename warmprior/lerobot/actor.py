@@ -23,10 +23,9 @@ __all__ = ["LeRobotActor", "LeRobotFlow"]
 
 
 class LeRobotFlow(TensorDictModuleBase):
-    """The sampler of a LeRobot policy in the place of :class:`~warmprior.ODEActor`.
-
-    A deterministic map ``(noise, observation) -> chunk``: what pads the prior's part of the source is one
-    draw, the same for every call and row, unless a call brings its own.
+    """The sampler of a LeRobot policy in place of :class:`~warmprior.ODEActor`. A deterministic map ``(noise,
+    observation) -> chunk``: the padding around the prior's part of the source is one fixed draw, unless a
+    call passes its own.
     The policy's weights are not among the parameters of this module.
 
     Args:
@@ -36,18 +35,18 @@ class LeRobotFlow(TensorDictModuleBase):
     Keyword Args:
         names: LeRobot's name of each entry of the observation, such as
             ``{"state": "observation.state", "agentview_image": "observation.images.top"}``.
-        preprocess: what turns raw observations into the policy's batch, such as LeRobot's preprocessor; none
-            if the environment's transforms do.
+        preprocess: turns raw observations into the policy's batch, such as LeRobot's preprocessor; none by
+            default.
         nfe: integration steps per chunk; the policy's own by default.
-        seed: of what pads the source.
+        seed: of the padding.
         noise_key: the source, ``[*B, P, d_a]``.
         observation_key: the observation, ``[*B, To, d]`` (LeRobot's ``observation.state``), or a
             tensordict of such entries. Images of bytes become floats in [0, 1].
-        chunk_key: key written, ``[*B, P, d_a]``, the model's units.
+        chunk_key: key written, ``[*B, P, d_a]``, in the model's units.
 
     Raises:
-        ValueError: if gradients are asked for: LeRobot's samplers compute none, or ``padding`` has another
-            shape than the model's source.
+        ValueError: if gradients are required, which LeRobot's samplers do not compute, or ``padding`` has
+            another shape than the model's source.
         KeyError: if an input key is missing.
 
     See Also:
@@ -81,8 +80,8 @@ class LeRobotFlow(TensorDictModuleBase):
         super().__init__()
         check_steps(nfe)
         self._port = port_for(policy)
-        # Not a part of this module: policies of billions of weights are trained and saved by LeRobot, and not
-        # by the agents that contain this.
+        # Not a submodule: LeRobot trains and saves policies of billions of weights, not the agents that
+        # contain this.
         self._policy = (policy,)
         self.source = source
         self.names = dict(names or {})
@@ -116,7 +115,7 @@ class LeRobotFlow(TensorDictModuleBase):
         nfe: int | None = None,
         padding: Tensor | None = None,
     ) -> TensorDictBase:
-        """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source of what the prior has no part in."""
+        """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source outside of the prior's part."""
         nfe = self.nfe if nfe is None else nfe
         check_steps(nfe)
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
@@ -129,7 +128,7 @@ class LeRobotFlow(TensorDictModuleBase):
         a0 = noise.reshape(-1, *noise.shape[-2:])
         inputs = self._batch(network_observation(tensordict.get(self.in_keys[1]), batch))
         if padding is None:
-            # One draw for all rows: a chunk does not depend on who is asked beside it.
+            # One draw for all rows, so that a chunk does not depend on the other rows.
             generator = torch.Generator(a0.device).manual_seed(self.seed)
             padding = self.source.place(a0[:1].detach(), generator)
         wanted = (self.source.length, self.source.width)
@@ -145,7 +144,7 @@ class LeRobotFlow(TensorDictModuleBase):
         def draw(shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
             return whole.to(dtype=dtype, device=device)
 
-        # A policy of the plugin has a source of its own, which this one takes the place of.
+        # A policy of the plugin has a source of its own, which this one replaces.
         own = getattr(self.policy, "warm_adapter", None)
         with (
             nullcontext() if own is None else own.aside(),
@@ -162,8 +161,8 @@ class LeRobotFlow(TensorDictModuleBase):
             unnamed = set(observation.keys()) - set(self.names)
             if unnamed:
                 raise ValueError(
-                    f"what are {', '.join(sorted(unnamed))} of the observation to LeRobot? Tell by names, "
-                    "such as names={'state': 'observation.state'}"
+                    f"LeRobot's names of {', '.join(sorted(unnamed))} are missing: give names, such as "
+                    "names={'state': 'observation.state'}"
                 )
             entries = {self.names[str(name)]: value for name, value in observation.items()}
         steps = self.policy.config.n_obs_steps
@@ -182,24 +181,20 @@ class LeRobotFlow(TensorDictModuleBase):
 class LeRobotActor(TensorDictModuleBase):
     """A LeRobot policy with the keys of :class:`~warmprior.WarmPriorActor`.
 
-    ``(observation, history) -> (loc, warm, noise, chunk)``: it acts in ``env.rollout`` and collectors with
-    :class:`~warmprior.ActionHistory` and
-    :class:`~warmprior.ChunkStep`, resets included, and :class:`~warmprior.PriorDecoder` takes it as a frozen
-    policy. What the model's source has beside the prior's part (padded dimensions, positions before the
-    chunk) is drawn for every decision; :class:`~warmprior.PriorDecoder` keeps it fixed. Chunks are in the
-    model's units: append what denormalises them next to the environment.
+    ``(observation, history) -> (loc, warm, noise, chunk)``: it acts in ``env.rollout`` and collectors behind
+    :func:`~warmprior.policy_transforms`, and :class:`~warmprior.PriorDecoder` takes it as a frozen policy.
+    Every decision draws the rest of the model's source anew (padded dimensions, positions before the chunk);
+    :class:`~warmprior.PriorDecoder` keeps it fixed. Chunks are in the model's units: denormalise them next to
+    the environment.
 
     Args:
         policy: of LeRobot, see :class:`WarmPriorAdapter`.
         prior: the source distribution that it was trained with.
 
     Keyword Args:
-        names: see :class:`LeRobotFlow`.
-        preprocess: see :class:`LeRobotFlow`.
         std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it.
-        nfe: integration steps per chunk; the policy's own by default. Per call: ``actor(data, nfe=1)``.
         generator: source of randomness; per call: ``actor(data, generator=...)``.
-        kwargs: further arguments of :class:`LeRobotFlow`.
+        kwargs: further arguments of :class:`LeRobotFlow`, such as ``names``, ``preprocess`` and ``nfe``.
 
     Raises:
         ValueError: see :class:`WarmPriorAdapter`.

@@ -18,13 +18,13 @@ from warmprior.modules.prior import Prior
 __all__ = ["HISTORY", "HISTORY_IS_PAD", "WarmPriorAdapter", "history_indices"]
 
 HISTORY = "action_history"
-"""The actions before the current step, where they do not ride in front of ``"action"``."""
+"""The actions before the current step, if they are not in front of ``"action"``."""
 
 HISTORY_IS_PAD = f"{HISTORY}_is_pad"
 
 
 def history_indices(history_length: int, length: int, lead: int = 0) -> list[int]:
-    """Steps of the dataset that a training window takes, for ``action_delta_indices``.
+    """Dataset steps of a training window, for ``action_delta_indices``.
 
     Args:
         history_length: of the prior, usually ``H``.
@@ -44,16 +44,16 @@ def history_indices(history_length: int, length: int, lead: int = 0) -> list[int
 class WarmPriorAdapter:
     """Trains and runs an unmodified flow policy of LeRobot from a prior's source.
 
-    Supported are pi0, pi0.5, SmolVLA, GR00T N1.7, multi_task_dit (flow matching) and X-VLA of lerobot 0.6,
-    and GR00T N1.5 of lerobot 0.5.1. The policy stays as it is: only the noise that its loss and its sampler
-    would draw is replaced, exactly once each, or an error says that it was not. Everything is in the model's
-    own units, after LeRobot's preprocessor and before its postprocessor.
+    It supports pi0, pi0.5, SmolVLA, GR00T N1.7, multi_task_dit (flow matching) and X-VLA of lerobot 0.6, and
+    GR00T N1.5 of lerobot 0.5.1. It replaces the noise that loss and sampler draw, exactly once each, or
+    raises an error. Everything is in the model's own units, after LeRobot's preprocessor and before its
+    postprocessor.
 
     For training, the dataset gives ``H`` more actions in front of each chunk: set
-    ``delta_timestamps["action"]`` to :attr:`action_indices` over the frame rate. They ride in
-    ``batch["action"]`` ``[B, H + T, d_a]``, and ``batch["action_is_pad"]`` tells which of them lie before
-    the episode. LeRobot fills those with the episode's first action, the very target, so they are never used.
-    GR00T's preprocessor takes no longer chunks: give it the history as ``"action_history"`` with
+    ``delta_timestamps["action"]`` to :attr:`action_indices` over the frame rate. They come in
+    ``batch["action"]`` ``[B, H + T, d_a]``, and ``batch["action_is_pad"]`` marks those before the episode.
+    LeRobot fills these with the episode's first action, which is the target, so they are never used. GR00T's
+    preprocessor cuts longer chunks: pass the history as ``"action_history"`` with
     ``"action_history_is_pad"``.
 
     Args:
@@ -62,20 +62,20 @@ class WarmPriorAdapter:
             the policy, whose later positions then start cold.
 
     Keyword Args:
-        sigma_unit: what ``sigma`` is in units of: ``"model"`` (the normalised action space, as in the paper)
-            or ``"std"`` (the standard deviation of the data), which does not depend on the normalisation.
+        sigma_unit: unit of ``sigma``: ``"model"`` (the normalised action space, as in the paper) or ``"std"``
+            (the standard deviation of the data), which does not depend on the normalisation.
         stats: of the dataset (``dataset.meta.stats``), for ``sigma_unit="std"``.
         action_std: the standard deviation itself, ``[d_a]`` in the model's units, instead of ``stats``.
-        relative: for policies with relative actions, how remembered ones are expressed at the next state.
+        relative: expresses remembered actions at the next state, for policies with relative actions.
         coupling: pairs the sources and targets of a batch (:data:`~warmprior.objectives.Coupling`), without
-            observations; as they come by default.
+            observations; in their order by default.
         cold_probability: share of the training windows whose history is withheld.
         nfe: integration steps per chunk; the policy's own by default.
         generator: source of randomness on the policy's device; PyTorch's global one by default.
 
     Raises:
         ValueError: if the family is unknown, or prior, policy and options do not fit each other.
-        ImportError: if another release of lerobot is installed than the ports are for.
+        ImportError: if the installed release of lerobot has no ports.
 
     Examples:
         >>> adapter = WarmPriorAdapter(policy, PastPrior(50))  # doctest: +SKIP
@@ -130,7 +130,7 @@ class WarmPriorAdapter:
         check_steps(nfe)
         self._relative = relative
         self._memory = ActionMemory(prior, self.source.action_dim)
-        # Raw states at the decision that is remembered, and at the one under way.
+        # Raw states at the last decision, and at the one under way.
         self._state: Tensor | None = None
         self._now: Tensor | None = None
         self._sampling = False
@@ -154,14 +154,14 @@ class WarmPriorAdapter:
             kwargs: handed to it.
 
         Returns:
-            What it returns: the loss, and what it tells besides.
+            The policy's own loss and information.
 
         Raises:
             KeyError: if ``"action"`` or its mask is missing.
             ValueError: if the window or its mask has another length, or noise is given.
         """
         if kwargs.get("noise") is not None:
-            raise ValueError("noise= is what the prior gives: leave it out")
+            raise ValueError("the prior gives noise=: leave it out")
         before, valid, target, is_pad = self._window(batch)
         a0, target = self.source.learn(
             before, valid, target, self.generator, self.coupling, self.cold_probability
@@ -213,9 +213,9 @@ class WarmPriorAdapter:
 
         Args:
             batch: a preprocessed observation.
-            executed_steps: actions executed of the last chunk: a number, which leaves out the environments
-                that were reset since, or ``[B]``; by default the policy's ``n_action_steps``, or those that
-                :meth:`select_action` gave out.
+            executed_steps: actions executed of the last chunk: a number, for all environments that were not
+                reset since, or ``[B]``; by default the policy's ``n_action_steps``, or as many as
+                :meth:`select_action` returned.
             predict: the policy's ``predict_action_chunk`` by default.
             kwargs: handed to it.
 
@@ -233,9 +233,8 @@ class WarmPriorAdapter:
             return call(batch, **kwargs)
 
     def record_executed(self, action: Tensor) -> None:
-        """Correct the action that :meth:`select_action` just gave: what was executed instead.
-
-        Postprocessors and robots clip; the past is what the robot did.
+        """Replace the action that :meth:`select_action` just returned by the executed one, where a
+        postprocessor or robot clips.
 
         Args:
             action: ``[B, d_a]``, the model's units.
@@ -249,20 +248,21 @@ class WarmPriorAdapter:
         """Begin new episodes: their next chunk starts cold.
 
         Args:
-            mask: of environments, bool ``[B]``; all by default, which also resets the policy. LeRobot's queue
-                of actions is common to all of them, so that the rest of its chunk is executed in any case.
+            mask: of environments, bool ``[B]``; all by default, which also resets the policy. All
+                environments share LeRobot's queue of actions, so the rest of its chunk is executed in any
+                case.
         """
         self.forget(mask)
         if mask is None:
             self.policy.reset()
 
     def forget(self, mask: Tensor | None = None) -> None:
-        """The part of :meth:`reset` that leaves the policy alone."""
+        """As :meth:`reset`, without resetting the policy."""
         self._memory.forget(mask)
 
     @contextmanager
     def aside(self) -> Iterator[None]:
-        """Within, a policy of the plugin, which goes through its adapter, samples as its base class does."""
+        """Inside, a policy of the plugin samples as its base class does, without its adapter."""
         before, self._sampling = self._sampling, True
         try:
             yield
@@ -310,8 +310,8 @@ class WarmPriorAdapter:
         ):
             if mask.shape != values.shape[:2]:
                 raise ValueError(
-                    f"{name} has shape {tuple(mask.shape)}, expected {tuple(values.shape[:2])}: it tells of "
-                    "every action of the window, those of the history included, whether it is padding"
+                    f"{name} has shape {tuple(mask.shape)}, expected {tuple(values.shape[:2])}: it marks "
+                    "padding among all actions of the window, those of the history included"
                 )
         return past, ~past_is_pad, actions[:, -length:], is_pad[:, -length:]
 

@@ -1,4 +1,4 @@
-"""Handing a policy its source where it would draw standard normal noise."""
+"""Gives a policy its source where it would draw standard normal noise."""
 
 from __future__ import annotations
 
@@ -12,21 +12,18 @@ from torch.overrides import TorchFunctionMode
 __all__ = ["Source", "SourceInjection"]
 
 Source = Callable[[torch.Size, torch.dtype, torch.device], Tensor]
-"""``(shape [B, T, D], dtype, device) -> a_0``: what stands in the place of a draw."""
+"""``(shape [B, T, D], dtype, device) -> a_0``: replaces a draw."""
 
 
 class SourceInjection(TorchFunctionMode):
     """Replaces the one draw of ``torch.randn`` or ``torch.randn_like`` of the shape of a chunk.
 
-    It is exact, or it raises: a policy that draws no such noise, or more than once, is not the one that
-    its port was written for.
+    It raises if a policy draws no such noise, or more than once: its port was written for another one.
 
     Args:
         length: ``T``, the length of the noisy chunk.
         width: ``D``, its width with padding.
-        source: what takes the place of the draw.
-
-    Raises:
+        source: replaces the draw. Raises:
         RuntimeError: at the exit, if there was not exactly one draw of shape ``[B, T, D]``.
 
     Examples:
@@ -67,7 +64,7 @@ class SourceInjection(TorchFunctionMode):
         return self.source(torch.Size(size), dtype, torch.device(device))
 
     def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        """Count, unless something else went wrong."""
+        """Check the count, unless an error is under way."""
         super().__exit__(kind, error, trace)
         if kind is None and self.draws != 1:
             length, width = self.expected

@@ -1,4 +1,4 @@
-"""What the robots of a batch did since their last decision, where no environment keeps it."""
+"""The history of a batch of robots, where no environment keeps it."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ __all__ = ["ActionMemory"]
 class ActionMemory:
     """The history (:mod:`warmprior.history`) from decision to decision, one row per environment.
 
-    What :class:`~warmprior.ActionHistory` is in an environment of TorchRL: LeRobot's environments keep
-    nothing, and its policies have a queue of actions that is common to all rows.
+    The counterpart of :class:`~warmprior.ActionHistory`: LeRobot's environments keep nothing, and its
+    policies share one queue of actions for all rows.
 
     Args:
-        prior: of the policy, whose lengths alone are used.
+        prior: the policy's prior, of which only the lengths matter.
         action_dim: ``d_a``.
 
     Examples:
@@ -44,7 +44,7 @@ class ActionMemory:
         self.action_dim = action_dim
         # None between episodes; the others are of the same decision.
         self._chunk: Tensor | None = None
-        # That of the decision under way counts only once it has a chunk: a sampler may fail.
+        # The history of the decision under way counts once there is a chunk, since a sampler may fail.
         self._history = self._decision = TensorDict()
         self._executed = self._new = torch.empty(0)
 
@@ -54,7 +54,7 @@ class ActionMemory:
         device: torch.device | str = "cpu",
         move: Callable[[Tensor], Tensor] | None = None,
     ) -> TensorDict:
-        """The history at the decision that comes now.
+        """The history at the next decision.
 
         Args:
             batch_size: ``B``.
@@ -74,7 +74,7 @@ class ActionMemory:
             raise ValueError(f"{batch_size} environments follow {len(self._chunk)}: call reset() in between")
         else:
             history = advance(self._history, self._chunk, self._executed)
-            # What is left of the chunk is the plan of an episode that is over.
+            # The rest of the chunk belongs to an episode that is over.
             cold = without(history, self._new)
             history.update(cold.select("forecast", "forecast_steps"))
             if move is not None:
@@ -99,18 +99,18 @@ class ActionMemory:
 
     @property
     def waits(self) -> bool:
-        """Whether a chunk was predicted of which no action is known to be executed."""
+        """Whether there is a chunk of which no action was executed yet."""
         return self._chunk is not None and not self._executed.any()
 
     def executed(self, steps: int | Tensor) -> None:
-        """Tell how many actions of the chunk were executed, whatever was counted.
+        """Set how many actions of the chunk were executed.
 
         Args:
-            steps: a number, which leaves out the environments whose episode began since; or ``[B]``, of
-                such environments those of the new episode.
+            steps: a number, for all environments whose episode goes on; or ``[B]``, which counts a new
+                episode's own actions.
 
         Raises:
-            ValueError: if more were executed than a decision may execute, or fewer than none.
+            ValueError: if the number is negative, or larger than a decision may execute.
         """
         if self._chunk is None:
             return
@@ -155,7 +155,7 @@ class ActionMemory:
                     f"the mask of environments has shape {tuple(rows.shape)}, expected "
                     f"{tuple(self._new.shape)}: one bool per environment"
                 )
-            # The rest of the chunk goes on being executed, now as the first actions of an episode.
+            # The rest of the chunk is still executed, as the first actions of the new episode.
             rest = advance(self._history, self._chunk, self._executed)["forecast"]
             self._chunk = torch.where(rows[:, None, None], rest, self._chunk)
             self._history = without(self._history, rows)

@@ -1,4 +1,4 @@
-"""Where the flow policies of LeRobot draw their noise, one small port per family."""
+"""One small port per family of LeRobot's flow policies: where it draws its noise."""
 
 from __future__ import annotations
 
@@ -22,13 +22,12 @@ Record = Callable[[Tensor], None]
 
 
 class FlowPort(ABC):
-    """What a source needs to know of a family of policies: the chunk's shape, and where it is drawn.
-
-    The policies themselves are not changed. Training and sampling run inside of :meth:`training` and
-    :meth:`sampling`, which see to it that the source is used exactly once.
+    """What a source needs to know about a family of policies: the chunk's shape, and where its noise is
+    drawn. The policies are not changed. Training and sampling run inside :meth:`training` and
+    :meth:`sampling`, which check that the source is used exactly once.
 
     See Also:
-        - :func:`~warmprior.lerobot.port_for`: finds that of a policy.
+        - :func:`~warmprior.lerobot.port_for`: finds the port of a policy.
         - :data:`~warmprior.lerobot.PORTS`: all of them.
 
     Examples:
@@ -45,7 +44,7 @@ class FlowPort(ABC):
 
     @abstractmethod
     def width(self, policy: Any) -> int:
-        """``D``, the width of the noisy chunk; what lies beyond the action's is padding."""
+        """``D``, the width of the noisy chunk, with padding beyond the action's."""
 
     def lead(self, policy: Any) -> int:
         """Positions of the chunk that lie before the current step."""
@@ -57,7 +56,7 @@ class FlowPort(ABC):
 
     @abstractmethod
     def check(self, policy: Any) -> None:
-        """Refuse options under which the source would not be exact.
+        """Refuse options that would make the source inexact.
 
         Raises:
             ValueError: naming the option.
@@ -65,13 +64,13 @@ class FlowPort(ABC):
 
     @abstractmethod
     def training(self, policy: Any, source: Source) -> AbstractContextManager[Any]:
-        """Around one ``policy.forward``: the loss is that of this source."""
+        """Context of one ``policy.forward``, whose loss uses this source."""
 
     @abstractmethod
     def sampling(
         self, policy: Any, source: Source, record: Record, nfe: int | None = None
     ) -> AbstractContextManager[Any]:
-        """Around ``select_action`` or ``predict_action_chunk``: every new chunk starts from the source.
+        """Context of ``select_action`` or ``predict_action_chunk``: new chunks start from the source.
 
         Args:
             policy: of the family.
@@ -81,11 +80,11 @@ class FlowPort(ABC):
         """
 
     def predict(self, policy: Any, batch: dict[str, Any]) -> None:
-        """Sample a chunk for a batch of observations, without regard to any queue."""
+        """Sample a chunk for a batch of observations, without a queue."""
         policy.predict_action_chunk(batch)
 
     def __reduce_ex__(self, protocol: Any) -> Any:
-        """Known ports are pickled and copied by name: what they are made of has none."""
+        """Known ports are pickled and copied by name, because their lambdas cannot be."""
         for release, ports in PORTS.items():
             for name, port in ports.items():
                 if port is self:
@@ -98,7 +97,7 @@ def _known(release: str, name: str) -> FlowPort:
 
 
 def check_steps(nfe: int | None) -> None:
-    """Refuse a number of integration steps that is none.
+    """Refuse a number of integration steps below 1.
 
     Raises:
         ValueError: if it is below 1.
@@ -109,7 +108,7 @@ def check_steps(nfe: int | None) -> None:
 
 @contextmanager
 def _steps(holder: Any, name: str, nfe: int | None) -> Iterator[None]:
-    """Another number of integration steps for a while."""
+    """Changes the number of integration steps inside the context."""
     before = getattr(holder, name)
     setattr(holder, name, before if nfe is None else nfe)
     try:
@@ -120,7 +119,7 @@ def _steps(holder: Any, name: str, nfe: int | None) -> Iterator[None]:
 
 @contextmanager
 def _replaced(owner: Any, name: str, around: Callable[[Callable[..., Any]], Any]) -> Iterator[None]:
-    """A method of one instance within a wrapper, which its class knows nothing of."""
+    """Wraps a method of one instance inside the context."""
     method, before = getattr(owner, name), vars(owner).get(name)
     vars(owner)[name] = wraps(method)(around(method))
     try:
@@ -133,7 +132,7 @@ def _replaced(owner: Any, name: str, around: Callable[[Callable[..., Any]], Any]
 
 
 class DrawnPort(FlowPort):
-    """Of policies that draw their noise by ``torch.randn`` inside of a sampler.
+    """For policies that draw their noise with ``torch.randn`` inside a sampler.
 
     Args:
         length: attribute of the model's configuration.
@@ -209,7 +208,7 @@ class DrawnPort(FlowPort):
 
 
 class GrootN15Port(DrawnPort):
-    """Of GR00T N1.5, which does otherwise than its configuration says."""
+    """For GR00T N1.5, which deviates from its configuration."""
 
     def normalization(self, policy: Any) -> str:
         """Its preprocessor takes minima and maxima, whatever its ``normalization_mapping``."""
@@ -221,7 +220,7 @@ class GrootN15Port(DrawnPort):
 
         def around(predict: Callable[..., Tensor]) -> Callable[..., Tensor]:
             def predicted(*args: Any, **kwargs: Any) -> Tensor:
-                # Its queue takes the whole chunk and keeps the last n_action_steps.
+                # Its queue takes the whole chunk and keeps the last n_action_steps actions.
                 return predict(*args, **kwargs)[:, : policy.config.n_action_steps]
 
             return predicted
@@ -234,7 +233,7 @@ class GrootN15Port(DrawnPort):
 
 
 class OpenPiPort(FlowPort):
-    """Of pi0, pi0.5 and SmolVLA, whose noise is an argument of the model (a compiled one included)."""
+    """For pi0, pi0.5 and SmolVLA, whose models take the noise as an argument (compiled ones too)."""
 
     def length(self, policy: Any) -> int:
         """``T``."""
@@ -248,8 +247,8 @@ class OpenPiPort(FlowPort):
         """See :meth:`FlowPort.check`."""
         if getattr(policy.config, "adapt_to_pi_aloha", False):
             raise ValueError(
-                "adapt_to_pi_aloha=True gives actions in another space than the model's, and the source "
-                "would be around the wrong ones: convert the dataset instead, and turn it off"
+                "adapt_to_pi_aloha=True gives actions in another space than the model's, so the source "
+                "would have the wrong mean: convert the dataset instead, and turn it off"
             )
 
     @contextmanager
@@ -284,7 +283,7 @@ class OpenPiPort(FlowPort):
             def sampled(images: Any, *args: Any, **kwargs: Any) -> Tensor:
                 if kwargs.get("noise") is not None:
                     raise ValueError(
-                        "noise= is what the prior gives: leave it out, and put no second prior around a "
+                        "the prior gives noise=: leave it out, and put no second prior around a "
                         "policy that has one (warm_smolvla, warm_pi05)"
                     )
                 shape = torch.Size((images[0].shape[0], length, width))
@@ -330,7 +329,7 @@ def _check_multi_task_dit(policy: Any) -> None:
 def _predict_multi_task_dit(policy: Any, batch: dict[str, Any]) -> None:
     # Its own predict_action_chunk takes the observations from its queue.
     policy.eval()
-    if policy.config.n_obs_steps == 1:  # the queue gives even a single one its dimension of time
+    if policy.config.n_obs_steps == 1:  # the queue adds a time dimension even to a single one
         seen = policy.config.input_features
         batch = {name: v.unsqueeze(1) if name in seen else v for name, v in batch.items()}
     with torch.no_grad():
@@ -383,7 +382,7 @@ PORTS: dict[str, dict[str, FlowPort]] = {
 }
 """By the release of LeRobot (``"0.6"`` is all of 0.6), and in it by LeRobot's name of the family.
 
-``"groot"`` is GR00T N1.7 in 0.6 and N1.5 in 0.5.1, whose other families may draw their noise elsewhere.
+``"groot"`` is GR00T N1.7 in 0.6, and N1.5 in 0.5.1, whose other families are not supported.
 """
 
 
@@ -391,10 +390,10 @@ def port_for(policy: Any) -> FlowPort:
     """The port of a policy's family in the release of lerobot that is installed.
 
     Args:
-        policy: of LeRobot, or of a class that inherits from one of its.
+        policy: of LeRobot, or of a subclass.
 
     Raises:
-        ValueError: if there is none, or the policy has options that it does not support.
+        ValueError: if there is none, or it does not support the policy's options.
         ImportError: if there is none for this release.
 
     See Also:

@@ -10,10 +10,9 @@ __all__ = ["RelativeActions"]
 
 
 class RelativeActions:
-    """Takes remembered actions from the state at which they were predicted to the present one.
-
-    Policies with relative actions (``use_relative_actions``) predict offsets from the state of the
-    decision. A mean that was predicted one chunk ago is an offset from where the robot was then.
+    """Expresses remembered relative actions at the present state. Policies with relative actions
+    (``use_relative_actions``) predict offsets from the state of the decision, so a mean from one chunk ago is
+    an offset from where the robot was then.
 
     Args:
         preprocessor: the policy's pipeline; its step ``RelativeActionsProcessorStep`` holds the raw state of
@@ -21,7 +20,7 @@ class RelativeActions:
         postprocessor: the policy's pipeline, which undoes the normalisation.
 
     Raises:
-        ValueError: if the steps are not there, or relative actions are off in them.
+        ValueError: if the pipelines lack the steps, or have relative actions turned off.
 
     See Also:
         - :class:`~warmprior.lerobot.ActionMemory`: remembers the actions.
@@ -62,12 +61,12 @@ class RelativeActions:
         """
         state = self._relative.get_cached_state()
         if state is None:
-            raise ValueError("run the preprocessor before the policy decides: it tells the state")
+            raise ValueError("run the preprocessor before the policy decides: it holds the state")
         # The last of several observations.
         return state.reshape(1, -1) if state.ndim == 1 else state[:, -1] if state.ndim == 3 else state
 
     def reanchor(self, actions: Tensor, before: Tensor, now: Tensor) -> Tensor:
-        """Actions relative to one state, as those relative to another.
+        """Convert actions relative to one state into actions relative to another.
 
         Args:
             actions: as they were predicted, ``[B, *, d_a]``, the model's units.

@@ -22,9 +22,8 @@ SigmaUnit = Literal["model", "std"]
 class ChunkSource:
     """Draws ``a_0`` ``[B, T, D]`` for a chunk of ``lead`` past, ``P`` predicted and further positions.
 
-    The prior decides about the ``P`` positions from the current step on and the ``d_a`` dimensions of the
-    action. Positions before and after, and the dimensions of padding, stay ``N(0, 1)``, as pretrained
-    checkpoints saw them.
+    The prior gives the ``P`` positions from the current step on, in the ``d_a`` dimensions of the action. All
+    other positions and the padded dimensions stay ``N(0, 1)``, as in pretrained checkpoints.
 
     Args:
         prior: the source distribution; any that needs no observation.
@@ -40,7 +39,7 @@ class ChunkSource:
 
     See Also:
         - :class:`~warmprior.lerobot.LeRobotFlow`: integrates from its samples.
-        - :class:`~warmprior.lerobot.WarmPriorAdapter`: puts it into a policy of LeRobot.
+        - :class:`~warmprior.lerobot.WarmPriorAdapter`: gives it to a policy of LeRobot.
 
     Examples:
         >>> import torch
@@ -78,7 +77,7 @@ class ChunkSource:
             prior.distribution(cold_history([1], *self._lengths, action_dim, device=device))
         except Exception as error:
             raise ValueError(
-                f"{prior} cannot be the source of a policy of LeRobot, where it is given the history and no "
+                f"{prior} cannot be the source of a policy of LeRobot, where it gets the history and no "
                 f"observation: {error}"
             ) from error
         if std is not None and not (
@@ -94,7 +93,7 @@ class ChunkSource:
 
     @property
     def positions(self) -> slice:
-        """Where the prior's ``P`` positions are in the chunk."""
+        """The prior's ``P`` positions in the chunk."""
         return slice(self.lead, self.lead + self.prior.prediction_length)
 
     def distribution(self, history: TensorDictBase) -> Source:
@@ -115,8 +114,8 @@ class ChunkSource:
         """Values of the source, such as draws, in the model's units.
 
         Args:
-            values: ``[*B, P, d_a]``, in units of ``sigma`` where they are warm, and in the model's elsewhere:
-                what is cold is N(0, 1) there.
+            values: ``[*B, P, d_a]``, in units of ``sigma`` on warm positions, and in the model's on cold
+                ones.
             warm: bool ``[*B, P, 1]``.
         """
         return torch.where(warm, values * self._unit(values), values)
@@ -152,7 +151,7 @@ class ChunkSource:
             cold_probability: share of the windows whose history is withheld.
 
         Returns:
-            ``a_0`` ``[B, T, D]`` and the target, which is another only where it is coupled.
+            ``a_0`` ``[B, T, D]`` and the target, which only a coupling changes.
         """
         wanted = target[:, self.positions, : self.action_dim]
         executed = torch.where(valid.unsqueeze(-1), before[..., : self.action_dim], 0.0)
@@ -169,7 +168,7 @@ class ChunkSource:
         return self.place(a0, generator), target
 
     def place(self, a0: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The whole source around the prior's part of it: ``N(0, 1)`` everywhere else.
+        """The whole source: the prior's part, and ``N(0, 1)`` elsewhere.
 
         Args:
             a0: ``[B, P, d_a]``.
@@ -196,15 +195,15 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
     """Standard deviation of a dataset's actions in the units of a policy, ``[d_a]``.
 
     Args:
-        policy: of LeRobot; its port tells the units.
+        policy: of LeRobot.
         stats: of the dataset (``dataset.meta.stats``).
 
     Raises:
-        ValueError: if the statistics that the policy's units need are missing, a dimension never varies
-            between its bounds, or the policy normalises actions elsewhere, or has no port.
+        ValueError: if needed statistics are missing, a dimension never varies, the policy normalises actions
+            elsewhere, or it has no port.
 
     See Also:
-        :class:`~warmprior.lerobot.WarmPriorAdapter`: warms the source in these units.
+        :class:`~warmprior.lerobot.WarmPriorAdapter`: uses these units for ``sigma``.
 
     Examples:
         >>> from types import SimpleNamespace

@@ -25,12 +25,11 @@ __all__ = ["WarmPriorActor"]
 class WarmPriorActor(TensorDictModuleBase):
     """Flow-matching policy with a choice of source: ``(observation, history) -> (loc, warm, noise, chunk)``.
 
-    Composes :class:`PriorSampler` and :class:`ODEActor`. It holds no state between calls: the history
-    arrives under keys (written by :class:`~warmprior.ActionHistory` in an environment and by
-    :class:`~warmprior.ActionWindow` in a replay buffer) and everything it predicts leaves under keys,
-    so it works unchanged in ``env.rollout``, collectors, batched environments and replay buffers.
-    TorchRL's ``ExplorationType`` is not read, for a flow needs its noise: seed the generator, or take a prior
-    with ``sigma=0``.
+    Composes :class:`PriorSampler` and :class:`ODEActor`. It holds no state between calls.
+    :class:`~warmprior.ActionHistory` in an environment, and :class:`~warmprior.ActionWindow` in a replay
+    buffer, write the history that it reads, so it works unchanged in ``env.rollout``, collectors, batched
+    environments and replay buffers. It ignores TorchRL's ``ExplorationType``, because a flow needs its noise:
+    seed the generator, or take a prior with ``sigma=0``.
 
     Args:
         network: velocity network, see :class:`ODEActor`.
@@ -38,28 +37,27 @@ class WarmPriorActor(TensorDictModuleBase):
 
     Keyword Args:
         nfe: network evaluations per chunk; per call: ``actor(data, nfe=1)``. 9 by default, or ``max_nfe``.
-        max_nfe: the most for which the trained field means anything: 1 for a network that was trained at
-            ``t = 0`` alone. Saved with the policy.
+        max_nfe: the largest ``nfe`` that the training allows: 1 for a network that was trained at ``t = 0``
+            alone. Saved with the policy.
         start: the point from which samplers start, if that is not the source itself.
         solver: see :func:`~warmprior.modules.ode.integrate`.
         grid: likewise.
         clip: see :class:`ODEActor`.
-        guidance: leads to chunks that continue the one being executed; it knows the source's standard
-            deviation position by position. None by default.
-        normalizer: the normaliser of the data, kept here so that it is saved with the policy; its
+        guidance: makes chunks continue the one being executed; none by default.
+        normalizer: the normaliser of the data, saved with the policy; its
             :meth:`~warmprior.Normalizer.env_transforms` go next to the base environment.
-        environment: description of the environment that the policy was made for, as JSON holds it; kept
-            here so that it is saved with the policy (``python -m warmprior evaluate FOLDER``).
+        environment: JSON description of the environment that the policy was made for, saved with the policy
+            (``python -m warmprior evaluate FOLDER``).
         generator: source of randomness of the sampler; per call: ``actor(data, generator=...)``.
-        observation_key: key of the observation, ``[*B, To, d_o]``, or of several, nested under it; that of
-            :class:`~warmprior.HistoryObservation`, :data:`warmprior.keys.CONDITIONED`, where the network sees
-            the last actions.
+        observation_key: key of the observation, ``[*B, To, d_o]``, or of several nested under it;
+            :data:`warmprior.keys.CONDITIONED` where the network sees the last actions
+            (:class:`~warmprior.HistoryObservation`).
         chunk_key: key of the chunk, ``[*B, P, d_a]``.
         path_key: if given, the integration path is written there.
 
     Raises:
-        ValueError: if the network was built for another prediction length than the prior's, ``nfe``
-            exceeds ``max_nfe``, there is no such grid, or the guidance is of what is no flow.
+        ValueError: if the network was built for another prediction length than the prior's, ``nfe`` exceeds
+            ``max_nfe``, the grid is unknown, or the policy to guide is no flow.
 
     Examples:
         >>> import torch
@@ -153,7 +151,7 @@ class WarmPriorActor(TensorDictModuleBase):
         return self.integrate(self.sampler(tensordict, generator=generator), nfe=nfe)
 
     def integrate(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
-        """Integrate a source that was drawn before to the chunk, guided where the policy is.
+        """Integrate a given source sample to the chunk, with the policy's guidance.
 
         Args:
             tensordict: with the input keys and the source, ``[*B, P, d_a]``, under ``ode.in_keys[0]``.
@@ -162,15 +160,15 @@ class WarmPriorActor(TensorDictModuleBase):
         return self.ode(tensordict, nfe=nfe, sigma=self._sigma(tensordict))
 
     def _sigma(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Standard deviation of the source, broadcastable to ``[*B, P, d_a]``, where guidance asks for it."""
+        """Standard deviation of the source, broadcastable to ``[*B, P, d_a]``, for the guidance."""
         return None if self.ode.guidance is None else self.sampler.source(tensordict).scale
 
     def replace(self, **changes: Any) -> WarmPriorActor:
-        """A policy of the same parts and options, but for those given.
+        """A copy of the policy, with the same parts, and some constructor arguments changed.
 
         Args:
-            changes: constructor arguments, such as ``nfe`` and ``generator`` where a policy is handed to
-                what calls it, or another ``network``. A smaller ``max_nfe`` lowers ``nfe``.
+            changes: constructor arguments, such as ``nfe``, ``generator`` or ``network``. A smaller
+                ``max_nfe`` lowers ``nfe``.
 
         Examples:
             >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor

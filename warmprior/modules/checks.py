@@ -1,4 +1,4 @@
-"""What numbers given to constructors have to be."""
+"""Checks of numbers given to constructors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The transformer of Diffusion Policy with a mask that lets the first action see the present."""
+"""The transformer of Diffusion Policy, with a mask that lets the first action see the current observation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["ChiTransformer"]
 class _ModulatedLayer(nn.TransformerDecoderLayer):
     """PyTorch's pre-norm decoder layer, modulated by the memory's first token, the time.
 
-    Of its options it knows those used here: batch first, norm first, a causal mask, none on the memory.
+    It supports only what is used here: batch first, norm first, a causal mask, and no mask on the memory.
     """
 
     def __init__(self, dim: int, num_heads: int, **kwargs: Any) -> None:
@@ -67,8 +67,8 @@ class ChiTransformer(VelocityNetwork):
         timestep_embedding_dim: width of the time embedding before its projection.
         dropout: dropout in attention and feed-forward layers.
         time_modulation: let the time also scale, shift and gate self-attention and feed-forward layers
-            (adaptive layer norm, Peebles and Xie, 2023), starting from no effect. Not in the paper: off
-            by default.
+            (adaptive layer norm, Peebles and Xie, 2023), from no effect at first. Off by default, as in the
+            paper.
 
     Raises:
         ValueError: if ``num_heads`` does not divide ``embedding_dim``.

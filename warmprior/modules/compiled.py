@@ -1,4 +1,4 @@
-"""Networks wrapped by :func:`torch.compile`, whose names and configuration are those of what is inside."""
+"""Networks wrapped by :func:`torch.compile`, with the names and configuration of the network inside."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _PREFIX = "_orig_mod."
 
 
 def uncompiled(module: nn.Module) -> nn.Module:
-    """The module inside of what :func:`torch.compile` returns; any other as it is."""
+    """The module inside a compiled one; any other is returned as it is."""
     return getattr(module, _PREFIX[:-1], module)
 
 
 def without_compilation(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A state dict under the names that it would have had nothing been compiled.
+    """A state dict under the names of the uncompiled network.
 
     Examples:
         >>> import torch

@@ -28,7 +28,7 @@ _SMALL_FEATURES = 64
 
 def _resnet18() -> tuple[nn.Module, int]:
     torchvision: Any = require("torchvision.models", "vision")
-    # As in Diffusion Policy: averaged weights and the running statistics of batch norm do not go together.
+    # As in Diffusion Policy: the running statistics of batch norm do not fit averaged weights.
     network = torchvision.resnet18(norm_layer=lambda width: nn.GroupNorm(width // 16, width))
     width = network.fc.in_features
     network.fc = nn.Identity()
@@ -42,16 +42,16 @@ def _small(crop_size: int) -> tuple[nn.Module, int]:
     convolutions = ConvNet(
         in_features=3, num_cells=[32, 64, 64], strides=2, paddings=1, activation_class=nn.ReLU
     )
-    # The positions of features are kept, which a pooling network of this size would lose.
+    # This keeps the positions of features, which pooling would lose at this size.
     return nn.Sequential(convolutions, nn.Linear(64 * side * side, _SMALL_FEATURES)), _SMALL_FEATURES
 
 
 class ImageEncoder(nn.Module):
     r"""Encodes an observation of images and a vector: one vector per observation step.
 
-    Every camera has a network of its own, ResNet-18 with group norm as in the paper (Table 3), whose
-    features stand behind the vector. In training mode a random window of the image is cut out, the same
-    one for all ``To`` images of a camera; otherwise the central one. Pixels are scaled by ImageNet's
+    Every camera has its own network, ResNet-18 with group norm as in the paper (Table 3). Features are
+    appended to the vector. In training mode the network sees a random window of the image, the same one for
+    all ``To`` images of a camera; otherwise the central one. Pixels are scaled by ImageNet's
     statistics.
 
     Args:
@@ -70,7 +70,7 @@ class ImageEncoder(nn.Module):
         ImportError: if ResNet-18 is asked for and torchvision is missing.
 
     .. note::
-        The windows of a training are drawn by PyTorch's global generator, like dropout.
+        PyTorch's global generator draws the windows of a training, as it draws dropout.
 
     See Also:
         - :class:`~warmprior.VisionNetwork`: a velocity network behind it.
@@ -211,7 +211,7 @@ def imagenet_weights() -> dict[str, Tensor]:
     """ImageNet's weights of ResNet-18, which torchvision downloads once.
 
     Raises:
-        OSError: if they are neither stored here nor can be downloaded, or what is stored is damaged.
+        OSError: if the weights are not stored here and cannot be downloaded, or the stored file is damaged.
         ImportError: if torchvision is missing.
 
     See Also:
@@ -224,9 +224,9 @@ def imagenet_weights() -> dict[str, Tensor]:
     torchvision: Any = require("torchvision.models", "vision")
     weights = torchvision.ResNet18_Weights.IMAGENET1K_V1
     try:
-        # Tensors alone: a file of theirs can hold code, too, which would run.
+        # Tensors alone: a pickled file could hold code, which would run.
         return weights.get_state_dict(progress=False, check_hash=True, weights_only=True)
-    # A download that breaks off or is another file, and a stored file that is cut, empty or no weights.
+    # An interrupted or wrong download, or a stored file that is cut, empty or holds no weights.
     except (OSError, HTTPException, RuntimeError, UnpicklingError, EOFError) as error:
         reason = str(error).partition("\n")[0].rstrip(". ") or type(error).__name__
         raise OSError(
@@ -239,7 +239,7 @@ def imagenet_weights() -> dict[str, Tensor]:
 def load_imagenet(encoder: ImageEncoder) -> None:
     """Give the ResNets of an encoder the weights of ImageNet, in place.
 
-    Group norm, which takes the place of batch norm, starts from no effect.
+    Group norm, which replaces batch norm, starts from no effect.
 
     Args:
         encoder: with the backbone ``"resnet18"``.

@@ -9,7 +9,7 @@ JUMP = 0.5
 
 
 def check_grid(grid: str) -> None:
-    """Whether there is a grid of this name, see :func:`grid_parts`.
+    """Check that a grid has this name, see :func:`grid_parts`.
 
     Raises:
         ValueError: if there is none, or its jump does not start in (0, 1).
@@ -18,14 +18,13 @@ def check_grid(grid: str) -> None:
 
 
 def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[float, float, int]]:
-    r"""The parts of a grid, in each of which the steps are equally long.
+    r"""The parts of a grid; within each the steps are equally long.
 
     - ``"uniform"``: one part.
-    - ``"dense-jump"``: all steps but one up to :math:`t_j`, and the last from there to ``t = 1``
-      (Dense-Jump Flow Matching, Chen et al., 2025, arXiv:2509.13574): late steps pull towards actions of the
-      training data, and the field is not Lipschitz near ``t = 1``. Meant for networks trained at
-      ``u-shaped`` times. :math:`t_j` is half way; ``"dense-jump:0.7"`` puts it at another share of the way
-      from ``start_time`` to 1.
+    - ``"dense-jump"``: all steps but one up to :math:`t_j`, and the last from there to ``t = 1`` (Dense-Jump
+      Flow Matching, Chen et al., 2025, arXiv:2509.13574). It avoids late steps, which pull towards actions of
+      the training data, and is meant for networks trained at ``u-shaped`` times. :math:`t_j` is half way from
+      ``start_time`` to 1; ``"dense-jump:0.7"`` moves it.
 
     One step is the same on every grid.
 
@@ -57,7 +56,7 @@ def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[
 
 
 def _jump(grid: str) -> float | None:
-    """Share of the way that lies before the jump; ``None`` where there is no jump."""
+    """Share of the way before the jump; ``None`` without a jump."""
     if grid == "uniform":
         return None
     name, colon, number = str(grid).partition(":")

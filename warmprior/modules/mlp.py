@@ -14,7 +14,8 @@ class _Block(nn.Module):
 
     def __init__(self, dim: int, time_dim: int) -> None:
         super().__init__()
-        # Two layers and not one of twice the width: its halves would be strided, and slow to multiply with.
+        # Two layers, because the halves of one layer of twice the width would be strided, and slow to
+        # multiply with.
         self.scale, self.shift = nn.Linear(time_dim, dim), nn.Linear(time_dim, dim)
         for layer, effect in ((self.scale, 1.0), (self.shift, 0.0)):
             nn.init.zeros_(layer.weight)
@@ -29,12 +30,11 @@ class _Block(nn.Module):
 class VelocityMLP(VelocityNetwork):
     """Residual multi-layer perceptron on the flattened chunk and observation, modulated by the time.
 
-    Time is no further input: it scales and shifts what enters every block (adaptive layer norm, Peebles and
-    Xie, 2023, but without their gate), starting from no effect. What the network does at ``t = 0``, the only
-    time that a one-step sampler evaluates, then disturbs the other times little. The observation passes an
-    encoder of its own, worth 2 to 3 percent of the held-out error on robot tasks, before it meets the chunk.
-
-    Wrap it in a :class:`~warmprior.PreconditionedNetwork` wherever there are data to fit one.
+    Time is not concatenated: it scales and shifts the input of every block (adaptive layer norm, Peebles and
+    Xie, 2023, without their gate), from no effect at first. Training at ``t = 0``, the only time that a
+    one-step sampler evaluates, then interferes little with other times. The observation has an encoder of its
+    own, which lowers the held-out error on robot tasks by 2 to 3 percent. Wrap the network in a
+    :class:`~warmprior.PreconditionedNetwork` wherever there are data to fit one.
 
     Args:
         action_dim: ``d_a``.
@@ -49,7 +49,7 @@ class VelocityMLP(VelocityNetwork):
 
     See Also:
         - :class:`~warmprior.ChiTransformer`: the paper's network.
-        - :class:`~warmprior.PreconditionedNetwork`: wraps it in what is known before training.
+        - :class:`~warmprior.PreconditionedNetwork`: adds what is known before training.
 
     Examples:
         >>> import torch

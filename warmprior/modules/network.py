@@ -1,4 +1,4 @@
-"""What every velocity network shares: its interface, its configuration and the time embedding."""
+"""The interface and configuration of velocity networks, and their time embedding."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class VelocityNetwork(nn.Module, Registered):
     """Base class of velocity networks ``v(t, a_t, o)`` that can be saved by name and configuration.
 
     :class:`~warmprior.ODEActor` and :class:`~warmprior.FlowMatchingLoss` take any callable of the same
-    signature; this base only adds shape checks and ``config()``, the name of the class and the arguments of
-    its constructor.
+    signature. This base class adds shape checks and ``config()``, the name of the class and its constructor's
+    arguments.
 
     Args:
         action_dim: ``d_a``.
@@ -107,9 +107,8 @@ class VelocityNetwork(nn.Module, Registered):
             raise ValueError(f"{built}, got {tuple(observation.shape)}")
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-        """What can be computed of an observation once, before the field is evaluated at it many times.
-
-        The network takes the result in place of the observation. By default nothing can.
+        """Encode an observation once, before the field is evaluated at it many times. The network takes the
+        result in place of the observation. By default this does nothing.
 
         Args:
             observation: ``[B, To, d_o]``, or a tensordict ``[B]``.
@@ -136,13 +135,13 @@ class VelocityNetwork(nn.Module, Registered):
 def velocity_field(
     network: nn.Module, observation: Tensor | TensorDictBase
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """A network's velocity ``(t, a) -> v`` at observations, in the precision of ``a``.
+    """A network's velocity ``(t, a) -> v`` at observations, in the dtype of ``a``.
 
     The observations are encoded once (:meth:`VelocityNetwork.encode`), however often the field is evaluated.
 
-    The network computes in its own precision (that of its first parameter): float64 demonstrations and
-    environments, and bfloat16 networks, need no casts elsewhere, and the path is integrated, and its error
-    measured, in the precision of the actions.
+    The network computes in its own dtype (that of its first parameter), so float64 environments and bfloat16
+    networks need no casts elsewhere. The path is integrated, and its error measured, in the dtype of the
+    actions.
 
     Args:
         network: ``(t [B], a_t [B, P, d_a], observation) -> [B, P, d_a]``.
@@ -157,7 +156,7 @@ def velocity_field(
 
 
 def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-    """What a network makes of observations once (:meth:`VelocityNetwork.encode`), in its own precision.
+    """The observations as the network encodes them (:meth:`VelocityNetwork.encode`), in its own dtype.
 
     Args:
         network: see :func:`velocity_field`.
@@ -180,12 +179,12 @@ def _encoded(network: nn.Module, observation: Any, dtype: torch.dtype | None) ->
 
 
 def _precision(network: nn.Module) -> torch.dtype | None:
-    # A frozen network has buffers alone.
+    # A frozen network has only buffers.
     return _first_precision(network, "_parameters") or _first_precision(network, "_buffers")
 
 
 def _first_precision(module: nn.Module, kind: str) -> torch.dtype | None:
-    # In the order of parameters(), which takes several times as long: as much as a small network's layer.
+    # In the order of parameters(), but faster: that call takes as long as a layer of a small network.
     for value in getattr(module, kind).values():
         if value is not None and value.is_floating_point():
             return value.dtype
@@ -194,7 +193,7 @@ def _first_precision(module: nn.Module, kind: str) -> torch.dtype | None:
 
 
 def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size) -> Tensor | TensorDictBase:
-    """The observation with the one batch dimension that a network gets.
+    """The observation with a single batch dimension, as a network takes it.
 
     Args:
         observation: ``[*B, To, *]``, or a tensordict ``[*B]`` of such entries.
@@ -210,9 +209,9 @@ def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size)
 class TimestepEmbedding(nn.Module):
     """Sines and cosines of ``t`` at frequencies from 1 to 100, log-spaced.
 
-    The embedding of diffusion models (frequencies up to 1 per step of a thousand) would suit flow times
-    in [0, 1] badly: at ``1000 t`` the fastest features are noise to the network, and ``t = 0``, the only
-    time that a one-step sampler evaluates, becomes a point unlike all those seen in training.
+    The embedding of diffusion models, made for a thousand steps, does not suit flow times in [0, 1]: at
+    ``1000 t`` its fastest features are noise to the network, and ``t = 0``, the only time that a one-step
+    sampler evaluates, looks unlike every time seen in training.
 
     Args:
         dim: width of the embedding, even.

@@ -1,4 +1,4 @@
-"""Min-max normalisation, fitted once and applied on the data's and the environment's side."""
+"""Min-max normalisation, fitted once and applied to data and environments."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ class Normalizer(nn.Module):
     """Maps every dimension of every key to ``[-1, 1]`` by the data's minimum and maximum (Table 3).
 
     Dimensions that vary by no more than the float noise of a resting body (half a range of 1e-5, relative
-    above 1) count as constant and are only shifted: blown up to [-1, 1], the noise would drown the
-    rest. The statistics are buffers: they travel with :func:`~warmprior.training.save_policy` and to
-    devices.
+    above 1) count as constant and are only shifted. The statistics are buffers, so they are saved by
+    :func:`~warmprior.training.save_policy` and move between devices.
 
     Args:
         low: minimum per key (or nested key, a tuple), each ``[d]``, raw units.
@@ -56,7 +55,7 @@ class Normalizer(nn.Module):
                 )
             if not (torch.isfinite(low[key]).all() and torch.isfinite(high[key]).all()):
                 raise ValueError(f"{key}: the minimum or maximum is NaN or infinite")
-            # Of the default precision, whatever the data's: what is normalised then keeps its own.
+            # In the default dtype: normalised values then keep their own.
             first, last = (value[key].to(torch.get_default_dtype()) for value in (low, high))
             loc, half = (last + first) / 2, (last - first) / 2
             constant = half <= 1e-5 * loc.abs().clamp_min(1.0)
@@ -78,8 +77,8 @@ class Normalizer(nn.Module):
             keys: the entries to normalise.
 
         Keyword Args:
-            units: per key what 1 stands for, ``[d]``, raw units, around the middle of what the data span; 0
-                where half of that is 1. With units of their own, dimensions may leave ``[-1, 1]``.
+            units: per key the raw size ``[d]`` of 1, around the middle of the range; 0 for half the range.
+                Dimensions with such a unit may leave ``[-1, 1]``.
 
         Raises:
             KeyError: if a key is missing.
@@ -159,7 +158,7 @@ class Normalizer(nn.Module):
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Normalizer:
-        """An unfitted normaliser of :meth:`config`'s keys and widths, to load buffers into."""
+        """An unfitted normaliser with the keys and widths of :meth:`config`, to load buffers into."""
         zero = {key: torch.zeros(shape) for key, shape in _leaves(config["widths"])}
         return cls(zero, zero)
 

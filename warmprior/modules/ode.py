@@ -21,13 +21,13 @@ from warmprior.modules.real_time_chunking import RealTimeChunking
 __all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "integrate"]
 
 DEFAULT_NFE = 9
-"""Network evaluations per chunk where nothing else is asked for."""
+"""Network evaluations per chunk by default."""
 
 MAX_NFE = 10_000
-"""No chunk is worth more: it would take minutes, and more look like a process that hangs."""
+"""More would take minutes per chunk, and look like a process that hangs."""
 
 GUIDED_BY = (keys.FORECAST, keys.FORECAST_STEPS, keys.DELAY)
-"""What guidance reads beside the inputs of every policy."""
+"""The further inputs of guided policies."""
 
 GUIDED_BY_WHOM = (
     ". The delay is written by InferenceDelay in an environment, as by policy_transforms(prior, "
@@ -147,16 +147,16 @@ class ODEActor(TensorDictModuleBase):
     Keyword Args:
         nfe: number of network evaluations per chunk; per call: ``actor(data, nfe=3)``. 9 by default, or
             ``max_nfe``.
-        max_nfe: the most for which the trained field means anything.
+        max_nfe: the largest ``nfe`` that the training allows.
         start_time: see :func:`integrate`.
         solver: see :func:`integrate`.
         grid: see :func:`integrate`.
         clip: the chunk is clamped to ``[-clip, clip]``, one bound for all action dimensions or ``d_a`` of
-            them; ``None`` (default) leaves it as integrated. Set it to what the normalised data span, such as
-            1, so that what the environment executes is what the prior remembers.
-        guidance: leads to chunks that continue the one being executed; none by default. It reads what is
-            left of that, ``("history", "forecast")`` and ``("history", "forecast_steps")``, and the delay,
-            int64 ``[*B, 1]``.
+            them; ``None`` (default) does not clamp. Set it to the range of the normalised data, such as 1, so
+            that the environment executes what the prior remembers.
+        guidance: makes chunks continue the one being executed; none by default. It reads the rest of that
+            chunk, ``("history", "forecast")`` and ``("history", "forecast_steps")``, and the delay, int64
+            ``[*B, 1]``.
         noise_key: key of the source, ``[*B, P, d_a]``.
         observation_key: key of the observation, ``[*B, To, d_o]``.
         chunk_key: key written, ``[*B, P, d_a]``.
@@ -164,7 +164,7 @@ class ODEActor(TensorDictModuleBase):
 
     Raises:
         ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend or that exceeds ``max_nfe``, or
-            an unknown solver or grid, or guidance of what is no flow (``max_nfe=1``).
+            an unknown solver or grid, or guidance with ``max_nfe=1``, which is no flow.
         KeyError: if an input key is missing.
 
     See Also:
@@ -202,7 +202,7 @@ class ODEActor(TensorDictModuleBase):
         super().__init__()
         if nfe is None:
             nfe = DEFAULT_NFE if max_nfe is None else min(DEFAULT_NFE, max_nfe)
-            if solver in SOLVERS:  # rounded down to what the solver can spend
+            if solver in SOLVERS:  # rounded down to a multiple of the stages
                 stages = len(SOLVERS[solver].b)
                 nfe = max(nfe - nfe % stages, stages)
         self.max_nfe = max_nfe
@@ -213,7 +213,7 @@ class ODEActor(TensorDictModuleBase):
         # A list, as the configuration of a saved policy has it.
         clip = clip if clip is None or isinstance(clip, int | float) else list(clip)
         bounds = clip if isinstance(clip, list) else [1.0 if clip is None else clip]
-        # A dimension that never varies is bounded by 0, but not all of them.
+        # A constant dimension is bounded by 0, but not all of them are constant.
         if not (all(bound >= 0 for bound in bounds) and any(bound > 0 for bound in bounds)):
             raise ValueError(f"clip must be > 0, one such number per dimension, or None, got {clip}")
         width = getattr(network, "action_dim", None)
@@ -221,8 +221,7 @@ class ODEActor(TensorDictModuleBase):
             raise ValueError(f"clip has {len(clip)} bounds, but the network has {width} action dimensions")
         if guidance is not None and max_nfe == 1:
             raise ValueError(
-                "the network's field means something at t = 0 alone, and is no flow to guide: leave the "
-                "guidance out"
+                "the network is trained at t = 0 alone, which is no flow to guide: leave the guidance out"
             )
         self.network = network
         self.nfe = nfe
@@ -236,7 +235,7 @@ class ODEActor(TensorDictModuleBase):
         self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
 
     def check_nfe(self, nfe: int) -> None:
-        """Whether the solver and the network can spend ``nfe`` network evaluations.
+        """Check that solver and network support ``nfe`` network evaluations.
 
         Raises:
             ValueError: if one of them cannot.

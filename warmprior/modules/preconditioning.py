@@ -20,10 +20,10 @@ from warmprior.modules.trend import PoseTrend
 __all__ = ["PreconditionedNetwork", "SourceMoments"]
 
 VARIANCE_FLOOR = 1e-4
-"""A standard deviation of 0.01, half a percent of the normalised range: what varies less is constant."""
+"""A standard deviation of 0.01, half a percent of the normalised range; smaller ones count as constant."""
 
 CORRELATION_LIMIT = 1 - 1e-6
-"""Source and target of a higher correlation determine each other."""
+"""Above this correlation source and target determine each other."""
 
 
 class SourceMoments(nn.Module):
@@ -91,15 +91,16 @@ class SourceMoments(nn.Module):
             "source_variance": v0,
             "target_variance": v1,
             "covariance": c,
-            # Of the target given the source. Here, because lower precisions lose the difference.
+            # Of the target given the source. Computed here, because lower precisions would lose the
+            # difference.
             "conditional_deviation": (v1 - c.square() / v0).sqrt(),
         }.items():
-            # Copies: a tensor given twice must not become one buffer under two names.
+            # Copies, so that a tensor given twice does not become one buffer under two names.
             self.register_buffer(name, value.to(source_mean.dtype, copy=True))
 
     @classmethod
     def identity(cls, prediction_length: int, action_dim: int) -> SourceMoments:
-        """Those of independent standard normal ends, to be replaced by loading a state dict."""
+        """Moments of independent standard normal ends, to be replaced by loading a state dict."""
         zero, one = (f(prediction_length, action_dim) for f in (torch.zeros, torch.ones))
         return cls(zero, zero, one, one, zero)
 
@@ -123,16 +124,14 @@ class SourceMoments(nn.Module):
 
         Keyword Args:
             coupling: how the training pairs sources and targets, see :data:`~warmprior.objectives.Coupling`;
-                as they come by default.
-            samples: windows to draw from a buffer, in its batches; windows given as a tensordict are
-                used once each.
-            trend: of the pose; the moments are those of what it leaves.
-            generator: source of randomness of the source samples, on the windows' device; the buffer
-                draws from its own.
+                in their order by default.
+            samples: how many windows to draw from a buffer; windows given as a tensordict are used once each.
+            trend: trend of the pose; the moments are those of the remainder.
+            generator: source of randomness of the source samples, on the windows' device.
 
         Returns:
-            The moments over the positions that are not padded, as float32. A position that is padded in
-            all windows gets the moments of independent standard normal ends: no loss ever reads it.
+            The moments over unpadded positions, as float32. A position that is padded in all windows gets
+            those of independent standard normal ends; no loss reads it.
 
         Raises:
             ValueError: if ``samples < 2``, there are fewer than two windows, or they are of other lengths.
@@ -183,7 +182,7 @@ class SourceMoments(nn.Module):
 
 
 class PreconditionedNetwork(VelocityNetwork):
-    r"""A velocity network that learns only what the best linear prediction leaves.
+    r"""A velocity network that learns only the remainder of the best linear prediction.
 
     With :math:`a_t = \alpha a_0 + \beta a_1`, the velocity
     :math:`u_t = \dot\alpha a_0 + \dot\beta a_1` and the moments of :math:`(a_0, a_1)`, per chunk
@@ -197,30 +196,31 @@ class PreconditionedNetwork(VelocityNetwork):
     The first two terms are the best linear predictor of the velocity from the point, and :math:`F` is
     trained on a standardised remainder: its input and target have mean 0 and variance 1 at every time
     and for every source. A network that has learnt nothing (:math:`F = 0`) is optimal where
-    :math:`(a_0, a_1)` is jointly Gaussian and independent of the observation. In the manner of EDM
-    (Karras et al., 2022, Eq. 7), whose constants assume zero means and an independent source.
+    :math:`(a_0, a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et
+    al., 2022, Eq. 7), whose constants assume zero means and an independent source.
 
     Variance and scale are computed without differences, with :math:`s_0 = \sqrt{v_0}` and the deviation
     :math:`q` of the target given the source: :math:`Var(a_t) = (\alpha s_0 + \beta c / s_0)^2 + (\beta q)^2`
     and :math:`|\alpha\dot\beta - \dot\alpha\beta| \, s_0 q / \sqrt{Var(a_t)}`.
 
     Args:
-        network: :math:`F`, whose sizes this network takes over; or its :meth:`config`.
+        network: :math:`F`; or its :meth:`config`.
 
     Keyword Args:
-        moments: of the prior's source and the targets; where they are missing, those of independent
-            standard normal ends, to be replaced by loading a state dict.
-        trend: what follows from where the grippers are, :math:`E[a_0 | o]` and :math:`E[a_1 | o]` in place
-            of the means above; the moments are then of what it leaves. None by default. Or its ``config()``.
-        interpolant: the path, that of the loss; linear by default. Or its ``config()``.
+        moments: moments of the prior's source and the targets; by default those of independent standard
+            normal ends, to be replaced by loading a state dict.
+        trend: trend of the gripper poses, which gives :math:`E[a_0 | o]` and :math:`E[a_1 | o]` in place of
+            the means above; the moments are then those of the remainder. None by default. Or its
+            ``config()``.
+        interpolant: the path of the loss; linear by default. Or its ``config()``.
 
     Raises:
         ValueError: if the moments or the trend do not have the network's shapes, or the path has no finite
             velocity at its ends.
 
     See Also:
-        - :class:`~warmprior.SourceMoments`: what it has to know.
-        - :func:`~warmprior.training.precondition`: estimates that and wraps a network.
+        - :class:`~warmprior.SourceMoments`: the moments.
+        - :func:`~warmprior.training.precondition`: estimates the moments and wraps a network.
 
     Examples:
         >>> import torch
@@ -291,7 +291,7 @@ class PreconditionedNetwork(VelocityNetwork):
         return self.network.parameter_groups(weight_decay)
 
     def remainder(self, t: Tensor) -> Tensor:
-        """Standard deviation of what the best linear prediction leaves of the velocity: the unit of ``F``.
+        """Standard deviation of the remainder of the velocity, the unit of ``F``.
 
         Args:
             t: times, ``[B]``.

@@ -57,7 +57,7 @@ class Source:
 
 
 class Prior(Registered):
-    r"""Base class of the source distributions; for one of your own, override :meth:`mean`.
+    r"""Base class of source distributions; a prior of your own overrides :meth:`mean`.
 
     A prior is a Gaussian around a mean on the *warm* positions and standard normal on the *cold* ones
     (`WarmPrior <https://sinnnj.github.io/WarmPrior/>`_, Eq. 1):
@@ -66,20 +66,19 @@ class Prior(Registered):
         a_0[\tau] = \mu_\tau + \sigma \varepsilon_\tau \;\; (\tau \in W), \qquad
         a_0[\tau] = \varepsilon_\tau \;\; (\tau \in C), \qquad \varepsilon \sim N(0, I).
 
-    The mean is a function of the history (:mod:`warmprior.history`), which training windows, environments
-    and robots write alike: it cannot differ between them. Overriding :meth:`distribution` gives another
-    source, such as a learned one: a subclass that is an ``nn.Module`` as well (call ``nn.Module.__init__``
-    first) is trained, saved and frozen with the policy.
+    The mean is a function of the history (:mod:`warmprior.history`). Training windows, environments and
+    robots write the same history, so the mean cannot differ between them. Override :meth:`distribution` for
+    another source, such as a learned one: a subclass that is an ``nn.Module`` as well (call
+    ``nn.Module.__init__`` first) is trained, saved and frozen with the policy.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
 
     Keyword Args:
-        sigma: residual noise on warm positions, in units of the normalised action space. ``0`` is the
+        sigma: standard deviation around the mean, in units of the normalised action space. ``0`` is the
             deterministic limit.
-        correlation: share of the residual noise's variance that all warm positions of a dimension have in
-            common, in [0, 1]. ``0`` is the paper's white noise, which averages out over the chunk: a network
-            that averages sees through it.
+        correlation: share of the noise's variance that all warm positions of a dimension have in common, in
+            [0, 1]. ``0`` is the paper's white noise; a network that averages over the chunk sees through it.
 
     Raises:
         ValueError: if ``chunk_length < 1``, ``sigma`` is not a finite number >= 0, or ``correlation`` is not
@@ -126,15 +125,15 @@ class Prior(Registered):
 
     @property
     def history_length(self) -> int:
-        """How many executed actions :meth:`mean` needs, ``H`` by default and at least."""
+        """How many executed actions :meth:`mean` needs: ``H`` or more."""
         return self.chunk_length
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Mean of the source.
 
         Args:
-            history: ``[*B]``, see :mod:`warmprior.history`. Of the forecast the first ``P - H`` steps alone
-                are known in training.
+            history: ``[*B]``, see :mod:`warmprior.history`. Training knows only the first ``P - H`` steps of
+                the forecast.
 
         Returns:
             ``loc`` ``[*B, P, d_a]``, ignored on cold positions, and ``warm``, bool ``[*B, P, 1]``.
@@ -148,15 +147,14 @@ class Prior(Registered):
 
         Args:
             history: ``[*B]``, see :mod:`warmprior.history`.
-            observation: what the network sees, ``[*B, To, d_o]``, and the paper's sources do not read.
+            observation: what the network sees, ``[*B, To, d_o]``; the paper's sources ignore it.
 
         Raises:
             KeyError: if an entry of the history is missing.
-            ValueError: if the history has other lengths than the prior, or :meth:`mean` returns other
-                shapes than it should.
+            ValueError: if the history has other lengths than the prior, or :meth:`mean` returns wrong shapes.
         """
         loc, warm = checked_mean(self, history)
-        scale = torch.where(warm, self.sigma, loc.new_ones(()))  # a number alone has no precision
+        scale = torch.where(warm, self.sigma, loc.new_ones(()))  # a plain number has no dtype
         return Source(torch.where(warm, loc, 0.0), scale, warm, self.correlation)
 
     def sample(
@@ -170,7 +168,7 @@ class Prior(Registered):
 
 
 def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-    """What :meth:`Prior.mean` makes of a history, in its precision, once both are checked."""
+    """The checked result of :meth:`Prior.mean`, in the history's dtype."""
     check_history(history, prior.history_length, prior.prediction_length, prior)
     found = prior.mean(history)
     loc, warm = found if isinstance(found, tuple) and len(found) == 2 else (found, None)
@@ -191,7 +189,7 @@ def checked_mean(prior: Prior, history: TensorDictBase) -> tuple[Tensor, Tensor]
 
 
 class GaussianPrior(Prior):
-    """The usual standard normal source: nothing is ever warm. The baseline of every comparison.
+    """The usual standard normal source: nothing is ever warm.
 
     Args:
         chunk_length: see :class:`Prior`.
@@ -214,9 +212,16 @@ class GaussianPrior(Prior):
 
 
 class PastPrior(Prior):
-    r"""WP-Past: the mean is the last ``H`` executed actions, ``sigma`` 0.5 by default (Equation 2).
+    r"""WP-Past: the mean is the last ``H`` executed actions (Eq. 2).
 
-    Nothing is warm before ``H`` actions of the episode were executed. Arguments as of :class:`Prior`.
+    Nothing is warm before ``H`` actions of the episode were executed.
+
+    Args:
+        chunk_length: ``H``, the number of actions executed per decision.
+
+    Keyword Args:
+        sigma: standard deviation around the mean, 0.5 by default; see :class:`Prior`.
+        correlation: share of the noise's variance that the whole chunk has in common, 0 by default.
 
     See Also:
         :class:`~warmprior.HistoryObservation`: lets the network see the last actions instead.
@@ -234,25 +239,30 @@ class PastPrior(Prior):
     default_sigma = 0.5
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """The last ``H`` executed actions, if there are so many."""
+        """The last ``H`` executed actions, if there are that many."""
         warm = (history["steps"] >= self.chunk_length).unsqueeze(-1)
         loc = history["actions"][..., -self.chunk_length :, :]
         return loc, warm.expand(*loc.shape[:-1], 1)
 
 
 class PreviewPrior(Prior):
-    r"""WP-Preview: the mean is the policy's own earlier forecast of this chunk, ``sigma`` 1 by default.
+    r"""WP-Preview: the mean is the policy's own earlier forecast of this chunk.
 
-    The network predicts ``P = 2H`` actions. In training the target's own first ``H`` actions stand in
-    for a perfect forecast (Eq. 3); at decisions the mean is the previous prediction ``[k, k+H)``
-    (Eq. 4). The second half is always cold.
+    The network predicts ``P = 2H`` actions. In training the target's own first ``H`` actions are the forecast
+    (Eq. 3); at decisions it is the previous prediction's ``[k, k+H)`` (Eq. 4). The second half is always
+    cold.
 
     .. note::
-        Algorithm 1 never shows the network a cold first half, which is what it meets at the first
-        decision of every episode. :class:`~warmprior.WithheldHistory` repairs that; it matters for small
-        ``sigma``.
+        Algorithm 1 never shows the network a cold first half, which it meets at the first decision of every
+        episode. :class:`~warmprior.WithheldHistory` does; it matters for small ``sigma``.
 
-    Arguments as of :class:`Prior`.
+    Args:
+        chunk_length: ``H``, the number of actions executed per decision.
+
+    Keyword Args:
+        sigma: standard deviation around the mean, 1 by default; see :class:`Prior`.
+        correlation: share of the noise's variance that the forecast's ``H`` positions have in common, 0 by
+            default.
 
     Examples:
         >>> from warmprior.history import advance, cold_history
@@ -267,7 +277,7 @@ class PreviewPrior(Prior):
     prediction_chunks = 2
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """The first ``H`` steps of the forecast, if it reaches so far."""
+        """The first ``H`` steps of the forecast, if it reaches that far."""
         forecast, steps = history["forecast"], history["forecast_steps"]
         position = torch.arange(self.prediction_length, device=steps.device)
         warm = (steps >= self.chunk_length) & (position < self.chunk_length)

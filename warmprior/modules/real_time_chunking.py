@@ -1,4 +1,4 @@
-"""Real-Time Chunking: a flow that is guided towards the rest of the chunk that is being executed."""
+"""Real-Time Chunking: guides a flow towards the rest of the chunk being executed."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ SCHEDULES: dict[str, Callable[[Tensor], Tensor]] = {
     "ones": torch.ones_like,
     "zeros": lambda linear: (linear >= 1).to(linear),
 }
-"""How the weight of a position falls behind the delay, by name, from one that falls linearly."""
+"""How the weight of a position falls behind the delay, by name, as a function of a linear fall."""
 
 Schedule = Literal["exp", "linear", "ones", "zeros"]
 
 
 def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
-    """A chunk as it is executed when it takes effect late: until then the old one's rest is.
+    """A late chunk as it is executed: until it takes effect, the rest of the old one is.
 
     Args:
         chunk: the prediction, ``[*B, P, d_a]``.
@@ -36,9 +36,8 @@ def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
         delay: control steps until ``chunk`` takes effect, int64 ``[*B, 1]``.
 
     See Also:
-        - :func:`~warmprior.history.advance`: takes the rest of the chunk before to the positions of the
-          next one.
-        - :class:`~warmprior.RealTimeChunking`: makes the prediction continue that rest.
+        - :func:`~warmprior.history.advance`: moves the rest of the old chunk to the positions of the new one.
+        - :class:`~warmprior.RealTimeChunking`: makes the prediction continue the old chunk.
 
     Examples:
         >>> import torch
@@ -54,8 +53,8 @@ def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
 class RealTimeChunking:
     r"""Guidance of `Real-Time Chunking <https://arxiv.org/abs/2506.07339>`_, for any source.
 
-    While a chunk is computed, the one before goes on being executed for ``d`` control steps (the delay),
-    and the new one should continue it. Velocities are corrected towards the leftover :math:`Y` of the old
+    While a chunk is computed, the old one is executed for ``d`` more control steps (the delay), and the new
+    one should continue it. Velocities are corrected towards the leftover :math:`Y` of the old
     chunk, with :math:`\hat a = a_t + (1-t)\,v(t, a_t)` and :math:`J = \partial \hat a / \partial a_t`:
 
     .. math::
@@ -64,26 +63,26 @@ class RealTimeChunking:
 
     :math:`g` is exact for a source :math:`N(\mu, \sigma^2)` and Gaussian data of standard deviation
     :math:`S` (docs/real_time_chunking.md derives it); :math:`\mu` drops out. :math:`\sigma = S = 1` is the
-    published weight, :math:`\frac{1-t}{t} \cdot \frac{t^2 + (1-t)^2}{(1-t)^2}`. It supposes a flow along
-    straight lines (:class:`~warmprior.LinearInterpolant`).
+    published weight, :math:`\frac{1-t}{t} \cdot \frac{t^2 + (1-t)^2}{(1-t)^2}`. It assumes straight paths
+    (:class:`~warmprior.LinearInterpolant`).
 
     :math:`W` is 1 on the positions before the delay, which are executed as they are in the old chunk, falls
     behind it by ``schedule``, and is 0 from ``horizon`` on.
 
     Args:
-        horizon: first position without guidance, LeRobot's execution_horizon and the official code's
-            prefix_attention_horizon; None, the default, for all that is left of the old chunk, as in
-            the official studies. It never reaches further than that.
+        horizon: first position without guidance (LeRobot's execution_horizon, the official code's
+            prefix_attention_horizon); None, the default, guides up to the end of the old chunk, as in the
+            official studies.
         schedule: "exp" (the official default), "linear" (LeRobot's), "ones" or "zeros".
         max_guidance_weight: :math:`\beta`; 5 in the official code, 10 in LeRobot.
-        jacobian: False takes the identity for :math:`J`, as LeRobot 0.6 does: no gradients, 0.6 of the
-            time, and another method, which is not exact where the formula is.
-        sigma: what to take for the source's standard deviation; its own by default. 1 is the published
-            weight whatever the source.
-        data_std: :math:`S`, how far actions spread where the observation is known, in normalised units. A
-            scale of the data in the weight is also what POTR (arXiv 2605.24433) names :math:`\sigma_d`.
-        trust_region: bound of the correction's part that is perpendicular to the velocity, as a share of
-            the velocity's norm; None for none. POTR bounds that part too; this form is ours.
+        jacobian: False takes the identity for :math:`J`, as LeRobot 0.6 does. That needs no gradients and 0.6
+            of the time, but is no longer exact in the Gaussian case.
+        sigma: the source's standard deviation in the weight; its own by default. 1 gives the published weight
+            for every source.
+        data_std: :math:`S`, the standard deviation of actions at a known observation, in normalised units.
+            POTR (arXiv 2605.24433) has such a scale too, :math:`\sigma_d`.
+        trust_region: bound of the correction perpendicular to the velocity, as a share of the velocity's
+            norm; None for no bound. POTR bounds that part too; this form is ours.
 
     Raises:
         ValueError: for an unknown schedule, or a number that is not positive.
@@ -126,14 +125,14 @@ class RealTimeChunking:
         return asdict(self)
 
     def check_delay(self, delay: int, left: int) -> None:
-        """Whether chunks can be guided that take effect so late.
+        """Check that chunks with this delay can be guided.
 
         Args:
             delay: ``d``, control steps.
-            left: actions that are left of the old chunk when the new one is begun.
+            left: actions left of the old chunk when the new one begins.
 
         Raises:
-            ValueError: if the delay reaches behind the leftover or the horizon.
+            ValueError: if the delay exceeds the leftover or the horizon.
         """
         if not 0 <= delay <= left:
             raise ValueError(
@@ -151,7 +150,7 @@ class RealTimeChunking:
 
         Args:
             delay: ``d``, int64 ``[*B]``.
-            left: number of positions that the leftover has, int64 ``[*B]``; the others weigh nothing.
+            left: number of positions of the leftover, int64 ``[*B]``; the others have weight 0.
             length: ``P``.
             dtype: of the weights; PyTorch's default one by default.
 
@@ -186,15 +185,13 @@ class RealTimeChunking:
         delay: Tensor,
         sigma: Tensor | float = 1.0,
     ) -> Velocity:
-        """A velocity that leads to chunks which continue the leftover.
-
-        It works under ``torch.no_grad()``, and what it gives is detached.
+        """A velocity that makes chunks continue the leftover. It works under ``torch.no_grad()``, and its
+        result is detached.
 
         Args:
             velocity: ``(t [B], a_t [B, P, d_a]) -> [B, P, d_a]``.
             leftover: ``Y``, ``[B, P, d_a]``, at the positions of the new chunk.
-            left: how many positions it has, the first ones, int64 ``[B, 1]``. Rows without any are not
-                guided.
+            left: how many of its first positions count, int64 ``[B, 1]``. Rows with 0 are not guided.
             delay: ``d``, int64 ``[B, 1]``.
             sigma: standard deviation of the source, broadcastable to ``[B, P, d_a]``.
 

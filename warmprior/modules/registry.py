@@ -1,4 +1,4 @@
-"""Classes that configurations name: what a file may build, and what it was built from."""
+"""Classes that configurations name, and the arguments that their objects were built from."""
 
 from __future__ import annotations
 
@@ -13,15 +13,13 @@ __all__ = ["Registered", "find", "from_config", "make", "options_of"]
 
 
 class Registered:
-    """A class whose subclasses are known by name, and whose objects remember their constructor's arguments.
-
-    A class that derives from this one directly has a registry of its own: of its subclasses, but for those
-    with ``abstract=True`` behind their bases.
+    """Base class whose subclasses are known by name, and whose objects remember their constructor's
+    arguments. Every direct subclass has a registry of its own subclasses, except for those declared with
+    ``abstract=True``.
 
     Raises:
-        ValueError: when a subclass takes the name of another, or one that no file can have.
-        TypeError: when a constructor is given arguments behind ``*`` that have no names in its base class to
-            save them by.
+        ValueError: when a subclass takes the name of another, or a name that no file can have.
+        TypeError: when positional arguments behind ``*`` have no names in the base class to be saved by.
 
     Examples:
         >>> class Shape(Registered): ...
@@ -43,15 +41,17 @@ class Registered:
         elif not abstract:
             cls.name = name = cls.__dict__.get("name", cls.__name__)
             if not re.fullmatch(r"[\w.+-]+", name):
-                raise ValueError(f"the name of {cls.__name__} becomes that of files: {name!r} cannot")
+                raise ValueError(
+                    f"the name of {cls.__name__} appears in file names, which cannot hold {name!r}"
+                )
             taken = cls._classes.get(name, cls)
-            # The same class once more, as when a notebook's cell runs again, replaces itself.
+            # The same class again, as when a notebook's cell runs twice, replaces itself.
             if (taken.__module__, taken.__qualname__) != (cls.__module__, cls.__qualname__):
                 raise ValueError(f"{name!r} is the name of {taken}: choose another for {cls}")
             cls._classes[name] = cls
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Self:
-        """Remember the arguments by name, whatever the subclass does with them."""
+        """Remember the arguments by name."""
         self = super().__new__(cls)
         arguments: dict[str, Any] = {}
         self.__dict__["_arguments"] = arguments
@@ -74,27 +74,27 @@ class Registered:
     def config(self) -> dict[str, Any]:
         """Name and constructor arguments as JSON holds them; :func:`from_config` reverses it.
 
-        An argument that was left to the constructor, as by ``sigma=None``, is what the object keeps under its
-        name, if that is a number or text; all others are as they were given.
+        An argument that the constructor chose, as for ``sigma=None``, is taken from the object's attribute of
+        that name, if it is a number or text. All others are as given.
 
         Raises:
-            TypeError: if an argument is nothing that JSON can hold.
+            TypeError: if JSON cannot hold an argument.
         """
         if "name" in self._arguments:
-            raise TypeError(f"{type(self).__name__} takes an argument called name: call it otherwise")
+            raise TypeError(f"{type(self).__name__} takes an argument called name: rename it")
         try:
             return json.loads(json.dumps({"name": self.name, **self._resolved()}, allow_nan=False))
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"{type(self).__name__} has an argument that cannot be saved ({error}): take numbers, text, "
-                "lists or dictionaries, and build the rest of them"
+                "lists or dictionaries, and build other objects from these"
             ) from error
 
     def _resolved(self) -> dict[str, Any]:
         plain, resolved = (bool, int, float, str), dict(self._arguments)
         for name, value in self._arguments.items():
             kept = getattr(self, name, None)
-            # What was given stays: what the constructor made of it, it would make again.
+            # Given values stay as they are: the constructor would convert them again.
             if isinstance(kept, plain) and (value is None or (isinstance(value, plain) and kept == value)):
                 resolved[name] = kept
         return resolved
@@ -106,7 +106,7 @@ class Registered:
 def find[T: Registered](base: type[T], name: str) -> type[T]:
     """The subclass of a name, or at a place such as ``"mypackage.priors:Anchor"``, which is imported.
 
-    Importing runs code: this is for what a user typed, and never for what a file says.
+    Importing runs code, so use this for names that a user typed, and never for names in a file.
 
     Args:
         base: of the registry.
@@ -138,7 +138,7 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
 
     Args:
         base: of the registry.
-        text: what :func:`find` takes, perhaps with options behind it, see :func:`options_of`.
+        text: as for :func:`find`, with options behind it if any, see :func:`options_of`.
         args: further arguments of the constructor.
 
     Raises:
@@ -164,7 +164,7 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
 def options_of(text: str) -> dict[str, Any]:
     """The options behind a name, as JSON or plain text.
 
-    A comma separates them if ``option=`` follows, and belongs to the value otherwise.
+    A comma separates options if ``option=`` follows, and belongs to the value otherwise.
 
     Args:
         text: ``name,option=value,...``.
@@ -193,7 +193,7 @@ def options_of(text: str) -> dict[str, Any]:
 
 
 def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
-    """Build what :meth:`Registered.config` describes; nothing is imported for it.
+    """Build what :meth:`Registered.config` describes, without importing anything.
 
     Raises:
         ValueError: if no imported class has that name.

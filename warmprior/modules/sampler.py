@@ -19,18 +19,19 @@ __all__ = ["PriorSampler"]
 
 
 class PriorSampler(TensorDictModuleBase):
-    """Draws where the flow starts: ``(observation, history) -> (loc, warm, noise)``.
+    """Draws the source sample: ``(observation, history) -> (loc, warm, noise)``.
 
     Args:
         prior: the source distribution.
 
     Keyword Args:
         start: the point from which samplers start, if that is not the source itself.
-        observation_key: key of the observation, ``[*B, To, d_o]``, which only a start point, or a prior that
-            overrides :meth:`~Prior.distribution`, is given.
+        observation_key: key of the observation, ``[*B, To, d_o]``; only start points and priors that override
+            :meth:`~Prior.distribution` read it.
         noise_key: key written, ``[*B, P, d_a]``.
         generator: source of randomness; PyTorch's global generator by default. Per call:
-            ``sampler(data, generator=...)``. Worker processes take none, for they would all draw the same.
+            ``sampler(data, generator=...)``. Worker processes take none, since all of them would draw the
+            same noise.
 
     Raises:
         KeyError: if an entry of the history is missing.
@@ -81,7 +82,7 @@ class PriorSampler(TensorDictModuleBase):
         return self.prior.distribution(*self._inputs(tensordict))
 
     def forward(self, tensordict: TensorDictBase, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Write the mean, where it is warm, and the point from which samplers start."""
+        """Write the mean, the warm positions, and the sample."""
         source = self.source(tensordict)
         point = source.sample(self.generator if generator is None else generator)
         if self.start is not None:

@@ -1,4 +1,4 @@
-"""Where samplers start, if not at the source: a point on the way, at a later time."""
+"""Start points: where samplers start at a later time than the source's."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ __all__ = ["StartPoint"]
 class StartPoint(Registered, nn.Module):
     r"""Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
 
-    The flow is trained from the prior's source as ever; at decisions it is entered on the way. A point learns
-    before the flow does, and is saved with the policy.
+    The flow is trained from the prior's source as usual; at decisions integration starts on the way. A start
+    point is trained before the flow, and saved with the policy.
 
     Attributes:
         time: ``s``.
@@ -38,7 +38,7 @@ class StartPoint(Registered, nn.Module):
     noise_share: float
 
     def centre(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
-        """Mean of the point, around which an agent searches, ``[*B, P, d_a]``; of what a prior is given."""
+        """Mean of the point, around which an agent searches, ``[*B, P, d_a]``; arguments as for a prior."""
         raise NotImplementedError
 
     def forward(self, noise: Tensor, history: TensorDictBase, observation: Tensor | None) -> Tensor:

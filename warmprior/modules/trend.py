@@ -1,4 +1,4 @@
-"""The part of a prior's source and of its targets that follows from where the grippers are."""
+"""The part of sources and targets that follows from the grippers' poses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DRAWS = 16
 """Of the source, per window: their mean has little noise, which belongs to no observation."""
 
 VARIANCE_FLOOR = 1e-4
-"""Of a resting action: one that varies less tells nothing about others."""
+"""Of a resting action; one that varies less predicts nothing."""
 
 _POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, rotation and gripper
 
@@ -31,12 +31,12 @@ class RestingAction(nn.Module):
     Args:
         columns: int64 ``[arms, 7]``, where in the observation each gripper's position and the
             ``(x, y, z, w)`` quaternion of its hand are, as robomimic's files have them.
-        normalizer: of the observations ``[d_o]`` and the actions ``[10 * arms]``; an identity by default,
-            to be replaced by loading a state dict.
+        normalizer: normaliser of the observations ``[d_o]`` and the actions ``[10 * arms]``; an identity by
+            default, to be replaced by loading a state dict.
 
     See Also:
         - :class:`~warmprior.PoseTrend`: fits the deviation from it.
-        - :func:`~warmprior.training.precondition`: takes it off what the network has to learn.
+        - :func:`~warmprior.training.precondition`: removes it from what the network has to learn.
 
     Examples:
         >>> import torch
@@ -75,7 +75,7 @@ class RestingAction(nn.Module):
         """The action, ``[*B, 10 * arms]`` in normalised units; 0 for the gripper.
 
         Args:
-            observation: ``[*B, d_o]``, normalised; further entries at its end are not looked at.
+            observation: ``[*B, d_o]``, normalised; further entries at its end are ignored.
         """
         pose = observation[..., self.columns] * self.scale + self.loc
         hand = quaternion_to_matrix(pose[..., 3:])
@@ -88,13 +88,13 @@ class RestingAction(nn.Module):
 class PoseTrend(nn.Module):
     r"""Best linear predictions of source :math:`a_0` and target :math:`a_1` from the resting action.
 
-    Absolute poses lie near the present one: most of their variance is that of where the robot is. A network
-    that has to find this by itself spends its precision on it, and what it hands on of the source's noise is
-    a share of the whole range, many times what a pose changes in a step. With a trend,
-    :class:`PreconditionedNetwork` learns the remainder: where to go from here, as with deltas.
+    Absolute poses lie near the present pose, which explains most of their variance. A network without a trend
+    spends its precision on that, and passes on source noise that is many times as large as the change of a
+    pose in one step. With a trend, :class:`PreconditionedNetwork` learns the remainder: where to go from
+    here, as with deltas.
 
-    Every action dimension is predicted from the same dimension of the resting action at the last observation
-    alone: a regression on the whole observation fits better, but leads astray where no demonstration was.
+    Every action dimension is predicted from the same dimension of the resting action at the last observation.
+    A regression on the whole observation fits better, but fails away from the demonstrations.
 
     Args:
         rest: the resting action of an observation.
@@ -160,7 +160,7 @@ class PoseTrend(nn.Module):
             generator: source of randomness of the source samples, on the windows' device.
 
         Returns:
-            The trend over the positions that are not padded, as float32; none where all are.
+            The trend over unpadded positions, as float32; 0 where all are padded.
         """
         resting = rest(windows[keys.OBSERVATION][:, -1].float()).double()
         centre = resting.mean(0)
@@ -180,7 +180,7 @@ class PoseTrend(nn.Module):
         return {"arms": len(self.rest.columns), "prediction_length": len(self.source)}
 
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
-        """What source and target deviate from their means by, each ``[B, P, d_a]``.
+        """The predicted deviations of source and target from their means, each ``[B, P, d_a]``.
 
         Args:
             observation: ``[B, To, d_o]``, normalised; the last step counts.

@@ -17,8 +17,8 @@ __all__ = ["VisionNetwork"]
 class VisionNetwork(VelocityNetwork):
     """A velocity network that sees observations with images through an encoder.
 
-    The encoder runs once per decision, and not once per integration step: samplers and losses call
-    :meth:`encode` first and hand the result on.
+    The encoder runs once per decision, not once per integration step: samplers and losses call :meth:`encode`
+    first and pass the result on.
 
     Args:
         encoder: of observations; or its ``config()``.
@@ -30,7 +30,7 @@ class VisionNetwork(VelocityNetwork):
     See Also:
         - :class:`~warmprior.ImageEncoder`: the encoder.
         - :class:`~warmprior.ChiTransformer`: a network to put behind it.
-        - :class:`~warmprior.CameraImages`: brings the images of an environment.
+        - :class:`~warmprior.CameraImages`: renders an environment's images.
 
     Examples:
         >>> import torch
@@ -77,7 +77,7 @@ class VisionNetwork(VelocityNetwork):
         }
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-        """What the encoder makes of an observation, ``[B, To, d_o]``; what it has made stays."""
+        """The encoded observation, ``[B, To, d_o]``; an encoded one is returned as it is."""
         return self.encoder(observation) if isinstance(observation, TensorDictBase) else observation
 
     def forward(self, t: Tensor, a: Tensor, observation: Tensor | TensorDictBase) -> Tensor:

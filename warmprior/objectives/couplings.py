@@ -1,4 +1,4 @@
-"""How the sources and targets of a batch are paired, other than as they come."""
+"""Couplings: how the sources and targets of a batch are paired."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ __all__ = ["BridgeCoupling", "Coupling", "OTCoupling", "ReflowCoupling"]
 Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
 """Pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, each chunk ``[*B, P, d_a]``.
 
-The observations ``[*B, To, d_o]`` belong to the targets: permute ``a0``, or replace ``a1``. What it depends
-on it tells by ``config()``, if it has that, so that a training knows whether it may be continued.
+The observations ``[*B, To, d_o]`` belong to the targets: permute ``a0``, or replace ``a1``. A coupling may
+have ``config()``, what it depends on, so that a training knows whether it may be continued.
 """
 
 
 class OTCoupling:
-    r"""OT-CFM: source and data of a batch are paired by optimal transport.
+    r"""OT-CFM: pairs the sources and targets of a batch by optimal transport.
 
     The permutation :math:`\pi` of the sources minimises
 
@@ -35,11 +35,11 @@ class OTCoupling:
         \sum_j \|a_0^{\pi(j)} - a_1^j\|^2 + w \|o^{\pi(j)} - o^j\|^2
 
     (Tong et al., 2024; Pooladian et al., 2023), exactly, in nearly equal groups of at most 256. At decisions
-    the source is drawn at any observation, so pairs across observations bias the policy; ``w`` makes them
-    dear. At ``w = 0`` the observation is ignored; at a large one everything stays where it is.
+    the source is independent of the observation, so pairs across observations bias the policy; ``w``
+    penalises them. ``w = 0`` ignores the observation; a large ``w`` leaves all pairs as they are.
 
     Args:
-        observation_weight: ``w``, for observations in the data's normalised units, each one tensor.
+        observation_weight: ``w``, for normalised observations, each one tensor.
 
     Raises:
         ValueError: if the weight is negative or not finite, a batch has fewer than two windows, or its
@@ -47,7 +47,7 @@ class OTCoupling:
         ImportError: if scipy is missing.
 
     See Also:
-        :class:`~warmprior.objectives.ReflowCoupling`: pairs each source with what a trained flow makes of it.
+        :class:`~warmprior.objectives.ReflowCoupling`: pairs each source with the end of a trained flow.
 
     Examples:
         >>> import torch
@@ -84,7 +84,7 @@ class OTCoupling:
                 "concatenate their entries, or set observation_weight=0"
             )
         paired = []
-        # Groups of nearly one size: a window that is left over could only be paired with itself.
+        # Groups of nearly equal size: a leftover window could only be paired with itself.
         for group in torch.arange(len(source)).tensor_split(-(-len(source) // self.GROUP)):
             cost = _squared_distances(target[group], source[group])
             if isinstance(observation, Tensor) and self.observation_weight:
@@ -155,7 +155,7 @@ def _squared_distances(x: Tensor, y: Tensor) -> Tensor:
 
 
 class ReflowCoupling:
-    r"""2-rectified flow: the target of every source is where a trained policy's flow leads it.
+    r"""2-rectified flow: the target of every source is the end of a trained policy's flow.
 
     Pairs :math:`(a_0, \hat a_1)`, with :math:`\hat a_1` the end of the teacher's flow at the window's
     observation, are drawn anew for every batch (Liu et al., 2023): a step costs ``nfe`` more forward passes.
@@ -183,7 +183,7 @@ class ReflowCoupling:
 
     def __init__(self, teacher: WarmPriorActor, nfe: int = 9) -> None:
         check_whole_numbers(nfe=nfe)
-        # Its flow alone: from the source at t = 0, whatever its samplers do beside.
+        # Its flow alone, from the source at t = 0.
         teacher = teacher.replace(start=None, guidance=None)
         self.teacher, self.nfe = teacher.eval().requires_grad_(False), nfe
 

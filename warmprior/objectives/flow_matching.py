@@ -27,10 +27,10 @@ Objective = Literal["velocity", "l1"]
 Weighting = Literal["velocity", "standardised"]
 
 TEACHER_STEPS = 9
-"""Steps from the start to the end of the flow that self-distillation learns to make in one: the paper's."""
+"""Euler steps, as in the paper, that self-distillation learns to make in one."""
 
 DISTILLED_SHARE = 0.25
-"""Of a batch, that of shortcut models: each of these windows costs nine forward passes more."""
+"""Share of a batch, as in shortcut models: each of these windows costs nine more forward passes."""
 
 
 def check_objective(
@@ -40,7 +40,7 @@ def check_objective(
     weighting: str | None,
     self_distillation: float,
 ) -> None:
-    """Whether there is a loss of these options.
+    """Check that there is a loss with these options.
 
     Keyword Args:
         times: name of the distribution of the times.
@@ -77,10 +77,8 @@ class FlowMatchingLoss(LossModule):
 
     For each window: draw :math:`a_0` from the prior, pair it with :math:`a_1`, draw
     :math:`t \sim U(0, 1)`, set :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regress
-    :math:`v_\theta(t, a_t, o)` on :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's
-    end do not count.
-
-    What else is done for few integration steps are options, with any prior. Two need the straight path:
+    :math:`v_\theta(t, a_t, o)` on :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's end do
+    not count. Two options for few integration steps work with any prior, and need the straight path:
 
     **The L1 objective** compares predicted samples instead of velocities (L1 Flow, Song et al., 2025,
     arXiv:2511.17898). The sample that a velocity predicts is :math:`\hat a_1 = a_t + (1 - t) v`, so a
@@ -100,38 +98,36 @@ class FlowMatchingLoss(LossModule):
         \left\| v_\theta(s, a_s, o) - \frac{\hat a_1 - a_s}{1 - s} \right\|^2, \qquad
         \hat a_1 = \Phi^{\bar\theta}_{s + h \to 1}(a_{s + h}), \qquad h = \frac{1 - s}{9},
 
-    where :math:`\Phi` is the flow by Euler's method with steps of :math:`h` and :math:`a_{s+h}` lies on the
-    data's own path, so that the jump is never its own teacher. It replaces the velocity at the one time
-    :math:`s`; at all others the network stays a flow. Idea and target are those of the self-consistency of
-    One-Step Flow Policy (Li et al., 2026, arXiv:2603.12480), for the interval from the start to the end.
-    What differs: a velocity network knows no interval, so this is the only one that is learnt, and the
-    teacher makes it in steps, as in progressive distillation, instead of in one that it has to learn as well
-    (so no schedule contracts it, either). There is no self-guidance, and the warm start is the prior's. A
-    quarter of the batch is distilled, as in shortcut models (Frans et al., 2025); a training step takes about
-    twice the time.
+    where :math:`\Phi` is the flow by Euler's method with steps of :math:`h`, and :math:`a_{s+h}` lies on the
+    data's own path. It replaces the velocity at the one time :math:`s`; at all others the network stays a
+    flow. The idea is the self-consistency of One-Step Flow Policy (Li et al., 2026, arXiv:2603.12480). Three
+    things differ: only the whole interval is learnt, because a velocity network has no input for another one;
+    the teacher crosses it in steps, as in progressive distillation, so no schedule is needed; and there is no
+    self-guidance. A quarter of the batch is distilled, as in shortcut models (Frans et al., 2025); a training
+    step takes about twice the time.
 
     Args:
         actor_network: the policy whose velocity network is trained; its prior gives the source.
 
     Keyword Args:
-        coupling: pairs the sources and targets of a batch, see :data:`~warmprior.objectives.Coupling`; as
-            they come by default (Algorithm 1).
+        coupling: pairs the sources and targets of a batch, see :data:`~warmprior.objectives.Coupling`; in
+            their order by default (Algorithm 1).
         times: how training times are distributed: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
             ``"logit-normal"``, ``"start"`` (regression) (:mod:`warmprior.objectives.times`), or a function
             of their signature.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) takes errors as they are. ``"standardised"`` divides them by
-            what the best linear prediction leaves (:meth:`PreconditionedNetwork.remainder`): every time,
-            position and dimension counts alike, in the manner of EDM (Karras et al., 2022, Table 1): the
-            default for a :class:`PreconditionedNetwork`, and what the tables here were measured with. As they
-            are, errors near the source count little: with a standard normal source and data of deviation
-            :math:`s`, those at ``t = 0``, where one-step samplers are, count :math:`s^2` times those at
-            ``t = 1``.
-        self_distillation: weight of the self-distillation; 0 is none.
+            the standard deviation of the remainder (:meth:`PreconditionedNetwork.remainder`), so that every
+            time, position and dimension counts alike, as in EDM (Karras et al., 2022, Table 1). It is the
+            default for a :class:`PreconditionedNetwork`, and the recipe of the tables here. Without it,
+            errors near the source count little: with a standard normal source and data of deviation
+            :math:`s`, those at ``t = 0``, where one-step samplers are, count :math:`s^2` times those at ``t =
+            1``.
+        self_distillation: weight of the self-distillation; 0 turns it off.
         teacher: the network of averaged weights that self-distillation learns from; by default the trained
-            one as it is. It is neither trained nor saved with the loss.
-        interpolant: the path; by default the one that the network is preconditioned for
-            (:class:`~warmprior.PreconditionedNetwork`), or the straight line.
+            network itself. It is neither trained nor saved with the loss.
+        interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or the
+            straight line.
         reduction: ``"mean"`` over unpadded coordinates (Algorithm 1 divided by their number),
             ``"sum"`` (Algorithm 1's squared norm, summed over the batch) or ``"none"``
             (``[*B, P, d_a]``, zero where padded).
@@ -140,8 +136,8 @@ class FlowMatchingLoss(LossModule):
     .. note::
         Keys read (all renameable by :meth:`set_keys`): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool
         ``[*B, P]`` (True = padded; optional), the history (:mod:`warmprior.history`) and
-        ``observation`` ``[*B, To, d_o]``; by default those of the actor. Batches of any device are
-        moved to the network's, where the generator has to be.
+        ``observation`` ``[*B, To, d_o]``; by default those of the actor. Batches are moved to the network's
+        device, where the generator has to be.
 
     Raises:
         ValueError: for an unknown ``reduction``, ``times``, ``objective`` or ``weighting``, or a negative
@@ -234,7 +230,7 @@ class FlowMatchingLoss(LossModule):
         self.times = times if callable(times) else TIMES[times]
         self.objective, self.weighting = objective, weighting
         self.self_distillation = float(self_distillation)
-        self.__dict__["teacher"] = teacher  # no part of this module: it is another's to save
+        self.__dict__["teacher"] = teacher  # not part of this module: its owner saves it
         built_for = getattr(actor_network.network, "interpolant", None)
         # A coupling may come with a path of its own.
         interpolant = interpolant or getattr(coupling, "interpolant", None)
@@ -331,7 +327,7 @@ class FlowMatchingLoss(LossModule):
                 if self.self_distillation:
                     errors.append(self._jump_error(a0, a1, observation, distilled))
             except KeyboardInterrupt as key:
-                interrupt = key  # leaving the context with it would make a RuntimeError of it
+                interrupt = key  # inside the context it would become a RuntimeError
         if interrupt is not None:
             raise interrupt
         losses = [self._reduced(errors[0], pad)]
@@ -350,7 +346,7 @@ class FlowMatchingLoss(LossModule):
         return self._distance(predicted.reshape(a1.shape), velocity, t)
 
     def _jump_error(self, a0: Tensor, a1: Tensor, observation: Tensor | TensorDictBase, n: int) -> Tensor:
-        """Error of the single step from the start to the end, of the first windows, ``[n, P, d_a]``."""
+        """Error of one step from start to end, for the first windows, ``[n, P, d_a]``."""
         a0, a1 = (a.detach().reshape(-1, *a.shape[-2:])[:n] for a in (a0, a1))
         observation = observation[:n]
         begin = self.start_time
@@ -370,7 +366,7 @@ class FlowMatchingLoss(LossModule):
         return self._distance(jump, (end - start) / (1.0 - begin), t)
 
     def _distance(self, predicted: Tensor, velocity: Tensor, t: Tensor) -> Tensor:
-        """What the objective makes of predicted velocities at times ``t`` ``[*B]``, ``[*B, P, d_a]``."""
+        """The objective's error of predicted velocities at times ``t`` ``[*B]``, ``[*B, P, d_a]``."""
         error = predicted - velocity
         if self.weighting == "standardised":
             unit = cast(Any, self.velocity_network).remainder(t.reshape(-1))
@@ -382,7 +378,7 @@ class FlowMatchingLoss(LossModule):
         count: Tensor | int = max(1, error.numel())
         if pad is not None:
             error = error.masked_fill(pad.unsqueeze(-1), 0.0)
-            # At least 1: padding alone has no error, and no NaN.
+            # At least 1, so that padding alone gives 0 and not NaN.
             count = ((~pad).sum() * error.shape[-1]).clamp_min(1)
         if self.reduction == "none":
             return error

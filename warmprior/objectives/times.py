@@ -1,4 +1,4 @@
-"""At which times a flow is trained."""
+"""The times at which a flow is trained."""
 
 from __future__ import annotations
 
@@ -58,8 +58,8 @@ def u_shaped_times(
     r"""More often near both ends.
 
     The density is :math:`p(t) \propto e^{at} + e^{a(1-t)}` with :math:`a = 4` (Lee et al., 2024, "Improving
-    the training of rectified flows"). Their text writes the second term :math:`e^{-at}`, which would be no U
-    on [0, 1]; this is what their code draws from. By the inverse of
+    the training of rectified flows"). Their text has :math:`e^{-at}` as the second term, which is no U on [0,
+    1]; this is what their code draws from, by the inverse of
 
     .. math::
         F(t) = \frac12 + \frac{\sinh(a(t - \frac12))}{2 \sinh\frac a2}.
@@ -115,7 +115,7 @@ def start_times(
 ) -> Tensor:
     r"""``t = 0`` alone: the network regresses :math:`a_1 - a_0`, and one step of Euler's method returns it.
 
-    The field means nothing at any other time: build the policy with ``max_nfe=1``.
+    The field is not trained at any other time: build the policy with ``max_nfe=1``.
 
     Args:
         shape: of the result.

@@ -1,4 +1,4 @@
-"""What learns in prior-space reinforcement learning: networks, loss and optimiser, but no environment."""
+"""The agent of prior-space reinforcement learning: networks, loss and optimiser."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PriorSpaceAgent:
         self.config = config
         self.device = next(actor.parameters()).device
         self.decoder = PriorDecoder(actor, delta=config.box(actor), nfe=config.nfe)
-        # By default what is drawn around a mean stays in the box, but not what is drawn around zero.
+        # By default draws around a mean stay in the box, and draws around zero do not.
         drawn: ResidualDistribution | None = None if has_anchor(actor) else "clipped"
         self.warmup = TensorDictSequential(ResidualSampler(self.decoder, distribution=drawn), self.decoder)
         self.state_keys = [self.decoder.observation_key, keys.ANCHOR]
@@ -122,7 +122,7 @@ class PriorSpaceAgent:
         return iter([self.loss] * self.config.updates)
 
     def learn(self, buffer: ReplayBuffer) -> dict[str, float]:
-        """The updates that one vector step of the environment pays for, each on a batch of its own.
+        """The updates for one vector step of the environment, each on its own batch.
 
         Args:
             buffer: transitions on the agent's device.
@@ -137,7 +137,7 @@ class PriorSpaceAgent:
         for compute in self._schedule():
             result = compute(buffer.sample())
             losses = {k: v for k, v in result.items() if k.startswith("loss_")}
-            check_finite(losses)  # TorchRL's SAC does not look by itself
+            check_finite(losses)  # TorchRL's SAC does not check this
             self.optimizer.zero_grad()
             torch.stack(list(losses.values())).sum().backward()
             self.optimizer.step()
@@ -147,8 +147,7 @@ class PriorSpaceAgent:
         return {"q": float(values["loss_qvalue"]), "alpha": float(values["alpha"])}
 
     def _parameters(self) -> dict[str, Tensor]:
-        # Of the buffers those of the target critics: the others are the frozen policy and constants, some of
-        # these made late.
+        # Only the buffers of the target critics: the others are the frozen policy and constants.
         buffers = self.loss.named_buffers()
         targets = {k: v for k, v in buffers if k.split(".")[0].endswith("_params")}
         return dict(self.loss.named_parameters()) | targets
@@ -157,8 +156,7 @@ class PriorSpaceAgent:
         """All that learning has changed, by name.
 
         Raises:
-            FloatingPointError: if any of it is NaN or infinite: a finite loss may have an infinite
-                gradient, and what it leaves must not be saved.
+            FloatingPointError: if any of it is NaN or infinite: a finite loss may have an infinite gradient.
         """
         tensors = {
             **named("loss", self._parameters()),

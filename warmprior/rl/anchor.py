@@ -21,16 +21,15 @@ __all__ = ["PriorAnchor", "has_anchor", "residual_sigma", "source_anchor"]
 
 
 def has_anchor(actor: Any) -> bool:
-    """Whether a policy's source has a centre that moves, around which an agent can search.
-
-    It has where the policy starts on the way, or where the mean of its prior is warm once the history is
-    full. Otherwise agents search around zero, as in DSRL.
+    """Whether a policy's source has a moving centre, around which an agent can search: the policy has a start
+    point, or its prior's mean is warm once the history is full. Otherwise agents search around zero, as in
+    DSRL.
 
     Args:
         actor: the policy.
 
     See Also:
-        :func:`~warmprior.rl.source_anchor`: where that centre is.
+        :func:`~warmprior.rl.source_anchor`: returns that centre.
 
     Examples:
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
@@ -39,7 +38,7 @@ def has_anchor(actor: Any) -> bool:
         [False, True]
     """
     prior, width = actor.prior, getattr(actor.network, "action_dim", None) or 1
-    # A prior without a mean of the history has a source of its own, which moves.
+    # Without mean() it overrides distribution(), and its source moves.
     if actor.start is not None or type(prior).mean is Prior.mean:
         return True
     chunk, target = (torch.zeros(length, width) for length in (prior.history_length, prior.prediction_length))
@@ -49,15 +48,15 @@ def has_anchor(actor: Any) -> bool:
 
 
 def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Where the source of decisions is centred: the mean where it is warm, or where the policy starts.
+    """The centre of the source at decisions: the mean where it is warm, or that of the start point.
 
     Args:
-        actor: the policy, or what has its ``prior`` and ``start``.
+        actor: the policy, or another object with ``prior`` and ``start``.
         history: ``[*B]``, see :mod:`warmprior.history`.
         observation: what the policy's network sees, ``[*B, To, d_o]``.
 
     Returns:
-        The anchor, ``[*B, P, d_a]``, and where it is one, bool ``[*B, P, 1]``.
+        The anchor, ``[*B, P, d_a]``, and where it is known, bool ``[*B, P, 1]``.
 
     See Also:
         :class:`~warmprior.PriorAnchor`: writes it in an environment, with noise elsewhere.
@@ -79,7 +78,7 @@ def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | Non
 
 
 def residual_sigma(actor: Any) -> float:
-    """Typical deviation of a policy's source from where an agent searches: 1 around zero.
+    """Typical deviation of a policy's source from the centre of the search; 1 around zero.
 
     Args:
         actor: the policy.
@@ -88,7 +87,7 @@ def residual_sigma(actor: Any) -> float:
         return 1.0
     if actor.start is not None:
         return actor.start.noise_share
-    # A learned source whose sigma is a factor knows what it multiplies.
+    # A learned source, whose sigma is a factor, has a scale of its own.
     return actor.prior.sigma * float(getattr(actor.prior, "typical_scale", 1.0))
 
 
@@ -99,34 +98,31 @@ class PriorAnchor(Transform):
         c_\tau = \mu_\tau \;\; (\tau \in W), \qquad
         c_\tau = \varepsilon_\tau \text{ or } 0 \;\; (\tau \in C), \qquad a_0 = c + \Delta.
 
-    The first chunk of an episode has no mean, nor has the second half of a preview. A small box around
-    zero would confine these positions to a corner of the source the policy was trained on; around a
-    draw of that source it does not. The draw is made *here*, before the agent acts, and written next to
-    the observation: the agent sees which noise will be used, the decision process stays Markov (for WP-Past
-    if whole chunks are executed, see :func:`~warmprior.make_prior_space_actor`) and the decoder
-    deterministic. Where the policy starts on the way (:class:`~warmprior.StartPoint`), the mean is that of
-    the point where it starts.
+    The first chunk of an episode has no mean, and neither has the second half of a preview. A small box
+    around zero would confine these positions to the middle of the source that the policy was trained on; a
+    box around a draw of that source does not. This transform makes the draw before the agent acts, and writes
+    it next to the observation. So the agent sees the noise, the decision process stays Markov (for WP-Past if
+    whole chunks are executed, see :func:`~warmprior.make_prior_space_actor`) and the decoder deterministic.
+    For a policy with a :class:`~warmprior.StartPoint` the mean is that of the start point.
 
-    Append it after :class:`ActionHistory`, inside or outside of batched environments.
-
-    Rows that rest in a partial step keep their anchor.
+    Append it after :class:`ActionHistory`, inside or outside of batched environments. Resting rows keep their
+    anchor in a partial step.
 
     .. note::
-        ``env.set_seed`` seeds simulators. TorchRL seeds PyTorch's global generator with it in the workers of
-        a ``ParallelEnv`` (not with ``use_buffers=False``) and of a ``MultiCollector``, and nowhere else: in
-        your own process call ``torch.manual_seed``. Workers without a seed, or with one for all
-        (``static_seed=True``), draw alike: append the transform outside of them, where one draws for all.
+        ``env.set_seed`` seeds simulators. It seeds PyTorch's global generator only in the workers of a
+        ``ParallelEnv`` (not with ``use_buffers=False``) and of a ``MultiCollector``: in your own process call
+        ``torch.manual_seed``. Workers without a seed, or with the same one (``static_seed=True``), draw the
+        same noise: append the transform outside of them.
 
     Args:
-        actor: the policy. What its prior has learnt is copied, as it is now: the copy goes where the
-            environment goes, and the policy's own where the policy goes.
+        actor: the policy. A learned prior is copied as it is now, and the copy moves with the environment.
 
     Keyword Args:
-        cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise where there
-            is an anchor (:func:`~warmprior.rl.has_anchor`) and zero elsewhere, which gives vanilla DSRL:
+        cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise if the policy
+            has an anchor (:func:`~warmprior.rl.has_anchor`), and zero otherwise, which gives vanilla DSRL:
             :math:`a_0 = \Delta`.
-        generator: source of the noise, on the CPU: one seed gives one noise on every device. PyTorch's
-            global one by default. A copy of the environment, in a worker too, continues from its state.
+        generator: source of the noise, on the CPU, so that a seed gives the same noise on every device;
+            PyTorch's global one by default. Copies of the environment continue from its state.
         anchor_key: where the anchor is written, ``[*B, P, d_a]``.
 
     Raises:
@@ -161,7 +157,7 @@ class PriorAnchor(Transform):
         super().__init__(in_keys=list(actor.in_keys), out_keys=[anchor_key])
         if cold not in (None, "noise", "zero"):
             raise ValueError(f"cold must be 'noise' or 'zero', got {cold!r}")
-        # Copies: they become parts of this one, and whatever moved the environment would move the policy's.
+        # Copies, so that moving the environment does not move the policy's own.
         self.prior, self.start = (
             copy.deepcopy(part).cpu().requires_grad_(False) if isinstance(part, nn.Module) else part
             for part in (actor.prior, actor.start)

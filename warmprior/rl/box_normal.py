@@ -1,4 +1,4 @@
-"""The agent's distribution, with densities that do not depend on the size of its box."""
+"""The agent's distribution, with densities independent of the size of its box."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["BoxTanhNormal"]
 
 
 class BoxTanhNormal(TanhNormal):
-    r""":class:`~torchrl.modules.TanhNormal` whose log-probabilities count in units of its box.
+    r""":class:`~torchrl.modules.TanhNormal` with log-probabilities in units of its box.
 
     For :math:`\Delta \in [-\delta, \delta]^n` they are those of :math:`\Delta / \delta \in [-1, 1]^n`,
     larger by :math:`n \log \delta`. With it TorchRL's own losses measure entropy as DSRL and
@@ -21,7 +21,7 @@ class BoxTanhNormal(TanhNormal):
     Args:
         loc: as for the parent.
         scale: as for the parent.
-        kwargs: as for the parent, ``low`` and ``high`` among them.
+        kwargs (Any): as for the parent, ``low`` and ``high`` among them.
 
     Examples:
         >>> import torch

@@ -1,4 +1,4 @@
-"""What numbers and tensors have to be."""
+"""Checks of numbers and tensors."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def check_finite(
 
     Args:
         tensors: of any kind, by name.
-        cause: what to look at.
+        cause: what to check, for the message.
 
     Raises:
         FloatingPointError: naming the tensors.

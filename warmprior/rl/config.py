@@ -36,14 +36,14 @@ class PriorSpaceConfig:
         hidden_dim: width of actor and critics.
         num_layers: their number of hidden layers.
         backup: ``"min"`` or ``"mean"`` over critics, DSRL-NA only.
-        backup_entropy: whether the targets of DSRL-NA's critic hold the entropy term; TorchRL's SAC always
-            has it.
-        alpha_init: initial temperature, DSRL's 1. Where success ends the episode, below
-            ``reward_offset * H / (P * d_a * log 2)``: otherwise the entropy of further decisions is worth
-            more than success, until the temperature has fallen.
+        backup_entropy: whether the targets of DSRL-NA's critic include the entropy; those of TorchRL's SAC
+            always do.
+        alpha_init: initial temperature, DSRL's 1. If success ends the episode, take less than ``reward_offset
+            * H / (P * d_a * log 2)``: otherwise the entropy of further decisions is worth more than success
+            until the temperature has fallen.
         target_entropy: in units of the box.
         reward_offset: subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
-        bootstrap_timeouts: whether the value after a time-out counts; DSRL takes it for a termination.
+        bootstrap_timeouts: whether the value after a time-out counts; DSRL treats time-outs as terminations.
         evaluate_every: control steps between evaluations (and saves).
         evaluation_episodes: episodes per evaluation, greedy and stochastic each.
         seed: of everything random.

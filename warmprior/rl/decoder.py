@@ -22,7 +22,7 @@ __all__ = ["PriorDecoder"]
 class PriorDecoder(TensorDictModuleBase):
     r"""The frozen policy as a decoder: ``(observation, anchor, delta) -> (noise, chunk)``.
 
-    An agent acts in the policy's source space by a bounded residual around an anchor,
+    An agent acts in the policy's source space through a bounded residual around an anchor,
 
     .. math::
         a_0 = \mu + \Delta, \qquad \Delta \in [-\delta, \delta]^{P \times d_a},
@@ -32,13 +32,14 @@ class PriorDecoder(TensorDictModuleBase):
     `DSRL <https://arxiv.org/abs/2506.15799>`_.
 
     Place it behind the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
-    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` on a copy of the policy's network, in
-    evaluation mode, whose parameters have become buffers. They move and are saved with it, and are never in
-    ``parameters()`` of whatever contains it. ``children()`` is empty: PyTorch and TorchRL walk through
-    these to switch to training mode, apply a function or draw new weights.
+    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy's network, in
+    evaluation mode. The copy's parameters are buffers: they move and are saved with the decoder, and never
+    appear in ``parameters()``. ``children()`` is empty, so that PyTorch and TorchRL cannot switch the network
+    to training mode or reset its weights.
 
     Args:
-        actor: the policy; copied. Or what has its parts, such as :class:`~warmprior.lerobot.LeRobotActor`.
+        actor: the policy; copied. Or an object with the same parts, such as
+            :class:`~warmprior.lerobot.LeRobotActor`.
 
     Keyword Args:
         delta: half the side of the agent's box, in units of the normalised action space. The paper uses
@@ -47,7 +48,7 @@ class PriorDecoder(TensorDictModuleBase):
         differentiable: let gradients flow from the chunk to the residual. The network stays frozen.
         anchor_key: centre of the box, ``[*B, P, d_a]``.
         delta_key: the residual, ``[*B, P, d_a]``.
-        noise_key: where the source goes, ``[*B, P, d_a]``.
+        noise_key: where the source is written, ``[*B, P, d_a]``.
 
     Raises:
         ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0``
@@ -83,12 +84,11 @@ class PriorDecoder(TensorDictModuleBase):
         check_positive(delta=delta)
         if actor.ode.max_nfe == 1:
             raise ValueError(
-                "the policy is trained at t = 0 alone, and its field means nothing elsewhere: there is no "
-                "source space to act in"
+                "the policy is trained at t = 0 alone, so it has no flow from a source space to act in"
             )
         if actor.ode.guidance is not None:
             raise ValueError(
-                "an agent's residual alone decides what is decoded: take actor.replace(guidance=None)"
+                "the agent's residual alone must decide the chunk: take actor.replace(guidance=None)"
             )
         self.delta = float(delta)
         self.differentiable = differentiable
@@ -173,7 +173,7 @@ class PriorDecoder(TensorDictModuleBase):
             )
 
     def named_children(self) -> Iterator[tuple[str, nn.Module]]:
-        """None: what changes a policy from outside stops here."""
+        """None, so that nothing outside changes the policy."""
         return iter(())
 
     def train(self, mode: bool = True) -> PriorDecoder:
@@ -181,7 +181,7 @@ class PriorDecoder(TensorDictModuleBase):
         return super().train(False)
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> PriorDecoder:
-        # Moves to another device or type, which walk through the children as well.
+        # Moves to another device or dtype, which need the children.
         for part in self._modules.values() if recurse else ():
             if part is not None:
                 part._apply(fn)

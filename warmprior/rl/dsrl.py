@@ -36,10 +36,10 @@ type Critics = TensorDictModule | list[TensorDictModule]
 class DSRLNALoss(LossModule):
     r"""Noise-aliased DSRL (`Wagenmaker et al. 2025 <https://arxiv.org/abs/2506.15799>`_), around any anchor.
 
-    Many sources decode to the same chunk, so what a transition teaches is learned about the *chunk*: an
-    action critic :math:`Q^A(s, a)` by temporal differences on executed chunks. A noise critic
-    :math:`Q^W(s, \Delta)` is distilled from it through the frozen decoder :math:`D`, and the actor climbs
-    that one, without gradients through the decoder:
+    Many sources decode to the same chunk, so an action critic :math:`Q^A(s, a)` learns about the *chunk*, by
+    temporal differences on executed chunks. A noise critic :math:`Q^W(s, \Delta)` is distilled from it
+    through the frozen decoder :math:`D`, and the actor maximises the noise critic, without gradients through
+    the decoder:
 
     .. math::
         y &= r + \gamma^k (1 - d) \Big[\min_i \bar Q^A_i(s', D(s', \Delta'))
@@ -67,14 +67,13 @@ class DSRLNALoss(LossModule):
             if "loss_qvalue" in losses.keys():
                 updater.step()
 
-    One optimiser does for all: Adam passes over parameters without gradient.
+    One optimiser is enough: Adam skips parameters without gradient.
 
     Args:
         actor_network: the policy over residuals, see :func:`~warmprior.make_prior_space_actor`.
         qvalue_network: :math:`Q^A`, which reads ``decoder.chunk_key`` (all ``P`` actions, or its targets
-            would not be Markov for WP-Preview; for what else see
-            :func:`~warmprior.make_prior_space_critic`); one module, initialised ``num_qvalue_nets`` times
-            anew, or a list.
+            would not be Markov for WP-Preview; see :func:`~warmprior.make_prior_space_critic`); one module,
+            of which ``num_qvalue_nets`` copies are initialised, or a list.
         noise_qvalue_network: :math:`Q^W`, which reads ``decoder.delta_key``; the same.
         decoder: the frozen policy. Its buffers are in the loss's ``state_dict()`` and move with
             ``loss.to(device)``; ``parameters()`` and target updates never see it.
@@ -82,9 +81,9 @@ class DSRLNALoss(LossModule):
     Keyword Args:
         num_qvalue_nets: critics of each kind.
         backup: how critics are combined, in targets and in the actor's loss: ``"min"`` or ``"mean"``.
-        backup_entropy: whether targets hold the entropy term.
-        bootstrap_timeouts: whether the value after a time-out counts. The official implementation takes
-            time-outs for terminations.
+        backup_entropy: whether targets include the entropy.
+        bootstrap_timeouts: whether the value after a time-out counts. The official implementation treats
+            time-outs as terminations.
         discount: ``"step"`` discounts by :math:`\gamma^k` for ``k`` executed control steps, with the
             ``gamma`` given to :class:`~warmprior.ChunkStep`; ``"decision"`` by :math:`\gamma`
             whatever ``k``, as the official implementation does (with undiscounted rewards inside chunks).
@@ -102,9 +101,9 @@ class DSRLNALoss(LossModule):
         Keys (renameable by :meth:`set_keys`): ``chunk``, the decoded chunk of the transition (set it to
         ``("next", "decoded", "chunk")`` for data from :class:`~warmprior.PriorSpace`); under ``"next"``
         ``reward``, ``done``, ``terminated`` and ``executed``; ``priority``, where the TD error of each
-        row is written; ``priority_weight``; ``state_action_value``, the critics' output. Beyond them the
-        networks' and the decoder's ``in_keys``, at the root and under ``"next"``. The residual that led to
-        the chunk is not needed. ``loss.in_keys`` holds all that is read:
+        row is written; ``priority_weight``; ``state_action_value``, the critics' output. It also reads the
+        ``in_keys`` of the networks and the decoder, at the root and under ``"next"``, but not the residual
+        that led to the chunk. ``loss.in_keys`` lists everything:
         ``buffer.extend(data.reshape(-1).select(*loss.in_keys))``.
 
     Raises:
@@ -237,7 +236,7 @@ class DSRLNALoss(LossModule):
         self.in_keys = list(dict.fromkeys(unravel_key(key) for key in needed))
 
     def _states(self, *modules: TensorDictModuleBase) -> list[NestedKey]:
-        """What the modules read, actions apart."""
+        """What the modules read, without actions."""
         actions = {self.decoder.delta_key, self.decoder.chunk_key}
         needed = dict.fromkeys(unravel_key(key) for module in modules for key in module.in_keys)
         return [key for key in needed if key not in actions]
@@ -281,7 +280,7 @@ class DSRLNALoss(LossModule):
         return self.reinforcement_loss(tensordict).update(self.distillation_loss(tensordict))
 
     def schedule(self, updates: int) -> Iterator[Callable[[TensorDictBase], TensorDict]]:
-        """The official order: ``updates`` times the first three losses, then the distillation.
+        """The official order: the first three losses ``updates`` times, then the distillation.
 
         Args:
             updates: the official ``utd``: updates per vector step, 20 for four environments.
@@ -338,7 +337,8 @@ class DSRLNALoss(LossModule):
         return 0.5 * error.square().sum(0), error.detach().abs().amax(0)
 
     def distillation_loss(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss of the noise critic: head by head, the action critic's values of decoded residuals.
+        """The loss of the noise critic, head by head, against the action critic's values of decoded
+        residuals.
 
         Args:
             tensordict: any states ``[N]``; actions, rewards and next states are not read.
@@ -413,7 +413,7 @@ def _check_networks(
     noise_critic: Any,
     decoder: PriorDecoder,
 ) -> None:
-    """Whether the networks read and write what the decoder does.
+    """Check that the networks read and write the decoder's keys.
 
     Raises:
         TypeError: if the actor gives no distribution.
@@ -432,8 +432,8 @@ def _check_networks(
     high = getattr(box, "high", None)
     if high is not None and not torch.allclose(high, torch.full_like(high, decoder.delta)):
         raise ValueError(
-            f"the actor's residuals lie in a box of half side {float(high.max())}, the decoder's in one of "
-            f"{decoder.delta}: build the actor with delta=decoder.delta"
+            f"the actor's box has the half side {float(high.max())}, and the decoder's {decoder.delta}: "
+            "build the actor with delta=decoder.delta"
         )
     for name, critic, key in (
         ("qvalue_network", chunk_critic, decoder.chunk_key),

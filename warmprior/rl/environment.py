@@ -19,9 +19,9 @@ __all__ = ["PriorSpace"]
 class PriorSpace(Transform):
     r"""Makes the residual the environment's action: :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`.
 
-    The other wiring of :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
-    environment with a bounded action. The chunk is decoded on the way in and the transitions are those
-    of ``TensorDictSequential(agent, decoder)``, except for where the source and the chunk are found:
+    The other way to use :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
+    environment with a bounded action. The transitions are those of ``TensorDictSequential(agent, decoder)``,
+    with the source and the chunk under other keys:
 
     ========================================  =====================================================
     ``TensorDictSequential(agent, decoder)``  ``PriorSpace(decoder)``
@@ -30,11 +30,11 @@ class PriorSpace(Transform):
     ``("vla_action", "chunk")``               ``("next", "decoded", "chunk")``
     ========================================  =====================================================
 
-    (TorchRL keeps nothing that an inverse transform writes, so they leave with the next state. Under their
-    usual names the data would hold, at the root, those of the step before.)
+    (TorchRL drops what an inverse transform writes, so they are part of the next state. Under their usual
+    names they would be mistaken for those of the next step.)
 
-    Append it last, after :class:`~warmprior.PriorAnchor`, and outside of batched environments: inside, every
-    worker holds a copy of the network.
+    Append it last, after :class:`~warmprior.PriorAnchor`, and outside batched environments: inside, every
+    worker would hold a copy of the network.
 
     Args:
         decoder: the frozen policy.

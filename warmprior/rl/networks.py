@@ -1,4 +1,4 @@
-"""Networks of an agent that acts in source space: its actor and its critics."""
+"""Actor and critics of an agent that acts in source space."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LOG_STD_RANGE = (-20.0, 2.0)
 
 
 class _Trunk(nn.Module):
-    """Linear, LayerNorm and Tanh ``num_layers`` times, then linear; on flattened, concatenated inputs.
+    """``num_layers`` times Linear, LayerNorm and Tanh, then linear, on flattened and concatenated inputs.
 
     The first input is an observation ``[*B, To, d_o]``, the others are ``[*B, P, d_a]``.
     """
@@ -110,13 +110,12 @@ def make_prior_space_actor(
         delta: half the side of the box; :attr:`PriorDecoder.delta`.
         hidden_dim: width of the layers.
         num_layers: number of layers.
-        in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``. Leave the anchor
-            out where it is always zero. Add ``keys.ACTIONS`` where the anchor does not tell what the decoder
-            or the next mean depends on: for a network that sees the last actions, and for WP-Past with
-            ``execute < H``.
+        in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``. Leave the anchor out if
+            it is always zero. Add ``keys.ACTIONS`` if the decoder or the next mean depends on more than the
+            anchor: for a network that sees the last actions, and for WP-Past with ``execute < H``.
         delta_key: where the residual is written; its log-probability is summed over the chunk.
         distribution_class: :class:`~warmprior.BoxTanhNormal` for entropies in units of the box in TorchRL's
-            own losses; :class:`~warmprior.DSRLNALoss` gives the same for both.
+            own losses; :class:`~warmprior.DSRLNALoss` takes either.
 
     Raises:
         ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
@@ -169,10 +168,10 @@ def make_prior_space_critic(
 ) -> ValueOperator:
     """A critic of residuals or of chunks, with the trunk of :func:`make_prior_space_actor`.
 
-    The default judges residuals: a stock loss's critic, and the noise critic of
-    :class:`~warmprior.DSRLNALoss`. ``in_keys=(keys.OBSERVATION, keys.CHUNK)`` is the latter's action critic.
-    It judges all ``P`` actions of a chunk, which determine the next mean for WP-Preview, and for WP-Past if
-    whole chunks are executed. If not (``execute < H``), earlier actions are part of the next mean: give
+    The default judges residuals, for TorchRL's losses and as the noise critic of
+    :class:`~warmprior.DSRLNALoss`. ``in_keys=(keys.OBSERVATION, keys.CHUNK)`` makes the latter's action
+    critic. It judges all ``P`` actions of a chunk, which determine the next mean for WP-Preview, and for
+    WP-Past if whole chunks are executed. With ``execute < H`` earlier actions are part of the next mean: give
     actor and critics ``keys.ACTIONS`` as well.
 
     Args:
@@ -210,5 +209,5 @@ def make_prior_space_critic(
         num_layers,
         {unravel_key(delta_key): 1.0 / delta},
     )
-    # TorchRL would call it "state_value" for any action that is not named "action".
+    # TorchRL would call it "state_value", because the action is not named "action".
     return ValueOperator(trunk, in_keys=list(in_keys), out_keys=["state_action_value"])

@@ -26,14 +26,14 @@ EPISODES_APART = 10_000
 
 
 class WarmUpSwitch(TensorDictModuleBase):
-    """One of two policies, as a buffer among the weights says: whoever receives these does the same.
+    """Switches between two policies by a buffer, which collectors receive with the weights.
 
     Args:
         warmup: acts until ``learning`` is set.
         policy: acts then.
 
     Attributes:
-        learning: bool ``[]``.
+        learning (Tensor): bool ``[]``.
 
     See Also:
         - :func:`~warmprior.rl.ray_collection.ray_rounds`: collects with it.
@@ -67,7 +67,7 @@ class WarmUpSwitch(TensorDictModuleBase):
 
 
 def _actor_class() -> type:
-    """What an actor is: TorchRL's collector, in which Ray finds its way."""
+    """The class of an actor: TorchRL's collector, adapted to Ray."""
     from torchrl.collectors import Collector
 
     class Actor(Collector):
@@ -76,14 +76,14 @@ def _actor_class() -> type:
 
         def __bool__(
             self,
-        ) -> bool:  # its length is infinite: Ray asks, and would lose an error on that
+        ) -> bool:  # Ray asks for it, and the infinite length would raise
             return True
 
     return Actor
 
 
 def _make_env(make_env: Callable[[int], EnvBase], seed: int, path: list[str]) -> EnvBase:
-    """In an actor: its environment, and its draws, from a seed."""
+    """Runs in an actor: makes its environment and seeds its draws."""
     stop_forking()
     sys.path.extend(place for place in path if place not in sys.path)
     torch.set_num_threads(1)
@@ -101,20 +101,20 @@ def ray_rounds(
     seed: int,
     address: str | None = None,
 ) -> Iterator[Iterator[TensorDictBase]]:
-    """Rounds of decisions, one of each environment of each of several actors, on a CPU each.
+    """Rounds of decisions: one by each environment of several Ray actors, each on its own CPU.
 
-    Before every round all actors receive the weights that ``policy`` has then, and all wait for the
-    slowest. Actor ``i`` draws from ``seed + 10_000 * i``: the same arguments give the same decisions, on
-    however many machines, but others than :class:`~warmprior.rl.PriorSpaceTraining` collects by itself.
+    Before every round all actors receive the current weights of ``policy``, and wait for the slowest. Actor
+    ``i`` draws from ``seed + 10_000 * i``, so the same arguments give the same decisions on any number of
+    machines. Local collection by :class:`~warmprior.rl.PriorSpaceTraining` gives others.
 
     Args:
-        policy: what acts; a copy on the CPU does.
+        policy: what acts, as a copy on the CPU.
         make_env: ``make_env(seed) -> EnvBase``, ``[num_envs]``.
 
     Keyword Args:
         collectors: how many actors.
         num_envs: environments of each.
-        seed: of all that is drawn.
+        seed: of all draws.
         address: of the cluster, see :func:`~warmprior.io.ray_cluster.check_ray`.
 
     Yields:

@@ -1,4 +1,4 @@
-"""Transitions on disk, appended and never rewritten: a replay buffer that survives the process."""
+"""A replay buffer on disk that survives the process: transitions are appended and never rewritten."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ __all__ = ["ReplaySegments"]
 class ReplaySegments:
     """A folder of safetensors files, one per save, with the transitions since the one before.
 
-    What is saved counts only once :meth:`committed` names it: a process that dies between writing a
-    segment and its training state leaves a segment that the next one replaces.
+    A segment is valid once :attr:`committed` counts it. If a process dies between writing a segment and its
+    training state, the next one replaces that segment.
 
     Args:
         directory: the folder; created with the first segment.

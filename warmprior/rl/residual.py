@@ -19,11 +19,10 @@ ResidualDistribution = Literal["normal", "clipped", "truncated", "uniform"]
 
 
 class ResidualSampler(TensorDictModuleBase):
-    r"""Draws residuals without an agent: to fill the buffer at first, and to distil the noise critic.
+    r"""Draws residuals without an agent, for the warm-up and for distilling the noise critic.
 
-    With :math:`\sigma` the typical deviation of the source from where the agent searches (the prior's
-    ``sigma`` around its mean, the share of noise where the policy starts on the way, and 1 around zero) and
-    :math:`\delta` the decoder's:
+    :math:`\sigma` is the typical deviation of the source from the centre of the search: the prior's ``sigma``
+    around its mean, the start point's share of noise, or 1 around zero. :math:`\delta` is the decoder's.
 
     ===============  =============================================================================
     distribution     residual
@@ -43,7 +42,7 @@ class ResidualSampler(TensorDictModuleBase):
     Keyword Args:
         distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
             noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
-        sigma: that by default.
+        sigma: as above by default.
         generator: source of randomness on the data's device; PyTorch's global one by default.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Off-policy reinforcement learning in the source space of a frozen policy, resumable at any moment."""
+"""Resumable off-policy reinforcement learning in the source space of a frozen policy."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ __all__ = ["PriorSpaceTraining"]
 class PriorSpaceTraining:
     """Trains an agent around a frozen policy, with TorchRL's environments, losses and replay buffer.
 
-    The folder receives ``state.safetensors`` (replaced atomically at every evaluation) and the replay
-    buffer in segments. Constructing the same training on it continues from the last save; simulators
-    cannot be saved, so that the episodes under way at an interruption are lost and new ones started.
+    The folder receives ``state.safetensors`` (replaced atomically at every evaluation) and the replay buffer
+    in segments. Constructing the same training on it continues from the last save. Simulators cannot be
+    saved, so episodes under way at an interruption are lost.
 
     Args:
-        actor: the frozen policy; not changed, but for its evaluation mode.
+        actor: the frozen policy; put into evaluation mode.
         make_env: ``make_env(seed) -> EnvBase``, a batched environment ``[n]`` with the policy's
             transforms and :class:`~warmprior.PriorAnchor`; called for training and evaluation.
         config: the recipe.
@@ -49,16 +49,16 @@ class PriorSpaceTraining:
     Keyword Args:
         evaluation_seed: simulator seed of the first evaluation episode.
         description: of the progress bar; no bar if ``None``.
-        collectors: how many actors of a Ray cluster collect, with environments of ``make_env`` each, see
-            :func:`~warmprior.rl.ray_collection.ray_rounds`; by default this process does. With another
-            number the agent meets other episodes.
+        collectors: how many actors of a Ray cluster collect, each with its own environments, see
+            :func:`~warmprior.rl.ray_collection.ray_rounds`; by default this process collects. Another number
+            means other episodes.
         ray_address: of the cluster.
 
     Attributes:
-        agent: what learns; its ``policy`` is the agent followed by the decoder.
-        decoder: the frozen policy as a decoder.
-        steps: control steps so far, those of the warm-up included.
-        curve: the evaluations so far, see :meth:`run`.
+        agent (PriorSpaceAgent): what learns; its ``policy`` is the agent followed by the decoder.
+        decoder (PriorDecoder): the frozen policy as a decoder.
+        steps (int): control steps so far, those of the warm-up included.
+        curve (list[dict[str, Any]]): the evaluations so far, see :meth:`run`.
 
     Raises:
         ValueError: if the recipe does not suit the policy, or the folder's state belongs to another
@@ -141,8 +141,8 @@ class PriorSpaceTraining:
             KeyError: if the environment has no anchor.
             ValueError: if the environment does not fit the policy, see :meth:`PriorDecoder.check_env`, or
                 executes less than ``H`` actions of a chunk.
-            FloatingPointError: if a loss, a parameter or what the environment gives becomes NaN or
-                infinite; the last save stays.
+            FloatingPointError: if a loss, a parameter or a value of the environment becomes NaN or infinite;
+                the last save stays.
             WorkerError: if a worker process of an environment, or a collector, dies, a ``RuntimeError``.
         """
         config = self.config
@@ -168,7 +168,7 @@ class PriorSpaceTraining:
                     bar.set_postfix(found | self._last_success(), refresh=False)
                 due = self.steps // config.evaluate_every > before // config.evaluate_every
                 if due or self.steps >= config.environment_steps:
-                    self.agent.state()  # Raises for an agent that is not worth an evaluation.
+                    self.agent.state()  # Raises if the agent's state is not finite.
                     policy = self.agent.policy
                     self._evaluate(evaluation_env, {"greedy": policy, "stochastic": policy})
                     self._save()
@@ -176,7 +176,7 @@ class PriorSpaceTraining:
 
     @contextmanager
     def _environment(self, seed: int) -> Iterator[EnvBase]:
-        """Closed in the end, and the death of a worker is an error."""
+        """An environment that is closed at the end; a dead worker raises."""
         env = self.make_env(seed)
         with watched(env):
             yield env
@@ -184,7 +184,7 @@ class PriorSpaceTraining:
 
     @contextmanager
     def _rounds(self, num_envs: int) -> Iterator[Iterator[int]]:
-        """Decisions of all environments, kept for learning, and how many control steps each round took."""
+        """Collect decisions of all environments; yields the control steps of each round."""
         if self.collectors is None:
             with self._environment(self._seed()) as env:
                 yield self._collected(env)
@@ -229,7 +229,7 @@ class PriorSpaceTraining:
         return {row["evaluation"]: row["success_rate"] for row in self.curve}
 
     def _seed(self) -> int:
-        # Away from evaluation and demonstrations; a continued training plays new episodes.
+        # Apart from the seeds of evaluation and demonstrations; a resumed training plays new episodes.
         if self.steps:
             return 1_000_000_000 + 10_000_000 * (self.config.seed % 100) + self.steps % 10_000_000
         return 6_000_000 + 100_000 * (self.config.seed % 10)
@@ -245,9 +245,9 @@ class PriorSpaceTraining:
         return following, self._keep(data)
 
     def _keep(self, data: TensorDictBase) -> int:
-        """Add decisions to what is learnt from; the number of their control steps."""
+        """Add decisions to the replay buffer; returns the number of their control steps."""
         transitions = self._transitions(data)
-        # Before they are saved: they would end every later training on them.
+        # Checked before saving: they would end every later training.
         self._check_finite(transitions)
         self._check_executed(transitions["next"])
         self.buffer.extend(transitions)
@@ -272,7 +272,7 @@ class PriorSpaceTraining:
 
     @property
     def _keys(self) -> list[NestedKey]:
-        """What is kept of a transition."""
+        """The stored keys of a transition."""
         states = [self.decoder.observation_key, keys.ANCHOR, *self.decoder.in_keys]
         states = [key for key in dict.fromkeys(states) if key != keys.DELTA]
         after = [*states, "reward", "done", "terminated", keys.EXECUTED]

@@ -26,16 +26,17 @@ _REACH = 2.0  # metres, in the specification of actions: it only says what is wo
 class AbsoluteActions(Transform):
     r"""Turns the pose that an action asks for into the delta from where the gripper is now.
 
-    An action is per arm a position in metres in the world, the first two rows of a rotation matrix and the
+    Per arm an action holds a position in metres in the world, the first two rows of a rotation matrix and the
     gripper, as :func:`~warmprior.envs.absolute_actions` computes them from demonstrations. The environment
     below gets
 
     .. math:: \mathrm{clip}\bigl((p^* - p) / s_p\bigr), \quad
               \mathrm{clip}\bigl(\log(R^* R^\top) / s_R\bigr)
 
-    and the gripper, with the gripper's pose :math:`(p, R)` before the step and clipped to the :math:`[-1, 1]`
-    that its controller takes: a pose farther away than one control step reaches is approached at full speed.
-    The six numbers of the rotation may be any that are not parallel; they are orthonormalised.
+    and the gripper, where :math:`(p, R)` is the gripper's pose before the step. The result is clipped to the
+    :math:`[-1, 1]` that the controller takes, so a pose beyond the reach of one control step is approached at
+    full speed.
+    Any two rows that are not parallel will do; they are orthonormalised.
 
     It acts on every control step: place it before :class:`ChunkStep` and next to the environment, so that
     actions are denormalised before they get here (:func:`policy_transforms` does so).
@@ -94,15 +95,14 @@ class AbsoluteActions(Transform):
 
     @property
     def one_step(self) -> Tensor:
-        """How far one control step can move each number of an action, ``[10 * arms]``; 0 for the gripper.
-
-        In these units (see :meth:`Normalizer.fit`) poses and deltas compare.
+        """How far one control step can move each number of an action, ``[10 * arms]``; 0 for the gripper. In
+        these units (see :meth:`Normalizer.fit`) poses and deltas are comparable.
         """
         position, turn = self.scale[:3], self.scale[3:].amin()
         return torch.cat((position, turn.expand(6), turn.new_zeros(1))).repeat(self.arms)
 
     def delta(self, action: Tensor, pose: Tensor) -> Tensor:
-        """The delta that leads from a pose to the one that is asked for, as far as one step goes.
+        """The delta towards the pose that an action asks for, as far as one step goes.
 
         Args:
             action: ``[*B, 10 * arms]``.
@@ -148,7 +148,7 @@ class AbsoluteActions(Transform):
         leaf = actions[self.action_key]
         if leaf.shape[-1] != self.arms * _DELTA:
             raise ValueError(
-                f"AbsoluteActions of {self.arms} arm(s) is for actions of width {self.arms * _DELTA}, the "
+                f"AbsoluteActions of {self.arms} arm(s) needs actions of width {self.arms * _DELTA}, but the "
                 f"environment's have {leaf.shape[-1]}"
             )
         limit = torch.tensor(([_REACH] * 3 + [1.0] * 7) * self.arms, device=leaf.device)
@@ -158,7 +158,7 @@ class AbsoluteActions(Transform):
 
 
 def _rotvec(turn: Tensor) -> Tensor:
-    """As :func:`matrix_to_rotvec`, at a third of its time: this runs at every control step.
+    """Like :func:`matrix_to_rotvec`, three times as fast: this runs at every control step.
 
     Args:
         turn: ``[..., 3, 3]``.

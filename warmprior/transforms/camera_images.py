@@ -18,13 +18,12 @@ __all__ = ["CameraImages"]
 
 
 class CameraImages(Transform):
-    """Makes of an observation vector one with images: the vector, and an image per camera.
+    """Adds an image per camera to an observation vector.
 
-    The images are rendered from the state that the environment tells
-    (``RobosuiteEnv(..., sim_state=True)``), which takes several times as long as the control step itself.
-    That is why a transform does it: inside of a chunk of actions it runs for the last observations alone,
-    those that the next decision reads. Place it first, next to the simulator, and inside of the workers of
-    batched environments (:func:`policy_transforms` places it).
+    The images are rendered from the environment's state (``RobosuiteEnv(..., sim_state=True)``). That takes
+    several times as long as a control step, so only the observations that the next decision reads are
+    rendered. Place it first, next to the simulator, and inside the workers of batched environments;
+    :func:`policy_transforms` does so.
 
     Args:
         cameras: names of the simulator's cameras; the image of ``"agentview"`` becomes
@@ -33,7 +32,7 @@ class CameraImages(Transform):
 
     Raises:
         ValueError: if there are no cameras, one is named twice or (in an environment) does not exist.
-        KeyError: if the environment does not tell its state.
+        KeyError: if the environment does not write its state.
         RuntimeError: if it is no simulator, or nothing here can render.
 
     Examples:

@@ -22,25 +22,25 @@ __all__ = ["ChunkStep"]
 class ChunkStep(Transform):
     r"""Turns an environment of single actions into one of action chunks (a semi-MDP).
 
-    One outer step executes the first ``execute`` actions of a chunk ``[*B, P, d_a]``, stopping each
-    sub-environment at its own episode end. The reward is the discounted sum
-    :math:`\sum_{i<k} \gamma^i r_i` over the ``k`` executed steps, ``k`` itself is written to
-    ``("next", "executed_steps")``, a success at any of them is one of the chunk (see ``event_keys``), and
-    everything else is that of the last executed step. Unlike
-    :class:`~torchrl.envs.transforms.MultiAction` it keeps the last reward of an episode that ends
-    inside a chunk and has fixed shapes, so that it works inside and outside batched environments.
+    One outer step executes the first ``execute`` actions of a chunk ``[*B, P, d_a]``, and stops each
+    sub-environment at the end of its own episode. The reward is the discounted sum :math:`\sum_{i<k} \gamma^i
+    r_i` over the ``k`` executed steps. ``k`` itself is written to ``("next", "executed_steps")``. A success
+    at any step is a success of the chunk (see ``event_keys``), and everything else is taken from the last
+    executed step. Unlike
+    :class:`~torchrl.envs.transforms.MultiAction` it keeps the last reward of an episode that ends inside a
+    chunk, and its shapes are fixed, so it works inside and outside batched environments.
 
     Per-step transforms (``StepCounter``, ``RewardSum``, ``ActionScaling``, ``CatFrames``,
-    ``VideoRecorder``) go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after. The
-    former run themselves at every control step; where all of them are of those that remember nothing
-    (``ObservationNorm``, ``ActionScaling``, :class:`ObservationStack`), only at those that a chunk's last
-    observation depends on. In a partial step, rows that rest keep all observations.
+    ``VideoRecorder``) go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after.
+    Per-step transforms run at every control step. If none of them remembers anything (``ObservationNorm``,
+    ``ActionScaling``, :class:`ObservationStack`), they run only at the steps that a chunk's last observation
+    depends on. In a partial step, resting rows keep all observations.
 
     .. note::
-        TorchRL's transforms with memory, such as ``CatFrames`` or ``VecNormV2``, update it in all rows of a
-        batched environment around which they are placed, also in those that a partial step leaves out.
-        Place them inside the workers where rows rest for longer than to their reset;
-        :class:`ObservationStack` has no such memory.
+        Around a batched environment, TorchRL's transforms with memory, such as ``CatFrames`` or
+        ``VecNormV2``, update it in all rows, also in those that a partial step leaves out. If rows rest for
+        longer than until their reset, place such transforms inside the workers. :class:`ObservationStack` has
+        no such memory.
 
     Args:
         chunk_length: ``H``.
@@ -53,8 +53,8 @@ class ChunkStep(Transform):
         action_key: the single action that the wrapped environment takes.
         chunk_key: the chunk, ``[*B, P, d_a]``.
         executed_key: where ``k`` is written, int64 ``[*B, 1]``.
-        event_keys: flags, bool, that hold after a chunk if they held after any of its executed steps;
-            those that the environment does not write are passed over.
+        event_keys: bool flags that hold after a chunk if they held after any of its executed steps; flags
+            that the environment does not write are ignored.
         measures: further keys whose values after a chunk are the ``"max"``, ``"sum"`` or ``"last"`` of those
             after its executed steps.
 

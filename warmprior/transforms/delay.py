@@ -19,12 +19,12 @@ __all__ = ["InferenceDelay", "check_delay", "executed_chunk"]
 
 
 def check_delay(delay: int, execute: int, length: int | None = None) -> None:
-    """Whether chunks can take effect so late.
+    """Check that chunks can take effect so late.
 
     Args:
         delay: ``d``, control steps until a chunk takes effect.
         execute: actions executed per decision.
-        length: ``P``, how many a chunk has, if it is known.
+        length: ``P``, if it is known.
 
     Raises:
         ValueError: if ``delay`` is no whole number, not ``0 <= delay <= execute``, or ``execute + delay``
@@ -34,28 +34,27 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
         raise ValueError(f"a delay is a whole number of control steps, at least 0, got {delay!r}")
     if length is not None and 2 * delay > length:
         raise ValueError(
-            f"a delay of {delay} control steps is too long for predictions of {length} actions, of which "
-            f"as many are executed, and as many more until the next ones take effect: at most {length // 2}. "
-            "Predict longer chunks, or make the policy faster"
+            f"a delay of {delay} control steps is too long for predictions of {length} actions: at most "
+            f"{length // 2}. Predict longer chunks, or make the policy faster"
         )
     if delay > execute:
         raise ValueError(
-            f"a delay of {delay} control steps does not go with {execute} actions per decision: need "
-            "0 <= delay <= execute, or the next decision is due before the last one took effect"
+            f"a delay of {delay} control steps does not fit {execute} actions per decision: need 0 <= delay "
+            "<= execute, or the next decision is due before the last one takes effect"
         )
     if length is not None and execute + delay > length:
         raise ValueError(
-            f"predictions of {length} actions do not reach {execute} executed ones and a delay of {delay} "
-            f"more: execute at most {length - delay} per decision, or predict longer chunks"
+            f"predictions of {length} actions do not reach {execute} executed ones and a delay of {delay}: "
+            f"execute at most {length - delay} per decision, or predict longer chunks"
         )
 
 
 def executed_chunk(tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK) -> Tensor:
-    """The chunks of decisions as they are executed: of late ones, first the rest of the one before.
+    """The chunks of decisions as they are executed: a late chunk begins with the rest of the one before.
 
     Args:
         tensordict: ``[*B]`` decisions, such as those of a rollout.
-        chunk_key: the prediction, ``[*B, P, d_a]``; without a delay beside it, it is executed as it is.
+        chunk_key: the prediction, ``[*B, P, d_a]``; executed as it is if no delay is recorded.
 
     See Also:
         - :class:`~warmprior.InferenceDelay`: lets chunks take effect late.
@@ -75,22 +74,21 @@ def executed_chunk(tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK
 
 
 class InferenceDelay(Transform):
-    r"""Lets every chunk take effect ``delay`` control steps after the observation that it answers.
+    r"""Makes every chunk take effect ``delay`` control steps after the observation that it answers.
 
-    Simulators wait for policies and robots do not. Here the robot goes on meanwhile: of the ``execute``
-    actions of a decision the first ``delay`` ones are those that the chunk before holds for these control
-    steps, and the new chunk's positions from ``delay`` on follow. At the first decision of an episode there
-    is no chunk to go on with, and the robot waits. With ``delay=0`` it only tells what is left of the chunk.
+    Simulators wait for policies, and robots do not. Here the robot goes on meanwhile: the first ``delay`` of
+    the ``execute`` actions come from the chunk before, and the rest from the new chunk, from position
+    ``delay`` on. At the first decision of an episode the robot waits. With ``delay=0`` the transform only
+    writes the delay.
 
-    It is a function of the step's own tensordict, without state, as :class:`ActionHistory` is. Append it
-    after that one, which then remembers what was executed, and forecasts from it: WP-Past's mean is
-    the last ``H`` executed actions, WP-Preview's the forecast of the same control steps. The policy decides
-    every ``execute`` steps, so that predictions have to reach ``execute + delay`` steps: with ``H = P``
-    (Gaussian source, WP-Past) fewer actions are executed per decision.
+    Like :class:`ActionHistory` it has no state. Append it after that transform, which then remembers what was
+    executed: WP-Past's mean is the last ``H`` executed actions, WP-Preview's the forecast for the same
+    control steps. The policy decides every ``execute`` steps, so predictions have to reach ``execute +
+    delay`` steps: with ``H = P`` (Gaussian source, WP-Past) fewer actions are executed per decision.
 
     It writes ``("rtc", "delay")``, int64 ``[*B, 1]``: ``delay``, and 0 at the first decision of an episode.
-    :class:`~warmprior.RealTimeChunking` reads it, and what is left of the chunk before from the history;
-    :func:`executed_chunk` tells of a rollout what was executed.
+    :class:`~warmprior.RealTimeChunking` reads it, and takes the rest of the chunk before from the history.
+    :func:`executed_chunk` gives the executed chunks of a rollout.
 
     Args:
         delay: ``d``, control steps until a chunk takes effect.

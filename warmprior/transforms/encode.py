@@ -1,4 +1,4 @@
-"""What a frozen policy's encoder makes of observations, in place of images."""
+"""Features of a frozen policy's encoder in place of images."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ __all__ = ["EncodeObservation"]
 
 
 class EncodeObservation(Transform):
-    """Writes the features that a frozen policy sees in an observation with images.
+    """Writes the features that a frozen policy's encoder extracts from images.
 
-    Agents in the policy's source space, and their critics, read these: the encoder runs once per decision,
-    and replay buffers hold vectors. The policy behind the agent reads them as well,
-    ``actor.replace(observation_key=keys.FEATURES)``: its network takes features in place of the observation.
-    Append it after :func:`policy_transforms`, and outside of batched environments: inside, every worker
-    holds a copy of the encoder.
+    Agents in the policy's source space and their critics read the features, so the encoder runs once per
+    decision and replay buffers hold vectors. The policy behind the agent reads them too:
+    ``actor.replace(observation_key=keys.FEATURES)``. Append it after :func:`policy_transforms`, and outside
+    batched environments: inside, every worker would hold a copy of the encoder.
 
     Args:
         actor: the policy; its network is copied and stays as it is.

@@ -1,4 +1,4 @@
-"""The environment's side of the history, and what is withheld of it in training."""
+"""The environment's side of the history, and histories withheld in training."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ HISTORY_KEYS: list[NestedKey] = [(keys.HISTORY, name) for name in ENTRIES]
 class ActionHistory(Transform):
     """Writes the history for the next decision after each step, and a cold one at resets.
 
-    A function of the step's own tensordict, without state: it gives the same in ``env.rollout``,
-    collectors and batched environments, inside or outside of workers, with any policy, and per
-    sub-environment when some of them reset. :mod:`warmprior.history` has the layout.
+    It has no state, so it does the same in ``env.rollout``, collectors and batched environments, inside and
+    outside of workers, and per sub-environment when some of them reset. :mod:`warmprior.history` has the
+    layout.
 
     Args:
         history_length: how many executed actions are remembered, usually ``H``.
@@ -121,7 +121,7 @@ class ActionHistory(Transform):
 
 
 class WithheldHistory(Transform):
-    """Makes the history of a share of training windows cold, so that the network also learns the cold start.
+    """Withholds the history of some training windows, so that the network also learns the cold start.
 
     Append it to a replay buffer, like any other augmentation. The paper's Algorithm 1 withholds nothing.
 

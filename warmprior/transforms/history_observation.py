@@ -1,4 +1,4 @@
-"""The last actions as a part of the observation, for networks that are conditioned on them."""
+"""The last actions as part of the observation, for networks conditioned on them."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ __all__ = ["HistoryObservation"]
 
 
 class HistoryObservation(Transform):
-    """Writes the observation extended by the last ``H`` actions, in environments and replay buffers alike.
+    """Appends the last ``H`` actions to the observation, in environments and replay buffers alike.
 
-    The actions (zero until there are ``H`` of them) are flattened, followed by 1 if there are ``H`` and else
-    0, and repeated over the observation steps. Build the network with ``observation_dim = d_o +
+    The actions are flattened (zero until there are ``H`` of them), followed by 1 if there are ``H`` and 0
+    otherwise, and repeated over the observation steps. Build the network with ``observation_dim = d_o +
     HistoryObservation.width(H, d_a)`` and the policy with ``observation_key=keys.CONDITIONED``. In an
     environment it comes after :class:`~warmprior.ActionHistory`.
 
@@ -54,7 +54,7 @@ class HistoryObservation(Transform):
 
     @staticmethod
     def width(history_length: int, action_dim: int) -> int:
-        """By how much the observation becomes wider: ``H * d_a + 1``."""
+        """How much wider the observation becomes: ``H * d_a + 1``."""
         return history_length * action_dim + 1
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -20,8 +20,8 @@ KEPT = "_kept"
 class InnerStep:
     """Steps the environment that a transform sees below itself.
 
-    ``Transform.parent`` is that environment too, but around *copies* of the transforms: what they count,
-    record or estimate would be lost to the container's own. This one runs the container's own.
+    ``Transform.parent`` is that environment too, but around *copies* of the transforms: what the copies
+    count, record or estimate would be lost. This one runs the container's own transforms.
 
     Args:
         transform: one of an environment's transforms.
@@ -58,8 +58,8 @@ class InnerStep:
         Args:
             tensordict: the step's input, ``[*B]``. Entries are added at its root; nested ones stay as they
                 are.
-            rows: which environments are stepped, bool ``[*B]``; all of them by default. What is returned
-                for the others means nothing.
+            rows: which environments are stepped, bool ``[*B]``; all by default. The result is undefined for
+                the others.
         """
         for branch in self._branches:
             if branch in tensordict:
@@ -75,7 +75,7 @@ class InnerStep:
         return result
 
     def bare(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """What a step of the environment itself leads to, with all its flags.
+        """The result of a step of the environment itself, with all its flags.
 
         Args:
             tensordict: the step's input, ``[*B]``, as the environment takes it.
@@ -117,7 +117,7 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
 def keep_resting(
     tensordict: TensorDictBase, next_tensordict: TensorDictBase, names: Iterable[NestedKey]
 ) -> TensorDictBase:
-    """Put back, after a partial step, what the rows had that were not asked to step.
+    """After a partial step, restore the rows that were not stepped.
 
     Args:
         tensordict: the step's input, ``[*B]``.

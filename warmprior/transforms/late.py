@@ -1,4 +1,4 @@
-"""Transforms that can wait to the end of a chunk, because only its last control steps decide."""
+"""Transforms that can wait until the end of a chunk, because only its last control steps matter."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ _REACH: dict[type[Transform], Callable[[Any], int]] = {
     ObservationNorm: lambda transform: 1,
     ObservationStack: lambda transform: transform.steps,
 }
-"""Transforms without memory, by type: on how many of the last observations what they give depends."""
+"""Transforms without memory, by type: how many of the last observations their output depends on."""
 
 
 class LateTransforms:
     """Runs control steps first, and their transforms afterwards, for the steps that count.
 
-    A decision of ``k`` control steps is read once, at its end. What transforms such as
-    :class:`ObservationStack` make of all but its last few observations is thrown away, and beside a
-    fast simulator that takes longer than anything else here. The result is that of transforming every
-    step, bit by bit.
+    A decision of ``k`` control steps is read once, at its end. Transforms such as :class:`ObservationStack`
+    would transform all of its observations only to discard most of them, which costs more than anything else
+    here beside a fast simulator. The result equals that of transforming every step, bit by bit.
 
     An environment without batch dimensions may offer ``control_steps(actions, keep)``, as
-    :class:`~warmprior.envs.RobosuiteWrapper` does, which takes all steps in one go. It is used where actions
-    can be inverted at once, and is another factor of two.
+    :class:`~warmprior.envs.RobosuiteWrapper` does, which takes all steps in one call. It is used where
+    actions can be inverted at once, and doubles the speed.
 
     Args:
         step: the step of the environment, through its transforms.
         action_key: the environment's action, at the root.
-        brief: whether only reward and flags are read of the first steps: ``control_steps`` tells no more.
+        brief: whether only reward and flags of the first steps are read, all that ``control_steps`` returns
+            of them.
     """
 
     def __init__(self, step: InnerStep, action_key: str, brief: bool) -> None:
@@ -151,7 +151,7 @@ def _control_steps(base: EnvBase) -> Callable[[Tensor, int], list[TensorDictBase
 
 
 def advance(current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey) -> None:
-    """As ``step_mdp``, in place and without its generality: it runs at every control step.
+    """A lean ``step_mdp``, in place: it runs at every control step.
 
     Args:
         current: entries of a step's input, ``[*B]``, replaced by what the step led to.

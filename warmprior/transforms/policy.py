@@ -1,4 +1,4 @@
-"""The transforms between a base environment and a policy, in the order that makes them right."""
+"""The transforms between a base environment and a policy, in their order."""
 
 from __future__ import annotations
 
@@ -41,38 +41,38 @@ def policy_transforms(
 ) -> Compose:
     """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
 
-    In this order: what makes actions the environment's own, images of its cameras, normalisation of
+    In this order: conversion of actions to the environment's own, camera images, normalisation of
     observations and denormalisation of actions, a stack of the last ``To`` observations (the first one
-    repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`, and :class:`HistoryObservation` and
-    :class:`InferenceDelay` where asked for. It works around a single
-    environment, and inside or outside of batched ones (with images, inside).
+    repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`, and on request
+    :class:`HistoryObservation` and :class:`InferenceDelay`. It works around a single environment, and inside
+    or outside of batched ones (with images, inside).
 
     Args:
-        policy: the policy, which says what it needs; or its source distribution, whose lengths alone are
-            used: the environment serves every policy with a prior of the same.
+        policy: the policy; or its prior, of which only the lengths matter: the environment serves every
+            policy with a prior of these lengths.
 
     Keyword Args:
         normalizer: the normaliser of the training data; the policy's by default. Give the policy's prior in
             place of the policy if the environment is normalised already.
-        actions: between the policy's actions, in raw units, and the environment's, such as
-            :class:`AbsoluteActions`; a copy of it is used. None if they are the same.
-        images: makes observations with images, such as :class:`CameraImages`; a copy of it is used.
+        actions: converts the policy's actions, in raw units, to the environment's, such as
+            :class:`AbsoluteActions`; a copy of it is used. None by default.
+        images: adds images to observations, such as :class:`CameraImages`; a copy of it is used.
         observation_steps: ``To``; those of the policy's network by default, or 2.
-        execute: actions executed per decision; all ``H`` by default, with a ``delay`` as many as predictions
-            allow.
+        execute: actions executed per decision; by default all ``H``, or with a ``delay`` as many as
+            predictions allow.
         delay: control steps until a chunk takes effect, see :class:`InferenceDelay`. By default 0 for a
             policy with :class:`~warmprior.RealTimeChunking`, and otherwise none is written.
         gamma: discount per control step inside a chunk.
-        see_history: whether the network sees the last actions; as the policy's does by default.
+        see_history: whether the network sees the last actions; as in the policy by default.
         observation_key: the policy's by default, also for the following.
         action_key: the single action that the environment takes.
         chunk_key: the chunk.
-        success: the environment's key for whether the task is solved, which counts at any step of a chunk.
+        success: the environment's key for whether the task is solved; it counts at any step of a chunk.
         measures: see :class:`ChunkStep`.
 
     Raises:
         TypeError: for anything else than a policy or a prior.
-        ValueError: if the normaliser lacks the action, or for numbers that do not go together, see
+        ValueError: if the normaliser lacks the action, or numbers do not fit each other, see
             :class:`ChunkStep` and :class:`InferenceDelay`.
 
     See Also:
@@ -105,8 +105,8 @@ def policy_transforms(
     observation_key, chunk_key = observation_key or keys.OBSERVATION, chunk_key or keys.CHUNK
     if normalizer is not None and action_key not in normalizer.keys:
         raise ValueError(
-            f"the normaliser has {normalizer.keys}, and not the environment's action {action_key!r}: "
-            "fit it to data that call the action so, or name the action with action_key"
+            f"the normaliser has {normalizer.keys}, but not the environment's action {action_key!r}: "
+            "fit it to data with that key, or name the action with action_key"
         )
     late: list[Transform] = []
     seen = [HistoryObservation(observation_key=observation_key)] if see_history else []

@@ -20,11 +20,11 @@ __all__ = ["ObservationStack"]
 class ObservationStack(Transform):
     """Replaces the observation ``[*B, d_o]`` by the last ``To`` of them, ``[*B, To, d_o]``.
 
-    Images ``[*B, C, H, W]`` become ``[*B, To, C, H, W]``, and so does every entry of a nested observation:
-    as in the windows of :class:`ActionWindow`. After a reset the first observation is repeated. Unlike
-    :class:`~torchrl.envs.transforms.CatFrames` it keeps no buffer: the older observations are taken
-    from the step's own tensordict, so that it is right wherever a tensordict is, in and outside of
-    batched environments and when only some sub-environments reset or step.
+    Images ``[*B, C, H, W]`` become ``[*B, To, C, H, W]``, and so does every entry of a nested observation, as
+    in the windows of :class:`ActionWindow`. After a reset the first observation is repeated. Unlike
+    :class:`~torchrl.envs.transforms.CatFrames` it keeps no buffer: older observations come from the step's
+    own tensordict. So it is right inside and outside batched environments, and when only some
+    sub-environments reset or step.
 
     Args:
         steps: ``To``.

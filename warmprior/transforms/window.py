@@ -27,7 +27,7 @@ class ActionWindow(Transform):
     start), the target chunk ``[i, i+P)`` (the episode's last action repeated past its end, and marked
     in ``"action_is_pad"``) and the history (:mod:`warmprior.history`): the actions before, and the target's
     first ``P - H`` as a forecast. Windows never cross episode borders, and border windows are sampled like
-    all others. They know no prior: one buffer serves all priors of its lengths.
+    all others. One buffer serves all priors of its lengths.
 
     Args:
         data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
@@ -174,7 +174,7 @@ def _checked(
         raise ValueError(f"the data must be flat steps [N] with N > 0, got {tuple(data.shape)}")
     if action.ndim != 2 or not action.is_floating_point():
         raise ValueError(
-            f"an action is one vector of real numbers, {action_key!r} [N, d_a], got {tuple(action.shape)} of "
+            f"actions must be vectors of real numbers, {action_key!r} [N, d_a], got {tuple(action.shape)} of "
             f"{action.dtype}: flatten it, or convert it with .float()"
         )
     observations = {observation_key: observation}
@@ -187,12 +187,12 @@ def _checked(
 
 
 def check_finite(key: NestedKey, value: Tensor, memory: int = 2**22) -> None:
-    """Whether an entry of a dataset is free of NaN and infinity.
+    """Check that an entry of a dataset is free of NaN and infinity.
 
     Args:
         key: its name.
         value: ``[N, *]``, memory-mapped perhaps, and larger than the memory.
-        memory: how many numbers are looked at in one go.
+        memory: how many numbers are checked at a time.
 
     Raises:
         ValueError: naming the first bad step.
@@ -229,16 +229,15 @@ def window_transforms(
     generator: torch.Generator | None = None,
     **renamed: NestedKey,
 ) -> Compose:
-    """What makes of step numbers the windows that a policy reads.
+    """Transforms that turn step numbers into the windows that a policy reads.
 
-    :class:`ActionWindow`, and where asked for :class:`~warmprior.WithheldHistory` and
-    :class:`~warmprior.HistoryObservation`: the counterpart of :func:`~warmprior.policy_transforms` on the
-    side of the data.
+    :class:`ActionWindow`, and on request :class:`~warmprior.WithheldHistory` and
+    :class:`~warmprior.HistoryObservation`: the counterpart of :func:`~warmprior.policy_transforms` for data.
 
     Args:
         data: contiguous normalised steps, see :class:`ActionWindow`.
-        prior: the policy's source distribution, whose lengths alone are used: the windows serve every prior
-            of the same.
+        prior: the policy's prior, of which only the lengths matter: the windows serve every prior of these
+            lengths.
 
     Keyword Args:
         observation_steps: ``To``.
@@ -295,8 +294,8 @@ def window_replay_buffer(
 
     Args:
         data: contiguous normalised steps, see :class:`ActionWindow`.
-        prior: the policy's source distribution, whose lengths alone are used: the windows serve every prior
-            of the same.
+        prior: the policy's prior, of which only the lengths matter: the windows serve every prior of these
+            lengths.
 
     Keyword Args:
         batch_size: windows per sample.
@@ -354,7 +353,7 @@ def window_replay_buffer(
 
 
 def without_images(data: TensorDictBase) -> TensorDictBase:
-    """Steps with the vector of their observations alone, where thousands of windows would fill the memory.
+    """Steps without images, which would fill the memory in thousands of windows.
 
     Args:
         data: contiguous steps, see :class:`ActionWindow`.

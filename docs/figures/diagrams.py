@@ -1,0 +1,99 @@
+"""The flowchart of the page on sources, and the timeline of the page on concepts.
+
+python docs/figures/diagrams.py    # or: make results; writes docs/_static
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+OUT = Path(__file__).parents[1] / "_static"
+GREY, BLUE, ORANGE, LIGHT = "#7f7f7f", "#1f77b4", "#d95f02", "#eeeeee"
+QUESTIONS = (
+    ("Can the same observation call for\ndifferent actions (several ways)?", "PastPrior,\nsmall sigma", BLUE),
+    ("Do chunks take effect late?", "PreviewPrior\nwith guidance", ORANGE),
+    ("Are actions absolute poses?", "GaussianPrior", GREY),
+    ("Can you afford nine steps a chunk?", "GaussianPrior", GREY),
+    ("At most 25 demonstrations?", "PastPrior or\nPreviewPrior", BLUE),
+)
+
+
+def canvas(width: float, height: float) -> tuple[Figure, Axes]:
+    """A picture in units of a tenth of an inch, without axes."""
+    made = Figure(figsize=(width, height))
+    axis = made.add_axes((0, 0, 1, 1), xlim=(0, 10 * width), ylim=(0, 10 * height))
+    axis.axis("off")
+    return made, axis
+
+
+def box(
+    axis: Axes, place: tuple[float, float], size: tuple[float, float], text: str, **style: object
+) -> None:
+    """A rectangle with its text, around a place."""
+    (x, y), (width, height) = place, size
+    colors = {"fc": style.get("fc", "white"), "ec": style.get("ec", "0.3")}
+    axis.add_patch(Rectangle((x - width / 2, y - height / 2), width, height, lw=1.2, **colors))
+    axis.text(x, y, text, ha="center", va="center", fontsize=10.5, color=style.get("color", "black"))
+
+
+def flowchart() -> None:
+    """Chart H: which source to take."""
+    made, axis = canvas(6.0, 6.2)
+    left, right, step = 17.0, 48.5, 10.2
+    for k, (question, answer, color) in enumerate(QUESTIONS):
+        y = 56 - step * k
+        box(axis, (left, y), (30, 6.4), question, fc=LIGHT)
+        box(axis, (right, y), (20, 6.4), answer, fc=color, ec=color, color="white")
+        arrow = {"arrowstyle": "-|>", "color": "0.3"}
+        axis.annotate("", (right - 10, y), (left + 15, y), arrowprops=arrow)
+        axis.annotate("", (left, y - step + 3.2), (left, y - 3.2), arrowprops=arrow)
+        axis.text(left + 16, y + 0.6, "yes", fontsize=10)
+        axis.text(left + 0.8, y - step / 2 - 0.8, "no", fontsize=10)
+    box(
+        axis,
+        (left, 56 - step * 5),
+        (30, 6.4),
+        "PastPrior(8, correlation=0.5)",
+        fc=BLUE,
+        ec=BLUE,
+        color="white",
+    )
+    made.savefig(OUT / "which_source.png", dpi=110)
+
+
+def timeline() -> None:
+    """Chart I: what each source knows when chunk B is decided."""
+    made, axis = canvas(6.0, 3.9)
+    start, unit = 14.2, 1.84  # where step 0 is, and how wide a step
+
+    def bar(row: float, first: int, last: int, text: str, **style: object) -> None:
+        width = unit * (last - first)
+        box(axis, (start + unit * first + width / 2, row), (width - 0.4, 4.4), text, **style)
+
+    rows = {"executed": 31.0, "Gaussian source": 23.0, "WP-Past": 15.0, "WP-Preview": 7.0}
+    for name, row in rows.items():
+        axis.text(0.5, row, name, va="center", fontsize=10.5)
+    for step in range(0, 25, 8):
+        axis.text(start + unit * step, 36.4, str(step), ha="center", fontsize=10, color="0.3")
+        axis.plot([start + unit * step] * 2, [3.5, 35.6], color="0.85", zorder=0)
+    axis.text(0.8, 36.4, "control step", fontsize=10, color="0.3")
+    axis.plot([start + unit * 8] * 2, [3.5, 35.6], color="0.3", ls="--")
+    axis.text(start + unit * 8, 1.0, "decision", ha="center", fontsize=10)
+    bar(31, 0, 8, "chunk A", fc=LIGHT)
+    bar(31, 8, 16, "chunk B,\nto decide", fc="white")
+    bar(23, 8, 16, "mean 0,\nwidth 1", fc=GREY, ec=GREY, color="white")
+    bar(15, 0, 8, "remembered", fc=LIGHT)
+    bar(15, 8, 16, "mean: chunk A,\nwidth 0.5", fc=BLUE, ec=BLUE, color="white")
+    bar(7, 0, 8, "forecast\nwith A", fc=LIGHT)
+    bar(7, 8, 16, "mean: forecast,\nwidth 1", fc=ORANGE, ec=ORANGE, color="white")
+    bar(7, 16, 24, "cold: mean 0,\nwidth 1", fc=GREY, ec=GREY, color="white")
+    made.savefig(OUT / "timeline.png", dpi=110)
+
+
+if __name__ == "__main__":
+    flowchart()
+    timeline()
