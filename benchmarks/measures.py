@@ -31,7 +31,7 @@ from warmprior.diagnostics import (
 )
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history, sees_history
 from warmprior.training import Task
-from warmprior.training.task import read_like
+from warmprior.training.task import demonstrations_of, read_like
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
 HELD_OUT_SEED = 50  # of generated demonstrations that no training uses; training data have seed 0
@@ -117,7 +117,7 @@ def held_out(
     """
     place: Path | str
     facts, device, count = task.facts, options.run.device, options.observations
-    given = options.validation
+    given, mask = options.validation, None
     generator = torch.Generator().manual_seed(0)
     if task.normalizer is None or "file" not in facts:
         if given is not None:
@@ -128,9 +128,12 @@ def held_out(
         return shared, "the TRAINING demonstrations (not held out)"
     if given is not None:
         place, words = given, ""
+    elif options.data.mask == "train":
+        place, words, mask = demonstrations_of(options.data, task.name, task.style)[0], "", "valid"
     elif facts.get("source") != "scripted":
         raise ValueError(
-            f"these policies are trained on demonstrations of {facts['file']}: add --validation "
+            f"these policies are trained on all demonstrations of {facts['file']}: add --mask train, to "
+            "train on the file's own part for that and to measure on its part called valid, or --validation "
             "FILE with others (or with the same file, to measure on the training data)"
         )
     else:
@@ -139,7 +142,7 @@ def held_out(
         episodes = max(20, int(-(-count // max(1.0, min(50.0, usable)))))
         place = generate_demonstrations(task.name, task.style, episodes, HELD_OUT_SEED)
         words = f"{episodes} newly generated demonstrations"
-    data, called = read_like(place, task.name, facts)
+    data, called = read_like(place, task.name, facts, mask)
     # A copy: the data are normalised on the CPU, the policy may live elsewhere.
     data = copy.deepcopy(task.normalizer).to("cpu").normalize(data).to(device)
     shared = SharedObservations(

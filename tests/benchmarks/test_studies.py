@@ -4,14 +4,25 @@ from __future__ import annotations
 
 import pytest
 
-from tests.benchmarks.script_parts import command_line, is_png, options, refused, stored, written
+from tests.benchmarks.script_parts import (
+    command_line,
+    described,
+    is_png,
+    options,
+    refused,
+    stored,
+    written,
+)
+from tests.data.synthetic import write_robomimic_file
 
+pytest.importorskip("h5py")
 pytest.importorskip("robosuite")
 pytest.importorskip("tyro")
 
 import budget
 import chunking
 import curvature
+import h5py
 import navigation1d
 import real_time_chunking
 import robomimic
@@ -109,6 +120,28 @@ def test_every_budget_is_a_training_of_its_own(dataset, validation, tmp_path):
     assert len({row["action_error"] for row in cells.values()}) == len(cells)
     mean = (cells[2, 0, 3]["action_error"] + cells[2, 1, 3]["action_error"]) / 2
     assert f"| 2 | 3 | WP-Past | 0.0% ± 0.0% | {mean:.4f} ±" in (out / "report.md").read_text()
+
+
+def test_a_file_with_masks_is_its_own_validation(tmp_path):
+    """Trained on its mask train, and measured on its mask valid: which demonstrations is not said twice."""
+    path, lengths = tmp_path / "lift.hdf5", (30, 5, 40, 25)
+    masks = {"train": [0, 1, 2], "valid": [3]}
+    write_robomimic_file(path, lengths=lengths, task="lift", masks=masks)
+    few = {"observations": 10, "steps": 8, "prior": ["gaussian", "past"], "nfe": 1}
+    out = tmp_path / "runs" / "masked"
+    assert curvature.main(options(path, out, mask="train", **few)) == 0
+    assert described(out, "tasks")[0]["demonstrations"] == 3
+    assert "10 observations of lift.hdf5 (mask valid)" in (out / "report.md").read_text()
+    # As from a file of those demonstrations alone, beside one of the others.
+    for name, kept in masks.items():
+        write_robomimic_file(tmp_path / f"{name}.hdf5", lengths=lengths, task="lift", masks={"kept": kept})
+        with h5py.File(tmp_path / f"{name}.hdf5", "a") as file:
+            for number in set(range(len(lengths))) - set(kept):
+                del file[f"data/demo_{number}"]
+    apart = tmp_path / "runs" / "apart"
+    argv = options(tmp_path / "train.hdf5", apart, validation=tmp_path / "valid.hdf5", **few)
+    assert curvature.main(argv) == 0
+    assert stored(apart, "curvature") == stored(out, "curvature")
 
 
 def test_navigation_has_its_own_columns_and_pictures(tmp_path, capsys):

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from warmprior.data.hdf5 import read_index
+from warmprior.data.hdf5_members import DatasetError
 from warmprior.data.index import DatasetIndex
 from warmprior.data.lerobot import (
     LeRobotExperienceReplay,
@@ -23,7 +24,7 @@ from warmprior.data.lerobot_index import LeRobotIndex
 from warmprior.data.replay import DemonstrationReplay
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
-from warmprior.io.files import file_digest
+from warmprior.io.files import digest_of, file_digest
 
 __all__ = [
     "LEROBOT",
@@ -91,12 +92,15 @@ def resolved_place(place: Path) -> str:
     return str(place) if is_remote(dataset) else f"{LEROBOT}{Path(dataset).expanduser().resolve()}"
 
 
-def open_demonstrations(place: str | Path, env_args: Mapping[str, Any] | None = None) -> Demonstrations:
+def open_demonstrations(
+    place: str | Path, env_args: Mapping[str, Any] | None = None, mask: str | None = None
+) -> Demonstrations:
     """What reads the demonstrations at a place.
 
     Args:
         place: an HDF5 file, or ``lerobot:`` and a folder or repository.
         env_args: of the environment, for a LeRobotDataset that does not describe its own.
+        mask: of the file, such as ``"train"``; all demonstrations if ``None``.
 
     See Also:
         - :class:`~warmprior.data.opening.Demonstrations`: what it returns.
@@ -107,7 +111,7 @@ def open_demonstrations(place: str | Path, env_args: Mapping[str, Any] | None = 
         'lerobot:square'
     """
     dataset = _lerobot(place)
-    return _RobomimicFile(place) if dataset is None else _LeRobotFolder(dataset, env_args)
+    return _RobomimicFile(place, mask) if dataset is None else _LeRobotFolder(dataset, env_args, mask)
 
 
 class Demonstrations(ABC):
@@ -150,19 +154,24 @@ class Demonstrations(ABC):
         """
 
 
+def _called(name: str, mask: str | None) -> str:
+    return name if mask is None else f"{name} (mask {mask})"
+
+
 class _RobomimicFile(Demonstrations):
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        self.name = self.path.name
+    def __init__(self, path: str | Path, mask: str | None = None) -> None:
+        self.path, self.mask = Path(path), mask
+        self.name = _called(self.path.name, mask)
 
     def index(self, **options: Any) -> DatasetIndex:
-        return read_index(self.path, **options)
+        return read_index(self.path, filter_key=self.mask, **options)
 
     def replay(self, **options: Any) -> RobomimicExperienceReplay:
-        return RobomimicExperienceReplay(self.path, **options)
+        return RobomimicExperienceReplay(self.path, filter_key=self.mask, **options)
 
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        return file_digest(self.path)
+        whole = file_digest(self.path)
+        return whole if self.mask is None else digest_of(whole, self.mask)
 
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
@@ -172,25 +181,32 @@ class _RobomimicFile(Demonstrations):
         if set(cameras) <= set(self.index(demos=demos).cameras):
             compare_images(self.path, [f"{camera}_image" for camera in cameras], fast)
             return self
+        if self.mask is not None:
+            raise DatasetError(
+                f"{self.path} has no images of {', '.join(cameras)}, and files are rendered whole: render it "
+                "first (python -m warmprior render), or leave the mask out"
+            )
         return _RobomimicFile(render_demonstrations(self.path, cameras, size, demos=demos, fast=fast))
 
 
 class _LeRobotFolder(Demonstrations):
-    def __init__(self, dataset: str, env_args: Mapping[str, Any] | None = None) -> None:
-        self.dataset, self.env_args = dataset, env_args
-        self.name = f"{LEROBOT}{name_of_place(LEROBOT + dataset)}"
+    def __init__(self, dataset: str, env_args: Mapping[str, Any] | None, mask: str | None) -> None:
+        self.dataset, self.mask = dataset, mask
+        self._given: dict[str, Any] = {"env_args": env_args, "filter_key": mask}
+        self.name = _called(f"{LEROBOT}{name_of_place(LEROBOT + dataset)}", mask)
 
     def index(self, **options: Any) -> LeRobotIndex:
-        return find_lerobot(self.dataset, env_args=self.env_args, **options)
+        return find_lerobot(self.dataset, **self._given, **options)
 
     def _fetched(self, **options: Any) -> LeRobotIndex:
-        return fetch_lerobot(self.dataset, env_args=self.env_args, **options)
+        return fetch_lerobot(self.dataset, **self._given, **options)
 
     def replay(self, **options: Any) -> LeRobotExperienceReplay:
-        return LeRobotExperienceReplay(self.dataset, env_args=self.env_args, **options)
+        return LeRobotExperienceReplay(self.dataset, **self._given, **options)
 
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        return self._fetched(image_keys=image_keys, demos=demos).digest()
+        whole = self._fetched(image_keys=image_keys, demos=demos).digest()
+        return whole if self.mask is None else digest_of(whole, self.mask)
 
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool

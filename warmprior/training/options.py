@@ -63,6 +63,7 @@ class DataOptions:
             Instead of generated data.
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
+        mask: of the file, such as train: the demonstrations to take (default: all of them).
         demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
             numbers for ph and mh.
         actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
@@ -89,6 +90,7 @@ class DataOptions:
     dataset: Path | None = None
     download: bool = False
     force_download: bool = False
+    mask: str | None = None
     demonstrations: tuple[int, ...] = ()
     actions: Literal["delta", "absolute"] = "delta"
     obs: Literal["state", "image"] = "state"
@@ -113,6 +115,8 @@ class DataOptions:
         """
         if self.force_download and not self.download:
             raise ValueError("--force-download belongs to --download")
+        if self.mask is not None and self.generated:
+            raise ValueError("--mask is that of a file: add --download, or --dataset FILE")
         if self.obs == "image":
             try:
                 require_rendering()

@@ -263,7 +263,7 @@ def robosuite_task(
     options = DataOptions() if options is None else options
     # A generated file has as many as were asked for.
     demos = None if source == "scripted" else options.first(style)
-    found = _open(path, next(iter(options.task), None))
+    found = _open(path, next(iter(options.task), None), options.mask)
     index = found.index()
     if demos == len(index.demos):
         demos = None  # all of them
@@ -321,9 +321,9 @@ def robosuite_task(
     )
 
 
-def _open(place: Path | str, task: str | None) -> Demonstrations:
+def _open(place: Path | str, task: str | None, mask: str | None = None) -> Demonstrations:
     """The demonstrations at a place; the task's environment is theirs where they do not say."""
-    return open_demonstrations(place, task_env_args(task) if task in TASKS else None)
+    return open_demonstrations(place, task_env_args(task) if task in TASKS else None, mask)
 
 
 def _names(images: Mapping[str, Any] | None) -> list[str]:
@@ -368,13 +368,16 @@ def _name_of(dataset: DemonstrationReplay | DatasetIndex) -> str:
     return str(dataset.env_args["env_name"]).lower() if task is None else task.name
 
 
-def read_like(place: Path | str, name: str, facts: Mapping[str, Any]) -> tuple[TensorDictBase, str]:
+def read_like(
+    place: Path | str, name: str, facts: Mapping[str, Any], mask: str | None = None
+) -> tuple[TensorDictBase, str]:
     """Further demonstrations of a task in robosuite, in raw units, as its policies see them.
 
     Args:
         place: see :func:`robosuite_task`.
         name: of the task.
         facts: of the task.
+        mask: of the file; all demonstrations if ``None``.
 
     Returns:
         The steps, and what the place is called in results.
@@ -382,7 +385,7 @@ def read_like(place: Path | str, name: str, facts: Mapping[str, Any]) -> tuple[T
     Raises:
         ValueError: if they are of another task.
     """
-    found = _open(place, name)
+    found = _open(place, name, mask)
     if (theirs := _name_of(found.index())) != name:  # before images are rendered
         raise ValueError(f"{place} holds demonstrations of {theirs}, but these policies are for {name}")
     images = facts.get("images")
@@ -453,17 +456,28 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
         if not isinstance(task, Task):
             raise ValueError(f"--task {name} returns {type(task).__name__}, not a Task")
         return task
-    source: str
-    path: Path | str
+    path, source = demonstrations_of(options, name, style)
+    return robosuite_task(path, style, source=source, observation_steps=observation_steps, options=options)
+
+
+def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tuple[Path, str]:
+    """Where the demonstrations of a robosuite task are, once they are downloaded or generated.
+
+    Args:
+        options: see :func:`load_task`.
+        name: likewise.
+        style: likewise.
+
+    Returns:
+        The file or dataset, and what made it: ``"file"``, ``"official"`` or ``"scripted"``.
+    """
     if options.dataset is not None:
-        path, source = options.dataset, "file"
-    elif options.download:
+        return options.dataset, "file"
+    if options.download:
         theirs = is_mimicgen(get_task(str(name)).env_name)
         download = download_mimicgen if theirs else download_robomimic
-        path, source = download(str(name), style, force=options.force_download), "official"
-    else:
-        path, source = generate_demonstrations(str(name), style, options.count(style)), "scripted"
-    return robosuite_task(path, style, source=source, observation_steps=observation_steps, options=options)
+        return download(str(name), style, force=options.force_download), "official"
+    return generate_demonstrations(str(name), style, options.count(style)), "scripted"
 
 
 def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
