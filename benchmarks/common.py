@@ -42,7 +42,7 @@ from warmprior import WarmPriorActor
 from warmprior.diagnostics import SharedObservations, mean_revision, smoothness
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import from_leader, leader_first, rank
-from warmprior.io.files import check_writable, digest_of, read_json, read_lines, write_atomic
+from warmprior.io.files import digest_of, read_json, read_lines, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.training import (
     DataOptions,
@@ -146,7 +146,6 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
     The tasks are those that the options name and `more`, or with `only` the latter alone.
     """
-    check_writable(options.run.policies)
     run = replace(options.run, out=options.run.folder.absolute())
     with leader_first():  # other processes find what it has generated, rendered or downloaded
         places = [*([] if only else task_places(options.data)), *more]

@@ -39,7 +39,7 @@ from pictures import draw
 from report import success_report, summary, terminal_table, unlike, write_report
 
 from warmprior.io.distributed import go_on_alone, rank, world_size
-from warmprior.io.files import write_atomic
+from warmprior.io.files import check_writable, write_atomic
 from warmprior.io.script import PartialFailure
 from warmprior.training import Episode
 
@@ -138,6 +138,7 @@ def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
 
     The first process goes on alone.
     """
+    check_writable(options.run.policies)
     tasks = {policy.place: policy.task() for policy in policies}.values()
     text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
     if not rank():
