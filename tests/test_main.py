@@ -140,7 +140,7 @@ def test_train_makes_a_policy_per_task_and_continues(tmp_path, capsys):
     small = [*argv, "--iterations", "2", "--prior", "past,correlation=0.5,sigma=0.3"]
     assert main(small) == 0
     folder = capsys.readouterr().out.splitlines()[-1]
-    assert folder == str(out / "lift-ph-past-seed3" / "policy_000002")
+    assert folder == str(out / "lift-ph-past,correlation=0.5,sigma=0.3-seed3" / "policy_000002")
     assert main(["info", folder]) == 0
     assert "PastPrior(chunk_length=8, sigma=0.3, correlation=0.5)" in capsys.readouterr().out
     written = {p: p.stat().st_mtime_ns for p in out.rglob("*.safetensors")}

@@ -172,8 +172,9 @@ def train(args: argparse.Namespace) -> None:
     )
     options.network.check(options.data)
     prior = make(Prior, options.prior, options.chunk)
+    source = ",".join([prior.name, *options.prior.split(",")[1:]])
     for task in _tasks(options):
-        name = f"{task.name}-{task.style}-{prior.name}-seed{options.training.seed}"
+        name = f"{task.name}-{task.style}-{source}-seed{options.training.seed}"
         folder = (options.out or Path("policies")) / name
         train_policy(
             task,
