@@ -1,6 +1,6 @@
 """The charts and the table of the results page, from the numbers in docs/results.
 
-python docs/figures/results.py    # or: make results; writes docs/_static/results and the page's table
+python docs/figures/results.py    # or: make results; writes docs/_static/results and two pages' tables
 
 An interval is of 95%. A success rate has Wilson's score interval, a difference of two Newcombe's. Both take
 the episodes of all seeds as independent; training seeds differ by more than that, paired episodes by less.
@@ -266,6 +266,46 @@ def actions() -> None:
     save(made, "actions")
 
 
+def human() -> None:
+    """Human demonstrations: score and success against the number of integration steps."""
+    rows = read("pusht")
+    counts = rows["demonstrations"].unique()
+    title = "On human demonstrations of Push-T warm sources need fewer steps, and nine steps make all alike"
+    made, axes = figure(11.6, 4.8, 2 * len(counts), title)
+    for (count, part), pair in zip(
+        rows.groupby("demonstrations", sort=False), zip(axes[::2], axes[1::2], strict=True), strict=True
+    ):
+        scores = part.assign(success=part["score"])
+        lines(pair[0], scores, "nfe", [1, 3, 9], interval=False)
+        for _, row in scores.iterrows():
+            each = [float(n) for n in row["seed_score"].split()]
+            place = row["nfe"] * (1 + 0.025 * (list(SOURCES).index(row["source"]) - 2))
+            pair[0].plot([place] * len(each), each, ".", ms=7, alpha=0.55, color=SOURCES[row["source"]][1])
+        lines(pair[1], part, "nfe", [1, 3, 9])
+        setting, steps = f"{count} demonstrations", "integration steps (NFE)"
+        finish(pair[0], f"{setting}: score\n(dots: seeds)", xlabel=steps)
+        finish(pair[1], f"{setting}: episodes solved\n(95% interval)", xlabel=steps)
+    axes[0].set_ylabel("percent")
+    save(made, "human")
+
+
+def human_table() -> str:
+    """The numbers of :func:`human`, in Markdown."""
+    rows = read("pusht")
+    names = [source for source in SOURCES if source in set(rows["source"])]
+    text = ["| demonstrations | steps | " + " | ".join(SOURCES[name][0] for name in names) + " |"]
+    text.append("|---" * (2 + len(names)) + "|")
+    for (count, nfe), part in rows.groupby(["demonstrations", "nfe"], sort=False):
+        part = part.set_index("source")
+        cells = []
+        for name in names:
+            row = part.loc[name]
+            pairs = "" if np.isnan(row["won"]) else f", {row['won']:.0f}:{row['lost']:.0f}"
+            cells.append(f"{row['score']:.0f} / {row['success']:.0f}{pairs}")
+        text.append(f"| {count} | {nfe} | " + " | ".join(cells) + " |")
+    return "\n".join(text) + "\n"
+
+
 def table() -> str:
     """Success at one step, in Markdown."""
     rows = read("means").pivot(index="setting", columns="source", values="success")
@@ -283,12 +323,13 @@ def table() -> str:
 
 
 def main() -> None:
-    """Draw the charts, and write the table into the page."""
+    """Draw the charts, and write the tables into the pages."""
     OUT.mkdir(parents=True, exist_ok=True)
-    for draw in one_step, steps, demonstrations, iterations, memory, noise, actions:
+    for draw in one_step, steps, demonstrations, iterations, memory, noise, actions, human:
         draw()
     marked = re.compile(r"(?<=<!-- table -->\n).*?(?=<!-- end -->)", re.S)
-    PAGE.write_text(marked.sub(table(), PAGE.read_text()))
+    for page, text in ((PAGE, table()), (DOCS / "evidence.md", human_table())):
+        page.write_text(marked.sub(text, page.read_text()))
 
 
 if __name__ == "__main__":
