@@ -17,6 +17,17 @@ from warmprior.history import advance, cold_history, without
 ACTION_DIM = 2
 
 
+def demonstrations(steps=60, length=20, d_o=3, d_a=2):
+    """Random contiguous steps, actions in [-1, 1]."""
+    generator = torch.Generator().manual_seed(0)
+    data = {
+        "observation": torch.randn(steps, d_o, generator=generator),
+        "action": torch.rand(steps, d_a, generator=generator) * 2 - 1,
+        "episode": torch.arange(steps) // length,
+    }
+    return TensorDict(data, [steps])
+
+
 class CountingEnv(EnvBase):
     """Observation ``[step, episode, *last action]``; reward ``step`` at each step; ends after ``length``."""
 
