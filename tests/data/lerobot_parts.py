@@ -31,8 +31,8 @@ def scene(episode, step, side=32):
     return image
 
 
-def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, seed=0, **options):
-    """Write random episodes with LeRobot.
+def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, seed=0, resting=(), **options):
+    """Write random episodes with LeRobot; the last number of features that are resting never changes.
 
     Returns:
         Per feature the values of all steps.
@@ -56,6 +56,7 @@ def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, see
             for name, feature in features.items():
                 value = rng.normal(size=feature["shape"])
                 value = value > 0 if feature["dtype"] == "bool" else value.astype(feature["dtype"])
+                value[-1] = 0.5 if name in resting else value[-1]
                 frame[name] = value
                 written[name].append(value)
             frame |= {name: scene(episode, step) for name in cameras}
