@@ -49,9 +49,6 @@ class LeRobotIndex(DatasetIndex):
         images: the feature of each of the images to read.
         described: what ``meta/warmprior.json`` says; empty for datasets that were not converted.
 
-    See Also:
-        :func:`~warmprior.data.lerobot_index.read_lerobot_index`: makes it.
-
     Examples:
         >>> index = read_lerobot_index("square_lerobot")  # doctest: +SKIP
         >>> index.files  # doctest: +SKIP
@@ -143,10 +140,6 @@ def action_names(arms: int) -> list[str]:
     Args:
         arms: how many.
 
-    See Also:
-        - :func:`~warmprior.data.lerobot_index.state_names`: of the observations.
-        - :func:`~warmprior.data.convert_robomimic`: writes these names.
-
     Examples:
         >>> action_names(1)[3:]
         ['robot0_rx', 'robot0_ry', 'robot0_rz', 'robot0_gripper']
@@ -159,10 +152,6 @@ def state_names(widths: Mapping[str, int]) -> list[str]:
 
     Args:
         widths: of the observations, in their order.
-
-    See Also:
-        - :func:`~warmprior.data.lerobot_index.action_names`: of the actions.
-        - :func:`~warmprior.data.convert_robomimic`: writes these names.
 
     Examples:
         >>> state_names({"robot0_gripper_qpos": 2})

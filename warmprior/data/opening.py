@@ -55,9 +55,6 @@ def check_place(place: str | Path, option: str) -> None:
         FileNotFoundError: if there is no such file or folder.
         ImportError: if what reads it is not installed.
 
-    See Also:
-        :func:`~warmprior.data.opening.open_demonstrations`: reads what is there.
-
     Examples:
         >>> check_place("lerobot:user/square", "--dataset")
         >>> check_place("lerobot:./square", "--dataset")
@@ -98,10 +95,6 @@ def open_demonstrations(place: str | Path, env_args: Mapping[str, Any] | None = 
         place: an HDF5 file, or ``lerobot:`` and a folder or repository.
         env_args: of the environment, for a LeRobotDataset that does not describe its own.
 
-    See Also:
-        - :class:`~warmprior.data.opening.Demonstrations`: what it returns.
-        - :func:`~warmprior.data.opening.check_place`: looks first, and reads nothing.
-
     Examples:
         >>> open_demonstrations("lerobot:user/square").name  # nothing is fetched yet
         'lerobot:square'
@@ -112,9 +105,6 @@ def open_demonstrations(place: str | Path, env_args: Mapping[str, Any] | None = 
 
 class Demonstrations(ABC):
     """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
-
-    See Also:
-        :func:`~warmprior.data.opening.open_demonstrations`: finds the one for a place.
 
     Examples:
         >>> place = open_demonstrations("nowhere.hdf5")  # not looked at yet

@@ -127,9 +127,6 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     Raises:
         OSError: if the file cannot be written, naming ``path``.
 
-    See Also:
-        :func:`~warmprior.io.files.exclusive`: keeps other processes out of the folder.
-
     Examples:
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder:
@@ -201,9 +198,6 @@ def exclusive(directory: Path) -> Iterator[None]:
 
     Raises:
         BlockingIOError: if another process is in there.
-
-    See Also:
-        :func:`~warmprior.io.files.write_atomic`: what readers see is whole without a lock.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
