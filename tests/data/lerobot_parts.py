@@ -32,10 +32,9 @@ def scene(episode, step, side=32):
 
 
 def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, seed=0, resting=(), **options):
-    """Write random episodes with LeRobot; the last number of features that are resting never changes.
+    """Write random episodes with LeRobot, and return the values of all steps by feature.
 
-    Returns:
-        Per feature the values of all steps.
+    The last number of features that are resting never changes.
     """
     from lerobot.datasets import LeRobotDataset
 
