@@ -80,16 +80,8 @@ def download_mimicgen(
     Args:
         task: ``stack_d0``, ``coffee_d0`` or ``threading_d0``.
         style: ``"source"`` (ten human demonstrations) or ``"core"`` (a thousand that MimicGen made of them).
-        root: the folder under which to keep the file; by default the hub client's cache.
-        force: download again even if the file is there.
-
-    Returns:
-        The path of the local file.
-
-    Raises:
-        ValueError: if there is no official file of the task or style.
-        OSError: if the repository delivers no readable file; names the cause.
-        ImportError: if h5py or huggingface_hub is not installed.
+        root: see :func:`download_robomimic`, also for errors and what is returned.
+        force: likewise.
 
     Examples:
         >>> download_mimicgen("coffee_d0")  # doctest: +SKIP

@@ -187,16 +187,8 @@ def read_lerobot_index(
     ``observation.state`` alone, or each in ``observation.<key>``. Where no environment is known an
     observation is a whole feature.
 
-    Args:
-        root: the dataset's folder.
-        filter_key: a mask of the converted file, such as ``"train"``; all episodes if ``None``.
-        observation_keys: the observations to read; by default those of the task, or of an unknown
-            environment ``observation.environment_state`` and ``observation.state`` as far as there.
-        image_keys: images to read as well: ``"agentview_image"`` is the feature
-            ``observation.images.agentview``.
-        poses: also require the hand pose of every arm, from which absolute actions are built.
-        demos: how many to take, the first ones by their numbers; all if ``None``.
-        env_args: of the environment, for a dataset that does not describe it.
+    Options are those of :class:`~warmprior.data.LeRobotExperienceReplay`; ``poses`` also requires the hand
+    pose of every arm, from which absolute actions are built.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
