@@ -150,7 +150,8 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
             f"cannot write {path}: {error}. Free some space or choose another output folder."
         ) from error
     finally:
-        _remove(temporary)
+        with contextlib.suppress(OSError):  # a read-only folder never received the file
+            temporary.unlink(missing_ok=True)
 
 
 def _remove_stale(path: Path) -> None:
@@ -167,12 +168,6 @@ def _remove_stale(path: Path) -> None:
         with contextlib.suppress(OSError):
             if (here and not psutil.pid_exists(int(process))) or time.time() - old.stat().st_mtime > 86_400:
                 old.unlink()
-
-
-def _remove(path: Path) -> None:
-    # A read-only folder never received the file.
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
 
 
 def check_writable(directory: Path) -> None:

@@ -371,16 +371,8 @@ def _name_of(dataset: DemonstrationReplay | DatasetIndex) -> str:
 def read_like(place: Path | str, name: str, facts: Mapping[str, Any]) -> tuple[TensorDictBase, str]:
     """Further demonstrations of a task in robosuite, in raw units, as its policies see them.
 
-    Args:
-        place: see :func:`robosuite_task`.
-        name: of the task.
-        facts: of the task.
-
-    Returns:
-        The steps, and what the place is called in results.
-
-    Raises:
-        ValueError: if they are of another task.
+    By its name and facts; also what the place (see :func:`robosuite_task`) is called in results. A
+    ``ValueError`` if they are of another task.
     """
     found = _open(place, name)
     if (theirs := _name_of(found.index())) != name:  # before images are rendered
