@@ -29,7 +29,7 @@ from warmprior.data.lerobot_index import (
 )
 from warmprior.data.replay import DemonstrationReader, DemonstrationReplay
 from warmprior.io.extras import require
-from warmprior.io.hub import is_repository
+from warmprior.io.files import is_repository
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
 __all__ = [

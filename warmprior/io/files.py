@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import tempfile
 import time
 import uuid
@@ -27,6 +28,7 @@ __all__ = [
     "digest_of",
     "exclusive",
     "file_digest",
+    "is_repository",
     "read_json",
     "read_lines",
     "read_tensors",
@@ -64,6 +66,17 @@ def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
 
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     return load(data), header.get("__metadata__", {})
+
+
+def is_repository(name: str) -> bool:
+    """Whether a text has the form of a repository's name at the hub.
+
+    Examples:
+        >>> [is_repository(name) for name in ("user/name", "runs/a/b", "../name", "policy", "/tmp/name")]
+        [True, False, False, False, False]
+    """
+    part = r"[A-Za-z0-9_]([A-Za-z0-9._-]*[A-Za-z0-9_])?"
+    return bool(re.fullmatch(f"{part}/{part}", name))
 
 
 def check_regular(path: Path) -> None:

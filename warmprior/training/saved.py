@@ -16,8 +16,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior.io.extras import require
-from warmprior.io.files import as_json, read_json, write_atomic
-from warmprior.io.hub import is_repository
+from warmprior.io.files import as_json, is_repository, read_json, write_atomic
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled, without_compilation
 from warmprior.modules.network import VelocityNetwork
