@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 
-import numpy as np
 import pytest
 
 from tests.data.synthetic import write_robomimic_file
@@ -170,19 +169,10 @@ def test_train_refuses_what_cannot_be_before_any_work(tmp_path, capsys, words, m
 
 def test_train_on_a_dataset_of_any_robot(tmp_path, capsys):
     pytest.importorskip("lerobot.datasets")
-    from lerobot.datasets import LeRobotDataset
+    from tests.data.lerobot_parts import numbers, write_lerobot
 
-    features = {
-        name: {"dtype": "float32", "shape": (width,), "names": None}
-        for name, width in {"arm": 3, "cup": 2, "action": 4}.items()
-    }
-    dataset = LeRobotDataset.create("local/cups", 10, features, root=tmp_path / "cups", use_videos=False)
-    for _ in range(2):
-        for step in range(12):
-            values = {name: np.full(f["shape"], step, np.float32) for name, f in features.items()}
-            dataset.add_frame({**values, "task": "stack cups"})
-        dataset.save_episode()
-    dataset.finalize()
+    features = {name: numbers(width) for name, width in {"arm": 3, "cup": 2, "action": 4}.items()}
+    write_lerobot(tmp_path / "cups", (12, 12), features)
     words = f"train --dataset lerobot:{tmp_path / 'cups'} --observation-keys arm cup --iterations 2"
     assert main([*words.split(), "--hidden-dim", "8", "--out", str(tmp_path / "out")]) == 0
     actor = load_policy(capsys.readouterr().out.strip())

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torchrl.envs import GymEnv, RenameTransform, TransformedEnv
 from torchrl.record.loggers.csv import CSVLogger
 
+from tests.toy_env import demonstrations
 from warmprior import (
     PastPrior,
     RealTimeChunking,
@@ -30,12 +31,7 @@ def actor(**options) -> WarmPriorActor:
 
 
 def steps() -> TensorDict:
-    data = {
-        "observation": torch.randn(20, 3),
-        "action": torch.randn(20, 1),
-        "episode": torch.arange(20) // 10,
-    }
-    return TensorDict(data, [20])
+    return demonstrations(20, 10, d_a=1)
 
 
 def test_a_vector_environment_of_gymnasium_cannot_execute_chunks():

@@ -8,7 +8,7 @@ from methods import Method
 from tensordict import TensorDict
 from torch import nn
 
-from tests.toy_env import Halfway
+from tests.toy_env import Halfway, demonstrations
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
@@ -61,15 +61,7 @@ def frozen(shift=0.0):
 
 @pytest.fixture
 def data():
-    draws = torch.Generator().manual_seed(0)
-    return TensorDict(
-        {
-            "observation": torch.randn(40, D_O, generator=draws),
-            "action": torch.randn(40, D_A, generator=draws),
-            "episode": torch.arange(40) // 20,
-        },
-        [40],
-    )
+    return demonstrations(40)
 
 
 def cloning(folder, data, **options):

@@ -86,14 +86,11 @@ def test_the_sdist_builds_the_same_wheel(built, tmp_path):
         assert {i.filename: i.CRC for i in mine.infolist()} == {i.filename: i.CRC for i in again.infolist()}
 
 
-def test_the_wheel_runs_in_an_empty_environment(python, tmp_path):
+def test_the_wheel_runs_in_an_empty_environment_and_the_quickstart_with_it(python, tmp_path):
     printed = run(python, "-m", "warmprior", "--version", cwd=tmp_path)
     assert printed == f"warmprior {PROJECT['version']}\n"
     where = run(python, "-c", "import warmprior; print(warmprior.__file__)", cwd=tmp_path)
     assert Path(where.strip()).is_relative_to(python.parents[1])
-
-
-def test_the_quickstart_runs_from_the_wheel(python, tmp_path):
     text = (ROOT / "docs" / "quickstart.md").read_text()
     code, *_ = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
     (tmp_path / "quickstart.py").write_text(code)

@@ -11,10 +11,29 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
 
-from warmprior import Prior, StartPoint
+from warmprior import ActionWindow, Prior, StartPoint
 from warmprior.history import advance, cold_history, without
 
 ACTION_DIM = 2
+
+
+def demonstrations(steps=60, length=20, d_o=3, d_a=2):
+    """Random contiguous steps, actions in [-1, 1]."""
+    generator = torch.Generator().manual_seed(0)
+    data = {
+        "observation": torch.randn(steps, d_o, generator=generator),
+        "action": torch.rand(steps, d_a, generator=generator) * 2 - 1,
+        "episode": torch.arange(steps) // length,
+    }
+    return TensorDict(data, [steps])
+
+
+def window_histories(actions, frames, chunk_length):
+    """Histories of an episode's training windows, at some of its steps."""
+    steps = {"observation": torch.zeros(len(actions), 1), "action": actions}
+    steps["episode"] = torch.zeros(len(actions), dtype=torch.int64)
+    window = ActionWindow(TensorDict(steps, [len(actions)]), chunk_length)
+    return window(TensorDict({"frame": frames}, frames.shape))["history"]
 
 
 class CountingEnv(EnvBase):

@@ -29,11 +29,6 @@ HAND_TO_SITE = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
 robosuite's controllers move: -90 degrees about the z axis that both share."""
 
 
-def _check_width(value: Tensor, width: int, what: str) -> None:
-    if value.ndim == 0 or value.shape[-1] != width:
-        raise ValueError(f"{what} needs {width} numbers in its last dimension, got {value.shape}")
-
-
 def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
     """Turn ``(x, y, z, w)`` quaternions ``[..., 4]`` into rotation matrices ``[..., 3, 3]``.
 
@@ -45,7 +40,6 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
                 [ 1.,  0.,  0.],
                 [ 0.,  0.,  1.]])
     """
-    _check_width(quaternion, 4, "a quaternion")
     x, y, z, w = normalize(quaternion, dim=-1).unbind(-1)
     rows = (
         torch.stack((1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)), -1),
@@ -57,14 +51,11 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
 
 def rotvec_to_matrix(rotvec: Tensor) -> Tensor:
     """Turn rotation vectors (axis times angle in radians) ``[..., 3]`` into matrices ``[..., 3, 3]``."""
-    _check_width(rotvec, 3, "a rotation vector")
     return _by_scipy("from_rotvec", rotvec, "as_matrix", (3,))
 
 
 def matrix_to_rotvec(matrix: Tensor) -> Tensor:
     """Turn rotation matrices ``[..., 3, 3]`` into rotation vectors ``[..., 3]`` of length at most pi."""
-    if matrix.shape[-2:] != (3, 3):
-        raise ValueError(f"a rotation matrix needs shape [..., 3, 3], got {matrix.shape}")
     return _by_scipy("from_matrix", matrix, "as_rotvec", (3, 3))
 
 
@@ -78,8 +69,6 @@ def _by_scipy(read: str, value: Tensor, write: str, form: tuple[int, ...]) -> Te
 
 def matrix_to_rotation_6d(matrix: Tensor) -> Tensor:
     """Keep the first two rows of rotation matrices ``[..., 3, 3]``: ``[..., 6]``."""
-    if matrix.shape[-2:] != (3, 3):
-        raise ValueError(f"a rotation matrix needs shape [..., 3, 3], got {matrix.shape}")
     return matrix[..., :2, :].flatten(-2)
 
 
@@ -94,7 +83,8 @@ def rotation_6d_to_matrix(rotation_6d: Tensor) -> Tensor:
                 [0., 1., 0.],
                 [0., 0., 1.]])
     """
-    _check_width(rotation_6d, 6, "a 6-d rotation")
+    if rotation_6d.shape[-1:] != (6,):
+        raise ValueError(f"a 6-d rotation needs 6 numbers in its last dimension, got {rotation_6d.shape}")
     first = normalize(rotation_6d[..., :3], dim=-1)
     second = rotation_6d[..., 3:]
     second = normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)

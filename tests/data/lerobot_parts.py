@@ -31,11 +31,10 @@ def scene(episode, step, side=32):
     return image
 
 
-def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, seed=0, **options):
-    """Write random episodes with LeRobot.
+def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, seed=0, resting=(), **options):
+    """Write random episodes with LeRobot, and return the values of all steps by feature.
 
-    Returns:
-        Per feature the values of all steps.
+    The last number of features that are resting never changes.
     """
     from lerobot.datasets import LeRobotDataset
 
@@ -56,6 +55,7 @@ def write_lerobot(root, lengths=(6, 1, 9), features=None, images=(), fps=20, see
             for name, feature in features.items():
                 value = rng.normal(size=feature["shape"])
                 value = value > 0 if feature["dtype"] == "bool" else value.astype(feature["dtype"])
+                value[-1] = 0.5 if name in resting else value[-1]
                 frame[name] = value
                 written[name].append(value)
             frame |= {name: scene(episode, step) for name in cameras}

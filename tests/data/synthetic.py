@@ -13,50 +13,22 @@ import numpy as np
 from warmprior.envs.simulator import task_env_args
 from warmprior.envs.tasks import get_task
 
-OSC_14 = {
-    "type": "OSC_POSE",
-    "input_max": 1,
-    "input_min": -1,
-    "output_max": [0.05, 0.05, 0.05, 0.5, 0.5, 0.5],
-    "output_min": [-0.05, -0.05, -0.05, -0.5, -0.5, -0.5],
-    "kp": 150,
-    "damping": 1,
-    "impedance_mode": "fixed",
-    "kp_limits": [0, 300],
-    "damping_limits": [0, 10],
-    "position_limits": None,
-    "orientation_limits": None,
-    "uncouple_pos_ori": True,
-    "control_delta": True,
-    "interpolation": None,
-    "ramp_ratio": 0.2,
-}
-"""The controller as files of robosuite 1.4 describe it."""
-
 WIDTHS = {"eef_pos": 3, "eef_quat": 4, "gripper_qpos": 2}
 
 
 def env_args_14(task: str) -> dict[str, Any]:
-    """The ``env_args`` of a robomimic file recorded with robosuite 1.4."""
-    spec = get_task(task)
-    kwargs: dict[str, Any] = {
-        "has_renderer": False,
-        "has_offscreen_renderer": False,
-        "ignore_done": True,
-        "use_object_obs": True,
-        "use_camera_obs": False,
-        "control_freq": 20,
-        "controller_configs": dict(OSC_14),
-        "robots": ["Panda"] * spec.arms,
-        "camera_depths": False,
-        "camera_heights": 84,
-        "camera_widths": 84,
-        "reward_shaping": False,
-        "render_gpu_device_id": 0,
-    }
-    if spec.arms == 2:
+    """The ``env_args`` of a robomimic file of robosuite 1.4, which has one arm's controller."""
+    meta = task_env_args(task)
+    kwargs = meta["env_kwargs"]
+    arm = kwargs.pop("controller_configs")["body_parts"]["right"]
+    arm["damping"], arm["damping_limits"] = arm.pop("damping_ratio"), arm.pop("damping_ratio_limits")
+    for name in ("input_type", "input_ref_frame", "gripper"):
+        del arm[name]
+    kwargs.pop("lite_physics", None)
+    kwargs |= {"controller_configs": arm | {"control_delta": True}, "render_gpu_device_id": 0}
+    if get_task(task).arms == 2:
         kwargs["env_configuration"] = "single-arm-opposed"
-    return {"env_name": spec.env_name, "env_version": "1.4.1", "type": 1, "env_kwargs": kwargs}
+    return meta | {"env_version": "1.4.1"}
 
 
 def env_args_15(task: str, frame: str = "world") -> dict[str, Any]:
@@ -75,19 +47,10 @@ def write_robomimic_file(
     env_args: Mapping[str, Any] | None = None,
     failures: Sequence[int] = (),
 ) -> list[dict[str, np.ndarray]]:
-    """Write random demonstrations in robomimic's layout.
+    """Write random demonstrations in robomimic's layout, with a task's keys and widths.
 
-    Args:
-        path: file to write.
-        lengths: steps of each demo.
-        task: which task's keys and widths to use.
-        seed: of the random contents.
-        masks: filter key to demo numbers; no group ``mask`` if ``None``.
-        env_args: what to store as such; by default those of robosuite 1.5.
-        failures: numbers of the demos whose last reward is 0.
-
-    Returns:
-        Per demo the float64 arrays as written: ``actions``, ``rewards`` and the observations by key.
+    Masks are numbers of demos by filter key; the last reward of failures is 0. Returns per demo the float64
+    arrays as written: ``actions``, ``rewards`` and the observations by key.
     """
     spec = get_task(task)
     rng = np.random.default_rng(seed)

@@ -5,32 +5,7 @@ import numpy as np
 import pytest
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
-from warmprior.data.hdf5 import DatasetError, open_robomimic, read_index, read_rows
-from warmprior.envs.tasks import TASKS
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_index_of_every_task(tmp_path, task):
-    path = tmp_path / "file.hdf5"
-    write_robomimic_file(path, task=task)
-    index = read_index(path, poses=True)
-    assert index.task is TASKS[task]
-    assert index.observation_keys == TASKS[task].low_dim_keys
-    assert sum(index.observation_dims) == TASKS[task].observation_dim
-    assert index.action_dim == TASKS[task].action_dim
-    assert index.lengths == (12, 5, 30)
-    assert index.env_args == env_args_15(task)
-
-
-def test_values_round_trip(square_file):
-    path, demos = square_file
-    with open_robomimic(path) as file:
-        for number, demo in enumerate(demos):
-            for key, value in demo.items():
-                name = key if key in ("actions", "rewards") else f"obs/{key}"
-                out = np.full((len(value), value[0].size), np.nan)
-                read_rows(file, f"demo_{number}", name, out)
-                np.testing.assert_array_equal(out, value.reshape(out.shape))
+from warmprior.data.hdf5 import DatasetError, read_index, read_rows
 
 
 def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):

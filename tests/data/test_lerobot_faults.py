@@ -103,17 +103,6 @@ META = {
 }
 
 
-@pytest.mark.parametrize("name", META)
-def test_meta_is_checked_before_anything_is_read(root, name, monkeypatch):
-    change, said = META[name]
-    change(root)
-    monkeypatch.setattr("warmprior.data.lerobot.LeRobotReader", lambda i: pytest.fail("was read"))
-    with pytest.raises(DatasetError) as caught:
-        LeRobotExperienceReplay(root, env_args=LIFT)
-    for word in [str(root), *said]:
-        assert word in str(caught.value)
-
-
 PLACE = ["damaged, or not of this dataset", "is not where meta/episodes says", "finalize()"]
 VALUES = {
     "cut off": (cut(DATA), ["damaged", "finalize()", "again"]),
@@ -125,41 +114,36 @@ VALUES = {
 }
 
 
-@pytest.mark.parametrize("name", VALUES)
-def test_bad_values_stop_the_load(root, name):
-    change, said = VALUES[name]
-    change(root)
-    with pytest.raises(DatasetError) as caught:
-        LeRobotExperienceReplay(root, env_args=None if name == "narrow rows" else LIFT)
-    for word in [str(root / DATA), *said]:
-        assert word in str(caught.value)
-
-
 IMAGES = {
-    "missing camera": ("front_image", None, ["no images 'front_image'", "agentview_image", "--images"]),
-    "not square": ("agentview_image", feature(CAMERA, shape=[32, 16, 3]), ["only square"]),
+    "missing camera": (
+        lambda root: None,
+        ["no images 'front_image'", "agentview_image", "--images"],
+        "front_image",
+    ),
+    "not square": (feature(CAMERA, shape=[32, 16, 3]), ["only square"], "agentview_image"),
     "other size": (
-        "agentview_image",
         feature(CAMERA, shape=[16, 16, 3]),
         [DATA, CAMERA, "(3, 32, 32)", "(3, 16, 16)"],
+        "agentview_image",
     ),
     "cut-off video": (
-        "side_image",
         cut("videos/observation.images.side/chunk-000/file-000.mp4"),
         ["file-000.mp4: damaged"],
+        "side_image",
     ),
 }
 
 
-@pytest.mark.parametrize("name", IMAGES)
-def test_bad_images_are_named(root, name):
-    keys, change, said = IMAGES[name]
-    if change is not None:
-        change(root)
-    keys = [keys] if isinstance(keys, str) else keys
+@pytest.mark.parametrize("name", [*META, *VALUES, *IMAGES])
+def test_what_is_damaged_or_does_not_fit_is_named(root, name, monkeypatch):
+    """What ``meta/`` tells before anything is read, values with their file, and images."""
+    change, said, *keys = (META | VALUES | IMAGES)[name]
+    change(root)
+    if name in META:
+        monkeypatch.setattr("warmprior.data.lerobot.LeRobotReader", lambda i: pytest.fail("was read"))
     with pytest.raises(DatasetError) as caught:
         LeRobotExperienceReplay(root, env_args=LIFT, image_keys=keys)
-    for word in [str(root), *said]:
+    for word in [str(root / DATA if name in VALUES else root), *said]:
         assert word in str(caught.value)
 
 

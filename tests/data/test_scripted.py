@@ -210,14 +210,8 @@ def test_filter_keys_of_several_operators(tmp_path):
 @pytest.mark.parametrize(
     ("task", "style", "count", "least"),
     [
-        ("lift", "ph", 60, 0.95),
-        ("lift", "mh", 60, 0.90),
-        ("can", "ph", 60, 0.95),
-        ("can", "mh", 60, 0.90),
-        ("square", "ph", 60, 0.95),
-        ("square", "mh", 60, 0.90),
-        ("stack", "ph", 60, 0.95),
-        ("stack", "mh", 60, 0.90),
+        *((task, "ph", 60, 0.95) for task in ("lift", "can", "square", "stack")),
+        *((task, "mh", 60, 0.90) for task in ("lift", "can", "square", "stack")),
         ("transport", "ph", 40, 0.85),
     ],
 )

@@ -13,9 +13,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from tests.toy_env import ACTION_DIM, CountingEnv, Momentum
+from tests.toy_env import ACTION_DIM, CountingEnv, Momentum, window_histories
 from warmprior import (
-    ActionWindow,
     GaussianPrior,
     HistoryObservation,
     Normalizer,
@@ -159,14 +158,7 @@ def test_a_users_prior_has_the_mean_of_its_training_windows():
     with AsyncExecutor(made, execute=1, latency=0, observation_steps=2) as executor:
         for tick in range(frames):
             actions.append(executor.act(torch.full((OBSERVATION_DIM,), tick / frames)))
-    data = {
-        "observation": torch.zeros(frames, OBSERVATION_DIM),
-        "action": torch.stack(actions),
-        "episode": torch.zeros(frames, dtype=torch.int64),
-    }
-    window = ActionWindow(TensorDict(data, [frames]), prior.chunk_length)
-    batch = window(TensorDict({"frame": torch.arange(frames)}, [frames]))
-    loc, _, warm = prior.distribution(batch["history"])
+    loc, _, warm = prior.distribution(window_histories(torch.stack(actions), torch.arange(frames), 4))
     assert len(found) == frames and warm[:, 0, 0].tolist() == [False] * 2 + [True] * (frames - 2)
     assert torch.equal(torch.stack([data["prior", "loc"] for data in found]), loc)
     assert torch.equal(torch.stack([data["prior", "warm"] for data in found]), warm)

@@ -81,12 +81,7 @@ class Threading_D0(Coffee_D0):
 
 
 def write_mimicgen(folder: Path, **modules: str) -> None:
-    """Write the package into a folder that is to be on Python's path.
-
-    Args:
-        folder: where ``mimicgen`` goes.
-        modules: contents of tasks in place of those above.
-    """
+    """Write the package into a folder on Python's path, some modules with other contents than above."""
     tasks = folder / "mimicgen" / "envs" / "robosuite"
     tasks.mkdir(parents=True)
     for package in (tasks, tasks.parent):

@@ -35,12 +35,7 @@ class Outcome:
 
 
 def attempt(load: Callable[[], Outcome], names: str) -> Outcome:
-    """Load in a fork of this process.
-
-    Args:
-        load: judges what it loaded; whatever it raises is judged here.
-        names: what a clear error contains: the path of the damaged folder or file.
-    """
+    """Load in a fork of this process, and judge what that raises: a clear error names the damaged path."""
     ours, theirs = os.pipe()
     child = os.fork()
     if child == 0:

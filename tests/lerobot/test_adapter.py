@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 
 from tests.lerobot.seen import at_times, watch
 from tests.lerobot.tiny import ACTION, LENGTH, observations, windows
-from tests.toy_env import Momentum
-from warmprior import ActionWindow, PastPrior, PreviewPrior
+from tests.toy_env import Momentum, window_histories
+from warmprior import PastPrior, PreviewPrior
 from warmprior.history import window_history
 from warmprior.lerobot import RelativeActions, WarmPriorAdapter, action_std
 
@@ -99,15 +98,8 @@ def test_a_users_prior_has_the_mean_of_its_training_windows(built):
     made = built("pi0", n_action_steps=every)
     adapter = WarmPriorAdapter(made, prior, generator=generator())
     actions, sources = started(adapter, "pi0", made, observations("pi0", 1), steps)
-    data = {
-        "observation": torch.zeros(steps, 1),
-        "action": actions[0],
-        "episode": torch.zeros(steps, dtype=torch.int64),
-    }
     decisions = torch.arange(0, steps, every)
-    window = ActionWindow(TensorDict(data, [steps]), prior.chunk_length)
-    batch = window(TensorDict({"frame": decisions}, [len(decisions)]))
-    loc, _, warm = prior.distribution(batch["history"])
+    loc, _, warm = prior.distribution(window_histories(actions[0], decisions, prior.chunk_length))
     assert warm[:, 0, 0].tolist() == [False, *[True] * (len(decisions) - 1)]
     # Without noise the source is the mean.
     assert torch.equal(torch.cat(sources)[1:, :4], loc[1:])

@@ -16,7 +16,8 @@ def chunk(first, length, size=2):
 
 
 def row(history, i=0):
-    return {name: history[name][i].flatten().tolist() for name in ENTRIES}
+    """Actions, steps, forecast and its steps of one row."""
+    return [history[name][i].flatten().tolist() for name in ENTRIES]
 
 
 def executing(prior, count, first=1):
@@ -31,79 +32,44 @@ def executing(prior, count, first=1):
 
 def test_a_history_moves_by_what_was_executed():
     memory = executing(PreviewPrior(3), 2)
-    expected = {"actions": [0, 1, 2], "steps": [2], "forecast": [3, 4, 5, 6, 0, 0], "forecast_steps": [4]}
+    expected = [[0, 1, 2], [2], [3, 4, 5, 6, 0, 0], [4]]
     assert row(memory.decide(2)) == expected
     assert row(memory.decide(2)) == expected  # a decision without a chunk does not count
     memory.record(chunk(11, 6))
     memory.executed(torch.tensor([3, 0]))
     history = memory.decide(2)
-    assert row(history) == {
-        "actions": [11, 12, 13],
-        "steps": [3],
-        "forecast": [14, 15, 16, 0, 0, 0],
-        "forecast_steps": [3],
-    }
-    assert row(history, 1) == {
-        "actions": [0, 101, 102],
-        "steps": [2],
-        "forecast": [111, 112, 113, 114, 115, 116],
-        "forecast_steps": [6],
-    }
+    assert row(history) == [[11, 12, 13], [3], [14, 15, 16, 0, 0, 0], [3]]
+    assert row(history, 1) == [[0, 101, 102], [2], [111, 112, 113, 114, 115, 116], [6]]
 
 
 def test_an_episode_that_begins_inside_a_chunk():
     """It executes the rest of the chunk, and has no plan of the old episode."""
     memory = executing(PreviewPrior(4), 1)
     memory.forget(torch.tensor([True, False]))
-    assert row(memory._history) == {
-        "actions": [0] * 4,
-        "steps": [0],
-        "forecast": [0] * 8,
-        "forecast_steps": [0],
-    }
+    assert row(memory._history) == [[0] * 4, [0], [0] * 8, [0]]
     memory.step()
     memory.correct(torch.tensor([[-5.0], [-6.0]]))  # of the rest
     memory.step()
     history = memory.decide(2)
-    assert row(history) == {
-        "actions": [0, 0, -5, 3],
-        "steps": [2],
-        "forecast": [0] * 8,
-        "forecast_steps": [0],
-    }
-    assert row(history, 1) == {
-        "actions": [0, 101, -6, 103],
-        "steps": [3],
-        "forecast": [104, 105, 106, 107, 108, 0, 0, 0],
-        "forecast_steps": [5],
-    }
+    assert row(history) == [[0, 0, -5, 3], [2], [0] * 8, [0]]
+    assert row(history, 1) == [[0, 101, -6, 103], [3], [104, 105, 106, 107, 108, 0, 0, 0], [5]]
     _, _, warm = PreviewPrior(4).distribution(history)
     assert warm[:, :4].all(1).flatten().tolist() == [False, True]
     # From its own first chunk on it has a plan as others have.
     memory.record(chunk(21, 8))
     memory.step()
-    assert row(memory.decide(2)) == {
-        "actions": [0, -5, 3, 21],
-        "steps": [3],
-        "forecast": [22, 23, 24, 25, 26, 27, 28, 0],
-        "forecast_steps": [7],
-    }
+    assert row(memory.decide(2)) == [[0, -5, 3, 21], [3], [22, 23, 24, 25, 26, 27, 28, 0], [7]]
 
 
 def test_actions_are_expressed_at_the_present_state_and_nothing_becomes_one():
     memory = executing(PreviewPrior(3), 2)
     history = memory.decide(2, move=lambda actions: actions.double() - 0.5)
-    assert row(history) == {
-        "actions": [0, 0.5, 1.5],
-        "steps": [2],
-        "forecast": [2.5, 3.5, 4.5, 5.5, 0, 0],
-        "forecast_steps": [4],
-    }
+    assert row(history) == [[0, 0.5, 1.5], [2], [2.5, 3.5, 4.5, 5.5, 0, 0], [4]]
     assert history["actions"].dtype == history["forecast"].dtype == torch.float32
     # What was moved once is moved on from there.
     memory.record(chunk(11, 6))
     memory.step()
-    assert row(memory.decide(2, move=lambda actions: actions - 1.0))["actions"] == [-0.5, 0.5, 10]
+    assert row(memory.decide(2, move=lambda actions: actions - 1.0))[0] == [-0.5, 0.5, 10]
     memory.forget(torch.tensor([True, True]))
     history = memory.decide(2, move=lambda actions: actions - 1.0)
     assert not any(history[name].any() for name in ENTRIES)

@@ -13,6 +13,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.data.lerobot_parts import write_lerobot
 from tests.lerobot.seen import watch
 from tests.lerobot.tiny import (
     ACTION,
@@ -121,26 +122,6 @@ def test_losses_and_chunks_start_from_the_prior(found, name):
     assert not torch.equal(seen.x[0][..., :ACTION], sources[2])
 
 
-def write_dataset(root, episodes=3, steps=12):
-    """Of lift's widths."""
-    import numpy as np
-    from lerobot.datasets import LeRobotDataset
-
-    widths = {"observation.state": STATE, "observation.environment_state": OBJECT, "action": 7}
-    features = {
-        name: {"dtype": "float32", "shape": (width,), "names": None} for name, width in widths.items()
-    }
-    dataset = LeRobotDataset.create("local/tiny", fps=20, root=root, use_videos=False, features=features)
-    rng = np.random.default_rng(0)
-    for _ in range(episodes):
-        for _ in range(steps):
-            frame = {name: rng.uniform(-1, 1, width).astype("float32") for name, width in widths.items()}
-            frame["action"][-1] = 0.5  # a gripper that never moves
-            dataset.add_frame({**frame, "task": "lift the cube"})
-        dataset.save_episode()
-    dataset.finalize()
-
-
 TRAIN = """--policy.type=warm_flow --policy.embedding_dim=24 --policy.num_layers=1 --policy.device=cpu
 --policy.push_to_hub=false --steps=2 --batch_size=4 --num_workers=0 --save_freq=2"""
 
@@ -150,7 +131,7 @@ def test_lerobot_trains_and_evaluates_it(found, tmp_path, monkeypatch):
     """The commands of the documentation, offline."""
     pytest.importorskip("robosuite")
     pytest.importorskip("accelerate")
-    write_dataset(tmp_path / "data")
+    write_lerobot(tmp_path / "data", (12, 12, 12), resting=["action"])
     scripts, options = Path(sys.executable).parent, os.environ | {"HF_HUB_OFFLINE": "1"}
 
     def run(script, *argv):
@@ -208,7 +189,7 @@ def test_the_flow_policy_is_preconditioned_for_the_dataset(found, tmp_path):
     """By the moments that this library fits to the same steps; and its averaged weights play."""
     from lerobot.datasets import LeRobotDatasetMetadata
 
-    write_dataset(tmp_path / "data")
+    write_lerobot(tmp_path / "data", (12, 12, 12), resting=["action"])
     meta = LeRobotDatasetMetadata("local/tiny", root=tmp_path / "data")
     config = flow_policy(found).config
     widths = {name: feature["shape"] for name, feature in meta.features.items()}

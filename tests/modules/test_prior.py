@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from tests.toy_env import random_history
-from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior
-from warmprior.modules.registry import find, from_config
+from warmprior import GaussianPrior, PastPrior, PreviewPrior
 
 PRIORS = [GaussianPrior, PastPrior, PreviewPrior]
 PAPER_SIGMA = {GaussianPrior: 1.0, PastPrior: 0.5, PreviewPrior: 1.0}
@@ -80,12 +79,3 @@ def test_bad_arguments(prior_class, arguments, options, message):
     wrong = TypeError if prior_class is GaussianPrior and options else ValueError
     with pytest.raises(wrong, match=next(iter(options)) if wrong is TypeError else message):
         prior_class(*arguments, **options)
-
-
-@pytest.mark.parametrize("prior_class", PRIORS)
-def test_config_round_trip(prior_class):
-    prior = prior_class(5, **({} if prior_class is GaussianPrior else {"sigma": 0.25}))
-    again = from_config(Prior, prior.config())
-    assert type(again) is prior_class and again.config() == prior.config()
-    assert repr(again) == repr(prior)
-    assert find(Prior, prior.name) is prior_class

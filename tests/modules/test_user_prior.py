@@ -6,9 +6,9 @@ import json
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 
+from tests.toy_env import demonstrations
 from warmprior import GaussianPrior, PastPrior, Prior, PriorDecoder, VelocityMLP, WarmPriorActor
 from warmprior.modules.registry import find, from_config, make, options_of
 from warmprior.training import BehaviourCloning, TrainingConfig
@@ -47,18 +47,6 @@ class Learned(PastPrior, nn.Module):
         return loc + self.shift + self.offset, warm
 
 
-def data(steps=60):
-    generator = torch.Generator().manual_seed(0)
-    return TensorDict(
-        {
-            "observation": torch.randn(steps, D_O, generator=generator),
-            "action": torch.rand(steps, D_A, generator=generator),
-            "episode": torch.arange(steps) // 20,
-        },
-        [steps],
-    )
-
-
 def actor_for(prior, **options):
     torch.manual_seed(1)
     network = VelocityMLP(D_A, D_O, prior.prediction_length, TO, hidden_dim=8)
@@ -88,7 +76,7 @@ def test_the_same_prior_has_one_configuration():
 def test_what_cannot_be_saved_is_told_before_anything_is_trained(tmp_path):
     prior = Anchor(H, gain=torch.ones(2))
     with pytest.raises(TypeError, match="Anchor has an argument that cannot be saved"):
-        BehaviourCloning(actor_for(prior), data(), TrainingConfig(iterations=20), tmp_path)
+        BehaviourCloning(actor_for(prior), demonstrations(), TrainingConfig(iterations=20), tmp_path)
     assert not list(tmp_path.iterdir())
 
 
@@ -114,7 +102,7 @@ def test_found_by_name_or_place():
         "nothing",
         "no.such.module:Anchor",
         f"{__name__}:Missing",
-        f"{__name__}:data",
+        f"{__name__}:actor_for",
         "Prior",
         "warmprior.modules.prior:Prior",
     ):
@@ -128,7 +116,7 @@ def test_found_by_name_or_place():
 def test_a_learned_prior_trains_saves_resumes_and_freezes(tmp_path):
     def training(folder, iterations=6):
         config = TrainingConfig(iterations=iterations, batch_size=8, checkpoints=1, save_every=3)
-        return BehaviourCloning(actor_for(Learned(H)), data(), config, folder, observation_steps=TO)
+        return BehaviourCloning(actor_for(Learned(H)), demonstrations(), config, folder, observation_steps=TO)
 
     whole = training(tmp_path / "whole")
     whole.run(None)

@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from tests.objectives.test_flow_matching import actor_for, sample
+from tests.toy_env import demonstrations
 from warmprior import (
     BridgeInterpolant,
     FlowMatchingLoss,
@@ -102,22 +103,12 @@ def test_the_loss_takes_the_path_of_the_coupling():
         BridgeCoupling(0.0)
 
 
-def demonstrations():
-    g = torch.Generator().manual_seed(0)
-    data = {
-        "observation": torch.randn(400, 3, generator=g),
-        "action": torch.randn(400, 1, generator=g),
-        "episode": torch.arange(400) // 40,
-    }
-    return TensorDict(data, [400])
-
-
 def test_moments_are_those_of_the_pairs():
     """Paired without regard of the observation, sources come close to their targets."""
     prior, correlations = GaussianPrior(1), []
     for coupling in (None, OTCoupling(0.0)):
         g = torch.Generator().manual_seed(0)
-        buffer = window_replay_buffer(demonstrations(), prior, batch_size=256, generator=g)
+        buffer = window_replay_buffer(demonstrations(400, 40, d_a=1), prior, batch_size=256, generator=g)
         moments = SourceMoments.fit(buffer, prior, coupling=coupling, samples=2048, generator=g)
         deviation = (moments.source_variance * moments.target_variance).sqrt()
         correlations.append(float((moments.covariance / deviation).mean()))

@@ -45,12 +45,12 @@ def make_decoder(prior, delta=DELTA):
     return PriorDecoder(make_actor(prior), delta=delta)
 
 
-def make_env(prior, decoder=None, batched=SerialEnv, execute=None):
-    transforms = policy_transforms(prior, observation_steps=TO, execute=execute)
+def make_env(prior, decoder=None, batched=SerialEnv, truncate=False, **options):
+    transforms = policy_transforms(prior, observation_steps=TO, **options)
     transforms.append(PriorAnchor(make_actor(prior)))
     if decoder is not None:
         transforms.append(PriorSpace(decoder))
-    base = batched(2, [partial(CountingEnv, n) for n in LENGTHS])
+    base = batched(2, [partial(CountingEnv, n, truncate) for n in LENGTHS])
     return TransformedEnv(base, transforms)
 
 

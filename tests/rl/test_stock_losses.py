@@ -2,54 +2,28 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import RenameTransform, SerialEnv, TransformedEnv
+from torchrl.envs import RenameTransform
 from torchrl.objectives import CrossQLoss, REDQLoss, SACLoss, SoftUpdate, TQCLoss, ValueEstimators
 
-from tests.toy_env import ACTION_DIM, CountingEnv
+from tests.rl.test_environment import D_O, DELTA, TO, H, make_decoder, make_env
+from tests.toy_env import ACTION_DIM
 from warmprior import (
     PreviewPrior,
-    PriorAnchor,
-    PriorDecoder,
-    PriorSpace,
-    VelocityMLP,
-    WarmPriorActor,
     keys,
     make_prior_space_actor,
     make_prior_space_critic,
-    policy_transforms,
 )
 
-H, TO, D_O, DELTA, GAMMA = 3, 2, 2 + ACTION_DIM, 0.5, 0.9
-LENGTHS = (7, 4)
+GAMMA = 0.9
 PRIOR = PreviewPrior(H)
 SIZES = (ACTION_DIM, D_O, PRIOR.prediction_length, TO)
 LOG_PROB = ("prior", "delta_log_prob")
 LOSSES = [SACLoss, REDQLoss, CrossQLoss, TQCLoss]
-
-
-def make_policy():
-    torch.manual_seed(0)
-    return WarmPriorActor(VelocityMLP(*SIZES, hidden_dim=8), PRIOR, nfe=2, clip=1.0)
-
-
-def make_decoder():
-    return PriorDecoder(make_policy(), delta=DELTA)
-
-
-def make_env(decoder=None, truncate=False):
-    transforms = policy_transforms(PRIOR, observation_steps=TO, gamma=GAMMA)
-    transforms.append(PriorAnchor(make_policy()))
-    if decoder is not None:
-        transforms.append(PriorSpace(decoder))
-    base = SerialEnv(2, [partial(CountingEnv, n, truncate=truncate) for n in LENGTHS])
-    return TransformedEnv(base, transforms)
 
 
 def make_loss(loss_class):
@@ -77,13 +51,13 @@ def make_buffer():
 @pytest.mark.parametrize("wiring", ["policy", "environment"])
 @pytest.mark.parametrize("loss_class", LOSSES)
 def test_training_loop(loss_class, wiring):
-    decoder = make_decoder()
+    decoder = make_decoder(PRIOR)
     before = {name: tensor.clone() for name, tensor in decoder.state_dict().items()}
     actor, loss = make_loss(loss_class)
     if wiring == "policy":
-        env, policy = make_env(), TensorDictSequential(actor, decoder)
+        env, policy = make_env(PRIOR, gamma=GAMMA), TensorDictSequential(actor, decoder)
     else:
-        env, policy = make_env(decoder), actor
+        env, policy = make_env(PRIOR, decoder, gamma=GAMMA), actor
     collector = Collector(env, policy, frames_per_batch=16, total_frames=48)
     collector.set_seed(0)
     buffer = make_buffer()
@@ -138,9 +112,9 @@ def test_discount_of_short_chunks(loss_class, monkeypatch):
     actor, loss = make_loss(loss_class)
     if loss_class is not CrossQLoss:
         SoftUpdate(loss, tau=0.1)
-    env = make_env(truncate=True)
+    env = make_env(PRIOR, truncate=True, gamma=GAMMA)
     env.set_seed(0)
-    policy = TensorDictSequential(actor, make_decoder())
+    policy = TensorDictSequential(actor, make_decoder(PRIOR))
     data = env.rollout(12, policy, break_when_any_done=False)
     buffer = make_buffer()
     buffer.extend(data.reshape(-1))

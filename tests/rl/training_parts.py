@@ -98,13 +98,9 @@ def hand_rollout(decisions, lengths):
 
 
 def check_transitions(training, *, lengths=LENGTHS, offset=1.0, time_outs=False):
-    """What a training stored is what its environments do.
+    """What a training of WP-Past stored is what its environments do, with episodes of these lengths.
 
-    Args:
-        training: of WP-Past.
-        lengths: of the episodes of its environments.
-        offset: of rewards.
-        time_outs: whether episodes end by time-outs apart from terminations.
+    The offset is that of rewards; time-outs may count apart from terminations.
     """
     stored = training.buffer[:]
     expected = hand_rollout(len(stored) // len(lengths), lengths)

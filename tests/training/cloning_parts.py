@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tensordict import TensorDict
 
+from tests.toy_env import demonstrations
 from warmprior import ChiTransformer, PastPrior, VelocityMLP, WarmPriorActor
 from warmprior.training import BehaviourCloning, TrainingConfig
 
@@ -21,15 +21,7 @@ CONFIG = TrainingConfig(
 
 
 def dataset():
-    generator = torch.Generator().manual_seed(0)
-    return TensorDict(
-        {
-            "observation": torch.randn(120, 3, generator=generator),
-            "action": torch.randn(120, 2, generator=generator).clamp(-1, 1),
-            "episode": torch.arange(120) // 30,
-        },
-        [120],
-    )
+    return demonstrations(120, 30)
 
 
 def actor_for(prior=None, network=None):

@@ -146,6 +146,21 @@ def _iteration(folder):
     return load_state(path)[1]["iteration"] if path.exists() else 0
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"iterations": 3.5}, "iterations must be a whole number of at least 1, got 3.5"),
+        ({"save_every": 0}, "save_every must be a whole number"),
+        ({"seed": -1}, "seed must be a whole number from 0"),
+        ({"learning_rate": "fast"}, "learning_rate must be a finite number, got 'fast'"),
+        ({"betas": (0.9, 1.0)}, r"betas must lie in \[0, 1\), got \(0.9, 1.0\)"),
+    ],
+)
+def test_recipes_that_cannot_be(options, said):
+    with pytest.raises(ValueError, match=said):
+        TrainingConfig(**options)
+
+
 def test_the_papers_recipe():
     """Table 3."""
     config = PAPER

@@ -47,7 +47,7 @@ def test_products_are_bf16_and_the_loss_is_close(make, options):
         losses.append(value.item())
         types.append(seen)
     assert types == [{torch.float32}, {torch.bfloat16}]
-    assert losses[0] != losses[1] and losses[1] == pytest.approx(losses[0], rel=2e-2)
+    assert losses[1] == pytest.approx(losses[0], rel=2e-2)
 
 
 def test_states_and_policies_are_float32_and_resume_is_exact(tmp_path):

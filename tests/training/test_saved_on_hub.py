@@ -99,15 +99,6 @@ def test_what_is_to_be_private_is_not_published(hub, actor):
     assert not hub.files(NAME) and not hub.objects
 
 
-def test_a_tampered_file_is_refused(hub, actor, tmp_path):
-    save_policy(actor, tmp_path / "kept")
-    content = bytearray((tmp_path / "kept" / "model.safetensors").read_bytes())
-    content[-1] ^= 1
-    put(hub, actor, tmp_path / "kept", **{"model.safetensors": bytes(content)})
-    with pytest.raises(ValueError, match=r"safetensors is not a readable policy.*changed"):
-        load_policy(NAME)
-
-
 def test_something_else_is_refused_before_its_weights_are_fetched(hub, actor, tmp_path):
     put(hub, actor, tmp_path / "kept", **{"config.json": b'{"model_type": "bert"}'})
     with pytest.raises(ValueError, match=r"config\.json is of no policy of warmprior"):

@@ -12,10 +12,18 @@ from tensordict import TensorDict
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
-from tests.toy_env import ACTION_DIM, PLACES, ChunkPolicy, CountingEnv, Momentum, placed, random_history
+from tests.toy_env import (
+    ACTION_DIM,
+    PLACES,
+    ChunkPolicy,
+    CountingEnv,
+    Momentum,
+    placed,
+    random_history,
+    window_histories,
+)
 from warmprior import (
     ActionHistory,
-    ActionWindow,
     ChunkStep,
     GaussianPrior,
     HistoryObservation,
@@ -203,11 +211,7 @@ def test_every_decision_meets_the_mean_of_its_training_window(place):
     warm = 0
     for row, episode, frame, (loc, scale, mask) in decisions:
         actions = torch.stack(episodes[row][episode])
-        demonstration = {"observation": torch.zeros(len(actions), 1), "action": actions}
-        demonstration["episode"] = torch.zeros(len(actions), dtype=torch.int64)
-        window = ActionWindow(TensorDict(demonstration, [len(actions)]), 4)
-        history = window(TensorDict({"frame": torch.tensor(frame)}))["history"]
-        expected = prior.distribution(history)
+        expected = prior.distribution(window_histories(actions, torch.tensor(frame), 4))
         assert torch.equal(loc, expected.loc) and torch.equal(scale, expected.scale)
         assert torch.equal(mask, expected.warm) and mask.all() == mask.any() == (frame >= 2)
         warm += bool(mask.all())

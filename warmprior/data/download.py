@@ -80,16 +80,8 @@ def download_mimicgen(
     Args:
         task: ``stack_d0``, ``coffee_d0`` or ``threading_d0``.
         style: ``"source"`` (ten human demonstrations) or ``"core"`` (a thousand that MimicGen made of them).
-        root: the folder under which to keep the file; by default the hub client's cache.
-        force: download again even if the file is there.
-
-    Returns:
-        The path of the local file.
-
-    Raises:
-        ValueError: if there is no official file of the task or style.
-        OSError: if the repository delivers no readable file; names the cause.
-        ImportError: if h5py or huggingface_hub is not installed.
+        root: see :func:`download_robomimic`, also for errors and what is returned.
+        force: likewise.
 
     Examples:
         >>> download_mimicgen("coffee_d0")  # doctest: +SKIP
@@ -187,25 +179,18 @@ def _download(name: str, repositories: Sequence[str], root: str | Path | None, f
     failures: list[str] = []
     for repository in repositories:
         where = {"repo_id": repository, "filename": name, "repo_type": "dataset"}
-
-        def fetch(anew: bool, where: dict[str, Any] = where) -> Path:
-            path = Path(hub.hf_hub_download(**where, local_dir=root, force_download=anew))
-            _check(path, _published_digest(hub, where))
-            return path
-
-        # The client's failures share no base class: its own errors, those of the HTTP library
-        # underneath, and OSError for a broken connection, a full disk or a short file.
-        try:
+        for anew in dict.fromkeys((force, True)):  # a damaged copy is fetched once more
             try:
-                return fetch(force)
-            except DatasetError:
-                if force:
-                    raise
-                return fetch(True)
-        except Exception as error:
-            reason = str(error).strip() or "no message"
-            failures.append(f"{repository}: {type(error).__name__}: {reason}")
-            cause = error
+                path = Path(hub.hf_hub_download(**where, local_dir=root, force_download=anew))
+                _check(path, _published_digest(hub, where))
+                return path
+            # The client's failures share no base class: its own errors, those of the HTTP library
+            # underneath, and OSError for a broken connection, a full disk or a short file.
+            except Exception as error:
+                cause = error
+                if not isinstance(error, DatasetError):
+                    break
+        failures.append(f"{repository}: {type(cause).__name__}: {str(cause).strip() or 'no message'}")
     raise OSError(
         f"could not download {name}:\n- "
         + "\n- ".join(failures)

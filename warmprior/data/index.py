@@ -34,10 +34,6 @@ class DatasetIndex:
         env_args: the environment as it is described there; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
 
-    See Also:
-        - :class:`~warmprior.data.replay.DemonstrationReplay`: reads the values.
-        - :func:`~warmprior.data.opening.open_demonstrations`: finds what reads a place.
-
     Examples:
         >>> index = DatasetIndex(
         ...     path=Path("square.hdf5"), demos=("demo_0", "demo_1"), lengths=(120, 131),

@@ -29,7 +29,7 @@ from warmprior.data.lerobot_index import (
 )
 from warmprior.data.replay import DemonstrationReader, DemonstrationReplay
 from warmprior.io.extras import require
-from warmprior.io.hub import is_repository
+from warmprior.io.files import is_repository
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
 __all__ = [
@@ -224,16 +224,15 @@ class LeRobotExperienceReplay(DemonstrationReplay):
             for datasets that :func:`convert_robomimic` did not write; those are refused if it names
             another. Frequency, widths and names are checked against it, and robomimic's observations found
             by it. Without, whole features are observations.
-        filter_key: a mask of the converted file, such as ``"train"``; all episodes if ``None``.
-        demos: how many to take, the first ones by their numbers; all if ``None``.
+        filter_key: a mask of the converted file, see :class:`RobomimicExperienceReplay`.
+        demos: likewise.
         observation_keys: observations to concatenate; by default those of the task, or of an unknown
             environment ``"observation.environment_state"`` and ``"observation.state"`` as far as there.
         image_keys: images to read as well: ``"agentview_image"`` is the feature
             ``observation.images.agentview``, of pictures or a video. Take ``storage="memmap"`` where they
             are many.
-        absolute_actions: see :class:`RobomimicExperienceReplay`; of numbers that were rounded to
-            float32.
-        **kwargs: see :class:`RobomimicExperienceReplay`.
+        absolute_actions: see :class:`RobomimicExperienceReplay`; of numbers that were rounded to float32.
+        **kwargs: likewise.
 
     Raises:
         FileNotFoundError: if there is no such dataset.

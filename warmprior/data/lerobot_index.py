@@ -49,9 +49,6 @@ class LeRobotIndex(DatasetIndex):
         images: the feature of each of the images to read.
         described: what ``meta/warmprior.json`` says; empty for datasets that were not converted.
 
-    See Also:
-        :func:`~warmprior.data.lerobot_index.read_lerobot_index`: makes it.
-
     Examples:
         >>> index = read_lerobot_index("square_lerobot")  # doctest: +SKIP
         >>> index.files  # doctest: +SKIP
@@ -143,10 +140,6 @@ def action_names(arms: int) -> list[str]:
     Args:
         arms: how many.
 
-    See Also:
-        - :func:`~warmprior.data.lerobot_index.state_names`: of the observations.
-        - :func:`~warmprior.data.convert_robomimic`: writes these names.
-
     Examples:
         >>> action_names(1)[3:]
         ['robot0_rx', 'robot0_ry', 'robot0_rz', 'robot0_gripper']
@@ -159,10 +152,6 @@ def state_names(widths: Mapping[str, int]) -> list[str]:
 
     Args:
         widths: of the observations, in their order.
-
-    See Also:
-        - :func:`~warmprior.data.lerobot_index.action_names`: of the actions.
-        - :func:`~warmprior.data.convert_robomimic`: writes these names.
 
     Examples:
         >>> state_names({"robot0_gripper_qpos": 2})
@@ -198,16 +187,8 @@ def read_lerobot_index(
     ``observation.state`` alone, or each in ``observation.<key>``. Where no environment is known an
     observation is a whole feature.
 
-    Args:
-        root: the dataset's folder.
-        filter_key: a mask of the converted file, such as ``"train"``; all episodes if ``None``.
-        observation_keys: the observations to read; by default those of the task, or of an unknown
-            environment ``observation.environment_state`` and ``observation.state`` as far as there.
-        image_keys: images to read as well: ``"agentview_image"`` is the feature
-            ``observation.images.agentview``.
-        poses: also require the hand pose of every arm, from which absolute actions are built.
-        demos: how many to take, the first ones by their numbers; all if ``None``.
-        env_args: of the environment, for a dataset that does not describe it.
+    Options are those of :class:`~warmprior.data.LeRobotExperienceReplay`; ``poses`` also requires the hand
+    pose of every arm, from which absolute actions are built.
 
     Raises:
         FileNotFoundError: if there is no such dataset.

@@ -38,7 +38,7 @@ class MimicGenExperienceReplay(RobomimicExperienceReplay):
         >>> MimicGenExperienceReplay("coffee_d0")
         Traceback (most recent call last):
             ...
-        FileNotFoundError: coffee_d0: no such file; ...
+        FileNotFoundError: coffee_d0: no such file; check the path
     """
 
     def __init__(
@@ -53,10 +53,6 @@ class MimicGenExperienceReplay(RobomimicExperienceReplay):
         path = Path(dataset)
         if download and not path.is_file():
             path = download_mimicgen(str(dataset), style, root=root)
-        if not path.is_file():
-            raise FileNotFoundError(
-                f"{dataset}: no such file; check the path, or pass download=True with the name of a task"
-            )
         name = read_env_args(path)["env_name"]
         if not is_mimicgen(name):
             raise DatasetError(

@@ -56,9 +56,6 @@ def check_place(place: str | Path, option: str) -> None:
         FileNotFoundError: if there is no such file or folder.
         ImportError: if what reads it is not installed.
 
-    See Also:
-        :func:`~warmprior.data.opening.open_demonstrations`: reads what is there.
-
     Examples:
         >>> check_place("lerobot:user/square", "--dataset")
         >>> check_place("lerobot:./square", "--dataset")
@@ -102,10 +99,6 @@ def open_demonstrations(
         env_args: of the environment, for a LeRobotDataset that does not describe its own.
         mask: of the file, such as ``"train"``; all demonstrations if ``None``.
 
-    See Also:
-        - :class:`~warmprior.data.opening.Demonstrations`: what it returns.
-        - :func:`~warmprior.data.opening.check_place`: looks first, and reads nothing.
-
     Examples:
         >>> open_demonstrations("lerobot:user/square").name  # nothing is fetched yet
         'lerobot:square'
@@ -116,9 +109,6 @@ def open_demonstrations(
 
 class Demonstrations(ABC):
     """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
-
-    See Also:
-        :func:`~warmprior.data.opening.open_demonstrations`: finds the one for a place.
 
     Examples:
         >>> place = open_demonstrations("nowhere.hdf5")  # not looked at yet

@@ -272,11 +272,13 @@ def _rendered_before(path: Path, index: DatasetIndex, cameras: Sequence[str], fa
 def _write(path: Path, illustrator: _Illustrator, kept: Sequence[str]) -> None:
     """The file with the images of the demos, and with its masks if all of them are in it."""
     h5py, size, index = require("h5py", "sim"), illustrator.size, illustrator.index
+    kwargs = {"camera_names": list(illustrator.cameras), "camera_heights": size, "camera_widths": size}
+    env_args = index.env_args | {"env_kwargs": index.env_args["env_kwargs"] | kwargs}
     with open_robomimic(index.path) as source, h5py.File(path, "w") as file:
         data = file.create_group("data")
         data.attrs.update(source["data"].attrs)
         data.attrs["total"] = sum(index.lengths)
-        data.attrs["env_args"] = json.dumps(_with_cameras(index.env_args, illustrator), indent=4)
+        data.attrs["env_args"] = json.dumps(env_args, indent=4)
         data.attrs["rendering"] = json.dumps(
             {"size": size, "cameras": [*kept, *illustrator.cameras], "fast": illustrator.fast}
         )
@@ -293,15 +295,6 @@ def _write(path: Path, illustrator: _Illustrator, kept: Sequence[str]) -> None:
                     )
         if "mask" in source and len(index.demos) == len(source["data"]):
             source.copy("mask", file)
-
-
-def _with_cameras(env_args: Mapping[str, Any], illustrator: _Illustrator) -> dict[str, Any]:
-    kwargs = env_args["env_kwargs"] | {
-        "camera_names": list(illustrator.cameras),
-        "camera_heights": illustrator.size,
-        "camera_widths": illustrator.size,
-    }
-    return {**env_args, "env_kwargs": kwargs}
 
 
 def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) -> None:

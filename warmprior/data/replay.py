@@ -23,7 +23,7 @@ from warmprior.data.index import BLOCK, DatasetIndex
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
-from warmprior.io.memory import available_memory
+from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 
 __all__ = ["DemonstrationReader", "DemonstrationReplay"]

@@ -93,9 +93,8 @@ def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> d
         >>> arm["damping_ratio"], arm["input_type"], arm["input_ref_frame"]
         (1, 'delta', 'world')
     """
-    for key in ("env_name", "env_kwargs"):
-        if key not in env_args:
-            raise ValueError(f"env_args has no {key!r}; it has {sorted(env_args)}")
+    if missing := {"env_name", "env_kwargs"} - set(env_args):
+        raise ValueError(f"env_args lacks {sorted(missing)}; it has {sorted(env_args)}")
     new = copy.deepcopy(dict(env_args))
     kwargs = new["env_kwargs"]
     configs = kwargs.get("controller_configs")

@@ -53,9 +53,6 @@ def register_mimicgen() -> None:
     Raises:
         ImportError: if the package is missing, another one, or cannot be imported.
 
-    See Also:
-        :func:`~warmprior.data.download_mimicgen`: demonstrations of these tasks.
-
     Examples:
         >>> register_mimicgen()  # doctest: +SKIP
         >>> robosuite.make("Coffee_D0", "Panda")  # doctest: +SKIP

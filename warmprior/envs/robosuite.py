@@ -157,24 +157,14 @@ class RobosuiteWrapper(_EnvWrapper):
         size: int | tuple[int, int] | None = None,
         state: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Render a state; works whether or not ``from_pixels`` was asked for.
+        """Render a state, with or without ``from_pixels``: uint8 ``[h, w, 3]``, the right way up.
 
-        Args:
-            camera: defaults to the environment's first.
-            size: side in pixels or ``(height, width)``; defaults to ``camera_size``.
-            state: of the simulator, as ``"sim_state"`` and ``loop.state()`` tell it; the current one by
-                default.
-
-        Returns:
-            uint8 ``[h, w, 3]``, the right way up. The episode goes on as if nothing was rendered.
+        By default the first camera shows the present state in ``camera_size``; a state is given as
+        ``"sim_state"`` and ``loop.state()`` tell it. The episode goes on as if nothing was rendered.
 
         Raises:
             ValueError: if there is no such camera.
             RuntimeError: if no OpenGL backend works.
-
-        Examples:
-            >>> env.render_frame("frontview", 256).shape  # doctest: +SKIP
-            (256, 256, 3)
         """
         size = self.camera_size if size is None else size
         height, width = (size, size) if isinstance(size, int) else size
@@ -305,15 +295,6 @@ class RobosuiteWrapper(_EnvWrapper):
 
         Returns:
             What each step led to, ``n`` or fewer.
-
-        Raises:
-            ValueError: if ``keep < 1``.
-
-        Examples:
-            >>> _ = env.reset()  # doctest: +SKIP
-            >>> steps = env.control_steps(torch.zeros(8, 7), keep=1)  # doctest: +SKIP
-            >>> ["observation" in step for step in steps[-2:]]  # doctest: +SKIP
-            [False, True]
         """
         if keep < 1:
             raise ValueError(f"keep must be at least 1, got {keep}")

@@ -77,23 +77,10 @@ def isolated_numpy_seed(seed: int) -> Iterator[None]:
 
 
 def task_env_args(task: str) -> dict[str, Any]:
-    """Describe a task's environment as the ``env_args`` of a robomimic file.
+    """Describe a task's environment as the ``env_args`` of a robomimic file, which JSON can hold.
 
     Every option that changes what an action means is written out: pose deltas of at most 5 cm and
     0.5 rad in the world frame, 20 Hz control.
-
-    Args:
-        task: a name of :data:`warmprior.envs.tasks.TASKS`.
-
-    Returns:
-        A dict that JSON can hold: ``env_name``, ``env_version``, ``type`` and ``env_kwargs``.
-
-    Raises:
-        ValueError: if there is no such task.
-
-    Examples:
-        >>> task_env_args("square")["env_name"]
-        'NutAssemblySquare'
     """
     spec = get_task(task)
     kwargs: dict[str, Any] = {

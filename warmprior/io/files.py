@@ -8,6 +8,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import tempfile
 import time
 import uuid
@@ -27,6 +28,7 @@ __all__ = [
     "digest_of",
     "exclusive",
     "file_digest",
+    "is_repository",
     "read_json",
     "read_lines",
     "read_tensors",
@@ -64,6 +66,17 @@ def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
 
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     return load(data), header.get("__metadata__", {})
+
+
+def is_repository(name: str) -> bool:
+    """Whether a text has the form of a repository's name at the hub.
+
+    Examples:
+        >>> [is_repository(name) for name in ("user/name", "runs/a/b", "../name", "policy", "/tmp/name")]
+        [True, False, False, False, False]
+    """
+    part = r"[A-Za-z0-9_]([A-Za-z0-9._-]*[A-Za-z0-9_])?"
+    return bool(re.fullmatch(f"{part}/{part}", name))
 
 
 def check_regular(path: Path) -> None:
@@ -127,9 +140,6 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     Raises:
         OSError: if the file cannot be written, naming ``path``.
 
-    See Also:
-        :func:`~warmprior.io.files.exclusive`: keeps other processes out of the folder.
-
     Examples:
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder:
@@ -153,7 +163,8 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
             f"cannot write {path}: {error}. Free some space or choose another output folder."
         ) from error
     finally:
-        _remove(temporary)
+        with contextlib.suppress(OSError):  # a read-only folder never received the file
+            temporary.unlink(missing_ok=True)
 
 
 def _remove_stale(path: Path) -> None:
@@ -170,12 +181,6 @@ def _remove_stale(path: Path) -> None:
         with contextlib.suppress(OSError):
             if (here and not psutil.pid_exists(int(process))) or time.time() - old.stat().st_mtime > 86_400:
                 old.unlink()
-
-
-def _remove(path: Path) -> None:
-    # A read-only folder never received the file.
-    with contextlib.suppress(OSError):
-        path.unlink(missing_ok=True)
 
 
 def check_writable(directory: Path) -> None:
@@ -201,9 +206,6 @@ def exclusive(directory: Path) -> Iterator[None]:
 
     Raises:
         BlockingIOError: if another process is in there.
-
-    See Also:
-        :func:`~warmprior.io.files.write_atomic`: what readers see is whole without a lock.
 
     Examples:
         >>> from tempfile import TemporaryDirectory

@@ -1,15 +1,21 @@
-"""What computed a result: versions and hardware."""
+"""What this machine is, and how much of its memory is free."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
+import re
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any
 
+import psutil
 import torch
 
-__all__ = ["facts_of_machine"]
+__all__ = ["available_memory", "facts_of_machine"]
+
+_CONTROL_GROUP = Path("/sys/fs/cgroup")
 
 PACKAGES = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "numpy", "lerobot")
 
@@ -26,3 +32,15 @@ def facts_of_machine(**more: Any) -> dict[str, Any]:
     if torch.cuda.is_available():
         hardware["gpu"] = torch.cuda.get_device_name()
     return {"versions": versions, "hardware": hardware}
+
+
+def available_memory() -> int:
+    """Bytes that can be taken before the system, or this process's container, runs out."""
+    free = int(psutil.virtual_memory().available)
+    # psutil does not know the limit of a container. There is none where these are missing or say "max".
+    with contextlib.suppress(OSError, ValueError):
+        limit = int((_CONTROL_GROUP / "memory.max").read_text())
+        used = int((_CONTROL_GROUP / "memory.current").read_text())
+        cache = re.search(r"^file (\d+)", (_CONTROL_GROUP / "memory.stat").read_text(), re.M)
+        free = min(free, limit - used + (int(cache[1]) if cache else 0))
+    return free

@@ -26,9 +26,6 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
     They are no forks: nothing of this process, such as its threads, simulators and gradients, is in them.
     Ctrl-C is left to this process, and they end when it ends, however that happens.
 
-    See Also:
-        :func:`~warmprior.io.processes.working`: jobs on a state that the processes keep.
-
     Examples:
         >>> with fresh_processes(1) as executor:  # doctest: +SKIP
         ...     executor.submit(pow, 2, 3).result()
@@ -72,9 +69,6 @@ def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]],
 
     Raises:
         WorkerError: if a process dies.
-
-    See Also:
-        :func:`~warmprior.io.processes.fresh_processes`: what they are.
 
     Examples:
         >>> from functools import partial

@@ -42,9 +42,6 @@ def check_ray(address: str | None = None) -> str | None:
         ValueError: if this is no address of a head.
         ConnectionError: if nothing answers there, or the cluster has another Ray or Python.
 
-    See Also:
-        :func:`~warmprior.io.ray_cluster.ray_cluster`: connects to it.
-
     Examples:
         >>> check_ray("node-1:6379")  # doctest: +SKIP
         'node-1:6379'
@@ -94,9 +91,6 @@ def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str
 
     Raises:
         WorkerError: naming the machine and both versions, a ``RuntimeError``.
-
-    See Also:
-        :func:`~warmprior.io.ray_cluster.ray_cluster`: whose machines have to agree.
 
     Examples:
         >>> check_versions({"torch": "2.11.0"}, {"torch": "2.10.0"}, "node-7")

@@ -45,9 +45,6 @@ def run_script(
     Returns:
         The exit code: 0, 2 after an error, 130 after Ctrl-C.
 
-    See Also:
-        :func:`~warmprior.io.distributed.launched`: whether it is one of several processes.
-
     Examples:
         >>> from contextlib import redirect_stderr
         >>> run_script(lambda: print("trained"), "train.py")

@@ -337,7 +337,7 @@ def evaluate(
         ValueError: if ``episodes < 1``, or the environment has several batch dimensions, cannot play the
             episodes of given seeds in its rows, or adds an offset to them; if the policy keeps a normaliser
             that the environment lacks.
-        KeyError: if it lacks ``success``, one of ``measures``, or the policy's transforms.
+        KeyError: see :func:`play_episode`.
         WorkerError: if a worker process dies, a ``RuntimeError``.
 
     See Also:
@@ -346,8 +346,7 @@ def evaluate(
         - :func:`~warmprior.diagnostics.success_posterior`: what the successes tell about the rate.
 
     Examples:
-        >>> from torchrl.envs import TransformedEnv
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
+        >>> from warmprior import PastPrior, VelocityMLP, policy_transforms
         >>> from warmprior.envs import GoalNavigationEnv
         >>> prior = PastPrior(8)
         >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)

@@ -193,9 +193,6 @@ def record_video(
     actor: WarmPriorActor,
     path: Path,
     *,
-    seed: int,
-    nfe: int | None = None,
-    policy_seed: int = 0,
     size: int = 256,
     **options: Any,
 ) -> bool:
@@ -206,11 +203,8 @@ def record_video(
         path: of the MP4.
 
     Keyword Args:
-        seed: simulator seed of the episode.
-        nfe: network evaluations per chunk; the policy's own by default.
-        policy_seed: of the source samples.
         size: side of the picture in pixels, even.
-        options: further ones of :func:`record_filmstrip`.
+        options: those of :func:`record_filmstrip`: ``seed``, ``nfe``, ``policy_seed`` and so on.
 
     Returns:
         Whether the task was solved.
@@ -229,5 +223,4 @@ def record_video(
             ...
         ValueError: the side of a video must be an even number of pixels, got 255
     """
-    options |= {"nfe": nfe, "policy_seed": policy_seed, "size": size}
-    return record_filmstrip(actor, seed=seed, frames=1, video=path, **options).success
+    return record_filmstrip(actor, frames=1, size=size, video=path, **options).success

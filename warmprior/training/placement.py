@@ -55,10 +55,6 @@ class Prefetch:
     Keyword Args:
         device: where batches go; through pinned memory if that is a GPU.
 
-    See Also:
-        - :func:`~warmprior.training.placement.placed`: where data and network are to be.
-        - :class:`~warmprior.training.BehaviourCloning`: uses it with ``prefetch``.
-
     Examples:
         >>> generator = torch.Generator().manual_seed(0)
         >>> batches = Prefetch(lambda: torch.rand(2, generator=generator), generator)

@@ -16,8 +16,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior.io.extras import require
-from warmprior.io.files import as_json, read_json, write_atomic
-from warmprior.io.hub import is_repository
+from warmprior.io.files import as_json, is_repository, read_json, write_atomic
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.compiled import uncompiled, without_compilation
 from warmprior.modules.network import VelocityNetwork
@@ -163,10 +162,10 @@ def policy_file(place: str | Path, *, revision: str | None = None) -> dict[str, 
     return _read(_folder(place, revision=revision))[1]
 
 
-def check_saveable(actor: WarmPriorActor) -> None:
-    """Whether :func:`load_policy` could load what :func:`save_policy` would write.
+def check_saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The configuration and weights to save, after checking that :func:`load_policy` could load them.
 
-    For before a training: its policies would be lost otherwise.
+    Also for before a training: its policies would be lost otherwise.
 
     Raises:
         TypeError: if there is no :func:`policy_config`.
@@ -174,13 +173,8 @@ def check_saveable(actor: WarmPriorActor) -> None:
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP
-        >>> check_saveable(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)))
+        >>> config, weights = check_saveable(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)))
     """
-    _saveable(actor)
-
-
-def _saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The configuration and the tensors, after checking that they belong together."""
     config = policy_config(actor)
     tensors = without_compilation(actor.state_dict())
     try:
@@ -222,7 +216,7 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
         ...     load_policy(folder).prior
         PastPrior(chunk_length=4, sigma=0.5, correlation=0.0)
     """
-    config, tensors = _saveable(actor)
+    config, tensors = check_saveable(actor)
     directory = Path(directory)
     save_state(directory / WEIGHTS, tensors, config)
     text = json.dumps(config, indent=2) + "\n"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.objectives.flow_matching import Objective, Weighting, check_objective
 from warmprior.objectives.times import TimesName
 
@@ -75,26 +76,28 @@ class TrainingConfig:
     cold_probability: float = 0.0
 
     def __post_init__(self) -> None:
-        counts = ("iterations", "batch_size", "checkpoints", "log_every", "save_every")
-        for name, least in [*((name, 1) for name in counts), ("seed", 0)]:
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ValueError(f"{name} must be at least {least}, got {value}")
-        if self.seed >= 2**62:  # others are counted from it
-            raise ValueError(f"seed must be below 2**62, got {self.seed}")
-        for name, low in (("learning_rate", ">"), ("eps", ">"), ("weight_decay", ">=")):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and (value > 0 or (value == 0 and low == ">="))):
-                raise ValueError(f"{name} must be a finite number {low} 0, got {value}")
+        counts = ("iterations", "batch_size", "checkpoints", "log_every")
+        check_whole_numbers(**{name: getattr(self, name) for name in counts})
+        if self.save_every is not None:
+            check_whole_numbers(save_every=self.save_every)
+        if not isinstance(self.seed, int) or not 0 <= self.seed < 2**62:  # others are counted from it
+            raise ValueError(f"seed must be a whole number from 0 to 2**62 - 1, got {self.seed!r}")
+        ranges: dict[str, tuple[Callable[[float], bool], tuple[str, ...]]] = {
+            "be > 0": (lambda value: value > 0, ("learning_rate", "eps")),
+            "be >= 0": (lambda value: value >= 0, ("weight_decay",)),
+            "lie in [0, 1)": (lambda value: 0 <= value < 1, ("betas", "warmup_ratio", "ema_rate")),
+            "lie in [0, 1]": (lambda value: 0 <= value <= 1, ("cold_probability",)),
+        }
+        for words, (fits, names) in ranges.items():
+            for name in names:
+                value = getattr(self, name)
+                for number in value if name == "betas" else (value,):
+                    check_finite_numbers(**{name: number})
+                    if not fits(number):
+                        raise ValueError(f"{name} must {words}, got {value}")
         if self.precision not in get_args(Precision):
             known = ", ".join(get_args(Precision))
             raise ValueError(f"precision must be one of {known}, got {self.precision!r}")
-        if not 0.0 <= self.cold_probability <= 1.0:
-            raise ValueError(f"cold_probability must lie in [0, 1], got {self.cold_probability}")
-        shares = {"betas": self.betas, "warmup_ratio": (self.warmup_ratio,)}
-        for name, values in (shares | {"ema_rate": (self.ema_rate,)}).items():
-            if not all(0.0 <= value < 1.0 for value in values):
-                raise ValueError(f"{name} must lie in [0, 1), got {getattr(self, name)}")
         check_objective(
             times=self.times,
             objective=self.objective,
