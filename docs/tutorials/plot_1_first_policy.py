@@ -94,8 +94,8 @@ plt.show()
 # * :class:`~warmprior.PreconditionedNetwork` scales the network's inputs and outputs by what is
 #   known of source and data.
 # * :class:`~warmprior.WarmPriorActor` draws from the source, which the prior derives from the
-# history, and integrates the network's velocity to a chunk; ``nfe`` is the number of network
-# evaluations.
+#   history, and integrates the network's velocity to a chunk; ``nfe`` is the number of network
+#   evaluations.
 # * :class:`~warmprior.FlowMatchingLoss` is a TorchRL loss module.
 #
 # Between the two policies nothing changes but the prior.
