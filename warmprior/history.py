@@ -84,7 +84,7 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
             f"{remembered} and the chunk has {length}: execute between 0 and {min(remembered, length)}"
         )
     chunk = chunk.to(before.dtype)
-    # Of [actions, chunk, zeros] the last executed actions begin at k, what is left of the chunk behind them.
+    # Of [actions, chunk, zeros] the last executed actions begin at k, and the rest of the chunk follows.
     line = torch.cat([before, chunk, torch.zeros_like(chunk[..., :remembered, :])], -2)
     if low == high:  # one robot, or all in step: a slice, at a third of the time
         moved = line[..., low : low + remembered + length, :]

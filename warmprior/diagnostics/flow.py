@@ -171,8 +171,9 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
 
 
 def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
-    """Update the last actions in the observation after the history has changed. Images must not be encoded
-    yet: the actions stand at the end of the observation's vector.
+    """Update the last actions in the observation after the history has changed.
+
+    Images must not be encoded yet: the actions stand at the end of the observation's vector.
 
     Raises:
         KeyError: if the windows lack what the network sees, or the history.

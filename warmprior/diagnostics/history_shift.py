@@ -15,8 +15,10 @@ __all__ = ["HistoryShift"]
 
 
 class HistoryShift(TensorDictModuleBase):
-    """Disturbs a policy's history at every decision. Adds normal noise to the history's actions and forecast
-    before the policy sees them. The environment's own history stays as it is.
+    """Disturbs a policy's history at every decision.
+
+    Adds normal noise to the history's actions and forecast before the policy sees them. The environment's own
+    history stays as it is.
 
     Args:
         policy: the policy.

@@ -94,9 +94,10 @@ def mean_error(
 
 
 def mean_revision(rollout: TensorDictBase) -> float:
-    """Distance of the mean from the policy's next prediction, along rollouts. If it is larger than at
-    demonstrated states (:attr:`MeanError.revision`), forecasts age worse in the states that the policy
-    reaches than in the demonstrations.
+    """Distance of the mean from the policy's next prediction, along rollouts.
+
+    If it is larger than at demonstrated states (:attr:`MeanError.revision`), forecasts age worse in the
+    states that the policy reaches than in the demonstrations.
 
     Args:
         rollout: ``[D]`` decisions with what the policy wrote, see :class:`~warmprior.training.Episode`.

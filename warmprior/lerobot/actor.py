@@ -23,10 +23,11 @@ __all__ = ["LeRobotActor", "LeRobotFlow"]
 
 
 class LeRobotFlow(TensorDictModuleBase):
-    """The sampler of a LeRobot policy in place of :class:`~warmprior.ODEActor`. A deterministic map ``(noise,
-    observation) -> chunk``: the padding around the prior's part of the source is one fixed draw, unless a
-    call passes its own.
-    The policy's weights are not among the parameters of this module.
+    """The sampler of a LeRobot policy in place of :class:`~warmprior.ODEActor`.
+
+    A deterministic map ``(noise, observation) -> chunk``: the padding around the prior's part of the source
+    is one fixed draw, unless a call passes its own. The policy's weights are not among the parameters of this
+    module.
 
     Args:
         policy: of LeRobot, see :class:`WarmPriorAdapter`.
@@ -98,7 +99,7 @@ class LeRobotFlow(TensorDictModuleBase):
 
     @property
     def network(self) -> ChunkSource:
-        """What tells the width of actions."""
+        """The source, which has the width of actions."""
         return self.source
 
     def check_nfe(self, nfe: int | None) -> None:
@@ -247,7 +248,7 @@ class LeRobotActor(TensorDictModuleBase):
 
     @property
     def network(self) -> ChunkSource:
-        """What tells the width of actions."""
+        """The source, which has the width of actions."""
         return self.ode.source
 
     @property

@@ -233,8 +233,7 @@ class WarmPriorAdapter:
             return call(batch, **kwargs)
 
     def record_executed(self, action: Tensor) -> None:
-        """Replace the action that :meth:`select_action` just returned by the executed one, where a
-        postprocessor or robot clips.
+        """Replace the last action of :meth:`select_action` by the executed one, as after clipping.
 
         Args:
             action: ``[B, d_a]``, the model's units.

@@ -107,8 +107,9 @@ class VelocityNetwork(nn.Module, Registered):
             raise ValueError(f"{built}, got {tuple(observation.shape)}")
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-        """Encode an observation once, before the field is evaluated at it many times. The network takes the
-        result in place of the observation. By default this does nothing.
+        """Encode an observation once, before the field is evaluated at it many times.
+
+        The network takes the result in place of the observation. By default this does nothing.
 
         Args:
             observation: ``[B, To, d_o]``, or a tensordict ``[B]``.

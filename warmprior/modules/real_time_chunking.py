@@ -185,8 +185,9 @@ class RealTimeChunking:
         delay: Tensor,
         sigma: Tensor | float = 1.0,
     ) -> Velocity:
-        """A velocity that makes chunks continue the leftover. It works under ``torch.no_grad()``, and its
-        result is detached.
+        """A velocity that makes chunks continue the leftover.
+
+        It works under ``torch.no_grad()``, and its result is detached.
 
         Args:
             velocity: ``(t [B], a_t [B, P, d_a]) -> [B, P, d_a]``.

@@ -13,8 +13,9 @@ __all__ = ["Registered", "find", "from_config", "make", "options_of"]
 
 
 class Registered:
-    """Base class whose subclasses are known by name, and whose objects remember their constructor's
-    arguments. Every direct subclass has a registry of its own subclasses, except for those declared with
+    """Subclasses are known by name, and objects remember their constructor's arguments.
+
+    Every direct subclass has a registry of its own subclasses, except for those declared with
     ``abstract=True``.
 
     Raises:

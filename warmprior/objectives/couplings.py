@@ -66,7 +66,7 @@ class OTCoupling:
         self.observation_weight = observation_weight
 
     def config(self) -> dict[str, Any]:
-        """What it depends on."""
+        """The options that it depends on."""
         return {"name": "ot", "observation_weight": self.observation_weight}
 
     def __call__(
@@ -134,7 +134,7 @@ class ReflowCoupling:
         self.teacher, self.nfe = teacher.eval().requires_grad_(False), nfe
 
     def config(self) -> dict[str, Any]:
-        """What it depends on, with a digest of the teacher's weights."""
+        """The options, with a digest of the teacher's weights."""
         weights = {name: value.tolist() for name, value in self.teacher.state_dict().items()}
         return {"name": "reflow", "nfe": self.nfe, "teacher": digest_of(weights)}
 

@@ -21,9 +21,10 @@ __all__ = ["PriorAnchor", "has_anchor", "residual_sigma", "source_anchor"]
 
 
 def has_anchor(actor: Any) -> bool:
-    """Whether a policy's source has a moving centre, around which an agent can search: the policy has a start
-    point, or its prior's mean is warm once the history is full. Otherwise agents search around zero, as in
-    DSRL.
+    """Whether a policy's source has a moving centre, around which an agent can search.
+
+    It has if the policy has a start point, or its prior's mean is warm once the history is full. Otherwise
+    agents search around zero, as in DSRL.
 
     Args:
         actor: the policy.

@@ -141,7 +141,7 @@ class InferenceDelay(Transform):
                 "before gave, with the chunk"
             )
         if tensordict.get(self.chunk_key, None) is None:
-            return tensordict  # ChunkStep tells
+            return tensordict  # ChunkStep raises
         return tensordict.set(self.chunk_key, executed_chunk(tensordict, self.chunk_key))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

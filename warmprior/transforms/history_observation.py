@@ -71,7 +71,7 @@ class HistoryObservation(Transform):
         return tensordict.set(self.out_keys[0], _with_vector(observation, extend))
 
     def _read(self, place: TensorDictBase | Composite) -> list[Any]:
-        """What lies under the input keys, values or their specs."""
+        """The values or specs under the input keys."""
         known = place.keys(True)
         missing = [key for key in self.in_keys if key not in known]
         if missing:

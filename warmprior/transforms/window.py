@@ -243,7 +243,7 @@ def window_transforms(
         observation_steps: ``To``.
         see_history: whether the network sees the last actions.
         withhold: share of the windows whose history is withheld.
-        generator: source of randomness of what is withheld, on the data's device.
+        generator: source of randomness of the withheld windows, on the data's device.
         renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
 
     Examples:
