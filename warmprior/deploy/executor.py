@@ -71,6 +71,7 @@ class AsyncExecutor:
             provide.
 
     Examples:
+        >>> from warmprior.deploy import AsyncExecutor
         >>> import torch
         >>> from warmprior import PastPrior, RealTimeChunking, VelocityMLP, WarmPriorActor
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8), guidance=RealTimeChunking())

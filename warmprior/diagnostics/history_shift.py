@@ -35,6 +35,7 @@ class HistoryShift(TensorDictModuleBase):
         - :class:`~warmprior.PastPrior`: a source whose mean it disturbs.
 
     Examples:
+        >>> from warmprior.diagnostics import HistoryShift
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> actor = WarmPriorActor(VelocityMLP(1, 3, 4), PastPrior(4))

@@ -56,7 +56,7 @@ class LeRobotFlow(TensorDictModuleBase):
 
     Examples:
         >>> from warmprior import PastPrior
-        >>> from warmprior.lerobot import WarmPriorAdapter
+        >>> from warmprior.lerobot import LeRobotFlow, WarmPriorAdapter
         >>> adapter = WarmPriorAdapter(policy, PastPrior(8))  # doctest: +SKIP
         >>> flow = LeRobotFlow(policy, adapter.source, nfe=1)  # doctest: +SKIP
         >>> chunk = flow(data)["vla_action", "chunk"]  # doctest: +SKIP
@@ -202,6 +202,8 @@ class LeRobotActor(TensorDictModuleBase):
         KeyError: (when called) if an entry of the history is missing.
 
     Examples:
+        >>> from warmprior import ActionHistory, ChunkStep, PastPrior
+        >>> from warmprior.lerobot import LeRobotActor
         >>> actor = LeRobotActor(policy, PastPrior(16), nfe=1)  # doctest: +SKIP
         >>> env = TransformedEnv(base, Compose(ChunkStep(16), ActionHistory(16)))  # doctest: +SKIP
         >>> env.rollout(10, actor)["vla_action", "chunk"].shape  # doctest: +SKIP

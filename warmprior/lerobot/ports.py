@@ -32,6 +32,7 @@ class FlowPort(ABC):
         - :data:`~warmprior.lerobot.PORTS`: all of them.
 
     Examples:
+        >>> from warmprior.lerobot import PORTS
         >>> from types import SimpleNamespace
         >>> smolvla = SimpleNamespace(config=SimpleNamespace(chunk_size=50, max_action_dim=32))
         >>> port = PORTS["0.6"]["smolvla"]
@@ -402,6 +403,7 @@ def port_for(policy: Any) -> FlowPort:
         - :data:`~warmprior.lerobot.PORTS`: all of them.
 
     Examples:
+        >>> from warmprior.lerobot import port_for
         >>> port_for(policy).length(policy)  # a SmolVLAPolicy  # doctest: +SKIP
         50
         >>> class ACTPolicy:

@@ -28,6 +28,7 @@ class RelativeActions:
         - :class:`~warmprior.lerobot.WarmPriorAdapter`: takes it as ``relative``.
 
     Examples:
+        >>> from warmprior.lerobot import RelativeActions
         >>> relative = RelativeActions(preprocessor, postprocessor)  # doctest: +SKIP
         >>> _ = preprocessor(observation)  # doctest: +SKIP
         >>> before = relative.state()  # doctest: +SKIP

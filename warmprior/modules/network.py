@@ -37,6 +37,9 @@ class VelocityNetwork(nn.Module, Registered):
         - :class:`~warmprior.PreconditionedNetwork`: wraps any of them.
 
     Examples:
+        >>> import torch
+        >>> from torch import nn
+        >>> from warmprior import VelocityNetwork
         >>> class LinearNetwork(VelocityNetwork):
         ...     def __init__(self, action_dim, observation_dim, prediction_length, observation_steps):
         ...         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
@@ -224,6 +227,7 @@ class TimestepEmbedding(nn.Module):
         :class:`~warmprior.ChiTransformer`: embeds its times with it.
 
     Examples:
+        >>> from warmprior.modules import TimestepEmbedding
         >>> import torch
         >>> TimestepEmbedding(8)(torch.tensor([0.0, 1.0])).shape
         torch.Size([2, 8])

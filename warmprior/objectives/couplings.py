@@ -49,6 +49,7 @@ class OTCoupling:
         :class:`~warmprior.objectives.ReflowCoupling`: pairs each source with the end of a trained flow.
 
     Examples:
+        >>> from warmprior.objectives import OTCoupling
         >>> import torch
         >>> couple = OTCoupling(observation_weight=0.0)
         >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
@@ -118,6 +119,7 @@ class ReflowCoupling:
         :class:`~warmprior.objectives.OTCoupling`: permutes the sources instead.
 
     Examples:
+        >>> from warmprior.objectives import ReflowCoupling
         >>> import torch
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
         >>> couple = ReflowCoupling(WarmPriorActor(VelocityMLP(2, 3, 4), GaussianPrior(4)), nfe=2)

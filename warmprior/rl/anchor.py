@@ -33,6 +33,7 @@ def has_anchor(actor: Any) -> bool:
         :func:`~warmprior.rl.source_anchor`: returns that centre.
 
     Examples:
+        >>> from warmprior.rl import has_anchor
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
         >>> network, priors = VelocityMLP(2, 3, 4), (GaussianPrior(4), PastPrior(4))
         >>> [has_anchor(WarmPriorActor(network, prior)) for prior in priors]
@@ -63,6 +64,9 @@ def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | Non
         :class:`~warmprior.PriorAnchor`: writes it in an environment, with noise elsewhere.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.history import window_history
+        >>> from warmprior.rl import source_anchor
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> target, steps = torch.zeros(4, 2), torch.tensor([4])
         >>> history = window_history(torch.ones(4, 2), steps, target, chunk_length=4)

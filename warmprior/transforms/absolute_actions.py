@@ -57,6 +57,7 @@ class AbsoluteActions(Transform):
         KeyError: if there is no pose.
 
     Examples:
+        >>> from warmprior import AbsoluteActions
         >>> import torch
         >>> from tensordict import TensorDict
         >>> transform = AbsoluteActions([0.05] * 3 + [0.5] * 3)

@@ -35,7 +35,7 @@ class HistoryObservation(Transform):
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
-        >>> from warmprior import GaussianPrior, policy_transforms
+        >>> from warmprior import GaussianPrior, HistoryObservation, policy_transforms
         >>> transforms = policy_transforms(GaussianPrior(2), observation_steps=1, see_history=True)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), transforms)
         >>> seen = env.rollout(2)["prior", "observation"]  # 3 observations, 2 actions, whether there are 2

@@ -81,7 +81,7 @@ def policy_transforms(
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
-        >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> actor = WarmPriorActor(VelocityMLP(1, 3, prediction_length=8), PreviewPrior(4))
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(actor))
         >>> env.reset()["observation"].shape
