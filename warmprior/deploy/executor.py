@@ -146,7 +146,7 @@ class AsyncExecutor:
 
     @property
     def expected_delay(self) -> int:
-        """The delay that the next decision expects: the largest of :attr:`delays`, else ``delay``."""
+        """The delay that the next decision expects, the largest of :attr:`delays` or else ``delay``."""
         return max(self._delays, default=self._expected)
 
     def reset(self) -> None:

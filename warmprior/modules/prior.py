@@ -129,7 +129,7 @@ class Prior(Registered):
 
     @property
     def history_length(self) -> int:
-        """How many executed actions :meth:`mean` needs: ``H`` or more."""
+        """How many executed actions :meth:`mean` needs, at least ``H``."""
         return self.chunk_length
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
