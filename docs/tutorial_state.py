@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import random
 import warnings
@@ -18,6 +19,8 @@ os.environ |= {
     "HF_HUB_DISABLE_PROGRESS_BARS": "1",
     "RL_LOGGING_LEVEL": "WARNING",
 }
+# LeRobot logs at length where the libraries of its video decoder are missing.
+logging.getLogger("lerobot").setLevel(logging.ERROR)
 
 STYLE = {
     "figure.dpi": 100,

@@ -100,6 +100,25 @@ def test_every_class_and_function_has_an_example():
     assert {name for name, text in texts.items() if not _runs(text)} == set(SHOWN_ALONE)
 
 
+PASTED = ("history", "modules", "transforms", "objectives", "diagnostics", "rl", "lerobot", "deploy")
+"""Modules and packages whose examples bring their imports."""
+
+
+def _modules(name: str) -> list[str]:
+    found = importlib.import_module(f"warmprior.{name}")
+    inside = pkgutil.iter_modules(getattr(found, "__path__", ()), f"{found.__name__}.")
+    return [found.__name__, *(module.name for module in inside)]
+
+
+@pytest.mark.parametrize("name", [module for name in PASTED for module in _modules(name)])
+def test_examples_paste_into_a_fresh_interpreter(name, capsys):
+    module, finder = importlib.import_module(name), doctest.DocTestFinder()
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)
+    for example in finder.find(module, globs={"__name__": name}):
+        runner.run(example)
+    assert runner.summarize().failed == 0, capsys.readouterr().out
+
+
 def test_see_also_links_to_what_the_reference_has():
     listed = _reference()
     links = [(name, to) for name in listed for to in _see_also(_object(name).__doc__ or "")]

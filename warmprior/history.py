@@ -40,6 +40,7 @@ def cold_history(
     """The history of robots that have not acted yet, with ``dtype`` and ``device`` as in ``torch.zeros``.
 
     Examples:
+        >>> from warmprior.history import cold_history
         >>> cold_history([5], history_length=4, prediction_length=8, action_dim=2)["forecast"].shape
         torch.Size([5, 8, 2])
     """
@@ -65,6 +66,8 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
         ValueError: if the chunk has another length than the forecast, or ``executed`` is out of range.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.history import advance, cold_history
         >>> history = cold_history([], 2, 4, 1)
         >>> history = advance(history, torch.arange(1.0, 5.0)[:, None], torch.tensor([1]))
         >>> {key: value.flatten().tolist() for key, value in sorted(history.items())}
@@ -84,7 +87,7 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
             f"{remembered} and the chunk has {length}: execute between 0 and {min(remembered, length)}"
         )
     chunk = chunk.to(before.dtype)
-    # Of [actions, chunk, zeros] the last executed actions begin at k, what is left of the chunk behind them.
+    # Of [actions, chunk, zeros] the last executed actions begin at k, and the rest of the chunk follows.
     line = torch.cat([before, chunk, torch.zeros_like(chunk[..., :remembered, :])], -2)
     if low == high:  # one robot, or all in step: a slice, at a third of the time
         moved = line[..., low : low + remembered + length, :]
@@ -106,6 +109,8 @@ def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: 
         chunk_length: ``H``.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.history import window_history
         >>> target = torch.arange(1.0, 5.0)[:, None]
         >>> history = window_history(torch.zeros(2, 1), torch.tensor([0]), target, chunk_length=2)
         >>> history["forecast"].flatten().tolist(), history["forecast_steps"].tolist()
@@ -125,6 +130,8 @@ def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
         rows: which, bool ``[*B]``.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.history import window_history, without
         >>> history = window_history(
         ...     torch.ones(2, 1, 1), torch.ones(2, 1, dtype=torch.int64), torch.ones(2, 2, 1), 1)
         >>> without(history, torch.tensor([True, False]))["forecast_steps"].flatten().tolist()

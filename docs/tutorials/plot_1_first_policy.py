@@ -3,8 +3,8 @@
 =====================================
 
 A flow-matching policy turns a random sample into a chunk of actions. Usually that sample is plain
-Gaussian noise, drawn anew at every decision. This tutorial trains two policies that are alike but
-for that sample's distribution, the *source*: once :class:`~warmprior.GaussianPrior`, once
+Gaussian noise, drawn anew at every decision. This tutorial trains two policies that differ only in
+that sample's distribution, the *source*: once :class:`~warmprior.GaussianPrior`, once
 :class:`~warmprior.PastPrior`, which draws around what the agent has just done. The task is small
 enough to see everything that happens.
 """
@@ -87,14 +87,15 @@ plt.show()
 #
 # Training
 # --------
-# Everything follows from the *prior*, the object that describes the source:
+# The *prior* is the object that describes the source:
 #
 # * :func:`~warmprior.window_replay_buffer` is a TorchRL replay buffer of training windows:
 #   observation, target chunk, and the *history*, what the agent did before.
 # * :class:`~warmprior.PreconditionedNetwork` scales the network's inputs and outputs by what is
 #   known of source and data.
-# * :class:`~warmprior.WarmPriorActor` draws from the source, which the prior makes of the history,
-#   and integrates the network's velocity to a chunk; ``nfe`` is the number of network evaluations.
+# * :class:`~warmprior.WarmPriorActor` draws from the source, which the prior derives from the
+#   history, and integrates the network's velocity to a chunk; ``nfe`` is the number of network
+#   evaluations.
 # * :class:`~warmprior.FlowMatchingLoss` is a TorchRL loss module.
 #
 # Between the two policies nothing changes but the prior.
@@ -144,9 +145,9 @@ actors = {
 #
 # Acting
 # ------
-# :func:`~warmprior.policy_transforms` makes of any TorchRL environment one that executes chunks and
-# remembers the history. The actor itself keeps no state, so ``rollout``, collectors and
-# parallel environments work as ever.
+# :func:`~warmprior.policy_transforms` turn any TorchRL environment into one that executes chunks
+# and remembers the history. The actor keeps no state, so ``rollout``, collectors and parallel
+# environments work as usual.
 
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.1), sharey=True)
 for axis, (name, actor) in zip(axes, actors.items(), strict=True):
@@ -220,7 +221,7 @@ plt.show()
 # What to notice: the Gaussian source reaches both sides, half of its samples each, and its paths
 # bend, because at first they all head for the middle. The warm source lies on one side already, and
 # its paths are short and nearly straight. That is why it needs fewer integration steps, as long as
-# the past tells something: :doc:`tutorial 4 <plot_4_one_step>` measures both.
+# the past is informative: :doc:`tutorial 4 <plot_4_one_step>` measures both.
 #
 # Keeping a policy
 # ----------------
@@ -234,5 +235,5 @@ with tempfile.TemporaryDirectory() as folder:
 print(loaded.prior)
 
 # %%
-# ``python benchmarks/navigation1d.py`` compares more sources on this task (:doc:`results
+# ``python benchmarks/navigation1d.py`` compares more sources on this task (:doc:`lab notes
 # </evidence>`). Next: :doc:`a prior of your own <plot_2_own_prior>`.

@@ -48,19 +48,18 @@ class Momentum(Prior):
 
 
 # %%
-# ``mean`` gets the *history*: the last ``H`` executed actions, how many of them are real, and what the
-# last prediction says of the steps to come (:mod:`warmprior.history`). It returns the mean ``loc`` and
+# ``mean`` gets the *history*: the last ``H`` executed actions, how many of them are real, and the
+# last prediction for the steps to come (:mod:`warmprior.history`). It returns the mean ``loc`` and
 # the mask ``warm`` that says where it counts; elsewhere the source is a standard normal. Everything
 # else is inherited: drawing the samples, ``sigma``, saving and loading.
 #
-# Training windows, environments and robots write the same history, so that the mean is the same one
-# everywhere, whatever number of actions is executed per decision. (This one needs chunks of at least
-# two actions, for as many are remembered.)
+# Training windows, environments and robots write the same history, so the mean is the same
+# everywhere, for any number of executed actions. (This prior needs chunks of at least two actions.)
 #
 # Look before training
 # --------------------
-# A mean can be looked at without any policy. The nearer it is to what comes next, the shorter is
-# the way of the flow.
+# You can look at a mean without any policy. The nearer it is to the next actions, the shorter are
+# the paths of the flow.
 
 demos = navigation_demonstrations()
 priors = {
@@ -146,8 +145,8 @@ for name, actor in actors.items():
 # %%
 # What to notice: both warm sources keep their side at nine network evaluations per chunk (NFE 9).
 # At a single one the policy returns the mean of what its source leaves open, and there the new
-# prior seems to be ahead. The last column disturbs the actions that are remembered, as an imprecise
-# robot would: a line through two of them magnifies that, and loses what it kept.
+# prior seems to be ahead. The last column disturbs the remembered actions, as an imprecise robot
+# would: a line through two of them magnifies the disturbance, and the policy changes sides.
 #
 # The same rows as pictures, with one network evaluation:
 
@@ -183,65 +182,23 @@ plt.show()
 #
 # From the command line
 # ---------------------
-# A prior in a module of yours goes into any benchmark by its place, with no other code:
+# Every benchmark takes a prior of your own by its place, without other code:
 #
 # .. code-block:: console
 #
 #    python benchmarks/navigation1d.py --prior gaussian past mypackage.priors:Momentum --sigma 0.1
 #    python benchmarks/robomimic.py --task square --prior gaussian past mypackage.priors:Momentum
 #
-# The first one with the full recipe (a network of twice the width, 3,000 iterations, three minutes
-# of one core), recorded at commit 9ba6950:
-#
-# .. list-table::
-#    :header-rows: 1
-#
-#    * - policy
-#      - switches sides
-#      - collisions
-#      - distance to data
-#      - collisions, history shifted
-#    * - Base, NFE 9
-#      - 0.502
-#      - 0.949
-#      - 0.024
-#      - 0.934
-#    * - Base, NFE 1
-#      - 0.508
-#      - 1.000
-#      - 0.369
-#      - 1.000
-#    * - WP-Past, NFE 9
-#      - 0.000
-#      - 0.000
-#      - 0.016
-#      - 0.000
-#    * - WP-Past, NFE 1
-#      - 0.004
-#      - 0.480
-#      - 0.071
-#      - 0.801
-#    * - Momentum, NFE 9
-#      - 0.000
-#      - 0.000
-#      - 0.017
-#      - 0.000
-#    * - Momentum, NFE 1
-#      - 0.006
-#      - 0.578
-#      - 0.075
-#      - 0.891
-#
-# (In the last column of that run the mean itself was disturbed, and not the actions that it is made of:
-# Momentum fares worse now.) At NFE 1 the order has turned around. Neither that nor the order above
-# means anything yet: one training seed each. At NFE 9 the two agree in both runs. ``--seeds 5`` gives
-# means and deviations; a difference that does not survive them is none.
+# The first one has the full recipe: a network of twice the width, 3,000 iterations, three minutes of
+# one core. In a run of one training seed neither warm source collided at NFE 9, and at NFE 1 the
+# order of the two turned around. So neither order means anything yet: ``--seeds 5`` gives means and
+# deviations over seeds.
 
 folder.cleanup()
 
 # %%
-# A prior may also learn, or draw from something else than a Gaussian of one width: override
-# :meth:`Prior.distribution <warmprior.Prior.distribution>`. What is no source is no prior: pairs of sources
-# and targets and the times of the training belong to :class:`~warmprior.FlowMatchingLoss`, a network that
-# sees the last actions to :class:`~warmprior.HistoryObservation`, and a later start of the flow to
-# :class:`~warmprior.StartPoint`. :doc:`/sources` has an example of each.
+# A prior may also learn, or draw from another distribution: override :meth:`Prior.distribution
+# <warmprior.Prior.distribution>`. Couplings and training times are options of
+# :class:`~warmprior.FlowMatchingLoss`. :class:`~warmprior.HistoryObservation` shows the network the
+# last actions, and :class:`~warmprior.StartPoint` starts the flow later. :doc:`/sources` has an
+# example of each.

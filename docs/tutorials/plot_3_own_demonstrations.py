@@ -113,13 +113,12 @@ demos = replay.data
 print(demos.select("observation", "action", "episode"))
 
 # %%
-# What is wrong with a file (a missing key, other lengths, a NaN) is reported by file, demonstration and
+# If a file is wrong (a missing key, other lengths, a NaN), the error names file, demonstration and
 # key before anything is trained.
 #
 # Or as a LeRobotDataset
 # ----------------------
-# Whoever records with LeRobot has its format already, and needs no HDF5. The recorder is LeRobot's
-# own:
+# If you record with LeRobot, you need no HDF5. The recorder is LeRobot's own:
 
 features = {
     "observation.state": {
@@ -148,8 +147,7 @@ for key in ("observation", "action", "episode"):
     print(key, "is the same:", bool((same[key] == first[key]).all()))
 
 # %%
-# Both readers give the same tensors (here of five episodes, to save time). From here on it does not
-# matter where they come from.
+# Both readers give the same tensors (here of five episodes, to save time).
 #
 # Training
 # --------
@@ -190,9 +188,9 @@ policies = {
 # Evaluating
 # ----------
 # :func:`~warmprior.training.evaluate` plays the episodes of given seeds, the same ones for every
-# policy. It asks the environment for one thing that Gymnasium's pendulum does not tell:
-# ``"success"``. A small transform adds it: the pendulum stands when the time is over. It also keeps
-# what it sees, for the film below; transforms before :func:`~warmprior.policy_transforms` see every
+# policy. It needs one entry that Gymnasium's pendulum lacks: ``"success"``. A small transform adds
+# it: the pendulum stands when the time is over. It also keeps the observations, for the film below;
+# transforms before :func:`~warmprior.policy_transforms` see every
 # control step.
 
 
@@ -260,8 +258,8 @@ plt.show()
 # %%
 # What to notice: from both sources the policies swing up with growing energy, as the demonstrator
 # does. The Gaussian one then holds the pendulum, the other one often goes over the top and needs
-# another turn. Here the observation tells all of the next action, and the past adds nothing but the
-# temptation to go on as before. A warm source is for the other case, where one observation leaves
+# another turn. Here the observation determines the next action, and the past only misleads the
+# policy to go on as before. A warm source helps in the other case, where one observation leaves
 # several actions open, as in :doc:`tutorial 1 <plot_1_first_policy>`. (How many of 20 episodes end
 # upright differs by several by chance alone: for a comparison take more of them, and several
 # training seeds.)
@@ -270,7 +268,7 @@ plt.show()
 # ------
 # One episode of WP-Past, from a start that no demonstration has. (Tasks of robosuite have
 # :func:`~warmprior.training.record_video`, which renders the simulator; for an environment of your
-# own, draw what it tells.)
+# own, draw its observations.)
 
 
 class Film:

@@ -4,7 +4,7 @@
 
 Integrating a flow takes one network evaluation per step, and a robot has only so much time per
 decision. How few steps are enough? That depends on how straight the flow is, on what the source
-knows of the next chunk, and on whether the network has learnt to ignore the source's noise. The
+knows about the next chunk, and on whether the network has learnt to ignore the source's noise. The
 library measures all three. This tutorial does it on the task of :doc:`tutorial 1
 <plot_1_first_policy>`.
 """
@@ -111,14 +111,14 @@ axis.legend(loc="center right")
 plt.show()
 
 # %%
-# What to notice: warm sources get by with two or three evaluations, and the Gaussian one does not
-# get better with many. Its problem is another one: every decision chooses a side anew. More steps
-# draw a better sample of what was demonstrated, and here such samples contradict each other.
+# What to notice: warm sources need two or three evaluations, and many do not help the Gaussian one:
+# it chooses a side anew at every decision. More steps draw a better sample of the demonstrations,
+# and here such samples contradict each other.
 #
 # Why one step is different
 # -------------------------
-# One step returns the *mean* of all actions that are left open by observation and source. From the
-# Gaussian source that leaves both sides open, it is the middle. The figure shows the first action
+# One step returns the *mean* of all actions that observation and source leave open. The Gaussian
+# source leaves both sides open, so the mean is the middle. The figure shows the first action
 # at the first obstacle, after a past above it.
 
 step = 16
@@ -148,9 +148,9 @@ plt.show()
 
 # %%
 # Grey is the obstacle. At NFE 1 the Gaussian policy aims at it. The warm sources know the side, and
-# their mean is an action that was demonstrated. (What they do at the *first* decision of an
-# episode, where there is no past, is the same as the Gaussian one: that is why some of their
-# episodes collide at NFE 1.)
+# their mean is an action that was demonstrated. (At the *first* decision of an episode there is no
+# past, and they do the same as the Gaussian one: that is why some of their episodes collide at NFE
+# 1.)
 #
 # Straightness
 # ------------
@@ -191,9 +191,10 @@ plt.show()
 # Does the network leak?
 # ----------------------
 # All this holds for a network that has learnt its task. One that has not yet learnt to ignore the
-# noise at time 0 hands it on to the actions, most of all in one step. A comparison of sources at
-# NFE 1 then only shows which one has less noise. :func:`~warmprior.diagnostics.source_leak` tells:
-# if the steps between the actions of a chunk are longer than the data's, there is noise in them.
+# noise at time 0 passes it on to the actions, most of all in one step. A comparison of sources at
+# NFE 1 then only shows which one has less noise. :func:`~warmprior.diagnostics.source_leak`
+# measures it: if the steps between the actions of a chunk are longer than the data's, there is
+# noise in them.
 # Here it is for the Gaussian policy while it was trained.
 
 figure, axis = plt.subplots(figsize=(6, 3.2))
@@ -220,5 +221,4 @@ for iteration in (10, 800):
 # at the two sides of the obstacle.)
 #
 # Every benchmark writes these measures below its success rates. On robot tasks a leak once looked
-# like a gain of 40 points for a warm source at NFE 1: :doc:`the evidence page </evidence>` tells
-# how it was found, what removed it, and what was left.
+# like a gain of 40 points for a warm source at NFE 1 (:doc:`lab notes </evidence>`).

@@ -5,7 +5,7 @@
 With cameras nothing changes but the observation: a vector beside images, nested under one key, and
 an encoder in front of the network. The task of this tutorial draws its own pictures, so that it
 runs without a simulator: a gripper, seen from above, has to reach a part whose position only the
-camera tells.
+camera shows.
 """
 
 import matplotlib.pyplot as plt
@@ -189,9 +189,8 @@ blank["observation", "camera"].fill_(235)
 blind, blind_losses = train(blank, iterations=300)
 
 # %%
-# ``blind`` is the same policy trained on blank images: what can be had without seeing anything.
-# Whoever builds a policy that sees does well to train such a one; a policy that solves its task
-# blindfolded has learnt something else than one thinks.
+# ``blind`` is the same policy trained on blank images. Train one whenever you train a policy on
+# images: if it solves the task as well, the images are not what your policy uses.
 #
 # Playing
 # -------
@@ -251,12 +250,12 @@ plt.show()
 # %%
 # Each star is a part, in the color of the path to it; a dot is a decision, of four actions each.
 # What to notice: with images the paths lead to their parts, and their slight overshoot is that of
-# four actions decided at once. The blind policy has learnt what is true of all demonstrations, to
-# go up, and no more.
+# four actions decided at once. The blind policy has only learnt what all demonstrations share, to
+# go up.
 #
 # Robots
 # ------
-# On a simulated robot the same parts are put together by the benchmark:
+# The benchmark does the same on a simulated robot:
 #
 # .. code-block:: console
 #
@@ -265,5 +264,5 @@ plt.show()
 # Lift from two cameras of 48 x 48 pixels, 100 scripted demonstrations, 3,000 iterations of batch
 # 64, one seed: policies from the Gaussian source, WP-Past and WP-Preview solve 25 of 25 episodes, at
 # NFE 3 and at NFE 1, and an untrained one solves none (15 minutes on two cores;
-# :doc:`all conditions </evidence>`). :doc:`/images` tells how demonstrations get their images, and
-# what larger encoders take.
+# :doc:`lab notes </evidence>`). :doc:`/images` says how demonstrations get their images, and what
+# larger encoders need.

@@ -6,8 +6,7 @@ A cloned policy does what was demonstrated, and not always what is wanted. It ca
 without touching its weights: the policy stays frozen, and a small agent chooses where its flow
 *starts*. From a Gaussian source that is `DSRL <https://arxiv.org/abs/2506.15799>`_; from a warm
 source the agent searches in a small box around what the robot was doing. This tutorial does both,
-on the toy of :doc:`tutorial 1 <plot_1_first_policy>` with a goal that the demonstrations do not
-know.
+on the toy of :doc:`tutorial 1 <plot_1_first_policy>` with a goal that the demonstrations ignore.
 """
 
 import tempfile
@@ -90,7 +89,7 @@ colors = dict(zip(policies, ("#7f7f7f", "#1f77b4"), strict=True))
 # --------
 # :class:`~warmprior.envs.GoalNavigationEnv` is the same environment with a reward: 1 at the end of
 # the route *above both* obstacles. An episode ends, without reward, where it collides or passes on
-# the wrong side. For an agent it needs one transform more than usual:
+# the wrong side. An agent needs one more transform than usual:
 # :class:`~warmprior.PriorAnchor` writes the point around which the agent acts.
 #
 # :func:`~warmprior.training.evaluate` plays the same episodes with any policy, frozen ones and
@@ -202,7 +201,7 @@ plt.show()
 # side, and every residual is a reasonable action. That is what makes exploring safe, and it has
 # a price: after a wrong start an agent around the past can hardly change sides. But the side is
 # open at the first decision, where there is no past and the anchor is a draw of noise that the
-# agent is shown (right).
+# agent sees (right).
 #
 # Training the agents
 # -------------------
@@ -303,7 +302,7 @@ folder.cleanup()
 # ----------
 # This was one seed of each. The benchmark has the same toy with larger networks, 12,000 control
 # steps and three seeds: ``python benchmarks/prior_space_rl.py --preset unit --prior gaussian past``.
-# :doc:`The evidence page </evidence>` has what it measured. With chunks of eight both agents
+# :doc:`The lab notes </evidence>` have the results. With chunks of eight both agents
 # learn to solve every episode, in about the same number of steps. With chunks of four the Gaussian
 # policy meets the reward so rarely that its agent never learns where it is, and WP-Past's agent does as
 # before.

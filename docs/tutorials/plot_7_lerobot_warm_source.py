@@ -72,9 +72,9 @@ for episode in range(6):
 recorder.finalize()
 
 # %%
-# A warm source needs one thing of the data that LeRobot does not load by itself: the ``H`` actions
-# *before* each chunk. :func:`~warmprior.lerobot.history_indices` says which steps to ask for, here
-# ``H`` = 4 in front of a chunk of as many.
+# A warm source needs actions that LeRobot does not load by default: the ``H`` *before* each chunk.
+# :func:`~warmprior.lerobot.history_indices` gives the steps to load, here ``H`` = 4 in front of a
+# chunk of four.
 
 H = 4
 wanted = history_indices(H, H)
@@ -99,15 +99,15 @@ print({key: tuple(value.shape) for key, value in windows.items()})
 
 # %%
 # (LeRobot gives an action of a single number without its dimension, hence the ``unsqueeze``.)
-# ``action_is_pad`` matters: before an episode LeRobot repeats its first action, which would give
-# the target away. The adapter uses the mask, and refuses batches without it.
+# ``action_is_pad`` matters: before an episode LeRobot repeats its first action, which would leak
+# the target. The adapter uses the mask, and refuses batches without it.
 #
 # The policy
 # ----------
 # ``multi_task_dit`` is LeRobot's diffusion transformer, here with flow matching. It reads its
-# instruction by CLIP's text encoder from the hub; ours is one of next to no size with random
-# weights, and its instruction is always the same two tokens. Heights lie in [-1, 1] already, so
-# that the processors that would tokenise and normalise are left out.
+# instruction by CLIP's text encoder from the hub; ours is tiny, with random weights, and the
+# instruction is always the same two tokens. Heights lie in [-1, 1] already, so the processors that
+# tokenise and normalise are left out.
 
 CLIPTextModel(
     CLIPTextConfig(
@@ -185,9 +185,9 @@ train(policy, lerobots_own_loss, iterations=400, learning_rate=3e-3)
 # %%
 # The warm source
 # ---------------
-# :class:`~warmprior.lerobot.WarmPriorAdapter` stands around a policy. ``adapter.loss(batch)`` is the
-# policy's own loss, ``adapter.select_action`` its own sampler; both find the prior's sample where
-# they would draw noise, exactly once, or there is an error. The fine-tuning is the line it was.
+# :class:`~warmprior.lerobot.WarmPriorAdapter` wraps a policy. ``adapter.loss(batch)`` is the
+# policy's own loss, ``adapter.select_action`` its own sampler; both get the prior's sample where
+# they would draw noise, exactly once, or raise an error. The fine-tuning loop does not change.
 
 past = PastPrior(H, sigma=0.3)
 tuned = copy.deepcopy(policy)
@@ -254,9 +254,9 @@ axes[1].legend(loc="lower left")
 plt.show()
 
 # %%
-# What to notice: the Gaussian samples say nothing of where the robot is. Around the past most of them
-# lie on its side already (the wild ones among them are those from which the past was hidden), so
-# that the way of the flow is shorter.
+# What to notice: the Gaussian samples do not depend on where the robot is. Around the past most of
+# them lie on its side already (except those whose past was hidden), so the paths of the flow are
+# shorter.
 #
 # Playing
 # -------
@@ -357,4 +357,4 @@ folder.cleanup()
 # What was run: this page; the losses and samplers of all these families, LeRobot's own classes with
 # small random weights, against flow matching written by hand; and the library's own policy through
 # ``lerobot-train`` and ``lerobot-eval``. What was not: pretrained weights of any of them, and real
-# robots. How much a fine-tuned VLA gains from a warm source is not said by anything here.
+# robots. Nothing here shows how much a fine-tuned VLA gains from a warm source.

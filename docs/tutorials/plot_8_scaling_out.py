@@ -2,10 +2,10 @@
 8. Scaling out
 ==============
 
-A comparison of sources is a grid: sources, seeds, checkpoints, numbers of steps. Its cells need
-nothing of each other, so that more cores and more machines finish it sooner, and nothing else may
-change: not a weight, and not a row. This tutorial runs a small grid side by side, enlarges it,
-checks that promise, and shows what was measured on larger ones.
+A comparison of sources is a grid: sources, seeds, checkpoints, numbers of steps. Its cells are
+independent, so more cores and more machines finish it sooner, without changing a weight or a row.
+This tutorial runs a small grid side by side, enlarges it, checks that promise, and shows
+measurements of larger ones.
 """
 
 import json
@@ -50,7 +50,7 @@ for row in rows:
 # %%
 # Nothing is trained twice
 # ------------------------
-# A policy lies in a folder that is named by all that determines it, in ``policies/`` beside the
+# A policy lies in a folder named by everything that determines it, in ``policies/`` beside the
 # runs. A run with a third seed finds the other four policies there, and trains two.
 
 policies = Path(folder.name) / "grid" / "policies"
@@ -67,8 +67,8 @@ for path in sorted(policies.glob("*/state*")):
 #
 # Nothing depends on who computes
 # -------------------------------
-# Here is one seed again, elsewhere, in a single worker. If the number of workers had a say, the
-# weights would differ in the last bits, and so would what the policies do.
+# Here is one seed again, elsewhere, in a single worker. If the number of workers mattered, the
+# weights would differ in the last bits, and so would the policies' actions.
 # :func:`~warmprior.training.load_policy` reads both.
 
 alone, _ = compare("alone/run", seeds=1, envs=1)
@@ -143,9 +143,9 @@ plt.show()
 # %%
 # What to notice: only the crosses were measured, at one and two cores. Lockstep is what a
 # vectorised environment does: at every decision all wait for the slowest, and in the end for the
-# longest episode; its crosses lie below its line, for what the exchange between processes costs is
-# not simulated. Episodes apart lose at the end alone, and a whole comparison has so many of them
-# that it hardly matters. :doc:`/scaling` has the numbers, and what they leave out.
+# longest episode. Its crosses lie below its line, because the simulation leaves out communication
+# between processes. Separate episodes wait only at the end, which hardly matters in a whole
+# comparison. :doc:`/scaling` has the numbers.
 #
 # More machines
 # -------------
@@ -158,9 +158,9 @@ plt.show()
 #    ray start --address=HEAD:6379                   # on every other one
 #    python benchmarks/robomimic.py --engine ray --ray-address HEAD:6379 --out /shared/runs/square
 #
-# ``--out`` is a folder that all machines see at the same path. A lost machine costs what it was
-# doing: Ray starts its jobs again elsewhere, and a training goes on from its last state. If the one
-# that drives is lost, the run is continued, with Ray or without:
+# ``--out`` is a folder that all machines see at the same path. If a machine is lost, Ray starts its
+# jobs again elsewhere, and a training continues from its last state. If the driver is lost, resume
+# the run, with Ray or without:
 #
 # .. code-block:: console
 #
@@ -168,7 +168,7 @@ plt.show()
 #
 # One large network
 # -----------------
-# Where a single training is what takes long, several processes share its batches. Each draws a part of
+# If a single training takes too long, several processes share its batches. Each draws a part of
 # every batch, so the weights depend on their number:
 #
 # .. code-block:: console
@@ -176,6 +176,6 @@ plt.show()
 #    torchrun --nproc-per-node 2 benchmarks/robomimic.py --preset paper --device cuda
 #    torchrun --nproc-per-node 8 benchmarks/robomimic.py --resume --out runs/square-ph-paper
 #
-# On CPUs that does not pay: two processes reached 0.64 times twice the speed of one with the paper's
-# transformer, and less with small networks. None of it has been run on a GPU, or on more than one
-# physical machine: what was tested, and where, stands in :doc:`/scaling`.
+# On CPUs it does not pay: two processes reached 0.64 of twice the speed of one with the paper's
+# transformer, and less with small networks. None of this has been run on a GPU, or on more than one
+# physical machine (:doc:`/scaling`).

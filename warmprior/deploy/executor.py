@@ -31,10 +31,11 @@ __all__ = ["AsyncExecutor"]
 
 
 class AsyncExecutor:
-    """Runs a policy beside a control loop: computes the next chunk while this one is executed. Every
-    ``execute`` control steps a decision begins in a thread, with the observation of that step. Until its
-    chunk is ready the robot continues the old one; the new one takes effect at the position that the robot
-    has reached. The largest delay of the last decisions is what the policy expects next (``("rtc",
+    """Runs a policy beside a control loop: computes the next chunk while this one is executed.
+
+    Every ``execute`` control steps a decision begins in a thread, with the observation of that step. Until
+    its chunk is ready the robot continues the old one; the new one takes effect at the position that the
+    robot has reached. The largest delay of the last decisions is what the policy expects next (``("rtc",
     "delay")``, for :class:`~warmprior.RealTimeChunking`). The history (:mod:`warmprior.history`) holds the
     executed actions and the rest of the chunk. :class:`~warmprior.InferenceDelay` does the same in
     simulation: with ``latency`` the actions are equal.
@@ -70,6 +71,7 @@ class AsyncExecutor:
             provide.
 
     Examples:
+        >>> from warmprior.deploy import AsyncExecutor
         >>> import torch
         >>> from warmprior import PastPrior, RealTimeChunking, VelocityMLP, WarmPriorActor
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8), guidance=RealTimeChunking())
@@ -144,12 +146,13 @@ class AsyncExecutor:
 
     @property
     def expected_delay(self) -> int:
-        """The delay that the next decision expects: the largest of :attr:`delays`, else ``delay``."""
+        """The delay that the next decision expects, the largest of :attr:`delays` or else ``delay``."""
         return max(self._delays, default=self._expected)
 
     def reset(self) -> None:
-        """Begin another episode. A decision under way runs to its end, advances the generator and is
-        discarded.
+        """Begin another episode.
+
+        A decision under way runs to its end, advances the generator and is discarded.
         """
         pending: Future[Tensor] | None = getattr(self, "_pending", None)
         if pending is not None:

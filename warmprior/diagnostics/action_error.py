@@ -50,7 +50,7 @@ def action_error(
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.diagnostics import SharedObservations
+        >>> from warmprior.diagnostics import SharedObservations, action_error
         >>> from warmprior.envs import navigation_demonstrations
         >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4))
         >>> windows = SharedObservations(navigation_demonstrations(), 4).windows(untrained.prior)

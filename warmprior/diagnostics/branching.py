@@ -57,6 +57,7 @@ def branching_cost(
         ValueError: for bad batches or options, or a policy that is no flow.
 
     Examples:
+        >>> from warmprior.diagnostics import branching_cost
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, window_replay_buffer
@@ -125,6 +126,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
         ValueError: if the batch is empty or the source is not Gaussian.
 
     Examples:
+        >>> from warmprior.diagnostics import branching_bound
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PastPrior, window_replay_buffer

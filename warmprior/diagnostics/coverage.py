@@ -37,7 +37,7 @@ def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: f
 
     Examples:
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.diagnostics import SharedObservations
+        >>> from warmprior.diagnostics import SharedObservations, source_coverage
         >>> from warmprior.envs import navigation_demonstrations
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), GaussianPrior(4))
         >>> source_coverage(actor, SharedObservations(navigation_demonstrations(), 4).windows(actor.prior))

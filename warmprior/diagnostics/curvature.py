@@ -85,6 +85,7 @@ def curvature(
         - :func:`~warmprior.diagnostics.source_leak`: how the source's noise reaches the actions.
 
     Examples:
+        >>> from warmprior.diagnostics import curvature
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor

@@ -141,8 +141,10 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
         ValueError: if there are none.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.diagnostics import encoded_windows
         >>> from tensordict import TensorDict
-        >>> from warmprior import ImageEncoder, PastPrior, VelocityMLP, VisionNetwork
+        >>> from warmprior import ImageEncoder, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
         >>> encoder = ImageEncoder(["agentview_image"], 9, image_size=16, crop_size=12, backbone="small")
         >>> network = VisionNetwork(encoder, VelocityMLP(2, encoder.observation_dim, 4, hidden_dim=8))
         >>> images = torch.zeros(6, 2, 3, 16, 16, dtype=torch.uint8)
@@ -171,8 +173,9 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
 
 
 def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
-    """Update the last actions in the observation after the history has changed. Images must not be encoded
-    yet: the actions stand at the end of the observation's vector.
+    """Update the last actions in the observation after the history has changed.
+
+    Images must not be encoded yet: the actions stand at the end of the observation's vector.
 
     Raises:
         KeyError: if the windows lack what the network sees, or the history.

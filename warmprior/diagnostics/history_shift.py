@@ -15,8 +15,10 @@ __all__ = ["HistoryShift"]
 
 
 class HistoryShift(TensorDictModuleBase):
-    """Disturbs a policy's history at every decision. Adds normal noise to the history's actions and forecast
-    before the policy sees them. The environment's own history stays as it is.
+    """Disturbs a policy's history at every decision.
+
+    Adds normal noise to the history's actions and forecast before the policy sees them. The environment's own
+    history stays as it is.
 
     Args:
         policy: the policy.
@@ -33,6 +35,7 @@ class HistoryShift(TensorDictModuleBase):
         - :class:`~warmprior.PastPrior`: a source whose mean it disturbs.
 
     Examples:
+        >>> from warmprior.diagnostics import HistoryShift
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> actor = WarmPriorActor(VelocityMLP(1, 3, 4), PastPrior(4))

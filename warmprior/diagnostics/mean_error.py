@@ -28,8 +28,8 @@ class MeanError:
         :func:`~warmprior.diagnostics.mean_error`: measures it.
 
     Examples:
-        >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP
-        >>> from warmprior.diagnostics import SharedObservations
+        >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import SharedObservations, mean_error
         >>> from warmprior.envs import navigation_demonstrations
         >>> shared = SharedObservations(navigation_demonstrations(), 4)
         >>> def measured(prior):
@@ -74,7 +74,7 @@ def mean_error(
 
     Examples:
         >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.diagnostics import SharedObservations
+        >>> from warmprior.diagnostics import SharedObservations, mean_error
         >>> from warmprior.envs import navigation_demonstrations
         >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1), PreviewPrior(4))
         >>> shared = SharedObservations(navigation_demonstrations(), 4)
@@ -94,9 +94,10 @@ def mean_error(
 
 
 def mean_revision(rollout: TensorDictBase) -> float:
-    """Distance of the mean from the policy's next prediction, along rollouts. If it is larger than at
-    demonstrated states (:attr:`MeanError.revision`), forecasts age worse in the states that the policy
-    reaches than in the demonstrations.
+    """Distance of the mean from the policy's next prediction, along rollouts.
+
+    If it is larger than at demonstrated states (:attr:`MeanError.revision`), forecasts age worse in the
+    states that the policy reaches than in the demonstrations.
 
     Args:
         rollout: ``[D]`` decisions with what the policy wrote, see :class:`~warmprior.training.Episode`.
@@ -109,6 +110,7 @@ def mean_revision(rollout: TensorDictBase) -> float:
         KeyError: if a key is missing.
 
     Examples:
+        >>> from warmprior.diagnostics import mean_revision
         >>> import torch
         >>> from tensordict import TensorDict
         >>> rollout = TensorDict({  # forecasts 2, 3, then predicts 2, 5

@@ -85,7 +85,7 @@ def memory_gain(
 
     Examples:
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.diagnostics import SharedObservations
+        >>> from warmprior.diagnostics import SharedObservations, memory_gain
         >>> from warmprior.envs import navigation_demonstrations
         >>> shared = SharedObservations(navigation_demonstrations(), 4)
         >>> def measured(prior):

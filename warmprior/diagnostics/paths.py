@@ -49,6 +49,7 @@ def flow_paths(
         ValueError: for bad batches or options, or a policy that is no flow.
 
     Examples:
+        >>> from warmprior.diagnostics import flow_paths
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
@@ -100,6 +101,7 @@ def deployed_history(
         ValueError: for bad batches or options.
 
     Examples:
+        >>> from warmprior.diagnostics import deployed_history
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor

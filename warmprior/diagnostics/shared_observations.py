@@ -41,6 +41,7 @@ class SharedObservations:
         ValueError: if there are fewer observations than asked for.
 
     Examples:
+        >>> from warmprior.diagnostics import SharedObservations
         >>> from warmprior import PastPrior
         >>> from warmprior.envs import navigation_demonstrations
         >>> shared = SharedObservations(navigation_demonstrations(), 4)  # 6 episodes of 64 steps

@@ -36,6 +36,7 @@ class Smoothness:
         - :func:`~warmprior.diagnostics.compare_smoothness`: compares two policies.
 
     Examples:
+        >>> from warmprior.diagnostics import smoothness
         >>> import torch
         >>> from tensordict import TensorDict
         >>> rollout = TensorDict({
@@ -78,6 +79,7 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
         ValueError: if there is no time dimension, or an executed action is NaN or infinite.
 
     Examples:
+        >>> from warmprior.diagnostics import executed_actions
         >>> import torch
         >>> from tensordict import TensorDict
         >>> rollout = TensorDict({"vla_action": {"chunk": torch.arange(6.0).view(2, 3, 1)},
@@ -140,6 +142,7 @@ def smoothness(rollout: TensorDictBase, *, mode: Mode | None = None) -> Smoothne
         ValueError: if the rollout has no chunk boundary, or actions are NaN or infinite.
 
     Examples:
+        >>> from warmprior.diagnostics import smoothness
         >>> import torch
         >>> from tensordict import TensorDict
         >>> rollout = TensorDict({
@@ -195,6 +198,7 @@ def compare_smoothness(
             are not comparable then.
 
     Examples:
+        >>> from warmprior.diagnostics import compare_smoothness
         >>> import torch
         >>> from tensordict import TensorDict
         >>> rollout = TensorDict({"vla_action": {"chunk": torch.zeros(3, 2, 1)},

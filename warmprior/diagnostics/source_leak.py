@@ -51,6 +51,7 @@ class SourceLeak:
         :func:`~warmprior.diagnostics.source_leak`: measures it.
 
     Examples:
+        >>> from warmprior.diagnostics import SourceLeak
         >>> found = SourceLeak(nfe=1, spread=0.3, data_spread=0.2, ratio_to_last=1.5,
         ...                    inner_step=0.11, data_inner_step=0.1)
         >>> round(found.leak, 2), round(found.inner_step_ratio, 2), found.warning is None
@@ -79,6 +80,7 @@ class SourceLeak:
         """A sentence that names the exceeded bounds, or ``None``.
 
         Examples:
+            >>> from warmprior.diagnostics import SourceLeak
             >>> SourceLeak(1, 0.3, 0.2, 1.5, 0.11, 0.1).warning
             "at NFE 1 the actions carry noise of the source: their spread is 1.50 times the data's (bound 1)"
         """
@@ -157,7 +159,7 @@ def source_leak(
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.diagnostics import SharedObservations
+        >>> from warmprior.diagnostics import SharedObservations, source_leak
         >>> from warmprior.envs import navigation_demonstrations
         >>> shared = SharedObservations(navigation_demonstrations(), 4)
         >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4))

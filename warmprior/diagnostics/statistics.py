@@ -44,6 +44,7 @@ def success_posterior(successes: int, episodes: int) -> Any:
         :func:`~warmprior.diagnostics.probability_better`: compares two rates.
 
     Examples:
+        >>> from warmprior.diagnostics import success_posterior
         >>> round(float(success_posterior(9, 10).mean()), 3)  # (9 + 1) / (10 + 2)
         0.833
     """
@@ -76,6 +77,7 @@ def probability_better(successes_a: int, episodes_a: int, successes_b: int, epis
         ImportError: if scipy is missing.
 
     Examples:
+        >>> from warmprior.diagnostics import probability_better
         >>> round(probability_better(18, 20, 12, 20), 3)
         0.984
         >>> round(probability_better(0, 0, 0, 0), 3)  # nothing is known
@@ -98,6 +100,7 @@ def top_k_mean(rates: Sequence[float], k: int) -> float:
         :func:`~warmprior.diagnostics.summarize_seeds`: over the seeds then.
 
     Examples:
+        >>> from warmprior.diagnostics import top_k_mean
         >>> top_k_mean([0.1, 0.9, 0.5, 0.7], 3)
         0.7...
     """
@@ -128,6 +131,7 @@ def paired_probability_better(wins: int, losses: int) -> float:
         ImportError: if scipy is missing.
 
     Examples:
+        >>> from warmprior.diagnostics import paired_probability_better
         >>> round(paired_probability_better(3, 0), 4)  # 15 / 16
         0.9375
         >>> round(paired_probability_better(4, 4), 4)
@@ -152,6 +156,7 @@ class SeedSummary:
         - :func:`~warmprior.diagnostics.exceeds_one_sigma`: compares two.
 
     Examples:
+        >>> from warmprior.diagnostics import exceeds_one_sigma, summarize_seeds
         >>> one, three = summarize_seeds([0.6]), summarize_seeds([0.5, 0.6, 0.7])
         >>> one.std, round(three.std, 3), exceeds_one_sigma(one, three)
         (nan, 0.1, False)
@@ -173,6 +178,7 @@ def summarize_seeds(values: Sequence[float]) -> SeedSummary:
         - :func:`~warmprior.diagnostics.exceeds_one_sigma`: compares two summaries.
 
     Examples:
+        >>> from warmprior.diagnostics import summarize_seeds
         >>> summarize_seeds([0.5, 0.7])
         SeedSummary(mean=0.6, std=0.1414..., seeds=2)
     """
@@ -192,6 +198,7 @@ def exceeds_one_sigma(method: SeedSummary, base: SeedSummary) -> bool:
         - :func:`~warmprior.diagnostics.paired_probability_better`: where both played the same episodes.
 
     Examples:
+        >>> from warmprior.diagnostics import SeedSummary, exceeds_one_sigma
         >>> exceeds_one_sigma(SeedSummary(0.9, 0.02, 3), SeedSummary(0.8, 0.03, 3))
         True
     """
@@ -234,6 +241,7 @@ def bootstrap_ratio(
         :func:`~warmprior.diagnostics.curvature`: a measure whose ratio it judges.
 
     Examples:
+        >>> from warmprior.diagnostics import bootstrap_ratio
         >>> import torch
         >>> episode = torch.arange(100) // 10
         >>> x = 1.0 + episode.double()

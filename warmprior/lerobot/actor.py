@@ -23,10 +23,11 @@ __all__ = ["LeRobotActor", "LeRobotFlow"]
 
 
 class LeRobotFlow(TensorDictModuleBase):
-    """The sampler of a LeRobot policy in place of :class:`~warmprior.ODEActor`. A deterministic map ``(noise,
-    observation) -> chunk``: the padding around the prior's part of the source is one fixed draw, unless a
-    call passes its own.
-    The policy's weights are not among the parameters of this module.
+    """The sampler of a LeRobot policy in place of :class:`~warmprior.ODEActor`.
+
+    A deterministic map ``(noise, observation) -> chunk``: the padding around the prior's part of the source
+    is one fixed draw, unless a call passes its own. The policy's weights are not among the parameters of this
+    module.
 
     Args:
         policy: of LeRobot, see :class:`WarmPriorAdapter`.
@@ -55,7 +56,7 @@ class LeRobotFlow(TensorDictModuleBase):
 
     Examples:
         >>> from warmprior import PastPrior
-        >>> from warmprior.lerobot import WarmPriorAdapter
+        >>> from warmprior.lerobot import LeRobotFlow, WarmPriorAdapter
         >>> adapter = WarmPriorAdapter(policy, PastPrior(8))  # doctest: +SKIP
         >>> flow = LeRobotFlow(policy, adapter.source, nfe=1)  # doctest: +SKIP
         >>> chunk = flow(data)["vla_action", "chunk"]  # doctest: +SKIP
@@ -98,7 +99,7 @@ class LeRobotFlow(TensorDictModuleBase):
 
     @property
     def network(self) -> ChunkSource:
-        """What tells the width of actions."""
+        """The source, which has the width of actions."""
         return self.source
 
     def check_nfe(self, nfe: int | None) -> None:
@@ -201,6 +202,8 @@ class LeRobotActor(TensorDictModuleBase):
         KeyError: (when called) if an entry of the history is missing.
 
     Examples:
+        >>> from warmprior import ActionHistory, ChunkStep, PastPrior
+        >>> from warmprior.lerobot import LeRobotActor
         >>> actor = LeRobotActor(policy, PastPrior(16), nfe=1)  # doctest: +SKIP
         >>> env = TransformedEnv(base, Compose(ChunkStep(16), ActionHistory(16)))  # doctest: +SKIP
         >>> env.rollout(10, actor)["vla_action", "chunk"].shape  # doctest: +SKIP
@@ -247,7 +250,7 @@ class LeRobotActor(TensorDictModuleBase):
 
     @property
     def network(self) -> ChunkSource:
-        """What tells the width of actions."""
+        """The source, which has the width of actions."""
         return self.ode.source
 
     @property

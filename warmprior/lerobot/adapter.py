@@ -35,6 +35,7 @@ def history_indices(history_length: int, length: int, lead: int = 0) -> list[int
         :class:`~warmprior.lerobot.WarmPriorAdapter`: reads these steps of a dataset.
 
     Examples:
+        >>> from warmprior.lerobot import history_indices
         >>> history_indices(2, 3)
         [-2, -1, 0, 1, 2]
     """
@@ -78,6 +79,8 @@ class WarmPriorAdapter:
         ImportError: if the installed release of lerobot has no ports.
 
     Examples:
+        >>> from warmprior import PastPrior
+        >>> from warmprior.lerobot import WarmPriorAdapter
         >>> adapter = WarmPriorAdapter(policy, PastPrior(50))  # doctest: +SKIP
         >>> loss, _ = adapter.loss(preprocessor(batch))  # doctest: +SKIP
         >>> adapter.reset()  # doctest: +SKIP
@@ -233,8 +236,7 @@ class WarmPriorAdapter:
             return call(batch, **kwargs)
 
     def record_executed(self, action: Tensor) -> None:
-        """Replace the action that :meth:`select_action` just returned by the executed one, where a
-        postprocessor or robot clips.
+        """Replace the last action of :meth:`select_action` by the executed one, as after clipping.
 
         Args:
             action: ``[B, d_a]``, the model's units.

@@ -27,6 +27,7 @@ class SourceInjection(TorchFunctionMode):
         RuntimeError: at the exit, if there was not exactly one draw of shape ``[B, T, D]``.
 
     Examples:
+        >>> from warmprior.lerobot.injection import SourceInjection
         >>> import torch
         >>> with SourceInjection(4, 2, lambda shape, dtype, device: torch.ones(shape)):
         ...     noise, other = torch.randn(3, 4, 2), torch.randn(3)

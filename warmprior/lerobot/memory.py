@@ -25,6 +25,7 @@ class ActionMemory:
         action_dim: ``d_a``.
 
     Examples:
+        >>> from warmprior.lerobot import ActionMemory
         >>> import torch
         >>> from warmprior import PastPrior
         >>> memory = ActionMemory(PastPrior(2), action_dim=1)

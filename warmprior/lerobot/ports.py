@@ -22,15 +22,17 @@ Record = Callable[[Tensor], None]
 
 
 class FlowPort(ABC):
-    """What a source needs to know about a family of policies: the chunk's shape, and where its noise is
-    drawn. The policies are not changed. Training and sampling run inside :meth:`training` and
-    :meth:`sampling`, which check that the source is used exactly once.
+    """Describes a family of policies: the chunk's shape, and where its noise is drawn.
+
+    The policies are not changed. Training and sampling run inside :meth:`training` and :meth:`sampling`,
+    which check that the source is used exactly once.
 
     See Also:
         - :func:`~warmprior.lerobot.port_for`: finds the port of a policy.
         - :data:`~warmprior.lerobot.PORTS`: all of them.
 
     Examples:
+        >>> from warmprior.lerobot import PORTS
         >>> from types import SimpleNamespace
         >>> smolvla = SimpleNamespace(config=SimpleNamespace(chunk_size=50, max_action_dim=32))
         >>> port = PORTS["0.6"]["smolvla"]
@@ -136,7 +138,7 @@ class DrawnPort(FlowPort):
 
     Args:
         length: attribute of the model's configuration.
-        width: likewise.
+        width: attribute of its width.
         sampler: ``policy -> (object, name of its method)``.
         steps: ``policy -> (object, name of its attribute)``, the number of integration steps.
         model_config: ``policy -> `` the configuration that the two are read from.
@@ -401,6 +403,7 @@ def port_for(policy: Any) -> FlowPort:
         - :data:`~warmprior.lerobot.PORTS`: all of them.
 
     Examples:
+        >>> from warmprior.lerobot import port_for
         >>> port_for(policy).length(policy)  # a SmolVLAPolicy  # doctest: +SKIP
         50
         >>> class ACTPolicy:

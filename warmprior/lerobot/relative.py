@@ -10,9 +10,10 @@ __all__ = ["RelativeActions"]
 
 
 class RelativeActions:
-    """Expresses remembered relative actions at the present state. Policies with relative actions
-    (``use_relative_actions``) predict offsets from the state of the decision, so a mean from one chunk ago is
-    an offset from where the robot was then.
+    """Expresses remembered relative actions at the present state.
+
+    Policies with relative actions (``use_relative_actions``) predict offsets from the state of the decision,
+    so a mean from one chunk ago is an offset from where the robot was then.
 
     Args:
         preprocessor: the policy's pipeline; its step ``RelativeActionsProcessorStep`` holds the raw state of
@@ -27,6 +28,7 @@ class RelativeActions:
         - :class:`~warmprior.lerobot.WarmPriorAdapter`: takes it as ``relative``.
 
     Examples:
+        >>> from warmprior.lerobot import RelativeActions
         >>> relative = RelativeActions(preprocessor, postprocessor)  # doctest: +SKIP
         >>> _ = preprocessor(observation)  # doctest: +SKIP
         >>> before = relative.state()  # doctest: +SKIP

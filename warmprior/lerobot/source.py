@@ -42,6 +42,7 @@ class ChunkSource:
         - :class:`~warmprior.lerobot.WarmPriorAdapter`: gives it to a policy of LeRobot.
 
     Examples:
+        >>> from warmprior.lerobot import ChunkSource
         >>> import torch
         >>> from warmprior import PastPrior
         >>> from warmprior.history import window_history
@@ -206,6 +207,7 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
         :class:`~warmprior.lerobot.WarmPriorAdapter`: uses these units for ``sigma``.
 
     Examples:
+        >>> from warmprior.lerobot import action_std
         >>> from types import SimpleNamespace
         >>> class Policy:
         ...     name = "smolvla"

@@ -41,7 +41,7 @@ class WarmPriorActor(TensorDictModuleBase):
             alone. Saved with the policy.
         start: the point from which samplers start, if that is not the source itself.
         solver: see :func:`~warmprior.modules.ode.integrate`.
-        grid: likewise.
+        grid: see :func:`~warmprior.modules.ode.integrate`.
         clip: see :class:`ODEActor`.
         guidance: makes chunks continue the one being executed; none by default.
         normalizer: the normaliser of the data, saved with the policy; its

@@ -78,6 +78,7 @@ class ChiTransformer(VelocityNetwork):
         - :class:`~warmprior.VisionNetwork`: puts encoders of images before it.
 
     Examples:
+        >>> from warmprior import ChiTransformer
         >>> import torch
         >>> network = ChiTransformer(7, 23, 8, embedding_dim=24, num_layers=2)
         >>> network(torch.rand(4), torch.randn(4, 8, 7), torch.randn(4, 2, 23)).shape

@@ -20,6 +20,7 @@ def without_compilation(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """A state dict under the names of the uncompiled network.
 
     Examples:
+        >>> from warmprior.modules.compiled import without_compilation
         >>> import torch
         >>> list(without_compilation({"net._orig_mod.weight": torch.zeros(1)}))
         ['net.weight']

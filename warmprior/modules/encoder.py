@@ -78,6 +78,7 @@ class ImageEncoder(nn.Module):
         - :func:`~warmprior.modules.load_imagenet`: starts it from ImageNet's weights.
 
     Examples:
+        >>> from warmprior import ImageEncoder
         >>> import torch
         >>> from tensordict import TensorDict
         >>> encoder = ImageEncoder(["agentview_image"], 9, image_size=32, crop_size=28, backbone="small")
@@ -218,6 +219,7 @@ def imagenet_weights() -> dict[str, Tensor]:
         :func:`~warmprior.modules.load_imagenet`: puts them into an encoder.
 
     Examples:
+        >>> from warmprior.modules import imagenet_weights
         >>> imagenet_weights()["conv1.weight"].shape  # doctest: +SKIP
         torch.Size([64, 3, 7, 7])
     """
@@ -249,6 +251,8 @@ def load_imagenet(encoder: ImageEncoder) -> None:
         OSError: see :func:`imagenet_weights`.
 
     Examples:
+        >>> from warmprior import ImageEncoder
+        >>> from warmprior.modules import load_imagenet
         >>> load_imagenet(ImageEncoder(["agentview_image"], 9))  # doctest: +SKIP
         >>> load_imagenet(ImageEncoder(["agentview_image"], 9, backbone="small"))
         Traceback (most recent call last):

@@ -45,6 +45,7 @@ def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[
         :func:`~warmprior.integrate`: takes its steps on such a grid.
 
     Examples:
+        >>> from warmprior.modules.grid import grid_parts
         >>> grid_parts("dense-jump:0.75", 4), grid_parts("dense-jump", 1)
         ([(0.0, 0.75, 3), (0.75, 1.0, 1)], [(0.0, 1.0, 1)])
     """

@@ -31,6 +31,9 @@ class Interpolant(Registered):
         - :class:`~warmprior.FlowMatchingLoss`: regresses its velocity.
 
     Examples:
+        >>> import math
+        >>> import torch
+        >>> from warmprior import Interpolant
         >>> class SineInterpolant(Interpolant):
         ...     name = "sine"
         ...     def coefficients(self, t):
@@ -73,6 +76,7 @@ class LinearInterpolant(Interpolant):
         - :class:`~warmprior.PolynomialInterpolant`: starts at rest.
 
     Examples:
+        >>> from warmprior import LinearInterpolant
         >>> import torch
         >>> a0, a1 = torch.zeros(1, 2, 1), torch.ones(1, 2, 1)
         >>> a_t, velocity = LinearInterpolant()(a0, a1, torch.tensor([0.25]))
@@ -97,6 +101,8 @@ class TrigonometricInterpolant(Interpolant):
         :class:`~warmprior.LinearInterpolant`: the default.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import TrigonometricInterpolant
         >>> alpha, beta, _, _ = TrigonometricInterpolant().coefficients(torch.tensor(1 / 3))
         >>> round(alpha.item(), 3), round(beta.item(), 3)
         (0.866, 0.5)
@@ -125,6 +131,8 @@ class PolynomialInterpolant(Interpolant):
         :class:`~warmprior.LinearInterpolant`: the power 1.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import PolynomialInterpolant
         >>> a0, a1, t = torch.zeros(1, 1, 1), torch.ones(1, 1, 1), torch.tensor([0.5])
         >>> a_t, velocity = PolynomialInterpolant(n=2)(a0, a1, t)
         >>> a_t.item(), velocity.item()

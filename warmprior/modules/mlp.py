@@ -52,6 +52,7 @@ class VelocityMLP(VelocityNetwork):
         - :class:`~warmprior.PreconditionedNetwork`: adds what is known before training.
 
     Examples:
+        >>> from warmprior import VelocityMLP
         >>> import torch
         >>> network = VelocityMLP(7, 23, 8)
         >>> network(torch.rand(4), torch.randn(4, 8, 7), torch.randn(4, 2, 23)).shape

@@ -37,6 +37,9 @@ class VelocityNetwork(nn.Module, Registered):
         - :class:`~warmprior.PreconditionedNetwork`: wraps any of them.
 
     Examples:
+        >>> import torch
+        >>> from torch import nn
+        >>> from warmprior import VelocityNetwork
         >>> class LinearNetwork(VelocityNetwork):
         ...     def __init__(self, action_dim, observation_dim, prediction_length, observation_steps):
         ...         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
@@ -107,8 +110,9 @@ class VelocityNetwork(nn.Module, Registered):
             raise ValueError(f"{built}, got {tuple(observation.shape)}")
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-        """Encode an observation once, before the field is evaluated at it many times. The network takes the
-        result in place of the observation. By default this does nothing.
+        """Encode an observation once, before the field is evaluated at it many times.
+
+        The network takes the result in place of the observation. By default this does nothing.
 
         Args:
             observation: ``[B, To, d_o]``, or a tensordict ``[B]``.
@@ -223,6 +227,7 @@ class TimestepEmbedding(nn.Module):
         :class:`~warmprior.ChiTransformer`: embeds its times with it.
 
     Examples:
+        >>> from warmprior.modules import TimestepEmbedding
         >>> import torch
         >>> TimestepEmbedding(8)(torch.tensor([0.0, 1.0])).shape
         torch.Size([2, 8])

@@ -31,6 +31,7 @@ class Normalizer(nn.Module):
         ValueError: if the keys or shapes of ``low`` and ``high`` differ, or values are not finite.
 
     Examples:
+        >>> from warmprior import Normalizer
         >>> import torch
         >>> from tensordict import TensorDict
         >>> data = TensorDict({"observation": torch.tensor([[0.0, 5.0], [4.0, 5.0]]),

@@ -112,6 +112,7 @@ def integrate(
             ``start_time`` outside [0, 1).
 
     Examples:
+        >>> from warmprior import integrate
         >>> import torch
         >>> a0 = torch.ones(1, 1)
         >>> float(integrate(lambda t, a: a, a0, nfe=4, solver="rk4"))  # e = 2.71828...

@@ -50,7 +50,7 @@ class SourceMoments(nn.Module):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from warmprior import PreviewPrior, window_replay_buffer
+        >>> from warmprior import PreviewPrior, SourceMoments, window_replay_buffer
         >>> data = TensorDict({"observation": torch.zeros(999, 3), "action": torch.randn(999, 2),
         ...                    "episode": torch.arange(999) // 333}, [999])
         >>> prior = PreviewPrior(4)
@@ -224,7 +224,7 @@ class PreconditionedNetwork(VelocityNetwork):
 
     Examples:
         >>> import torch
-        >>> from warmprior import VelocityMLP
+        >>> from warmprior import PreconditionedNetwork, SourceMoments, VelocityMLP
         >>> one, zero = torch.ones(8, 7), torch.zeros(8, 7)
         >>> moments = SourceMoments(zero, one, one, 0.25 * one, zero)
         >>> network = PreconditionedNetwork(VelocityMLP(7, 23, 8), moments=moments)

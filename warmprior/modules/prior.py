@@ -29,6 +29,8 @@ class Source:
         correlation: share of the noise's variance that all warm positions of a dimension have in common.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import Source
         >>> warm = torch.ones(1, 2, 1, dtype=torch.bool)
         >>> Source(torch.ones(1, 2, 1), torch.zeros(()), warm).sample().flatten().tolist()
         [1.0, 1.0]
@@ -88,6 +90,8 @@ class Prior(Registered):
         :class:`~warmprior.PriorSampler`: draws from it.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import Prior
         >>> from warmprior.history import advance, cold_history
         >>> class LastAction(Prior):  # hold the last action
         ...     def mean(self, history):
@@ -125,7 +129,7 @@ class Prior(Registered):
 
     @property
     def history_length(self) -> int:
-        """How many executed actions :meth:`mean` needs: ``H`` or more."""
+        """How many executed actions :meth:`mean` needs, at least ``H``."""
         return self.chunk_length
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
@@ -195,6 +199,7 @@ class GaussianPrior(Prior):
         chunk_length: see :class:`Prior`.
 
     Examples:
+        >>> from warmprior import GaussianPrior
         >>> from warmprior.history import cold_history
         >>> GaussianPrior(8).distribution(cold_history([3], 8, 8, 2)).scale.unique()
         tensor([1.])
@@ -227,6 +232,8 @@ class PastPrior(Prior):
         :class:`~warmprior.HistoryObservation`: lets the network see the last actions instead.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import PastPrior
         >>> from warmprior.history import window_history
         >>> before, target = torch.tensor([[[1.0], [2.0]]]), torch.zeros(1, 2, 1)
         >>> loc, scale, warm = PastPrior(2).distribution(
@@ -265,6 +272,8 @@ class PreviewPrior(Prior):
             default.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import PreviewPrior
         >>> from warmprior.history import advance, cold_history
         >>> chunk = torch.arange(4.0).view(1, 4, 1)
         >>> loc, scale, warm = PreviewPrior(2).distribution(

@@ -40,6 +40,7 @@ def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
         - :class:`~warmprior.RealTimeChunking`: makes the prediction continue the old chunk.
 
     Examples:
+        >>> from warmprior.modules import with_leftover
         >>> import torch
         >>> chunk, leftover = torch.zeros(1, 4, 1), torch.ones(1, 4, 1)
         >>> with_leftover(chunk, leftover, torch.tensor([[2]])).flatten().tolist()
@@ -88,6 +89,7 @@ class RealTimeChunking:
         ValueError: for an unknown schedule, or a number that is not positive.
 
     Examples:
+        >>> from warmprior import RealTimeChunking
         >>> import torch
         >>> rtc = RealTimeChunking(schedule="linear")
         >>> weights = rtc.weights(torch.tensor(2), torch.tensor(6), 8)  # of 8 positions 6 are left
@@ -185,8 +187,9 @@ class RealTimeChunking:
         delay: Tensor,
         sigma: Tensor | float = 1.0,
     ) -> Velocity:
-        """A velocity that makes chunks continue the leftover. It works under ``torch.no_grad()``, and its
-        result is detached.
+        """A velocity that makes chunks continue the leftover.
+
+        It works under ``torch.no_grad()``, and its result is detached.
 
         Args:
             velocity: ``(t [B], a_t [B, P, d_a]) -> [B, P, d_a]``.

@@ -13,8 +13,9 @@ __all__ = ["Registered", "find", "from_config", "make", "options_of"]
 
 
 class Registered:
-    """Base class whose subclasses are known by name, and whose objects remember their constructor's
-    arguments. Every direct subclass has a registry of its own subclasses, except for those declared with
+    """Subclasses are known by name, and objects remember their constructor's arguments.
+
+    Every direct subclass has a registry of its own subclasses, except for those declared with
     ``abstract=True``.
 
     Raises:
@@ -22,6 +23,7 @@ class Registered:
         TypeError: when positional arguments behind ``*`` have no names in the base class to be saved by.
 
     Examples:
+        >>> from warmprior.modules.registry import Registered, from_config
         >>> class Shape(Registered): ...
         >>> class Circle(Shape):
         ...     def __init__(self, radius=1.0): ...
@@ -116,6 +118,7 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
         ValueError: if there is none, or it is a base class.
 
     Examples:
+        >>> from warmprior.modules.registry import find
         >>> from warmprior import Prior
         >>> find(Prior, "past").__name__
         'PastPrior'
@@ -146,6 +149,7 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
             the constructor takes.
 
     Examples:
+        >>> from warmprior.modules.registry import make
         >>> from warmprior import Prior
         >>> make(Prior, "past,correlation=0.5", 8)
         PastPrior(chunk_length=8, sigma=0.5, correlation=0.5)
@@ -173,6 +177,7 @@ def options_of(text: str) -> dict[str, Any]:
         ValueError: if they are not written like this, or one is given twice.
 
     Examples:
+        >>> from warmprior.modules.registry import options_of
         >>> options_of("preview,correlation=0.5,words=one, two")
         {'correlation': 0.5, 'words': 'one, two'}
     """
@@ -199,6 +204,7 @@ def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
         ValueError: if no imported class has that name.
 
     Examples:
+        >>> from warmprior.modules.registry import from_config
         >>> from warmprior import Prior
         >>> from_config(Prior, {"name": "past", "chunk_length": 8})
         PastPrior(chunk_length=8, sigma=0.5, correlation=0.0)

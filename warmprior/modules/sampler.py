@@ -41,8 +41,9 @@ class PriorSampler(TensorDictModuleBase):
         :class:`~warmprior.ODEActor`: integrates what it draws.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
-        >>> from warmprior import PastPrior
+        >>> from warmprior import PastPrior, PriorSampler
         >>> from warmprior.history import window_history
         >>> sampler = PriorSampler(PastPrior(2, sigma=0.0))
         >>> executed, steps = torch.ones(3, 2, 1), torch.full((3, 1), 2)

@@ -24,6 +24,7 @@ class StartPoint(Registered, nn.Module):
         :class:`~warmprior.WarmPriorActor`: takes one as ``start``.
 
     Examples:
+        >>> from warmprior import StartPoint
         >>> class Halved(StartPoint):
         ...     time = noise_share = 0.5
         ...     def centre(self, history, observation):

@@ -39,6 +39,7 @@ class RestingAction(nn.Module):
         - :func:`~warmprior.training.precondition`: removes it from what the network has to learn.
 
     Examples:
+        >>> from warmprior import RestingAction
         >>> import torch
         >>> rest = RestingAction(torch.arange(7)[None])
         >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
@@ -106,6 +107,8 @@ class PoseTrend(nn.Module):
         ValueError: if the shapes differ, or an entry is NaN or infinite.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import PoseTrend, RestingAction
         >>> rest = RestingAction(torch.arange(7)[None])
         >>> trend = PoseTrend(rest, torch.zeros(10), torch.zeros(4, 10), torch.ones(4, 10))
         >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7)

@@ -35,7 +35,7 @@ class VisionNetwork(VelocityNetwork):
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from warmprior import ImageEncoder, VelocityMLP
+        >>> from warmprior import ImageEncoder, VelocityMLP, VisionNetwork
         >>> encoder = ImageEncoder(["agentview_image"], 9, image_size=32, crop_size=28, backbone="small")
         >>> network = VisionNetwork(encoder, VelocityMLP(7, encoder.observation_dim, 8))
         >>> observation = TensorDict({

@@ -50,6 +50,7 @@ class OTCoupling:
         :class:`~warmprior.objectives.ReflowCoupling`: pairs each source with the end of a trained flow.
 
     Examples:
+        >>> from warmprior.objectives import OTCoupling
         >>> import torch
         >>> couple = OTCoupling(observation_weight=0.0)
         >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
@@ -67,7 +68,7 @@ class OTCoupling:
         self.observation_weight = observation_weight
 
     def config(self) -> dict[str, Any]:
-        """What it depends on."""
+        """The options that it depends on."""
         return {"name": "ot", "observation_weight": self.observation_weight}
 
     def __call__(
@@ -172,6 +173,7 @@ class ReflowCoupling:
         :class:`~warmprior.objectives.OTCoupling`: permutes the sources instead.
 
     Examples:
+        >>> from warmprior.objectives import ReflowCoupling
         >>> import torch
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
         >>> couple = ReflowCoupling(WarmPriorActor(VelocityMLP(2, 3, 4), GaussianPrior(4)), nfe=2)
@@ -188,7 +190,7 @@ class ReflowCoupling:
         self.teacher, self.nfe = teacher.eval().requires_grad_(False), nfe
 
     def config(self) -> dict[str, Any]:
-        """What it depends on, with a digest of the teacher's weights."""
+        """The options, with a digest of the teacher's weights."""
         weights = {name: value.tolist() for name, value in self.teacher.state_dict().items()}
         return {"name": "reflow", "nfe": self.nfe, "teacher": digest_of(weights)}
 

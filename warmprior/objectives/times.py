@@ -44,6 +44,8 @@ def uniform_times(
         - :class:`~warmprior.FlowMatchingLoss`: draws its times so.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.objectives.times import uniform_times
         >>> generator = torch.Generator().manual_seed(0)
         >>> t = uniform_times(torch.Size([1000]), generator, torch.float32, torch.device("cpu"))
         >>> abs(float(t.mean()) - 0.5) < 0.05
@@ -75,6 +77,7 @@ def u_shaped_times(
         - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
 
     Examples:
+        >>> from warmprior.objectives.times import u_shaped_times
         >>> import torch
         >>> t = u_shaped_times(torch.Size([9999]), torch.Generator().manual_seed(0), torch.float64,
         ...                    torch.device("cpu"))
@@ -102,6 +105,8 @@ def logit_normal_times(
         - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.objectives.times import logit_normal_times
         >>> generator = torch.Generator().manual_seed(0)
         >>> t = logit_normal_times(torch.Size([1000]), generator, torch.float32, torch.device("cpu"))
         >>> bool(((t - 0.5).abs() < 0.25).float().mean() > 0.6)  # half of uniform ones
@@ -127,6 +132,8 @@ def start_times(
         :class:`~warmprior.FlowMatchingLoss`: can be trained so.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.objectives.times import start_times
         >>> start_times(torch.Size([2]), None, torch.float32, torch.device("cpu"))
         tensor([0., 0.])
     """

@@ -48,6 +48,7 @@ class PriorSpaceAgent:
         ValueError: if the recipe does not suit the policy.
 
     Examples:
+        >>> from warmprior.rl.agent import PriorSpaceAgent
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.rl import PriorSpaceConfig
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4), nfe=1)

@@ -21,9 +21,10 @@ __all__ = ["PriorAnchor", "has_anchor", "residual_sigma", "source_anchor"]
 
 
 def has_anchor(actor: Any) -> bool:
-    """Whether a policy's source has a moving centre, around which an agent can search: the policy has a start
-    point, or its prior's mean is warm once the history is full. Otherwise agents search around zero, as in
-    DSRL.
+    """Whether a policy's source has a moving centre, around which an agent can search.
+
+    It has if the policy has a start point, or its prior's mean is warm once the history is full. Otherwise
+    agents search around zero, as in DSRL.
 
     Args:
         actor: the policy.
@@ -32,6 +33,7 @@ def has_anchor(actor: Any) -> bool:
         :func:`~warmprior.rl.source_anchor`: returns that centre.
 
     Examples:
+        >>> from warmprior.rl import has_anchor
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
         >>> network, priors = VelocityMLP(2, 3, 4), (GaussianPrior(4), PastPrior(4))
         >>> [has_anchor(WarmPriorActor(network, prior)) for prior in priors]
@@ -62,6 +64,9 @@ def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | Non
         :class:`~warmprior.PriorAnchor`: writes it in an environment, with noise elsewhere.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.history import window_history
+        >>> from warmprior.rl import source_anchor
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> target, steps = torch.zeros(4, 2), torch.tensor([4])
         >>> history = window_history(torch.ones(4, 2), steps, target, chunk_length=4)

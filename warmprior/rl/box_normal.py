@@ -24,6 +24,7 @@ class BoxTanhNormal(TanhNormal):
         kwargs (Any): as for the parent, ``low`` and ``high`` among them.
 
     Examples:
+        >>> from warmprior import BoxTanhNormal
         >>> import torch
         >>> loc, scale = torch.zeros(2), torch.ones(2)
         >>> small = BoxTanhNormal(loc, scale, low=-0.5, high=0.5, event_dims=1)

@@ -40,6 +40,8 @@ def check_finite(
         FloatingPointError: naming the tensors.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.rl.checks import check_finite
         >>> check_finite({"loss_actor": torch.tensor(torch.nan)})
         Traceback (most recent call last):
         FloatingPointError: NaN or infinity in loss_actor: the training has diverged; ...

@@ -56,6 +56,7 @@ class PriorSpaceConfig:
         - :class:`~warmprior.DSRLNALoss`: the loss of ``dsrl-na``.
 
     Examples:
+        >>> from warmprior.rl import PriorSpaceConfig
         >>> config = PriorSpaceConfig(algorithm="dsrl-sac", delta=1.5, hidden_dim=128)
         >>> config.environment_steps, config.gamma
         (1000000, 0.99)

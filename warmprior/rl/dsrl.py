@@ -236,7 +236,7 @@ class DSRLNALoss(LossModule):
         self.in_keys = list(dict.fromkeys(unravel_key(key) for key in needed))
 
     def _states(self, *modules: TensorDictModuleBase) -> list[NestedKey]:
-        """What the modules read, without actions."""
+        """The keys that the modules read, without actions."""
         actions = {self.decoder.delta_key, self.decoder.chunk_key}
         needed = dict.fromkeys(unravel_key(key) for module in modules for key in module.in_keys)
         return [key for key in needed if key not in actions]
@@ -337,8 +337,7 @@ class DSRLNALoss(LossModule):
         return 0.5 * error.square().sum(0), error.detach().abs().amax(0)
 
     def distillation_loss(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss of the noise critic, head by head, against the action critic's values of decoded
-        residuals.
+        """The loss of the noise critic against the action critic on decoded residuals, head by head.
 
         Args:
             tensordict: any states ``[N]``; actions, rewards and next states are not read.

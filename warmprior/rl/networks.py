@@ -121,6 +121,7 @@ def make_prior_space_actor(
         ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
 
     Examples:
+        >>> from warmprior import make_prior_space_actor
         >>> import torch
         >>> from tensordict import TensorDict
         >>> actor = make_prior_space_actor(2, 3, 4, delta=0.5)
@@ -192,6 +193,7 @@ def make_prior_space_critic(
         ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
 
     Examples:
+        >>> from warmprior import make_prior_space_critic
         >>> import torch
         >>> from tensordict import TensorDict
         >>> critic = make_prior_space_critic(2, 3, 4, in_keys=["observation", ("vla_action", "chunk")])

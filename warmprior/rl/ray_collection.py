@@ -40,6 +40,10 @@ class WarmUpSwitch(TensorDictModuleBase):
         - :class:`~warmprior.ResidualSampler`: what acts at first.
 
     Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import keys
+        >>> from warmprior.rl.ray_collection import WarmUpSwitch
         >>> from tensordict.nn import TensorDictModule
         >>> def always(value):
         ...     def act(seen):
@@ -125,6 +129,7 @@ def ray_rounds(
         WorkerError: if an actor dies, or an environment in it fails, a ``RuntimeError``.
 
     Examples:
+        >>> from warmprior.rl.ray_collection import ray_rounds
         >>> with ray_rounds(switch, make_env, collectors=2, num_envs=4, seed=0) as rounds:  # doctest: +SKIP
         ...     next(rounds).shape
         torch.Size([2, 4, 1])

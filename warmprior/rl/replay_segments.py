@@ -29,6 +29,10 @@ class ReplaySegments:
         :class:`~warmprior.rl.PriorSpaceTraining`: saves its replay buffer so.
 
     Examples:
+        >>> from pathlib import Path
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior.rl import ReplaySegments
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder:
         ...     segments = ReplaySegments(Path(folder))

@@ -70,6 +70,7 @@ class PriorSpaceTraining:
         - :func:`~warmprior.training.evaluate`: plays episodes with ``agent.policy``.
 
     Examples:
+        >>> from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
         >>> from tempfile import TemporaryDirectory
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, PriorAnchor, VelocityMLP, WarmPriorActor, policy_transforms

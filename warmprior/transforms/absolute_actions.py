@@ -57,6 +57,7 @@ class AbsoluteActions(Transform):
         KeyError: if there is no pose.
 
     Examples:
+        >>> from warmprior import AbsoluteActions
         >>> import torch
         >>> from tensordict import TensorDict
         >>> transform = AbsoluteActions([0.05] * 3 + [0.5] * 3)
@@ -95,8 +96,9 @@ class AbsoluteActions(Transform):
 
     @property
     def one_step(self) -> Tensor:
-        """How far one control step can move each number of an action, ``[10 * arms]``; 0 for the gripper. In
-        these units (see :meth:`Normalizer.fit`) poses and deltas are comparable.
+        """How far one control step can move each number of an action, ``[10 * arms]``; 0 for the gripper.
+
+        In these units (see :meth:`Normalizer.fit`) poses and deltas are comparable.
         """
         position, turn = self.scale[:3], self.scale[3:].amin()
         return torch.cat((position, turn.expand(6), turn.new_zeros(1))).repeat(self.arms)

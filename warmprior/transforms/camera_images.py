@@ -36,6 +36,7 @@ class CameraImages(Transform):
         RuntimeError: if it is no simulator, or nothing here can render.
 
     Examples:
+        >>> from warmprior import CameraImages
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior.envs import RobosuiteEnv
         >>> env = TransformedEnv(  # doctest: +SKIP

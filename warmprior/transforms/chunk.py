@@ -66,6 +66,7 @@ class ChunkStep(Transform):
             a vector environment of Gymnasium.
 
     Examples:
+        >>> from warmprior import ChunkStep
         >>> import torch
         >>> from torchrl.envs import GymEnv, StepCounter, TransformedEnv, Compose
         >>> env = TransformedEnv(

@@ -61,6 +61,9 @@ def executed_chunk(tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK
         - :func:`~warmprior.diagnostics.executed_actions`: the actions of a whole rollout.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import keys
+        >>> from warmprior.transforms import executed_chunk
         >>> from tensordict import TensorDict
         >>> chunk, forecast = torch.ones(1, 3, 1), torch.zeros(1, 3, 1)
         >>> data = TensorDict({keys.CHUNK: chunk, keys.FORECAST: forecast}, [1])
@@ -105,6 +108,7 @@ class InferenceDelay(Transform):
         RuntimeError: (on a step) if a decision executed more than ``execute`` actions.
 
     Examples:
+        >>> from warmprior.transforms import executed_chunk
         >>> import torch
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from warmprior import GaussianPrior, policy_transforms
@@ -141,7 +145,7 @@ class InferenceDelay(Transform):
                 "before gave, with the chunk"
             )
         if tensordict.get(self.chunk_key, None) is None:
-            return tensordict  # ChunkStep tells
+            return tensordict  # ChunkStep raises
         return tensordict.set(self.chunk_key, executed_chunk(tensordict, self.chunk_key))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

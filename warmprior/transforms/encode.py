@@ -36,6 +36,7 @@ class EncodeObservation(Transform):
         KeyError: if the environment lacks the policy's observation.
 
     Examples:
+        >>> from warmprior import EncodeObservation
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import ImageEncoder, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor

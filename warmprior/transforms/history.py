@@ -42,7 +42,7 @@ class ActionHistory(Transform):
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv, Compose
-        >>> from warmprior import ChunkStep
+        >>> from warmprior import ActionHistory, ChunkStep
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(4)))
         >>> rollout = env.rollout(3)
         >>> rollout["history", "steps"].flatten().tolist()
@@ -138,6 +138,8 @@ class WithheldHistory(Transform):
         :func:`~warmprior.window_replay_buffer`: appends it, with ``withhold``.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import WithheldHistory
         >>> from tensordict import TensorDict
         >>> from warmprior.history import window_history
         >>> steps = torch.full((1000, 1), 2)

@@ -35,7 +35,7 @@ class HistoryObservation(Transform):
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
-        >>> from warmprior import GaussianPrior, policy_transforms
+        >>> from warmprior import GaussianPrior, HistoryObservation, policy_transforms
         >>> transforms = policy_transforms(GaussianPrior(2), observation_steps=1, see_history=True)
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), transforms)
         >>> seen = env.rollout(2)["prior", "observation"]  # 3 observations, 2 actions, whether there are 2
@@ -71,7 +71,7 @@ class HistoryObservation(Transform):
         return tensordict.set(self.out_keys[0], _with_vector(observation, extend))
 
     def _read(self, place: TensorDictBase | Composite) -> list[Any]:
-        """What lies under the input keys, values or their specs."""
+        """The values or specs under the input keys."""
         known = place.keys(True)
         missing = [key for key in self.in_keys if key not in known]
         if missing:

@@ -53,7 +53,7 @@ class InnerStep:
         self._branches = {key[0] for key in (*inverse, *self.observed) if isinstance(key, tuple)}
 
     def __call__(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
-        """What the step leads to.
+        """Take the step.
 
         Args:
             tensordict: the step's input, ``[*B]``. Entries are added at its root; nested ones stay as they

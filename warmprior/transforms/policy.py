@@ -81,7 +81,7 @@ def policy_transforms(
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv
-        >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> actor = WarmPriorActor(VelocityMLP(1, 3, prediction_length=8), PreviewPrior(4))
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(actor))
         >>> env.reset()["observation"].shape
@@ -98,7 +98,7 @@ def policy_transforms(
         if observation_steps is None:
             observation_steps = getattr(uncompiled(policy.network), "observation_steps", None)
         if delay is None and policy.ode.guidance is not None:
-            delay = 0  # guidance reads what is left of the chunk before
+            delay = 0  # guidance reads the rest of the chunk before
     if not isinstance(prior, Prior):
         raise TypeError(f"policy_transforms takes a WarmPriorActor or a Prior, got {type(prior).__name__}")
     observation_steps = 2 if observation_steps is None else observation_steps

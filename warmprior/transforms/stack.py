@@ -38,6 +38,7 @@ class ObservationStack(Transform):
             the current stack.
 
     Examples:
+        >>> from warmprior import ObservationStack
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationStack(2))
         >>> rollout = env.rollout(3)

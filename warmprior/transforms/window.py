@@ -58,6 +58,7 @@ class ActionWindow(Transform):
         - :func:`~warmprior.window_replay_buffer`: a buffer of such windows.
 
     Examples:
+        >>> from warmprior import ActionWindow
         >>> import torch
         >>> from tensordict import TensorDict
         >>> data = TensorDict({"observation": torch.zeros(5, 3),
@@ -243,11 +244,13 @@ def window_transforms(
         observation_steps: ``To``.
         see_history: whether the network sees the last actions.
         withhold: share of the windows whose history is withheld.
-        generator: source of randomness of what is withheld, on the data's device.
+        generator: source of randomness of the withheld windows, on the data's device.
         renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
 
     Examples:
-        >>> from warmprior import PastPrior
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, window_transforms
         >>> data = TensorDict({"observation": torch.zeros(50, 3), "action": torch.arange(50.0)[:, None],
         ...                    "episode": torch.arange(50) // 25}, [50])
         >>> windows = window_transforms(data, PastPrior(2), observation_steps=1)
@@ -316,7 +319,7 @@ def window_replay_buffer(
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from warmprior import PreviewPrior
+        >>> from warmprior import PreviewPrior, window_replay_buffer
         >>> data = TensorDict({"observation": torch.zeros(50, 3), "action": torch.zeros(50, 2),
         ...                    "episode": torch.arange(50) // 25}, [50])
         >>> batch = window_replay_buffer(data, PreviewPrior(8), batch_size=32).sample()
