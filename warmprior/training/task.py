@@ -373,8 +373,8 @@ def read_like(
 ) -> tuple[TensorDictBase, str]:
     """Further demonstrations of a task in robosuite, in raw units, as its policies see them.
 
-    By its name and facts, all or those of a mask; also what the place (see :func:`robosuite_task`) is called in results. A
-    ``ValueError`` if they are of another task.
+    By its name and facts, all or those of a mask; also what the place (see :func:`robosuite_task`) is called
+    in results. A ``ValueError`` if they are of another task.
     """
     found = _open(place, name, mask)
     if (theirs := _name_of(found.index())) != name:  # before images are rendered
