@@ -56,13 +56,7 @@ from warmprior.training import (
     train_policy,
 )
 from warmprior.training.behaviour_cloning import STATE_FORMAT, policy_path
-from warmprior.training.checkpoint import (
-    load_state,
-    module_tensors,
-    restore_module,
-    restoring,
-    save_state,
-)
+from warmprior.training.checkpoint import load_state, module_tensors, restore_module, restoring, save_state
 from warmprior.training.task import task_places
 from warmprior.transforms import policy_transforms
 
@@ -401,13 +395,7 @@ def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int
     task = policy.task()
     return [
         play_episode(
-            actor,
-            env,
-            episode,
-            nfe=cell.nfe,
-            policy_seed=seed,
-            success=task.success,
-            measures=task.measures,
+            actor, env, episode, nfe=cell.nfe, policy_seed=seed, success=task.success, measures=task.measures
         )
         for episode in seeds
     ]

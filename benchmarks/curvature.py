@@ -10,24 +10,9 @@ import sys
 from dataclasses import dataclass
 
 import torch
-from common import (
-    facts_of,
-    finished_policies,
-    observations_of,
-    policies_of,
-    trained_actors,
-    write_rows,
-)
+from common import facts_of, finished_policies, observations_of, policies_of, trained_actors, write_rows
 from measures import RATIOS, straightness
-from options import (
-    PRESETS,
-    FinishedRun,
-    MeasuredOptions,
-    parse,
-    script,
-    started,
-    study,
-)
+from options import PRESETS, FinishedRun, MeasuredOptions, parse, script, started, study
 from paper import PAPER_CURVATURE
 from plots import plot_flow_paths
 from report import labelled, pooled, problem_title, table, text_of, write_report

@@ -21,11 +21,7 @@ from robomimic import run
 FEW = {
     name: with_parts(
         preset,
-        data={
-            "task": ("stack",),
-            "demonstrations": (10,),
-            "obs": "image" if name == "paper" else "state",
-        },
+        data={"task": ("stack",), "demonstrations": (10,), "obs": "image" if name == "paper" else "state"},
         training={"iterations": 50_000 if name == "paper" else 5_000, "batch_size": 128},
     )
     for name, preset in PRESETS.items()

@@ -217,10 +217,7 @@ PRESETS: dict[str, Options] = {
     # One seed, small network: a first table within 15 minutes on two cores.
     "quick": Options(data=DataOptions(demonstrations=(GENERATED,))),
     # The same policies with three seeds and twice the episodes: a table with seeds.
-    "cpu": Options(
-        data=DataOptions(demonstrations=(150, 300)),
-        evaluation=Evaluation(seeds=3, episodes=50),
-    ),
+    "cpu": Options(data=DataOptions(demonstrations=(150, 300)), evaluation=Evaluation(seeds=3, episodes=50)),
     # The paper's: 20M parameters, 200k iterations.
     "paper": Options(
         data=DataOptions(demonstrations=(200, 300)),

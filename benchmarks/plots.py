@@ -216,10 +216,7 @@ def plot_lines(
 
 
 def plot_learning_curves(
-    losses: Mapping[str, Sequence[Sequence[tuple[int, float]]]],
-    rows: DataFrame,
-    path: str | Path,
-    title: str,
+    losses: Mapping[str, Sequence[Sequence[tuple[int, float]]]], rows: DataFrame, path: str | Path, title: str
 ) -> None:
     """Loss and success against the iteration; `losses` by method, a list of (iteration, loss) per seed."""
     figure, (left, right) = new_figure(9.0, 3.6, columns=2)

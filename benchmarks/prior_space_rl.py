@@ -20,15 +20,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import pandas as pd
 import tyro
-from common import (
-    facts_of,
-    finished_policies,
-    policies_of,
-    slug,
-    stored_rows,
-    trained_actors,
-    write_rows,
-)
+from common import facts_of, finished_policies, policies_of, slug, stored_rows, trained_actors, write_rows
 from methods import ColdPrior, Method
 from navigation1d import NAVIGATION_PRESETS
 from options import (
@@ -243,18 +235,11 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
 # What a preset does differently on a task.
 BY_TASK: dict[tuple[str, str], dict[str, Any]] = {
     # Weak policies: solved in 0.3 to 0.8 of the episodes.
-    ("quick", "lift"): {
-        "data": {"demonstrations": (5,)},
-        "training": {"iterations": 300},
-        "horizon": 90,
-    },
+    ("quick", "lift"): {"data": {"demonstrations": (5,)}, "training": {"iterations": 300}, "horizon": 90},
     ("quick", "can"): {"training": {"iterations": 500}},
     ("paper", "lift"): {"rl": {"updates": 30}, "horizon": 300},
     ("paper", "can"): {"horizon": 300},
-    ("paper", "square"): {
-        "rl": {"gamma": 0.999, "warmup_steps": 32_000},
-        "horizon": 400,
-    },
+    ("paper", "square"): {"rl": {"gamma": 0.999, "warmup_steps": 32_000}, "horizon": 400},
     ("paper", "transport"): {"rl": {"hidden_dim": 128, "warmup_steps": 640_000}, "horizon": 800},
 }
 
@@ -274,9 +259,7 @@ def adapt(preset: AgentsOptions, asked: AgentsOptions) -> AgentsOptions:
     return with_parts(changed, data={"task": given})
 
 
-def frozen_policies(
-    options: AgentsOptions,
-) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
+def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
     """The task, and the frozen policies by method and seed: of --run, or trained now."""
     run = options.policies
     if run is None:
@@ -325,11 +308,7 @@ def encoding(actor: WarmPriorActor) -> list[EncodeObservation]:
 
 
 def learn(
-    options: AgentsOptions,
-    actor: WarmPriorActor,
-    arm: Arm,
-    seed: int,
-    out: Path,
+    options: AgentsOptions, actor: WarmPriorActor, arm: Arm, seed: int, out: Path
 ) -> PriorSpaceTraining:
     """Train an agent, or continue it where it was interrupted."""
     actor, name = arm.policy(actor), f"{arm}, seed {seed}"

@@ -21,10 +21,7 @@ from warmprior.envs import gym_env
 from warmprior.io.extras import require
 from warmprior.training import DataOptions, Task
 
-OBSERVATION = [
-    "observation.state",
-    "observation.environment_state",
-]  # the agent, the block's corners
+OBSERVATION = ["observation.state", "observation.environment_state"]  # the agent, the block's corners
 
 
 def make_env() -> EnvBase:

@@ -45,11 +45,7 @@ from warmprior.training import Episode
 
 
 def run(
-    argv: list[str] | None,
-    presets: Mapping[str, Options],
-    study: str,
-    doc: str | None,
-    **parsing: Any,
+    argv: list[str] | None, presets: Mapping[str, Options], study: str, doc: str | None, **parsing: Any
 ) -> None:
     """The whole benchmark: options, data, training and playing, table and pictures."""
     options = parse(presets, argv, study, doc, **parsing)

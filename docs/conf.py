@@ -89,9 +89,7 @@ def _show_own_signature(app, what, name, obj, options, signature, return_annotat
     if what == "class" and (signature or "").startswith("(*args"):
         record_typehints(app, what, name, obj.__init__, options, signature, return_annotation)
         own = stringify_signature(
-            _signature(obj.__init__, bound_method=True),
-            show_annotation=False,
-            show_return_annotation=False,
+            _signature(obj.__init__, bound_method=True), show_annotation=False, show_return_annotation=False
         )
         signature = signature if own.startswith("(*args") else own
     return signature, return_annotation

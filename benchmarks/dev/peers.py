@@ -110,9 +110,7 @@ def ours(name: str, make: Callable[[int], VelocityNetwork], width: int, device: 
         lambda nfe: actor(data, nfe=nfe),
         1,
         lambda batch: network(
-            torch.rand(len(batch), device=device),
-            batch["vla_action", "chunk"],
-            batch["observation"],
+            torch.rand(len(batch), device=device), batch["vla_action", "chunk"], batch["observation"]
         ),
     )
 

@@ -201,10 +201,7 @@ def simulated(recorded: Sequence[Played], batches: dict[int, float], cores: int)
 
     many = [*recorded] * -(-4 * cores // len(recorded))
     alone = apart(many, 1)
-    return {
-        "apart": alone / apart(many, cores),
-        "lockstep": alone / lockstep(many, cores, interpolated),
-    }
+    return {"apart": alone / apart(many, cores), "lockstep": alone / lockstep(many, cores, interpolated)}
 
 
 def draw(path: Path, results: dict[str, Any]) -> None:

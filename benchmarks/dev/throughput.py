@@ -32,18 +32,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs import TransformedEnv
 from tqdm import tqdm
-from training_figures import (
-    BATCH,
-    D_A,
-    D_O,
-    PRIOR,
-    TO,
-    H,
-    paper_network,
-    small_network,
-    step_of,
-    steps,
-)
+from training_figures import BATCH, D_A, D_O, PRIOR, TO, H, paper_network, small_network, step_of, steps
 
 from warmprior import (
     ChiTransformer,

@@ -14,12 +14,7 @@ import torch
 
 from warmprior import GaussianPrior, PastPrior, PreviewPrior
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
-from warmprior.envs.navigation1d import (
-    HALF_HEIGHT,
-    HALF_WIDTH,
-    OBSTACLES,
-    navigation_positions,
-)
+from warmprior.envs.navigation1d import HALF_HEIGHT, HALF_WIDTH, OBSTACLES, navigation_positions
 from warmprior.training import navigation_task, play_navigation, train_policy
 
 sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))

@@ -93,8 +93,7 @@ for axis, (name, prior), color in zip(
             label="mean" if start == 8 else None,
         )
     axis.set(
-        title=f"{name}: {error:.3f} from the next chunk",
-        xlabel="position",
+        title=f"{name}: {error:.3f} from the next chunk", xlabel="position"
     )
     axis.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
 axes[0].set_ylabel("height (action)")
@@ -161,17 +160,9 @@ for axis, (name, actor), color in zip(
             [centre - 0.12, centre + 0.12], -0.45, 0.45, color="0.8"
         )
     axis.plot(
-        navigation_positions(),
-        heights.T,
-        color=color,
-        lw=0.7,
-        alpha=0.6,
+        navigation_positions(), heights.T, color=color, lw=0.7, alpha=0.6
     )
-    axis.set(
-        title=f"{name}, NFE 1",
-        xlabel="position",
-        xlim=(-1, 1),
-    )
+    axis.set(title=f"{name}, NFE 1", xlabel="position", xlim=(-1, 1))
 axes[0].set_ylabel("height (action)")
 plt.show()
 

@@ -35,11 +35,7 @@ from warmprior.envs import (
     navigation_metrics,
     navigation_positions,
 )
-from warmprior.lerobot import (
-    LeRobotActor,
-    WarmPriorAdapter,
-    history_indices,
-)
+from warmprior.lerobot import LeRobotActor, WarmPriorAdapter, history_indices
 
 torch.manual_seed(0)
 folder = tempfile.TemporaryDirectory()
@@ -243,10 +239,7 @@ for axis, (name, one), color in zip(
         x[step - H : step], history[step], "k.:", label="executed before"
     )
     axis.plot(
-        x[step : step + H],
-        chunk[step],
-        "k.-",
-        label="demonstrated chunk",
+        x[step : step + H], chunk[step], "k.-", label="demonstrated chunk"
     )
     axis.set(title=f"{name}: {error:.2f} from the chunk", xlabel="position")
 axes[0].set_ylabel("height (action)")

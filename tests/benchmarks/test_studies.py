@@ -4,15 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.benchmarks.script_parts import (
-    command_line,
-    described,
-    is_png,
-    options,
-    refused,
-    stored,
-    written,
-)
+from tests.benchmarks.script_parts import command_line, described, is_png, options, refused, stored, written
 from tests.data.synthetic import write_robomimic_file
 
 pytest.importorskip("h5py")

@@ -12,12 +12,7 @@ from torchrl.objectives import CrossQLoss, REDQLoss, SACLoss, SoftUpdate, TQCLos
 
 from tests.rl.test_environment import D_O, DELTA, TO, H, make_decoder, make_env
 from tests.toy_env import ACTION_DIM
-from warmprior import (
-    PreviewPrior,
-    keys,
-    make_prior_space_actor,
-    make_prior_space_critic,
-)
+from warmprior import PreviewPrior, keys, make_prior_space_actor, make_prior_space_critic
 
 GAMMA = 0.9
 PRIOR = PreviewPrior(H)

@@ -26,10 +26,7 @@ from warmprior.training.saved import load_policy
 
 __all__ = ["export_policy"]
 
-_FEATURES = {
-    "observation.environment_state": FeatureType.ENV,
-    "observation.state": FeatureType.STATE,
-}
+_FEATURES = {"observation.environment_state": FeatureType.ENV, "observation.state": FeatureType.STATE}
 
 
 def export_policy(folder: str | Path, out: str | Path) -> Path:
