@@ -35,6 +35,8 @@ class DatasetIndex:
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
 
     Examples:
+        >>> from pathlib import Path
+        >>> from warmprior.data.index import DatasetIndex
         >>> index = DatasetIndex(
         ...     path=Path("square.hdf5"), demos=("demo_0", "demo_1"), lengths=(120, 131),
         ...     observation_keys=("object",), observation_dims=(14,), image_keys=(), image_size=0,

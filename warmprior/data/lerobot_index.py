@@ -50,6 +50,7 @@ class LeRobotIndex(DatasetIndex):
         described: what ``meta/warmprior.json`` says; empty for datasets that were not converted.
 
     Examples:
+        >>> from warmprior.data.lerobot_index import read_lerobot_index
         >>> index = read_lerobot_index("square_lerobot")  # doctest: +SKIP
         >>> index.files  # doctest: +SKIP
         ['data/chunk-000/file-000.parquet']
@@ -141,6 +142,7 @@ def action_names(arms: int) -> list[str]:
         arms: how many.
 
     Examples:
+        >>> from warmprior.data.lerobot_index import action_names
         >>> action_names(1)[3:]
         ['robot0_rx', 'robot0_ry', 'robot0_rz', 'robot0_gripper']
     """
@@ -154,6 +156,7 @@ def state_names(widths: Mapping[str, int]) -> list[str]:
         widths: of the observations, in their order.
 
     Examples:
+        >>> from warmprior.data.lerobot_index import state_names
         >>> state_names({"robot0_gripper_qpos": 2})
         ['robot0_gripper_qpos_0', 'robot0_gripper_qpos_1']
     """
@@ -196,6 +199,7 @@ def read_lerobot_index(
         ValueError: if no demos are to be taken.
 
     Examples:
+        >>> from warmprior.data.lerobot_index import read_lerobot_index
         >>> index = read_lerobot_index("square_lerobot")  # doctest: +SKIP
         >>> len(index.demos), index.action_dim  # doctest: +SKIP
         (200, 7)

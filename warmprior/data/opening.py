@@ -57,6 +57,7 @@ def check_place(place: str | Path, option: str) -> None:
         ImportError: if what reads it is not installed.
 
     Examples:
+        >>> from warmprior.data.opening import check_place
         >>> check_place("lerobot:user/square", "--dataset")
         >>> check_place("lerobot:./square", "--dataset")
         Traceback (most recent call last):
@@ -100,6 +101,7 @@ def open_demonstrations(
         mask: of the file, such as ``"train"``; all demonstrations if ``None``.
 
     Examples:
+        >>> from warmprior.data.opening import open_demonstrations
         >>> open_demonstrations("lerobot:user/square").name  # nothing is fetched yet
         'lerobot:square'
     """
@@ -111,6 +113,7 @@ class Demonstrations(ABC):
     """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
 
     Examples:
+        >>> from warmprior.data.opening import open_demonstrations
         >>> place = open_demonstrations("nowhere.hdf5")  # not looked at yet
         >>> place.index()
         Traceback (most recent call last):

@@ -83,6 +83,7 @@ def render_demonstrations(
         - :func:`~warmprior.data.generate_demonstrations`: makes files to render.
 
     Examples:
+        >>> from warmprior.data import render_demonstrations
         >>> path = render_demonstrations("square.hdf5", ["agentview"])  # doctest: +SKIP
         >>> path.name  # doctest: +SKIP
         'square_agentview84_1f2e3d4c.hdf5'

@@ -206,8 +206,10 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         OSError: if there is no space for memory maps.
 
     Examples:
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
         >>> import h5py
+        >>> import numpy as np
         >>> from warmprior.data import RobomimicExperienceReplay
         >>> with TemporaryDirectory() as folder:
         ...     path = Path(folder) / "toy.hdf5"

@@ -49,7 +49,9 @@ def environment_description(
             it sees besides, see :class:`RobosuiteEnv`.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.envs import environment_description
+        >>> from warmprior.envs.description import environment_name
         >>> kept = environment_description({"env_name": "Lift", "env_kwargs": {}}, "ph", observation_steps=2)
         >>> kept
         {'robosuite': {'env_args': {'env_name': 'Lift', 'env_kwargs': {}}, 'style': 'ph'},
@@ -129,6 +131,8 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         ValueError: if the policy keeps no description of one.
 
     Examples:
+        >>> from warmprior import WarmPriorActor
+        >>> from warmprior.envs import environment_of
         >>> from warmprior.training import load_policy
         >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> environment_of(actor).rollout(10, actor)["next", "success"].any()  # doctest: +SKIP

@@ -51,6 +51,7 @@ def rendering_backend() -> str | None:
         :class:`~warmprior.envs.RobosuiteEnv`: renders its cameras with it.
 
     Examples:
+        >>> from warmprior.envs import rendering_backend
         >>> rendering_backend() in ("egl", "osmesa", None)  # doctest: +SKIP
         True
     """

@@ -42,6 +42,7 @@ class TaskSpec:
         :func:`~warmprior.envs.get_task`: finds one by its short name.
 
     Examples:
+        >>> from warmprior.envs import TaskSpec
         >>> door = TaskSpec("door", "Door", arms=1, horizon_ph=300, horizon_mh=500, object_dim=22)
         >>> door.observation_dim, door.action_dim, door.horizon("mh")
         (31, 7, 500)
@@ -66,12 +67,7 @@ class TaskSpec:
 
     @property
     def low_dim_widths(self) -> dict[str, int]:
-        """The width of each of :attr:`low_dim_keys`.
-
-        Examples:
-            >>> get_task("lift").low_dim_widths["robot0_eef_quat"]
-            4
-        """
+        """The width of each of :attr:`low_dim_keys`."""
         widths = [self.object_dim, *[*_ARM_WIDTHS.values()] * self.arms]
         return dict(zip(self.low_dim_keys, widths, strict=True))
 
@@ -143,6 +139,7 @@ def get_task(name: str) -> TaskSpec:
         - :data:`~warmprior.envs.TASKS`: all of them.
 
     Examples:
+        >>> from warmprior.envs import get_task
         >>> get_task("square").observation_dim
         23
     """

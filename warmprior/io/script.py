@@ -46,7 +46,9 @@ def run_script(
         The exit code: 0, 2 after an error, 130 after Ctrl-C.
 
     Examples:
+        >>> import sys
         >>> from contextlib import redirect_stderr
+        >>> from warmprior.io.script import run_script
         >>> run_script(lambda: print("trained"), "train.py")
         trained
         0

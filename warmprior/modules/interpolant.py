@@ -174,6 +174,8 @@ class BridgeInterpolant(Interpolant):
         :class:`~warmprior.LinearInterpolant`: the path without noise.
 
     Examples:
+        >>> import torch
+        >>> from warmprior import BridgeInterpolant
         >>> a0, a1, t = torch.zeros(1, 1, 1), torch.ones(1, 1, 1), torch.tensor([0.5])
         >>> a_t, velocity = BridgeInterpolant(0.2)(a0, a1, t, torch.Generator().manual_seed(0))
         >>> bool(a_t != 0.5), velocity.item()

@@ -126,6 +126,7 @@ class BridgeCoupling(OTCoupling):
 
     Examples:
         >>> import torch
+        >>> from warmprior.objectives import BridgeCoupling
         >>> couple = BridgeCoupling(sigma=0.1, observation_weight=0.0)
         >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
         >>> [x.flatten().tolist() for x in couple(a0, a1)], couple.interpolant

@@ -95,9 +95,11 @@ class BehaviourCloning:
         - :func:`~warmprior.training.evaluate`: plays episodes with what it trained.
 
     Examples:
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.envs import navigation_demonstrations
+        >>> from warmprior.training import BehaviourCloning, TrainingConfig
         >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
         >>> actor = WarmPriorActor(network, PastPrior(4))
         >>> config = TrainingConfig(iterations=2, batch_size=8, checkpoints=1)

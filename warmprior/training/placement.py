@@ -25,7 +25,9 @@ def placed(data: TensorDictBase, device: torch.device | str) -> TensorDictBase:
         device: of the network.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
+        >>> from warmprior.training.placement import placed
         >>> placed(TensorDict({"action": torch.zeros(3, 2)}, [3]), "cpu").device
         device(type='cpu')
     """
@@ -56,6 +58,8 @@ class Prefetch:
         device: where batches go; through pinned memory if that is a GPU.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.training.placement import Prefetch
         >>> generator = torch.Generator().manual_seed(0)
         >>> batches = Prefetch(lambda: torch.rand(2, generator=generator), generator)
         >>> first, state, second = batches(), batches.state(), batches()

@@ -77,6 +77,7 @@ class Task:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.envs import GymEnv
+        >>> from warmprior.training import Task
         >>> steps = {"observation": torch.rand(60, 3), "action": torch.rand(60, 1),
         ...          "episode": torch.arange(60) // 20}
         >>> task = Task.of("pendulum", TensorDict(steps, [60]), lambda: GymEnv("Pendulum-v1"))
@@ -245,9 +246,12 @@ def robosuite_task(
         - :class:`~warmprior.envs.RobosuiteEnv`: its environment.
 
     Examples:
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
         >>> import h5py
         >>> import torch
+        >>> from warmprior.envs import TASKS
+        >>> from warmprior.training import robosuite_task
         >>> lift = TASKS["lift"]
         >>> with TemporaryDirectory() as folder:
         ...     path = Path(folder) / "lift.hdf5"
@@ -404,6 +408,7 @@ def navigation_task() -> Task:
         - :func:`~warmprior.envs.navigation_demonstrations`: its data.
 
     Examples:
+        >>> from warmprior.training import navigation_task
         >>> task = navigation_task()
         >>> task.title, task.make_env(batch_size=[8]).batch_size
         ('navigation toy', torch.Size([8]))
@@ -428,6 +433,7 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
         :func:`~warmprior.training.find_tasks`: all that options name.
 
     Examples:
+        >>> from warmprior.training import DataOptions, load_task
         >>> load_task(DataOptions(), "navigation").title
         'navigation toy'
         >>> load_task(DataOptions(), "nowhere:pendulum")
@@ -478,6 +484,8 @@ def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
         ValueError: if the options do not go together.
 
     Examples:
+        >>> from warmprior.training import DataOptions
+        >>> from warmprior.training.task import task_places
         >>> task_places(DataOptions(task=("can", "tool_hang"), data=("ph", "mh"), download=True))
         Data: there are no official mh demonstrations of tool_hang.
         [('can', 'ph'), ('can', 'mh'), ('tool_hang', 'ph')]
@@ -519,6 +527,7 @@ def find_tasks(options: DataOptions, observation_steps: int = 2) -> list[Task]:
         :func:`~warmprior.training.load_task`: one of them.
 
     Examples:
+        >>> from warmprior.training import DataOptions, find_tasks
         >>> [task.title for task in find_tasks(DataOptions(task=("navigation",)))]
         ['navigation toy']
     """
