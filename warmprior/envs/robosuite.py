@@ -149,7 +149,7 @@ class RobosuiteWrapper(_EnvWrapper):
 
     @property
     def loop(self) -> StepLoop:
-        """The control loop: simulator state, poses of bodies and sites."""
+        """The control loop, which holds the simulator state and the poses of bodies and sites."""
         return self._loop
 
     def render_frame(

@@ -62,7 +62,7 @@ class TaskSpec:
 
     @property
     def low_dim_keys(self) -> tuple[str, ...]:
-        """Observation keys whose concatenation is the state: ``object`` first, then each arm."""
+        """Observation keys whose concatenation is the state, ``object`` first, then each arm."""
         return low_dim_keys(self.arms)
 
     @property
@@ -78,7 +78,7 @@ class TaskSpec:
 
     @property
     def action_dim(self) -> int:
-        """Width of the action: a 6-d pose delta and a gripper command per arm."""
+        """Width of the action, which is a 6-d pose delta and a gripper command per arm."""
         return 7 * self.arms
 
     def horizon(self, style: str) -> int:

@@ -165,7 +165,7 @@ class Task:
 
     @cached_property
     def identity(self) -> str:
-        """Of the data: part of the identity of every policy that is trained on them."""
+        """Digest of the data, part of the identity of every policy that is trained on them."""
         if self.digest:
             return self.digest
         # Data in other units may be equal once they are normalised.
