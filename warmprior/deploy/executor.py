@@ -124,8 +124,7 @@ class AsyncExecutor:
         self._chunk_key = keys.CHUNK if chunk_key is None else chunk_key
         self._shape = (length, action_dim)
         self._device = next(
-            (value.device for value in chain(actor.parameters(), actor.buffers())),
-            torch.device("cpu"),
+            (value.device for value in chain(actor.parameters(), actor.buffers())), torch.device("cpu")
         )
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
         self._sees_history = keys.CONDITIONED in actor.in_keys
@@ -306,9 +305,6 @@ class AsyncExecutor:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()

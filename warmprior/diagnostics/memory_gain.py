@@ -116,8 +116,7 @@ def memory_gain(
     def predicted(shift: float) -> dict[int, Tensor]:
         generator.set_state(state)  # the same noise on both sides
         rows = seen_anew(
-            policy,
-            plain.clone(recurse=False).set(keys.HISTORY, shifted(history, shift * direction)),
+            policy, plain.clone(recurse=False).set(keys.HISTORY, shifted(history, shift * direction))
         )
         rows = encoded_windows(policy, rows).select(*policy.in_keys)
         a0 = drawn(policy, rows, generator)

@@ -8,13 +8,7 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.diagnostics.branching import executed_positions
-from warmprior.diagnostics.flow import (
-    check_flow,
-    drawn,
-    evaluation_mode,
-    field_of,
-    flat_windows,
-)
+from warmprior.diagnostics.flow import check_flow, drawn, evaluation_mode, field_of, flat_windows
 from warmprior.history import advance
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.ode import integrate

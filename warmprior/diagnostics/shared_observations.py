@@ -7,12 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.flow import (
-    depends_on_history,
-    encoded_windows,
-    seen_anew,
-    sees_history,
-)
+from warmprior.diagnostics.flow import depends_on_history, encoded_windows, seen_anew, sees_history
 from warmprior.diagnostics.paths import deployed_history
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior

@@ -227,10 +227,7 @@ class GrootN15Port(DrawnPort):
 
             return predicted
 
-        with (
-            _replaced(policy, "predict_action_chunk", around),
-            super().sampling(policy, source, record, nfe),
-        ):
+        with _replaced(policy, "predict_action_chunk", around), super().sampling(policy, source, record, nfe):
             yield
 
 
@@ -379,7 +376,7 @@ PORTS: dict[str, dict[str, FlowPort]] = {
             model_config=lambda policy: policy._groot_model.action_head.config,
             predicted=lambda output: output["action_pred"],
             check=_check_groot_n15,
-        ),
+        )
     },
 }
 """By the release of LeRobot (``"0.6"`` is all of 0.6), and in it by LeRobot's name of the family.

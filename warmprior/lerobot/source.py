@@ -179,10 +179,7 @@ class ChunkSource:
             ``[B, T, D]``.
         """
         whole = torch.randn(
-            (len(a0), self.length, self.width),
-            dtype=a0.dtype,
-            device=a0.device,
-            generator=generator,
+            (len(a0), self.length, self.width), dtype=a0.dtype, device=a0.device, generator=generator
         )
         whole[:, self.positions, : self.action_dim] = a0
         return whole

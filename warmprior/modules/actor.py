@@ -142,10 +142,7 @@ class WarmPriorActor(TensorDictModuleBase):
         return self.ode.network
 
     def forward(
-        self,
-        tensordict: TensorDictBase,
-        nfe: int | None = None,
-        generator: torch.Generator | None = None,
+        self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
         """Sample the source and integrate it to the chunk."""
         return self.integrate(self.sampler(tensordict, generator=generator), nfe=nfe)

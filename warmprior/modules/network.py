@@ -130,10 +130,7 @@ class VelocityNetwork(nn.Module, Registered):
         for name, parameter in self.named_parameters():
             is_matrix = parameter.ndim >= 2 and not name.endswith("position")
             (decay if is_matrix else no_decay).append(parameter)
-        return [
-            {"params": decay, "weight_decay": weight_decay},
-            {"params": no_decay, "weight_decay": 0.0},
-        ]
+        return [{"params": decay, "weight_decay": weight_decay}, {"params": no_decay, "weight_decay": 0.0}]
 
 
 def velocity_field(

@@ -51,9 +51,7 @@ SOLVERS: dict[str, _Tableau] = {
     "midpoint": _Tableau((0.0, 0.5), ((), (0.5,)), (0.0, 1.0)),
     "heun": _Tableau((0.0, 1.0), ((), (1.0,)), (0.5, 0.5)),
     "rk4": _Tableau(
-        (0.0, 0.5, 0.5, 1.0),
-        ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
-        (1 / 6, 1 / 3, 1 / 3, 1 / 6),
+        (0.0, 0.5, 0.5, 1.0), ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
     ),
 }
 
@@ -249,10 +247,7 @@ class ODEActor(TensorDictModuleBase):
             )
 
     def forward(
-        self,
-        tensordict: TensorDictBase,
-        nfe: int | None = None,
-        sigma: Tensor | None = None,
+        self, tensordict: TensorDictBase, nfe: int | None = None, sigma: Tensor | None = None
     ) -> TensorDictBase:
         """Write the chunk (and the path, where asked for).
 

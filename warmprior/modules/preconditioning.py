@@ -245,10 +245,7 @@ class PreconditionedNetwork(VelocityNetwork):
         if isinstance(interpolant, dict):
             interpolant = from_config(Interpolant, interpolant)
         super().__init__(
-            network.action_dim,
-            network.observation_dim,
-            network.prediction_length,
-            network.observation_steps,
+            network.action_dim, network.observation_dim, network.prediction_length, network.observation_steps
         )
         self.network = network
         self.encodes = getattr(network, "encodes", False)

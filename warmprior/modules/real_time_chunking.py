@@ -180,12 +180,7 @@ class RealTimeChunking:
         return (source + data).clamp(max=self.max_guidance_weight)
 
     def guided(
-        self,
-        velocity: Velocity,
-        leftover: Tensor,
-        left: Tensor,
-        delay: Tensor,
-        sigma: Tensor | float = 1.0,
+        self, velocity: Velocity, leftover: Tensor, left: Tensor, delay: Tensor, sigma: Tensor | float = 1.0
     ) -> Velocity:
         """A velocity that makes chunks continue the leftover.
 

@@ -9,11 +9,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -260,11 +256,7 @@ class DSRLNALoss(LossModule):
         value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if value_type is not None:
             dispatch_value_estimator(
-                self,
-                value_type,
-                supported=(ValueEstimators.TD0,),
-                value_network=None,
-                **hyperparams,
+                self, value_type, supported=(ValueEstimators.TD0,), value_network=None, **hyperparams
             )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
@@ -314,11 +306,7 @@ class DSRLNALoss(LossModule):
         loss_actor = alpha * log_prob - self._combine(value)
         loss_alpha = -self.log_alpha * (log_prob.detach() + self.target_entropy)
         losses = {"loss_actor": loss_actor, "loss_alpha": loss_alpha, "loss_qvalue": loss_qvalue}
-        diagnostics = {
-            "alpha": alpha,
-            "entropy": -log_prob.detach().mean(),
-            "td_error": td_error.mean(),
-        }
+        diagnostics = {"alpha": alpha, "entropy": -log_prob.detach().mean(), "td_error": td_error.mean()}
         return self._finish(losses, tensordict, weights).update(diagnostics)
 
     def _qvalue_loss(self, tensordict: TensorDictBase, alpha: Tensor) -> tuple[Tensor, Tensor]:
@@ -407,10 +395,7 @@ class DSRLNALoss(LossModule):
 
 
 def _check_networks(
-    actor: ProbabilisticTensorDictSequential,
-    chunk_critic: Any,
-    noise_critic: Any,
-    decoder: PriorDecoder,
+    actor: ProbabilisticTensorDictSequential, chunk_critic: Any, noise_critic: Any, decoder: PriorDecoder
 ) -> None:
     """Check that the networks read and write the decoder's keys.
 

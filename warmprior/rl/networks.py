@@ -133,13 +133,7 @@ def make_prior_space_actor(
     check_positive(delta=delta)
     chunk = (prediction_length, action_dim)
     trunk = _Trunk(
-        in_keys,
-        chunk,
-        (observation_steps, observation_dim),
-        2 * math.prod(chunk),
-        hidden_dim,
-        num_layers,
-        {},
+        in_keys, chunk, (observation_steps, observation_dim), 2 * math.prod(chunk), hidden_dim, num_layers, {}
     )
     parameters = ["delta_loc", "delta_scale"]
     return ProbabilisticActor(

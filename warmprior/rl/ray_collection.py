@@ -78,9 +78,7 @@ def _actor_class() -> type:
         def __repr__(self) -> str:  # Ray writes it before every line that an actor prints
             return "collector"
 
-        def __bool__(
-            self,
-        ) -> bool:  # Ray asks for it, and the infinite length would raise
+        def __bool__(self) -> bool:  # Ray asks for it, and the infinite length would raise
             return True
 
     return Actor

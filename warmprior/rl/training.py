@@ -118,11 +118,7 @@ class PriorSpaceTraining:
         self.segments = ReplaySegments(self.directory / "buffer")
         self.steps = 0
         self.curve: list[dict[str, Any]] = []
-        self.identity = {
-            "config": asdict(config),
-            "prior": actor.prior.config(),
-            "policy": _digest(actor),
-        }
+        self.identity = {"config": asdict(config), "prior": actor.prior.config(), "policy": _digest(actor)}
         if self.state_path.exists():
             self._restore()
 

@@ -193,13 +193,7 @@ def check_video(path: Path) -> None:
     check_writable(path.parent)
 
 
-def record_video(
-    actor: WarmPriorActor,
-    path: Path,
-    *,
-    size: int = 256,
-    **options: Any,
-) -> bool:
+def record_video(actor: WarmPriorActor, path: Path, *, size: int = 256, **options: Any) -> bool:
     """Play the episode of one seed and write it as an MP4, a frame per control step.
 
     Args:
