@@ -15,9 +15,9 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_finite
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.box_normal import BoxTanhNormal
-from warmprior.rl.checks import check_finite
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.decoder import PriorDecoder
 from warmprior.rl.dsrl import DSRLNALoss

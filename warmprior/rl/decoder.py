@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.rl.checks import check_positive
+from warmprior.modules.checks import check_positive
 
 __all__ = ["PriorDecoder"]
 

@@ -19,8 +19,8 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from warmprior import keys
+from warmprior.modules.checks import check_finite, check_positive, check_whole_numbers
 from warmprior.rl.box_normal import BoxTanhNormal
-from warmprior.rl.checks import check_counts, check_finite, check_positive
 from warmprior.rl.decoder import PriorDecoder
 from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 
@@ -178,7 +178,7 @@ class DSRLNALoss(LossModule):
             raise ValueError(f"backup must be 'min' or 'mean', got {backup!r}")
         if discount not in ("step", "decision"):
             raise ValueError(f"discount must be 'step' or 'decision', got {discount!r}")
-        check_counts(num_qvalue_nets=num_qvalue_nets, noise_critic_steps=noise_critic_steps)
+        check_whole_numbers(num_qvalue_nets=num_qvalue_nets, noise_critic_steps=noise_critic_steps)
         check_positive(alpha_init=alpha_init)
         if not math.isfinite(target_entropy):
             raise ValueError(f"target_entropy must be a finite number, got {target_entropy}")
@@ -283,7 +283,7 @@ class DSRLNALoss(LossModule):
         Raises:
             ValueError: if ``updates < 1``.
         """
-        check_counts(updates=updates)
+        check_whole_numbers(updates=updates)
         return iter([self.reinforcement_loss] * updates + [self.distillation_loss] * self.noise_critic_steps)
 
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:

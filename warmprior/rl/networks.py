@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
-from warmprior.rl.checks import check_counts, check_positive
+from warmprior.modules.checks import check_positive, check_whole_numbers
 
 __all__ = ["make_prior_space_actor", "make_prior_space_critic"]
 
@@ -37,7 +37,7 @@ class _Trunk(nn.Module):
         scales: Mapping[NestedKey, float],
     ) -> None:
         super().__init__()
-        check_counts(
+        check_whole_numbers(
             prediction_length=chunk[0],
             action_dim=chunk[1],
             observation_steps=observation[0],
