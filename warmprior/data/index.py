@@ -82,12 +82,7 @@ def check_count(path: Path, demos: int | None, available: int) -> None:
 
 
 def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advice: str) -> None:
-    """Copy numbers that were read to ``out``, ``[rows, width]``, and check them as they are kept.
-
-    Raises:
-        DatasetError: if a value is not finite in the type of ``out``, or greater than 1e9; it names ``what``,
-            counts rows from ``first`` on, and ends with the advice.
-    """
+    """Copy numbers to ``out``; a ``DatasetError`` if one is not finite there, or above 1e9."""
     with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
         out[...] = block.reshape(out.shape)
     usable = (np.abs(out) <= LARGEST).all(-1)  # NaN is not

@@ -93,12 +93,7 @@ def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = 
 
 
 def read_metadata(root: Path) -> Any:
-    """Let LeRobot read what describes a dataset in a folder; the hub is never asked.
-
-    Raises:
-        FileNotFoundError: if there is no dataset.
-        DatasetError: if it is empty or not whole, or LeRobot cannot read it.
-    """
+    """Let LeRobot read what describes a dataset in a folder, checked; the hub is never asked."""
     if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
     datasets = require("lerobot.datasets", "lerobot")

@@ -328,12 +328,8 @@ def compare_first_images(
 ) -> None:
     """Compare images of one state, uint8 ``[size, size, 3]`` by name, with what the simulator shows there.
 
-    Without the state nothing is compared, with a warning.
-
-    Raises:
-        DatasetError: if they are upside down, or show something else, or were rendered in the other quality.
-        ValueError: if the simulator has no such camera.
-        RuntimeError: if nothing here can render.
+    Without the state nothing is compared, with a warning. A ``DatasetError`` if they are upside down, show
+    something else, or were rendered in the other quality.
     """
     path = index.path
     if rendering is not None and bool(rendering["fast"]) != fast:

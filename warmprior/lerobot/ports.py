@@ -99,11 +99,7 @@ def _known(release: str, name: str) -> FlowPort:
 
 
 def check_steps(nfe: int | None) -> None:
-    """Refuse a number of integration steps below 1.
-
-    Raises:
-        ValueError: if it is below 1.
-    """
+    """A ``ValueError`` for a number of integration steps below 1."""
     if nfe is not None and nfe < 1:
         raise ValueError(f"nfe is the number of integration steps: it must be at least 1, got {nfe}")
 

@@ -42,22 +42,7 @@ def check_finite(
     tensors: Mapping[Any, Tensor],
     cause: str = "the training has diverged; lower the learning rate or check the rewards",
 ) -> None:
-    """Stop at NaN or infinity.
-
-    Args:
-        tensors: of any kind, by name.
-        cause: what to check, for the message.
-
-    Raises:
-        FloatingPointError: naming the tensors.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.modules.checks import check_finite
-        >>> check_finite({"loss_actor": torch.tensor(torch.nan)})
-        Traceback (most recent call last):
-        FloatingPointError: NaN or infinity in loss_actor: the training has diverged; ...
-    """
+    """Stop at NaN or infinity with a ``FloatingPointError`` that names the tensors and what to check."""
     wrong = [str(name) for name, value in tensors.items() if not torch.isfinite(value).all()]
     if wrong:
         more = f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""

@@ -136,18 +136,11 @@ class VelocityNetwork(nn.Module, Registered):
 def velocity_field(
     network: nn.Module, observation: Tensor | TensorDictBase
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """A network's velocity ``(t, a) -> v`` at observations, in the dtype of ``a``.
+    """A network's velocity ``(t [B], a [B, P, d_a]) -> v`` at observations, in the dtype of ``a``.
 
-    The observations are encoded once (:meth:`VelocityNetwork.encode`), however often the field is evaluated.
-
-    The network computes in its own dtype (that of its first parameter), so float64 environments and bfloat16
-    networks need no casts elsewhere. The path is integrated, and its error measured, in the dtype of the
-    actions.
-
-    Args:
-        network: ``(t [B], a_t [B, P, d_a], observation) -> [B, P, d_a]``.
-        observation: ``[B, To, *]``, or a tensordict of such entries; whole numbers, such as pixels, are
-            left as they are.
+    The observations, ``[B, To, *]`` or a tensordict of such entries, are encoded once. The network computes
+    in its own dtype (that of its first parameter): float64 environments and bfloat16 networks need no casts
+    elsewhere, and the path is integrated, and its error measured, in the dtype of the actions.
     """
     dtype = _precision(network)
     seen = _encoded(network, observation, dtype)
@@ -157,12 +150,7 @@ def velocity_field(
 
 
 def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-    """The observations as the network encodes them (:meth:`VelocityNetwork.encode`), in its own dtype.
-
-    Args:
-        network: see :func:`velocity_field`.
-        observation: see :func:`velocity_field`.
-    """
+    """The observations as the network encodes them (:meth:`VelocityNetwork.encode`), in its own dtype."""
     return _encoded(network, observation, _precision(network))
 
 
@@ -194,12 +182,7 @@ def _first_precision(module: nn.Module, kind: str) -> torch.dtype | None:
 
 
 def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size) -> Tensor | TensorDictBase:
-    """The observation with a single batch dimension, as a network takes it.
-
-    Args:
-        observation: ``[*B, To, *]``, or a tensordict ``[*B]`` of such entries.
-        batch: ``*B``.
-    """
+    """An observation, ``[*B, To, *]`` or a tensordict ``[*B]``, with one batch dimension for ``*B``."""
     if len(batch) == 1:
         return observation
     if isinstance(observation, TensorDictBase):

@@ -34,17 +34,7 @@ DISTILLED_SHARE = 0.25
 
 
 def check_objective(*, times: str, objective: str, weighting: str | None, self_distillation: float) -> None:
-    """Check that there is a loss with these options.
-
-    Keyword Args:
-        times: name of the distribution of the times.
-        objective: see :class:`FlowMatchingLoss`.
-        weighting: see :class:`FlowMatchingLoss`.
-        self_distillation: see :class:`FlowMatchingLoss`.
-
-    Raises:
-        ValueError: naming the option.
-    """
+    """A ``ValueError`` names the option if :class:`FlowMatchingLoss` has no such loss."""
     choices = {
         "times": (times, TIMES),
         "objective": (objective, get_args(Objective)),

@@ -83,11 +83,7 @@ def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | Non
 
 
 def residual_sigma(actor: Any) -> float:
-    """Typical deviation of a policy's source from the centre of the search; 1 around zero.
-
-    Args:
-        actor: the policy.
-    """
+    """Typical deviation of a policy's source from the centre of the search; 1 around zero."""
     if not has_anchor(actor):
         return 1.0
     if actor.start is not None:

@@ -397,12 +397,7 @@ class DSRLNALoss(LossModule):
 def _check_networks(
     actor: ProbabilisticTensorDictSequential, chunk_critic: Any, noise_critic: Any, decoder: PriorDecoder
 ) -> None:
-    """Check that the networks read and write the decoder's keys.
-
-    Raises:
-        TypeError: if the actor gives no distribution.
-        ValueError: naming the network and the key or size.
-    """
+    """Check that the networks read and write the decoder's keys; an error names what does not."""
     if not isinstance(actor, ProbabilisticTensorDictSequential):
         raise TypeError(
             f"the actor must be the ProbabilisticActor alone, without a decoder behind it, got "

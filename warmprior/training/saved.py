@@ -99,11 +99,7 @@ def check_repository(name: str) -> None:
 
 
 def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
-    """JSON-serialisable description of everything but the weights.
-
-    Raises:
-        TypeError: if the network is not a :class:`VelocityNetwork`, or an option cannot be written as JSON.
-    """
+    """Everything but the weights as JSON; a ``TypeError`` if a part cannot be written so."""
     network = uncompiled(actor.network)
     if not isinstance(network, VelocityNetwork):
         raise TypeError(

@@ -458,16 +458,7 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
 
 
 def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tuple[Path, str]:
-    """Where the demonstrations of a robosuite task are, once they are downloaded or generated.
-
-    Args:
-        options: see :func:`load_task`.
-        name: likewise.
-        style: likewise.
-
-    Returns:
-        The file or dataset, and what made it: ``"file"``, ``"official"`` or ``"scripted"``.
-    """
+    """The file or dataset of a robosuite task, downloaded or generated if needed, and what made it."""
     if options.dataset is not None:
         return options.dataset, "file"
     if options.download:
@@ -479,9 +470,6 @@ def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tup
 
 def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
     """The tasks that options name, checked: for each what :func:`load_task` takes, a name and a style.
-
-    Raises:
-        ValueError: if the options do not go together.
 
     Examples:
         >>> from warmprior.training import DataOptions

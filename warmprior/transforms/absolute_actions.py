@@ -160,11 +160,7 @@ class AbsoluteActions(Transform):
 
 
 def _rotvec(turn: Tensor) -> Tensor:
-    """Like :func:`matrix_to_rotvec`, three times as fast: this runs at every control step.
-
-    Args:
-        turn: ``[..., 3, 3]``.
-    """
+    """Like :func:`matrix_to_rotvec`, three times as fast: this runs at every control step."""
     cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
     if bool((cosine < _OBTUSE).any()):
         return matrix_to_rotvec(turn)
