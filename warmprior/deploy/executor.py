@@ -290,11 +290,7 @@ class AsyncExecutor:
         self._collect()
 
     def close(self, *, wait: bool = True) -> None:
-        """End the thread; a pool that was given is left as it is.
-
-        Args:
-            wait: for a decision under way to end.
-        """
+        """End the thread, after a decision under way if ``wait``; a pool that was given is left as it is."""
         self._closed = True
         if self._pending is not None:
             self._pending.cancel()

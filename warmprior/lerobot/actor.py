@@ -103,11 +103,7 @@ class LeRobotFlow(TensorDictModuleBase):
         return self.source
 
     def check_nfe(self, nfe: int | None) -> None:
-        """Whether ``nfe`` is a number of integration steps.
-
-        Raises:
-            ValueError: if it is below 1.
-        """
+        """A ``ValueError`` unless ``nfe`` is a number of integration steps."""
         check_steps(nfe)
 
     def forward(

@@ -230,8 +230,7 @@ class WarmPriorAdapter:
     def record_executed(self, action: Tensor) -> None:
         """Replace the last action of :meth:`select_action` by the executed one, as after clipping.
 
-        Args:
-            action: ``[B, d_a]``, the model's units.
+        It is ``[B, d_a]`` in the model's units.
 
         Raises:
             ValueError: if none was given yet.

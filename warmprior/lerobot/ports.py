@@ -58,11 +58,7 @@ class FlowPort(ABC):
 
     @abstractmethod
     def check(self, policy: Any) -> None:
-        """Refuse options that would make the source inexact.
-
-        Raises:
-            ValueError: naming the option.
-        """
+        """Refuse options that would make the source inexact, with a ``ValueError`` that names one."""
 
     @abstractmethod
     def training(self, policy: Any, source: Source) -> AbstractContextManager[Any]:
@@ -74,11 +70,7 @@ class FlowPort(ABC):
     ) -> AbstractContextManager[Any]:
         """Context of ``select_action`` or ``predict_action_chunk``: new chunks start from the source.
 
-        Args:
-            policy: of the family.
-            source: what takes the place of the noise.
-            record: called with each chunk, its positions and dimensions of padding.
-            nfe: integration steps; the policy's own by default.
+        ``record`` is called with each chunk, its positions and dimensions of padding.
         """
 
     def predict(self, policy: Any, batch: dict[str, Any]) -> None:

@@ -75,14 +75,7 @@ class VelocityNetwork(nn.Module, Registered):
         self.observation_steps = observation_steps
 
     def check_chunk(self, a: Tensor) -> None:
-        """Compare a chunk with what the network was built for.
-
-        Args:
-            a: ``[B, P, d_a]``.
-
-        Raises:
-            ValueError: naming the expected and the given shape.
-        """
+        """A ``ValueError`` if the network was built for other chunks than ``a`` ``[B, P, d_a]``."""
         expected = (self.prediction_length, self.action_dim)
         if tuple(a.shape[1:]) != expected:
             raise ValueError(
@@ -91,14 +84,9 @@ class VelocityNetwork(nn.Module, Registered):
             )
 
     def check_shapes(self, a: Tensor, observation: Tensor | TensorDictBase) -> None:
-        """Compare the inputs with what the network was built for.
+        """A ``ValueError`` if the network was built for other inputs.
 
-        Args:
-            a: ``[B, P, d_a]``.
-            observation: ``[B, To, d_o]``.
-
-        Raises:
-            ValueError: naming the expected and the given shape.
+        Those are chunks ``a`` ``[B, P, d_a]`` and observations ``[B, To, d_o]``.
         """
         self.check_chunk(a)
         expected = (self.observation_steps, self.observation_dim)
@@ -112,19 +100,13 @@ class VelocityNetwork(nn.Module, Registered):
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """Encode an observation once, before the field is evaluated at it many times.
 
-        The network takes the result in place of the observation. By default this does nothing.
-
-        Args:
-            observation: ``[B, To, d_o]``, or a tensordict ``[B]``.
+        The network takes the result in place of the observation, ``[B, To, d_o]`` or a tensordict ``[B]``. By
+        default this does nothing.
         """
         return observation
 
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
-        """Optimiser groups: decay on matrix weights, none on biases, norms and embeddings.
-
-        Args:
-            weight_decay: decay of the first group.
-        """
+        """Optimiser groups: decay on matrix weights, none on biases, norms and embeddings."""
         decay: list[nn.Parameter] = []
         no_decay: list[nn.Parameter] = []
         for name, parameter in self.named_parameters():

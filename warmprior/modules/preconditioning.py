@@ -288,13 +288,9 @@ class PreconditionedNetwork(VelocityNetwork):
         return self.network.parameter_groups(weight_decay)
 
     def remainder(self, t: Tensor) -> Tensor:
-        """Standard deviation of the remainder of the velocity, the unit of ``F``.
+        """Standard deviation of the remainder of the velocity at times ``[B]``, the unit of ``F``.
 
-        Args:
-            t: times, ``[B]``.
-
-        Returns:
-            ``[B, P, d_a]``, larger than 0.
+        ``[B, P, d_a]``, larger than 0.
         """
         coefficients = self.interpolant.coefficients(t[:, None, None])
         return self._remainder(*coefficients) * self._scale(*coefficients[:2])

@@ -249,9 +249,7 @@ class DSRLNALoss(LossModule):
     def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> None:
         """Choose the discount: ``make_value_estimator(ValueEstimators.TD0, gamma=0.99)``.
 
-        Args:
-            value_type: ``TD0``, the only one that fits, or an estimator of the user's.
-            hyperparams: ``gamma``, see the option ``discount``.
+        ``TD0`` is the only one that fits, besides an estimator of the user's.
         """
         value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if value_type is not None:
@@ -260,28 +258,18 @@ class DSRLNALoss(LossModule):
             )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """All four losses on one batch.
+        """All four losses on one batch of transitions ``[N]``.
 
-        Args:
-            tensordict: transitions ``[N]``, see the class docstring.
-
-        Returns:
-            TensorDict of scalars: ``loss_actor``, ``loss_alpha``, ``loss_qvalue`` and
-            ``loss_qvalue_noise``, and detached ``alpha``, ``entropy`` (units of the box) and ``td_error``.
+        They are scalars: ``loss_actor``, ``loss_alpha``, ``loss_qvalue`` and ``loss_qvalue_noise``, and
+        detached ``alpha``, ``entropy`` (units of the box) and ``td_error``.
         """
         return self.reinforcement_loss(tensordict).update(self.distillation_loss(tensordict))
 
     def schedule(self, updates: int) -> Iterator[Callable[[TensorDictBase], TensorDict]]:
         """The official order: the first three losses ``updates`` times, then the distillation.
 
-        Args:
-            updates: the official ``utd``: updates per vector step, 20 for four environments.
-
-        Returns:
-            The methods to call, each on a batch of its own.
-
-        Raises:
-            ValueError: if ``updates < 1``.
+        The methods to call, each on a batch of its own. ``updates`` is the official ``utd``: updates per
+        vector step, 20 for four environments. A ``ValueError`` if it is below 1.
         """
         check_whole_numbers(updates=updates)
         return iter([self.reinforcement_loss] * updates + [self.distillation_loss] * self.noise_critic_steps)
@@ -289,8 +277,7 @@ class DSRLNALoss(LossModule):
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """The losses of the actor, the temperature and the action critic, and the diagnostics.
 
-        Args:
-            tensordict: transitions ``[N]``, see the class docstring. The TD errors are written to it.
+        On transitions ``[N]``, to which the TD errors are written.
         """
         self._check_keys(tensordict, self._reinforcement_keys())
         weights = self._maybe_get_priority_weight(tensordict)
@@ -327,8 +314,7 @@ class DSRLNALoss(LossModule):
     def distillation_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of the noise critic against the action critic on decoded residuals, head by head.
 
-        Args:
-            tensordict: any states ``[N]``; actions, rewards and next states are not read.
+        On any states ``[N]``; actions, rewards and next states are not read.
         """
         self._check_keys(tensordict, self._distillation_keys())
         weights = self._maybe_get_priority_weight(tensordict)

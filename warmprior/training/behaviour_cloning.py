@@ -234,11 +234,7 @@ class BehaviourCloning:
         return policy_path(self.directory, self.config.iterations if iteration is None else iteration)
 
     def step(self) -> torch.Tensor:
-        """One gradient step: sample, loss, backward, optimiser, schedule, averaging.
-
-        Returns:
-            The loss of this process's part of the batch, a detached scalar.
-        """
+        """One gradient step; the loss of this process's part of the batch, a detached scalar."""
         if self._graphs:  # what the graphs of the last step have left may be overwritten
             torch.compiler.cudagraph_mark_step_begin()
         batch = self._prefetch() if self._prefetch else self.replay_buffer.sample()

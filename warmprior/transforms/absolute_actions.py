@@ -104,14 +104,9 @@ class AbsoluteActions(Transform):
         return torch.cat((position, turn.expand(6), turn.new_zeros(1))).repeat(self.arms)
 
     def delta(self, action: Tensor, pose: Tensor) -> Tensor:
-        """The delta towards the pose that an action asks for, as far as one step goes.
+        """The delta ``[*B, 7 * arms]`` in ``[-1, 1]`` towards the pose that an action asks for.
 
-        Args:
-            action: ``[*B, 10 * arms]``.
-            pose: ``[*B, arms, 3, 4]``.
-
-        Returns:
-            ``[*B, 7 * arms]`` in ``[-1, 1]``, in the dtype of ``action``.
+        As far as one step goes, from actions ``[*B, 10 * arms]`` and poses ``[*B, arms, 3, 4]``.
         """
         target, now = action.double().unflatten(-1, (self.arms, _ABSOLUTE)), pose.double()
         move = target[..., :3] - now[..., 3]
