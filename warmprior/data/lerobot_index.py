@@ -131,10 +131,7 @@ def vector_widths(features: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
 
 
 def action_names(arms: int) -> list[str]:
-    """What the pose deltas of robosuite are called in a dataset, in their order.
-
-    Args:
-        arms: how many.
+    """What the pose deltas of so many arms of robosuite are called in a dataset, in their order.
 
     Examples:
         >>> from warmprior.data.lerobot_index import action_names
@@ -145,10 +142,7 @@ def action_names(arms: int) -> list[str]:
 
 
 def state_names(widths: Mapping[str, int]) -> list[str]:
-    """What the numbers of observations are called in a dataset.
-
-    Args:
-        widths: of the observations, in their order.
+    """What the numbers of observations of these widths are called in a dataset, in the same order.
 
     Examples:
         >>> from warmprior.data.lerobot_index import state_names

@@ -123,9 +123,7 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv
 def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
     """The environment that a policy was made for, with the policy's own transforms.
 
-    Args:
-        actor: a policy, such as one that was loaded.
-        options: further ones of :class:`RobosuiteEnv`.
+    ``options`` are further ones of :class:`RobosuiteEnv`.
 
     Raises:
         ValueError: if the policy keeps no description of one.

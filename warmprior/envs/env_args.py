@@ -122,12 +122,8 @@ def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> d
 def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """Say in which units and frame an environment reads its pose deltas.
 
-    Args:
-        env_args: as :func:`modernize_env_args` takes.
-
-    Returns:
-        ``output_max`` ``[6]`` float64, what an input of 1 means (3 in metres, 3 in radians), and
-        ``base_rotation`` ``[arms, 3, 3]`` float64, from the frame of the deltas to the world.
+    ``output_max`` ``[6]`` float64, what an input of 1 means (3 in metres, 3 in radians), and
+    ``base_rotation`` ``[arms, 3, 3]`` float64, from the frame of the deltas to the world.
 
     Raises:
         ValueError: if the controller is not an ``OSC_POSE`` one fed with deltas in ``[-1, 1]``.

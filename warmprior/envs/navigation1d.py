@@ -102,14 +102,9 @@ def navigation_demonstrations() -> TensorDict:
 
 
 def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
-    """Whether the straight segments between consecutive points enter an obstacle.
+    """Whether the straight segments between consecutive points enter an obstacle, bool ``[*B, T - 1]``.
 
-    Args:
-        x: positions ``[*B, T]``, increasing.
-        y: heights ``[*B, T]``.
-
-    Returns:
-        bool ``[*B, T - 1]``.
+    The points are at positions ``[*B, T]``, increasing, and heights ``[*B, T]``.
 
     See Also:
         :func:`~warmprior.envs.navigation_metrics`: counts the rollouts that do.

@@ -126,10 +126,7 @@ TASKS: dict[str, TaskSpec] = {
 
 
 def get_task(name: str) -> TaskSpec:
-    """Look a task up by its short name.
-
-    Args:
-        name: a key of :data:`TASKS`.
+    """Look a task up by its short name, a key of :data:`TASKS`.
 
     Raises:
         ValueError: if there is no such task.

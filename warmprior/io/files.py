@@ -132,11 +132,8 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     """Call ``write(temporary_path)``, then put the result in place in one step.
 
-    A reader, or a process killed at any moment, sees the old file or the new one, never a part.
-
-    Args:
-        path: the file to replace; its folder is created if needed.
-        write: callable that writes a file at the path it is given.
+    A reader, or a process killed at any moment, sees the old file or the new one, never a part. The folder is
+    created if needed.
 
     Raises:
         OSError: if the file cannot be written, naming ``path``.

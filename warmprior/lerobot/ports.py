@@ -374,10 +374,7 @@ PORTS: dict[str, dict[str, FlowPort]] = {
 
 
 def port_for(policy: Any) -> FlowPort:
-    """The port of a policy's family in the release of lerobot that is installed.
-
-    Args:
-        policy: of LeRobot, or of a subclass.
+    """The port of a policy's family, or of a subclass, in the release of lerobot that is installed.
 
     Raises:
         ValueError: if there is none, or it does not support the policy's options.

@@ -171,11 +171,9 @@ class ChunkSource:
 
 
 def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Tensor:
-    """Standard deviation of a dataset's actions in the units of a policy, ``[d_a]``.
+    """Standard deviation of a dataset's actions in the units of a LeRobot policy, ``[d_a]``.
 
-    Args:
-        policy: of LeRobot.
-        stats: of the dataset (``dataset.meta.stats``).
+    The statistics are ``dataset.meta.stats``.
 
     Raises:
         ValueError: if needed statistics are missing, a dimension never varies, the policy normalises actions

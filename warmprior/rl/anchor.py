@@ -26,9 +26,6 @@ def has_anchor(actor: Any) -> bool:
     It has if the policy has a start point, or its prior's mean is warm once the history is full. Otherwise
     agents search around zero, as in DSRL.
 
-    Args:
-        actor: the policy.
-
     See Also:
         :func:`~warmprior.rl.source_anchor`: returns that centre.
 

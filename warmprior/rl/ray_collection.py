@@ -26,14 +26,9 @@ EPISODES_APART = 10_000
 
 
 class WarmUpSwitch(TensorDictModuleBase):
-    """Switches between two policies by a buffer, which collectors receive with the weights.
+    """Acts by ``warmup``, and by ``policy`` once ``learning`` is set.
 
-    Args:
-        warmup: acts until ``learning`` is set.
-        policy: acts then.
-
-    Attributes:
-        learning (Tensor): bool ``[]``.
+    That is a buffer, bool ``[]``, which collectors receive with the weights.
 
     See Also:
         - :func:`~warmprior.rl.ray_collection.ray_rounds`: collects with it.

@@ -63,21 +63,11 @@ def play_navigation(
 
 
 def judge_navigation(actor: WarmPriorActor, seed: int, *, nfe: int, rollouts: int = 256) -> dict[str, Any]:
-    """Play a policy on the toy and measure what it did.
+    """Play a policy on the toy (:func:`play_navigation`) and measure what it did.
 
-    Args:
-        actor: the policy.
-        seed: see :func:`play_navigation`.
-
-    Keyword Args:
-        nfe: network evaluations per chunk.
-        rollouts: how many.
-
-    Returns:
-        Metrics of the rollouts (:class:`~warmprior.envs.NavigationMetrics`), ``jump_ratio`` and ``jerk``
-        (:class:`~warmprior.diagnostics.Smoothness`), and some metrics under history shift
-        (``"shifted_..."``). A policy whose actions become NaN or infinite collides, and has no other
-        metrics.
+    Metrics of the rollouts (:class:`~warmprior.envs.NavigationMetrics`), ``jump_ratio`` and ``jerk``
+    (:class:`~warmprior.diagnostics.Smoothness`), and some metrics under history shift (``"shifted_..."``). A
+    policy whose actions become NaN or infinite collides, and has no other metrics.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor

@@ -18,11 +18,7 @@ DEVICE_SHARE = 0.5
 
 
 def placed(data: TensorDictBase, device: torch.device | str) -> TensorDictBase:
-    """The demonstrations on a device if they fit, or where they are.
-
-    Args:
-        data: contiguous steps, see :class:`~warmprior.ActionWindow`.
-        device: of the network.
+    """The demonstrations, contiguous steps, on the network's device if they fit, or where they are.
 
     Examples:
         >>> import torch
@@ -48,14 +44,7 @@ class Prefetch:
 
     The prefetching of TorchRL's replay buffers cannot be used here: batches on their way have been drawn
     already, so that a stored random state would lose them. This one knows the state that belongs to the batch
-    it gave last.
-
-    Args:
-        sample: draws a batch; nothing else may draw from its generator.
-        generator: that it draws from.
-
-    Keyword Args:
-        device: where batches go; through pinned memory if that is a GPU.
+    it gave last. Nothing else may draw from the generator, and batches go to a GPU through pinned memory.
 
     Examples:
         >>> import torch

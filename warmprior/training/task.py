@@ -502,11 +502,7 @@ def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
 
 
 def find_tasks(options: DataOptions, observation_steps: int = 2) -> list[Task]:
-    """Read, download or generate the demonstrations of all tasks that options name.
-
-    Args:
-        options: which.
-        observation_steps: ``To`` of the policies.
+    """Read, download or generate the demonstrations of all tasks that options name; see :func:`load_task`.
 
     Raises:
         ValueError: see :func:`task_places` and :func:`load_task`.
