@@ -100,17 +100,10 @@ def test_every_class_and_function_has_an_example():
     assert {name for name, text in texts.items() if not _runs(text)} == set(SHOWN_ALONE)
 
 
-PASTED = ("history", "modules", "transforms", "objectives", "diagnostics", "rl", "lerobot", "deploy")
-"""Modules and packages whose examples bring their imports."""
+MODULES = ["warmprior", *(module.name for module in pkgutil.walk_packages(warmprior.__path__, "warmprior."))]
 
 
-def _modules(name: str) -> list[str]:
-    found = importlib.import_module(f"warmprior.{name}")
-    inside = pkgutil.iter_modules(getattr(found, "__path__", ()), f"{found.__name__}.")
-    return [found.__name__, *(module.name for module in inside)]
-
-
-@pytest.mark.parametrize("name", [module for name in PASTED for module in _modules(name)])
+@pytest.mark.parametrize("name", MODULES)
 def test_examples_paste_into_a_fresh_interpreter(name, capsys):
     module, finder = importlib.import_module(name), doctest.DocTestFinder()
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE | doctest.ELLIPSIS)

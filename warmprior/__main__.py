@@ -283,14 +283,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run a command; what a user can mend is said in one line.
-
-    Args:
-        argv: the command line, without the program.
-
-    Returns:
-        The exit code.
-    """
+    """Run a command line, without the program; the exit code. What a user can mend is said in one line."""
     args = make_parser().parse_args(argv)
     # What cannot be rendered, or generated, here is a RuntimeError.
     return run_script(lambda: args.run(args), "warmprior", errors=(*ERRORS, RuntimeError))

@@ -123,11 +123,9 @@ def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: 
 
 
 def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
-    """The history with some rows made cold: new episodes, or windows whose history is withheld.
+    """A history ``[*B]`` with some rows, bool ``[*B]``, made cold.
 
-    Args:
-        history: ``[*B]``.
-        rows: which, bool ``[*B]``.
+    They begin new episodes, or are windows whose history is withheld.
 
     Examples:
         >>> import torch
@@ -147,14 +145,7 @@ def _history(batch_size: Any, *values: Tensor) -> TensorDict:
 
 
 def check_history(history: Any, history_length: int, prediction_length: int, whose: Any) -> None:
-    """Refuse a history that is missing or incomplete (``KeyError``), or of other lengths (``ValueError``).
-
-    Args:
-        history: what was found.
-        history_length: actions that have to be remembered.
-        prediction_length: ``P``.
-        whose: what reads it, for the message.
-    """
+    """Refuse a history that is missing or incomplete (``KeyError``), or of other lengths (``ValueError``)."""
     found = () if history is None else history.keys()
     missing = [f'("history", "{name}")' for name in ENTRIES if name not in found]
     if missing:

@@ -35,6 +35,8 @@ def quaternion_to_matrix(quaternion: Tensor) -> Tensor:
     They are normalised here, so any non-zero length will do.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.rotation import quaternion_to_matrix
         >>> quaternion_to_matrix(torch.tensor([0.0, 0.0, 1.0, 1.0])).round(decimals=3)
         tensor([[ 0., -1.,  0.],
                 [ 1.,  0.,  0.],
@@ -78,6 +80,8 @@ def rotation_6d_to_matrix(rotation_6d: Tensor) -> Tensor:
     The two rows in ``[..., 6]`` need be neither of unit length nor orthogonal, but not parallel.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.rotation import rotation_6d_to_matrix
         >>> rotation_6d_to_matrix(torch.tensor([2.0, 0.0, 0.0, 1.0, 3.0, 0.0]))
         tensor([[1., 0., 0.],
                 [0., 1., 0.],
@@ -107,6 +111,8 @@ def rotation_6d_to_rotvec(rotation_6d: Tensor) -> Tensor:
         :func:`~warmprior.envs.absolute_to_env_action`: turns whole actions.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.envs import rotation_6d_to_rotvec
         >>> rotation_6d_to_rotvec(torch.tensor([0.0, -1.0, 0.0, 1.0, 0.0, 0.0]))
         tensor([0.0000, 0.0000, 1.5708])
     """

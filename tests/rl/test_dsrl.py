@@ -217,5 +217,5 @@ def test_schedule():
     names = [compute.__name__ for compute in loss.schedule(updates=2)]
     assert names == ["reinforcement_loss"] * 2 + ["distillation_loss"] * 3
     assert [c.__name__ for c in build().schedule(20)].count("distillation_loss") == 10
-    with pytest.raises(ValueError, match="updates must be at least 1"):
+    with pytest.raises(ValueError, match="updates must be a whole number of at least 1"):
         loss.schedule(0)

@@ -68,7 +68,7 @@ def test_networks_that_do_not_fit():
     ("options", "message"),
     [
         ({"backup": "max"}, "backup must be 'min' or 'mean'"),
-        ({"noise_critic_steps": 0}, "noise_critic_steps must be at least 1"),
+        ({"noise_critic_steps": 0}, "noise_critic_steps must be a whole number of at least 1"),
         ({"alpha_init": 0.0}, "alpha_init must be a finite number > 0"),
         ({"distillation": "laplace"}, "distribution must be"),
     ],

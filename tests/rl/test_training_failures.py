@@ -127,10 +127,10 @@ def test_chunks_executed_in_part_are_refused_where_the_mean_would_hold_them(tmp_
     [
         ({"algorithm": "sac"}, "algorithm must be dsrl-na or dsrl-sac, got 'sac'"),
         ({"delta": 0.0}, "delta must be a finite number > 0, got 0.0"),
-        ({"warmup_steps": 0}, "warmup_steps must be at least 1"),
+        ({"warmup_steps": 0}, "warmup_steps must be a whole number of at least 1"),
         ({"warmup_steps": 9, "environment_steps": 8}, r"warmup_steps \(9\) exceed .* \(8\)"),
         ({"gamma": 1.5}, r"gamma must lie in \(0, 1\], got 1.5"),
-        ({"noise_critic_steps": 0}, "noise_critic_steps must be at least 1"),
+        ({"noise_critic_steps": 0}, "noise_critic_steps must be a whole number of at least 1"),
         ({"reward_offset": float("nan")}, "reward_offset must be a finite number"),
         ({"algorithm": "dsrl-sac", "backup_entropy": False}, "dsrl-sac has .* leave them out"),
     ],

@@ -84,6 +84,7 @@ def convert_robomimic(
         - :class:`~warmprior.data.RobomimicExperienceReplay`: reads the file as it is.
 
     Examples:
+        >>> from warmprior.data import convert_robomimic
         >>> convert_robomimic("square.hdf5", "square_lerobot")  # doctest: +SKIP
         PosixPath('square_lerobot')
         >>> convert_robomimic("nowhere.hdf5", "out")

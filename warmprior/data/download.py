@@ -56,6 +56,7 @@ def download_robomimic(
         - :func:`~warmprior.data.download_mimicgen`: MimicGen's files.
 
     Examples:
+        >>> from warmprior.data import download_robomimic
         >>> download_robomimic("square", "mh")  # doctest: +SKIP
         PosixPath('.../v1.5/square/mh/low_dim_v15.hdf5')
         >>> download_robomimic("tool_hang", "mh")
@@ -84,6 +85,7 @@ def download_mimicgen(
         force: likewise.
 
     Examples:
+        >>> from warmprior.data import download_mimicgen
         >>> download_mimicgen("coffee_d0")  # doctest: +SKIP
         PosixPath('.../source/coffee.hdf5')
         >>> download_mimicgen("stack")
@@ -127,6 +129,7 @@ def download_lerobot(
         :class:`~warmprior.data.LeRobotExperienceReplay`: reads the dataset.
 
     Examples:
+        >>> from warmprior.data import download_lerobot
         >>> download_lerobot("lerobot/libero")  # doctest: +SKIP
         PosixPath('.../hub/datasets--lerobot--libero/snapshots/...')
     """

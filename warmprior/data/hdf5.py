@@ -32,12 +32,7 @@ _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
 
 @contextmanager
 def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
-    """Open a robomimic file, whose group ``data`` has at least one demo, for reading.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        DatasetError: if it is not a complete HDF5 file or has no demos.
-    """
+    """Open a robomimic file for reading; a ``DatasetError`` if it is not whole or has no demos."""
     h5py = require("h5py", "sim")
     path = Path(path)
     if not path.is_file():
@@ -206,18 +201,11 @@ def read_index(
     poses: bool = False,
     demos: int | None = None,
 ) -> DatasetIndex:
-    """Check a robomimic file and say what it holds. No values are read.
+    """Say what a robomimic file holds; a ``DatasetError`` names what is wrong with it. No values are read.
 
     Options as of :class:`~warmprior.data.RobomimicExperienceReplay`. By default the observations are those of
     the task, or, for an unknown environment, ``object`` and each robot's pose and gripper as far as the file
     has them; ``poses`` also requires the hand pose of every arm.
-
-    Raises:
-        FileNotFoundError: if there is no such file.
-        DatasetError: if the file is cut short or not a robomimic file, the filter key is unknown or
-            names absent demos, there are fewer demos than are to be taken, a key is missing, a demo is
-            empty, or shapes disagree.
-        ValueError: if no demos are to be taken.
     """
     path = Path(path)
     if demos is not None and demos < 1:

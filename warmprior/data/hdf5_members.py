@@ -68,12 +68,7 @@ def names(group: h5py.Group) -> list[str]:
 def member(
     parent: h5py.Group, name: str, kind: Literal["group", "dataset"]
 ) -> h5py.Group | h5py.Dataset | None:
-    """Open a group or dataset below ``parent`` that the file itself holds; ``None`` if there is none.
-
-    Raises:
-        DatasetError: if it is of another kind, lies in another file, or was declared without being
-            written.
-    """
+    """Open a group or dataset that the file itself holds, and has written, below ``parent``; or ``None``."""
     with reading(parent, name):
         found = _follow(parent, name, _MAX_SOFT_LINKS)
         if found is None:

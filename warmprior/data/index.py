@@ -35,6 +35,8 @@ class DatasetIndex:
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
 
     Examples:
+        >>> from pathlib import Path
+        >>> from warmprior.data.index import DatasetIndex
         >>> index = DatasetIndex(
         ...     path=Path("square.hdf5"), demos=("demo_0", "demo_1"), lengths=(120, 131),
         ...     observation_keys=("object",), observation_dims=(14,), image_keys=(), image_size=0,
@@ -80,12 +82,7 @@ def check_count(path: Path, demos: int | None, available: int) -> None:
 
 
 def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advice: str) -> None:
-    """Copy numbers that were read to ``out``, ``[rows, width]``, and check them as they are kept.
-
-    Raises:
-        DatasetError: if a value is not finite in the type of ``out``, or greater than 1e9; it names ``what``,
-            counts rows from ``first`` on, and ends with the advice.
-    """
+    """Copy numbers to ``out``; a ``DatasetError`` if one is not finite there, or above 1e9."""
     with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
         out[...] = block.reshape(out.shape)
     usable = (np.abs(out) <= LARGEST).all(-1)  # NaN is not

@@ -244,6 +244,7 @@ class LeRobotExperienceReplay(DemonstrationReplay):
         ImportError: if lerobot is not installed.
 
     Examples:
+        >>> from warmprior.data import LeRobotExperienceReplay
         >>> data = LeRobotExperienceReplay("square_lerobot", batch_size=256)  # doctest: +SKIP
         >>> data.sample()["observation"].shape  # doctest: +SKIP
         torch.Size([256, 23])
@@ -309,6 +310,7 @@ def lerobot_steps(
         :class:`~warmprior.training.Task`: takes them, with an environment.
 
     Examples:
+        >>> from warmprior.data import lerobot_steps
         >>> steps = lerobot_steps("lerobot/pusht_keypoints")  # doctest: +SKIP
         >>> steps["action"].shape  # doctest: +SKIP
         torch.Size([25650, 2])

@@ -50,6 +50,7 @@ class LeRobotIndex(DatasetIndex):
         described: what ``meta/warmprior.json`` says; empty for datasets that were not converted.
 
     Examples:
+        >>> from warmprior.data.lerobot_index import read_lerobot_index
         >>> index = read_lerobot_index("square_lerobot")  # doctest: +SKIP
         >>> index.files  # doctest: +SKIP
         ['data/chunk-000/file-000.parquet']
@@ -92,12 +93,7 @@ def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = 
 
 
 def read_metadata(root: Path) -> Any:
-    """Let LeRobot read what describes a dataset in a folder; the hub is never asked.
-
-    Raises:
-        FileNotFoundError: if there is no dataset.
-        DatasetError: if it is empty or not whole, or LeRobot cannot read it.
-    """
+    """Let LeRobot read what describes a dataset in a folder, checked; the hub is never asked."""
     if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
     datasets = require("lerobot.datasets", "lerobot")
@@ -135,12 +131,10 @@ def vector_widths(features: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
 
 
 def action_names(arms: int) -> list[str]:
-    """What the pose deltas of robosuite are called in a dataset, in their order.
-
-    Args:
-        arms: how many.
+    """What the pose deltas of so many arms of robosuite are called in a dataset, in their order.
 
     Examples:
+        >>> from warmprior.data.lerobot_index import action_names
         >>> action_names(1)[3:]
         ['robot0_rx', 'robot0_ry', 'robot0_rz', 'robot0_gripper']
     """
@@ -148,12 +142,10 @@ def action_names(arms: int) -> list[str]:
 
 
 def state_names(widths: Mapping[str, int]) -> list[str]:
-    """What the numbers of observations are called in a dataset.
-
-    Args:
-        widths: of the observations, in their order.
+    """What the numbers of observations of these widths are called in a dataset, in the same order.
 
     Examples:
+        >>> from warmprior.data.lerobot_index import state_names
         >>> state_names({"robot0_gripper_qpos": 2})
         ['robot0_gripper_qpos_0', 'robot0_gripper_qpos_1']
     """
@@ -196,6 +188,7 @@ def read_lerobot_index(
         ValueError: if no demos are to be taken.
 
     Examples:
+        >>> from warmprior.data.lerobot_index import read_lerobot_index
         >>> index = read_lerobot_index("square_lerobot")  # doctest: +SKIP
         >>> len(index.demos), index.action_dim  # doctest: +SKIP
         (200, 7)

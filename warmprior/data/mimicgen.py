@@ -32,6 +32,7 @@ class MimicGenExperienceReplay(RobomimicExperienceReplay):
         OSError: if a download fails.
 
     Examples:
+        >>> from warmprior.data import MimicGenExperienceReplay
         >>> data = MimicGenExperienceReplay("coffee_d0", download=True)  # doctest: +SKIP
         >>> data.num_episodes, data.data["observation"].shape[-1]  # doctest: +SKIP
         (10, 66)

@@ -48,15 +48,14 @@ def _lerobot(place: str | Path) -> str | None:
 def check_place(place: str | Path, option: str) -> None:
     """Refuse a place where there can be no demonstrations; nothing is read or fetched.
 
-    Args:
-        place: an HDF5 file, or ``lerobot:`` and a folder or repository.
-        option: names it in errors.
+    A place is an HDF5 file, or ``lerobot:`` and a folder or repository; errors name it by the option.
 
     Raises:
         FileNotFoundError: if there is no such file or folder.
         ImportError: if what reads it is not installed.
 
     Examples:
+        >>> from warmprior.data.opening import check_place
         >>> check_place("lerobot:user/square", "--dataset")
         >>> check_place("lerobot:./square", "--dataset")
         Traceback (most recent call last):
@@ -92,14 +91,13 @@ def resolved_place(place: Path) -> str:
 def open_demonstrations(
     place: str | Path, env_args: Mapping[str, Any] | None = None, mask: str | None = None
 ) -> Demonstrations:
-    """What reads the demonstrations at a place.
+    """What reads the demonstrations at a place, see :func:`check_place`.
 
-    Args:
-        place: an HDF5 file, or ``lerobot:`` and a folder or repository.
-        env_args: of the environment, for a LeRobotDataset that does not describe its own.
-        mask: of the file, such as ``"train"``; all demonstrations if ``None``.
+    All of them, or those of a mask, such as ``"train"``. ``env_args`` are of the environment, for a
+    LeRobotDataset that does not describe its own.
 
     Examples:
+        >>> from warmprior.data.opening import open_demonstrations
         >>> open_demonstrations("lerobot:user/square").name  # nothing is fetched yet
         'lerobot:square'
     """
@@ -111,6 +109,7 @@ class Demonstrations(ABC):
     """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
 
     Examples:
+        >>> from warmprior.data.opening import open_demonstrations
         >>> place = open_demonstrations("nowhere.hdf5")  # not looked at yet
         >>> place.index()
         Traceback (most recent call last):

@@ -83,6 +83,7 @@ def render_demonstrations(
         - :func:`~warmprior.data.generate_demonstrations`: makes files to render.
 
     Examples:
+        >>> from warmprior.data import render_demonstrations
         >>> path = render_demonstrations("square.hdf5", ["agentview"])  # doctest: +SKIP
         >>> path.name  # doctest: +SKIP
         'square_agentview84_1f2e3d4c.hdf5'
@@ -327,12 +328,8 @@ def compare_first_images(
 ) -> None:
     """Compare images of one state, uint8 ``[size, size, 3]`` by name, with what the simulator shows there.
 
-    Without the state nothing is compared, with a warning.
-
-    Raises:
-        DatasetError: if they are upside down, or show something else, or were rendered in the other quality.
-        ValueError: if the simulator has no such camera.
-        RuntimeError: if nothing here can render.
+    Without the state nothing is compared, with a warning. A ``DatasetError`` if they are upside down, show
+    something else, or were rendered in the other quality.
     """
     path = index.path
     if rendering is not None and bool(rendering["fast"]) != fast:

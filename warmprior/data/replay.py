@@ -36,13 +36,7 @@ class DemonstrationReader(ABC):
 
     @abstractmethod
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows from ``first`` on of one array of a demo into ``out``, ``[rows, width]``, and check them.
-
-        The array is ``"actions"``, ``"rewards"`` or ``"obs/<key>"``; ``out`` may be a strided view.
-
-        Raises:
-            DatasetError: if a value is not finite or absurdly large, or cannot be read.
-        """
+        """Read rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"`` into ``out``, and check them."""
 
     @abstractmethod
     def images(self, demo: str, key: str, out: Tensor) -> None:
@@ -206,8 +200,10 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         OSError: if there is no space for memory maps.
 
     Examples:
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
         >>> import h5py
+        >>> import numpy as np
         >>> from warmprior.data import RobomimicExperienceReplay
         >>> with TemporaryDirectory() as folder:
         ...     path = Path(folder) / "toy.hdf5"

@@ -94,6 +94,7 @@ class RobomimicExperienceReplay(DemonstrationReplay):
         ImportError: if h5py, or for a download huggingface_hub, is not installed.
 
     Examples:
+        >>> from warmprior.data import RobomimicExperienceReplay
         >>> data = RobomimicExperienceReplay("square.hdf5", batch_size=256)  # doctest: +SKIP
         >>> data.sample()["observation"].shape  # doctest: +SKIP
         torch.Size([256, 23])

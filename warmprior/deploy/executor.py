@@ -124,8 +124,7 @@ class AsyncExecutor:
         self._chunk_key = keys.CHUNK if chunk_key is None else chunk_key
         self._shape = (length, action_dim)
         self._device = next(
-            (value.device for value in chain(actor.parameters(), actor.buffers())),
-            torch.device("cpu"),
+            (value.device for value in chain(actor.parameters(), actor.buffers())), torch.device("cpu")
         )
         self._normalizer = None if normalizer is None else copy.deepcopy(normalizer).to("cpu")
         self._sees_history = keys.CONDITIONED in actor.in_keys
@@ -291,11 +290,7 @@ class AsyncExecutor:
         self._collect()
 
     def close(self, *, wait: bool = True) -> None:
-        """End the thread; a pool that was given is left as it is.
-
-        Args:
-            wait: for a decision under way to end.
-        """
+        """End the thread, after a decision under way if ``wait``; a pool that was given is left as it is."""
         self._closed = True
         if self._pending is not None:
             self._pending.cancel()
@@ -306,9 +301,6 @@ class AsyncExecutor:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()

@@ -10,12 +10,7 @@ from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revisio
 from warmprior.diagnostics.memory_gain import memory_gain
 from warmprior.diagnostics.paths import deployed_history, flow_paths
 from warmprior.diagnostics.shared_observations import SharedObservations
-from warmprior.diagnostics.smoothness import (
-    Smoothness,
-    compare_smoothness,
-    executed_actions,
-    smoothness,
-)
+from warmprior.diagnostics.smoothness import Smoothness, compare_smoothness, executed_actions, smoothness
 from warmprior.diagnostics.source_leak import SourceLeak, source_leak
 from warmprior.diagnostics.statistics import (
     SeedSummary,

@@ -172,11 +172,7 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
 
 
 def executed_positions(prior: Prior, executed: int | None) -> int:
-    """How many positions of a prediction are executed: ``H`` by default.
-
-    Raises:
-        ValueError: if not ``1 <= executed <= P``.
-    """
+    """How many positions of a prediction are executed, 1 to ``P``: ``H`` by default."""
     executed = prior.chunk_length if executed is None else executed
     if not 1 <= executed <= prior.prediction_length:
         raise ValueError(

@@ -12,13 +12,7 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.diagnostics.branching import branching_cost, executed_positions
-from warmprior.diagnostics.flow import (
-    RunningVariance,
-    check_flow,
-    evaluation_mode,
-    field_of,
-    flat_windows,
-)
+from warmprior.diagnostics.flow import RunningVariance, check_flow, evaluation_mode, field_of, flat_windows
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.ode import integrate

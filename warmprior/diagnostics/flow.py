@@ -53,12 +53,7 @@ class Windows:
 
 
 def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed: bool = False) -> Windows:
-    """Check a batch and bring it into shape.
-
-    Raises:
-        KeyError: if a needed key is missing.
-        ValueError: if the batch is empty, holds NaN or Inf, or belongs to another prediction length.
-    """
+    """Check a batch and bring it into shape; a ``KeyError`` or ``ValueError`` says what is wrong with it."""
     observation_key = policy.in_keys[0]
     needed = [*policy.in_keys, *([policy.chunk_key] if target_needed else [])]
     missing = [key for key in needed if batch.get(key, None) is None]
@@ -176,9 +171,6 @@ def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase
     """Update the last actions in the observation after the history has changed.
 
     Images must not be encoded yet: the actions stand at the end of the observation's vector.
-
-    Raises:
-        KeyError: if the windows lack what the network sees, or the history.
     """
     if not sees_history(policy):
         return windows
@@ -204,11 +196,7 @@ def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
 
 
 def check_flow(policy: WarmPriorActor, steps: int) -> None:
-    """Refuse policies whose field is not trained along a whole path.
-
-    Raises:
-        ValueError: if the policy is trained for fewer than ``steps`` network evaluations, or ``steps < 1``.
-    """
+    """A ``ValueError`` if the field is not trained along a whole path of ``steps`` network evaluations."""
     if steps < 1:
         raise ValueError(f"a path needs at least 1 step, got {steps}")
     most = policy.ode.max_nfe
@@ -237,11 +225,7 @@ def evaluation_mode(policy: WarmPriorActor) -> Iterator[None]:
 
 
 def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
-    """Those that the policy is trained for, ascending.
-
-    Raises:
-        ValueError: if none is, or the solver cannot spend one.
-    """
+    """Those that the policy is trained for, ascending; a ``ValueError`` if none is."""
     most = policy.ode.max_nfe
     allowed = sorted({nfe for nfe in nfes if most is None or nfe <= most})
     if not allowed:
@@ -255,11 +239,7 @@ def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
 
 
 def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, *, nfe: int, split: int) -> Tensor:
-    """The chunks ``[N, P, d_a]`` from windows ``[N]`` and sources, ``split`` at a time.
-
-    Raises:
-        FloatingPointError: if one is NaN or infinite.
-    """
+    """The chunks ``[N, P, d_a]`` from windows ``[N]`` and sources, ``split`` at a time; all finite."""
     parts = rows.clone(recurse=False).set(policy.ode.in_keys[0], a0).split(split)
     chunk = torch.cat([policy.integrate(part, nfe).get(policy.chunk_key) for part in parts])
     if not torch.isfinite(chunk).all():

@@ -116,8 +116,7 @@ def memory_gain(
     def predicted(shift: float) -> dict[int, Tensor]:
         generator.set_state(state)  # the same noise on both sides
         rows = seen_anew(
-            policy,
-            plain.clone(recurse=False).set(keys.HISTORY, shifted(history, shift * direction)),
+            policy, plain.clone(recurse=False).set(keys.HISTORY, shifted(history, shift * direction))
         )
         rows = encoded_windows(policy, rows).select(*policy.in_keys)
         a0 = drawn(policy, rows, generator)
@@ -137,12 +136,7 @@ def memory_gain(
 
 
 def shifted(history: TensorDictBase, by: Tensor) -> TensorDictBase:
-    """A history with its real actions and forecast moved, ``[*B]``; empty entries stay zero.
-
-    Args:
-        history: ``[*B]``, see :mod:`warmprior.history`.
-        by: ``[*B, n, d_a]``, where ``n`` is 1 or at least the number of actions, whose first are taken.
-    """
+    """A history with its real actions and forecast moved by ``[*B, n, d_a]``; empty entries stay zero."""
     moved = history.copy()
     for name, from_end in (("actions", True), ("forecast", False)):
         entry, steps = history[name], history["steps" if from_end else "forecast_steps"]

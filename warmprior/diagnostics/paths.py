@@ -8,13 +8,7 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.diagnostics.branching import executed_positions
-from warmprior.diagnostics.flow import (
-    check_flow,
-    drawn,
-    evaluation_mode,
-    field_of,
-    flat_windows,
-)
+from warmprior.diagnostics.flow import check_flow, drawn, evaluation_mode, field_of, flat_windows
 from warmprior.history import advance
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.ode import integrate
@@ -119,7 +113,6 @@ def deployed_history(
         raise ValueError(f"at most H = {prior.chunk_length} actions are executed, got {k}")
     data = previous.select(*policy.in_keys).to(windows.loc.device)
     with evaluation_mode(policy):
-        generator = policy.sampler.generator if generator is None else generator
         data.set(policy.ode.in_keys[0], drawn(policy, data, generator))
         chunk = policy.integrate(data, nfe).get(policy.chunk_key)
         steps = torch.full((*data.batch_size, 1), k, device=chunk.device)

@@ -7,12 +7,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.flow import (
-    depends_on_history,
-    encoded_windows,
-    seen_anew,
-    sees_history,
-)
+from warmprior.diagnostics.flow import depends_on_history, encoded_windows, seen_anew, sees_history
 from warmprior.diagnostics.paths import deployed_history
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
@@ -112,13 +107,7 @@ class SharedObservations:
     def deployed(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
         """Windows with the history at deployment, from the policy's own earlier prediction.
 
-        Observations with images are encoded, see :func:`encoded_windows`.
-
-        Args:
-            policy: the policy.
-
-        Keyword Args:
-            generator: see :func:`deployed_history`.
+        See :func:`deployed_history`. Observations with images are encoded, see :func:`encoded_windows`.
         """
         see = sees_history(policy)
         earlier = self.windows(policy.prior, offset=self.chunk_length, see_history=see)
@@ -127,14 +116,7 @@ class SharedObservations:
         return encoded_windows(policy, seen_anew(policy, windows))
 
     def met(self, policy: WarmPriorActor, *, generator: torch.Generator | None = None) -> TensorDictBase:
-        """Windows as at deployment: :meth:`deployed`, if the policy depends on the history.
-
-        Args:
-            policy: the policy.
-
-        Keyword Args:
-            generator: see :func:`deployed_history`.
-        """
+        """Windows as at deployment: :meth:`deployed`, if the policy depends on the history."""
         see = sees_history(policy)
         windows = encoded_windows(policy, self.windows(policy.prior, see_history=see))
         if depends_on_history(policy, windows):
@@ -142,11 +124,7 @@ class SharedObservations:
         return windows
 
     def subset(self, index: Tensor) -> SharedObservations:
-        """Some of the observations.
-
-        Args:
-            index: which, int64 ``[m]``.
-        """
+        """The observations with these indices, int64 ``[m]``."""
         part = object.__new__(SharedObservations)
         part.__dict__.update(self.__dict__)
         part.frames, part.episodes = self.frames[index], self.episodes[index]

@@ -95,14 +95,7 @@ class StepLoop:
         return self.observations(refresh=True)
 
     def step(self, action: np.ndarray) -> tuple[Observations, bool]:
-        """Advance one control step (50 ms).
-
-        Args:
-            action: ``[7]`` per arm: a pose delta and the gripper, each in ``[-1, 1]``.
-
-        Returns:
-            The observations after the step, and whether the task is solved.
-        """
+        """Advance one control step (50 ms); what is observed, and whether the task is solved."""
         self.env.step(action)
         return self.observations(refresh=False), bool(self.env._check_success())
 

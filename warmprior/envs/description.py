@@ -49,7 +49,9 @@ def environment_description(
             it sees besides, see :class:`RobosuiteEnv`.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.envs import environment_description
+        >>> from warmprior.envs.description import environment_name
         >>> kept = environment_description({"env_name": "Lift", "env_kwargs": {}}, "ph", observation_steps=2)
         >>> kept
         {'robosuite': {'env_args': {'env_name': 'Lift', 'env_kwargs': {}}, 'style': 'ph'},
@@ -121,14 +123,14 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv
 def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
     """The environment that a policy was made for, with the policy's own transforms.
 
-    Args:
-        actor: a policy, such as one that was loaded.
-        options: further ones of :class:`RobosuiteEnv`.
+    ``options`` are further ones of :class:`RobosuiteEnv`.
 
     Raises:
         ValueError: if the policy keeps no description of one.
 
     Examples:
+        >>> from warmprior import WarmPriorActor
+        >>> from warmprior.envs import environment_of
         >>> from warmprior.training import load_policy
         >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> environment_of(actor).rollout(10, actor)["next", "success"].any()  # doctest: +SKIP

@@ -85,6 +85,7 @@ def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> d
             controller other than ``OSC_POSE``.
 
     Examples:
+        >>> from warmprior.envs import modernize_env_args
         >>> old = {"type": "OSC_POSE", "damping": 1, "control_delta": True}
         >>> new = modernize_env_args(
         ...     {"env_name": "Lift", "env_kwargs": {"robots": ["Panda"], "controller_configs": old}}
@@ -121,17 +122,14 @@ def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> d
 def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     """Say in which units and frame an environment reads its pose deltas.
 
-    Args:
-        env_args: as :func:`modernize_env_args` takes.
-
-    Returns:
-        ``output_max`` ``[6]`` float64, what an input of 1 means (3 in metres, 3 in radians), and
-        ``base_rotation`` ``[arms, 3, 3]`` float64, from the frame of the deltas to the world.
+    ``output_max`` ``[6]`` float64, what an input of 1 means (3 in metres, 3 in radians), and
+    ``base_rotation`` ``[arms, 3, 3]`` float64, from the frame of the deltas to the world.
 
     Raises:
         ValueError: if the controller is not an ``OSC_POSE`` one fed with deltas in ``[-1, 1]``.
 
     Examples:
+        >>> from warmprior.envs import delta_conventions
         >>> arm = {"type": "OSC_POSE", "output_max": [0.05] * 3 + [0.5] * 3}
         >>> output_max, base_rotation = delta_conventions(
         ...     {"env_name": "Lift", "env_kwargs": {"robots": "Panda", "controller_configs": arm}}
@@ -203,6 +201,8 @@ def absolute_actions(
         ValueError: if a width does not belong to one or two arms, or the widths disagree.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.envs import absolute_actions
         >>> action = torch.tensor([1.0, 0, 0, 0, 0, 0, -1.0])
         >>> position, hand = torch.tensor([0.1, 0, 1.0]), torch.tensor([0, 0, 1.0, 1.0])
         >>> absolute_actions(action, position, hand).round(decimals=3)[:3]
@@ -238,6 +238,8 @@ def absolute_to_env_action(actions: Tensor) -> Tensor:
         ValueError: if the width is neither 10 nor 20.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.envs import absolute_to_env_action
         >>> absolute_to_env_action(torch.tensor([0.1, 0, 1, 1, 0, 0, 0, 1, 0, -1]))
         tensor([ 0.1000,  0.0000,  1.0000,  0.0000,  0.0000,  0.0000, -1.0000])
     """

@@ -73,6 +73,7 @@ def gym_env(
 
     Examples:
         >>> import gymnasium
+        >>> from warmprior.envs import gym_env
         >>> env = gym_env(gymnasium.make("Pendulum-v1"), success="is_success")
         >>> env.reset()["observation"].shape, env.rollout(3)["next", "is_success"].any().item()
         (torch.Size([3]), False)

@@ -54,6 +54,8 @@ def register_mimicgen() -> None:
         ImportError: if the package is missing, another one, or cannot be imported.
 
     Examples:
+        >>> import robosuite  # doctest: +SKIP
+        >>> from warmprior.envs.mimicgen import register_mimicgen
         >>> register_mimicgen()  # doctest: +SKIP
         >>> robosuite.make("Coffee_D0", "Panda")  # doctest: +SKIP
     """

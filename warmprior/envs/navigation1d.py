@@ -40,6 +40,7 @@ def navigation_positions() -> Tensor:
         :func:`~warmprior.envs.navigation_heights`: the demonstrations at these positions.
 
     Examples:
+        >>> from warmprior.envs import navigation_positions
         >>> navigation_positions()[[0, -1]].tolist()
         [-1.0, 1.0]
     """
@@ -57,6 +58,7 @@ def navigation_heights() -> Tensor:
         - :func:`~warmprior.envs.navigation_positions`: where they are held.
 
     Examples:
+        >>> from warmprior.envs import navigation_heights
         >>> heights = navigation_heights()
         >>> bool((heights[:3] == -heights[3:]).all()), round(float(2 * heights[0].min()), 2)
         (True, 0.35)
@@ -83,6 +85,7 @@ def navigation_demonstrations() -> TensorDict:
         ``"action"`` ``[384, 1]`` (the height) and ``"episode"`` ``[384]``.
 
     Examples:
+        >>> from warmprior.envs import navigation_demonstrations
         >>> navigation_demonstrations()["observation"].shape
         torch.Size([384, 9])
     """
@@ -99,19 +102,16 @@ def navigation_demonstrations() -> TensorDict:
 
 
 def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
-    """Whether the straight segments between consecutive points enter an obstacle.
+    """Whether the straight segments between consecutive points enter an obstacle, bool ``[*B, T - 1]``.
 
-    Args:
-        x: positions ``[*B, T]``, increasing.
-        y: heights ``[*B, T]``.
-
-    Returns:
-        bool ``[*B, T - 1]``.
+    The points are at positions ``[*B, T]``, increasing, and heights ``[*B, T]``.
 
     See Also:
         :func:`~warmprior.envs.navigation_metrics`: counts the rollouts that do.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.envs import navigation_collides
         >>> x = torch.tensor([-0.6, -0.3, 0.0])
         >>> navigation_collides(x, torch.tensor([0.0, 0.0, 0.0])).tolist()
         [True, False]
@@ -159,8 +159,9 @@ class NavigationEnv(EnvBase):
         - :class:`~warmprior.envs.GoalNavigationEnv`: adds a goal and a reward.
 
     Examples:
-        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from torchrl.envs import TransformedEnv
+        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor, policy_transforms
+        >>> from warmprior.envs import NavigationEnv
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), GaussianPrior(4))
         >>> transforms = policy_transforms(actor.prior, observation_steps=1)
         >>> env = TransformedEnv(NavigationEnv(batch_size=[32]), transforms)
@@ -271,6 +272,8 @@ class NavigationMetrics:
         :func:`~warmprior.envs.navigation_metrics`: measures them.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.envs import navigation_metrics
         >>> through = navigation_metrics(torch.zeros(2, 64), chunk_length=4)  # neither above nor below
         >>> through.collision_rate, through.commit_rate, through.jump, through.switch_rate
         (1.0, 1.0, 0.0, nan)
@@ -300,6 +303,7 @@ def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
         - :func:`~warmprior.training.judge_navigation`: plays and judges a policy.
 
     Examples:
+        >>> from warmprior.envs import navigation_heights, navigation_metrics
         >>> metrics = navigation_metrics(navigation_heights(), chunk_length=4)
         >>> metrics.switch_rate, metrics.collision_rate, metrics.route_entropy, metrics.distance
         (0.0, 0.0, 1.0, 0.0)

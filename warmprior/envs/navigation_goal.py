@@ -32,6 +32,8 @@ class GoalNavigationEnv(NavigationEnv):
         ValueError: if the route is not two of these numbers.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.envs import GoalNavigationEnv
         >>> env = GoalNavigationEnv((1, -1), batch_size=[2])
         >>> below = torch.full((2, 64, 1), -0.6)
         >>> data = env.reset()

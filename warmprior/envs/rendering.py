@@ -51,6 +51,7 @@ def rendering_backend() -> str | None:
         :class:`~warmprior.envs.RobosuiteEnv`: renders its cameras with it.
 
     Examples:
+        >>> from warmprior.envs import rendering_backend
         >>> rendering_backend() in ("egl", "osmesa", None)  # doctest: +SKIP
         True
     """
@@ -83,10 +84,6 @@ class CameraRenderer:
     It has a simulation of its own, in which nothing moves: an episode goes on as if nothing was rendered.
     ``fast`` leaves out reflections, shadows and the smoothing of edges: three to five times faster, and the
     images differ by 1 to 2 of 255 on average.
-
-    Raises:
-        ValueError: if images of this size are too large for OpenGL.
-        RuntimeError: if no OpenGL backend works, or the process was forked from one that has rendered.
     """
 
     def __init__(self, model: Any, height: int, width: int, *, fast: bool = False) -> None:
@@ -139,12 +136,7 @@ class CameraRenderer:
         self.close()
 
     def render(self, camera: str, qpos: np.ndarray) -> np.ndarray:
-        """The image of a camera, uint8 ``[height, width, 3]``, the right way up, at joints ``[nq]``.
-
-        Raises:
-            ValueError: if the model has no such camera.
-            RuntimeError: if the process was forked from the one that made the renderer.
-        """
+        """The image of a camera, uint8 ``[height, width, 3]``, the right way up, at joints ``[nq]``."""
         _check_process()
         mujoco, model, data = self._mujoco, self.model, self._data
         number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, camera)

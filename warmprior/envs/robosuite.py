@@ -81,6 +81,7 @@ class RobosuiteWrapper(_EnvWrapper):
         RuntimeError: if pixels are asked for and nothing here can render.
 
     Examples:
+        >>> from warmprior.envs import RobosuiteWrapper
         >>> import robosuite  # doctest: +SKIP
         >>> options = {"has_renderer": False, "has_offscreen_renderer": False}
         >>> door = robosuite.make("Door", "Panda", use_camera_obs=False, **options)  # doctest: +SKIP
@@ -148,7 +149,7 @@ class RobosuiteWrapper(_EnvWrapper):
 
     @property
     def loop(self) -> StepLoop:
-        """The control loop: simulator state, poses of bodies and sites."""
+        """The control loop, which holds the simulator state and the poses of bodies and sites."""
         return self._loop
 
     def render_frame(
@@ -339,6 +340,7 @@ class RobosuiteEnv(RobosuiteWrapper):
         ValueError: if the task is unknown, or not exactly one of ``task`` and ``env_args`` is given.
 
     Examples:
+        >>> from warmprior.envs import RobosuiteEnv
         >>> env = RobosuiteEnv("lift", seed=3)  # doctest: +SKIP
         >>> env.rollout(5)["observation"].shape  # doctest: +SKIP
         torch.Size([5, 19])

@@ -111,10 +111,6 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
     Frames are rendered on demand elsewhere, and time limits belong to the wrapper, so the options of
     ``env_args`` (in the terms of robosuite 1.5) that concern either are overridden. The model is loaded once
     (``hard_reset=False``), under a fixed seed.
-
-    Raises:
-        ImportError: if robosuite is not installed, or MimicGen is not where the environment is one of its.
-        ValueError: if robosuite has no environment of that name.
     """
     robosuite = import_robosuite()
     name = env_args["env_name"]

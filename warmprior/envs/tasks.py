@@ -42,6 +42,7 @@ class TaskSpec:
         :func:`~warmprior.envs.get_task`: finds one by its short name.
 
     Examples:
+        >>> from warmprior.envs import TaskSpec
         >>> door = TaskSpec("door", "Door", arms=1, horizon_ph=300, horizon_mh=500, object_dim=22)
         >>> door.observation_dim, door.action_dim, door.horizon("mh")
         (31, 7, 500)
@@ -61,17 +62,12 @@ class TaskSpec:
 
     @property
     def low_dim_keys(self) -> tuple[str, ...]:
-        """Observation keys whose concatenation is the state: ``object`` first, then each arm."""
+        """Observation keys whose concatenation is the state, ``object`` first, then each arm."""
         return low_dim_keys(self.arms)
 
     @property
     def low_dim_widths(self) -> dict[str, int]:
-        """The width of each of :attr:`low_dim_keys`.
-
-        Examples:
-            >>> get_task("lift").low_dim_widths["robot0_eef_quat"]
-            4
-        """
+        """The width of each of :attr:`low_dim_keys`."""
         widths = [self.object_dim, *[*_ARM_WIDTHS.values()] * self.arms]
         return dict(zip(self.low_dim_keys, widths, strict=True))
 
@@ -82,7 +78,7 @@ class TaskSpec:
 
     @property
     def action_dim(self) -> int:
-        """Width of the action: a 6-d pose delta and a gripper command per arm."""
+        """Width of the action, which is a 6-d pose delta and a gripper command per arm."""
         return 7 * self.arms
 
     def horizon(self, style: str) -> int:
@@ -130,10 +126,7 @@ TASKS: dict[str, TaskSpec] = {
 
 
 def get_task(name: str) -> TaskSpec:
-    """Look a task up by its short name.
-
-    Args:
-        name: a key of :data:`TASKS`.
+    """Look a task up by its short name, a key of :data:`TASKS`.
 
     Raises:
         ValueError: if there is no such task.
@@ -143,6 +136,7 @@ def get_task(name: str) -> TaskSpec:
         - :data:`~warmprior.envs.TASKS`: all of them.
 
     Examples:
+        >>> from warmprior.envs import get_task
         >>> get_task("square").observation_dim
         23
     """

@@ -38,6 +38,7 @@ def launched() -> bool:
     """Whether ``torchrun`` started this process as one of several.
 
     Examples:
+        >>> from warmprior.io.distributed import launched
         >>> launched()
         False
     """
@@ -49,6 +50,7 @@ def world_size() -> int:
     """How many processes train together: 1 unless this one has :func:`joined` others.
 
     Examples:
+        >>> from warmprior.io.distributed import world_size
         >>> 256 // world_size()  # windows per process; here there is one
         256
     """
@@ -59,6 +61,7 @@ def rank() -> int:
     """The number of this process among them. The first, 0, is the leader: it alone writes and prints.
 
     Examples:
+        >>> from warmprior.io.distributed import rank
         >>> if not rank():
         ...     print("trained")
         trained
@@ -74,6 +77,7 @@ def joined() -> Iterator[None]:
     started afresh: the threads of a group do not survive a fork.
 
     Examples:
+        >>> from warmprior.io.distributed import joined, rank, world_size
         >>> with joined():  # started without torchrun
         ...     world_size(), rank()
         (1, 0)
@@ -104,6 +108,7 @@ def from_leader[T](make: Callable[[], T]) -> T:
         SystemExit: in the others, if it fails in the first, which says why.
 
     Examples:
+        >>> from warmprior.io.distributed import from_leader
         >>> from_leader(lambda: 3)
         3
     """
@@ -132,6 +137,7 @@ def leader_first() -> Iterator[None]:
         SystemExit: in the others, if it failed otherwise in the first, which says why.
 
     Examples:
+        >>> from warmprior.io.distributed import leader_first
         >>> found = set()
         >>> with leader_first():  # what it leaves, such as a file, is there for the others
         ...     found.add("generated")
@@ -163,6 +169,7 @@ def go_on_alone() -> None:
         SystemExit: in the others, with success.
 
     Examples:
+        >>> from warmprior.io.distributed import go_on_alone, joined, world_size
         >>> with joined():
         ...     go_on_alone()  # of several processes the others end here
         ...     world_size()
@@ -183,6 +190,7 @@ def check_batch(size: int) -> None:
         ValueError: if it cannot.
 
     Examples:
+        >>> from warmprior.io.distributed import check_batch
         >>> check_batch(0)
         Traceback (most recent call last):
             ...
@@ -202,6 +210,7 @@ def check_device(device: str) -> None:
         ValueError: naming ``--device`` and what there is instead.
 
     Examples:
+        >>> from warmprior.io.distributed import check_device
         >>> check_device("cpu")
     """
     try:

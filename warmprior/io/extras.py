@@ -16,6 +16,7 @@ def require(module: str, extra: str) -> ModuleType:
     a missing one.
 
     Examples:
+        >>> from warmprior.io.extras import require
         >>> require("no_such_module", "sim")
         Traceback (most recent call last):
             ...

@@ -72,6 +72,7 @@ def is_repository(name: str) -> bool:
     """Whether a text has the form of a repository's name at the hub.
 
     Examples:
+        >>> from warmprior.io.files import is_repository
         >>> [is_repository(name) for name in ("user/name", "runs/a/b", "../name", "policy", "/tmp/name")]
         [True, False, False, False, False]
     """
@@ -131,17 +132,16 @@ def read_lines(path: Path) -> list[dict[str, Any]]:
 def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     """Call ``write(temporary_path)``, then put the result in place in one step.
 
-    A reader, or a process killed at any moment, sees the old file or the new one, never a part.
-
-    Args:
-        path: the file to replace; its folder is created if needed.
-        write: callable that writes a file at the path it is given.
+    A reader, or a process killed at any moment, sees the old file or the new one, never a part. The folder is
+    created if needed.
 
     Raises:
         OSError: if the file cannot be written, naming ``path``.
 
     Examples:
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.io.files import write_atomic
         >>> with TemporaryDirectory() as folder:
         ...     path = Path(folder) / "new" / "table.md"
         ...     write_atomic(path, lambda temporary: temporary.write_text("done"))
@@ -208,7 +208,9 @@ def exclusive(directory: Path) -> Iterator[None]:
         BlockingIOError: if another process is in there.
 
     Examples:
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.io.files import exclusive
         >>> with TemporaryDirectory() as folder, exclusive(Path(folder)):
         ...     with exclusive(Path(folder)):  # whoever comes second
         ...         pass

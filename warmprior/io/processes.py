@@ -27,6 +27,7 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
     Ctrl-C is left to this process, and they end when it ends, however that happens.
 
     Examples:
+        >>> from warmprior.io.processes import fresh_processes
         >>> with fresh_processes(1) as executor:  # doctest: +SKIP
         ...     executor.submit(pow, 2, 3).result()
         8
@@ -73,6 +74,7 @@ def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]],
     Examples:
         >>> from functools import partial
         >>> from operator import add
+        >>> from warmprior.io.processes import working
         >>> with working(1, 40) as call:  # doctest: +SKIP
         ...     call(partial(add, 2)).result()
         42

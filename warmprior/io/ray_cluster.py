@@ -43,6 +43,7 @@ def check_ray(address: str | None = None) -> str | None:
         ConnectionError: if nothing answers there, or the cluster has another Ray or Python.
 
     Examples:
+        >>> from warmprior.io.ray_cluster import check_ray
         >>> check_ray("node-1:6379")  # doctest: +SKIP
         'node-1:6379'
         >>> check_ray("ray://node-1:10001")
@@ -93,6 +94,7 @@ def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str
         WorkerError: naming the machine and both versions, a ``RuntimeError``.
 
     Examples:
+        >>> from warmprior.io.ray_cluster import check_versions
         >>> check_versions({"torch": "2.11.0"}, {"torch": "2.10.0"}, "node-7")
         Traceback (most recent call last):
             ...
@@ -148,6 +150,7 @@ def ray_cluster(
         OSError: if a machine does not see a folder.
 
     Examples:
+        >>> from warmprior.io.ray_cluster import ray_cluster
         >>> with ray_cluster(num_cpus=2) as ray:  # of this machine  # doctest: +SKIP
         ...     ray.cluster_resources()["CPU"]
         2.0

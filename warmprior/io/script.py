@@ -32,21 +32,14 @@ def run_script(
     errors: tuple[type[BaseException], ...] = ERRORS,
     together: bool = False,
 ) -> int:
-    """Run a script.
+    """Run a script of this name; its exit code: 0, 2 after one of ``errors``, 130 after Ctrl-C.
 
-    Args:
-        script: what to run.
-        name: of the script.
-
-    Keyword Args:
-        errors: what to report without a traceback.
-        together: several processes that ``torchrun`` starts may run it, of which the first prints.
-
-    Returns:
-        The exit code: 0, 2 after an error, 130 after Ctrl-C.
+    ``together`` allows several processes that ``torchrun`` starts, of which the first prints.
 
     Examples:
+        >>> import sys
         >>> from contextlib import redirect_stderr
+        >>> from warmprior.io.script import run_script
         >>> run_script(lambda: print("trained"), "train.py")
         trained
         0

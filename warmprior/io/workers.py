@@ -23,6 +23,7 @@ class WorkerError(RuntimeError):
         - :func:`~warmprior.io.processes.working`: its workers.
 
     Examples:
+        >>> from warmprior.training import WorkerError
         >>> raise WorkerError("worker 0 of 2 (exit code 9) died")
         Traceback (most recent call last):
             ...

@@ -103,18 +103,11 @@ class LeRobotFlow(TensorDictModuleBase):
         return self.source
 
     def check_nfe(self, nfe: int | None) -> None:
-        """Whether ``nfe`` is a number of integration steps.
-
-        Raises:
-            ValueError: if it is below 1.
-        """
+        """A ``ValueError`` unless ``nfe`` is a number of integration steps."""
         check_steps(nfe)
 
     def forward(
-        self,
-        tensordict: TensorDictBase,
-        nfe: int | None = None,
-        padding: Tensor | None = None,
+        self, tensordict: TensorDictBase, nfe: int | None = None, padding: Tensor | None = None
     ) -> TensorDictBase:
         """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source outside of the prior's part."""
         nfe = self.nfe if nfe is None else nfe
@@ -259,10 +252,7 @@ class LeRobotActor(TensorDictModuleBase):
         return self.ode.out_keys[0]
 
     def forward(
-        self,
-        tensordict: TensorDictBase,
-        nfe: int | None = None,
-        generator: torch.Generator | None = None,
+        self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
         """Sample the source and the chunk."""
         chunks, generator = self.ode.source, self.generator if generator is None else generator

@@ -143,12 +143,7 @@ class WarmPriorAdapter:
         """The :func:`history_indices` of prior and policy."""
         return history_indices(self.prior.history_length, self.source.length, self.source.lead)
 
-    def loss(
-        self,
-        batch: Mapping[str, Any],
-        forward: Callable[..., Any] | None = None,
-        **kwargs: Any,
-    ) -> Any:
+    def loss(self, batch: Mapping[str, Any], forward: Callable[..., Any] | None = None, **kwargs: Any) -> Any:
         """The policy's own loss, from the prior's source.
 
         Args:
@@ -185,10 +180,7 @@ class WarmPriorAdapter:
             return (self.policy.forward if forward is None else forward)(inputs, **kwargs)
 
     def select_action(
-        self,
-        batch: dict[str, Any],
-        select: Callable[..., Tensor] | None = None,
-        **kwargs: Any,
+        self, batch: dict[str, Any], select: Callable[..., Tensor] | None = None, **kwargs: Any
     ) -> Tensor:
         """The next action of every environment, ``[B, d_a]``, the model's units.
 
@@ -238,8 +230,7 @@ class WarmPriorAdapter:
     def record_executed(self, action: Tensor) -> None:
         """Replace the last action of :meth:`select_action` by the executed one, as after clipping.
 
-        Args:
-            action: ``[B, d_a]``, the model's units.
+        It is ``[B, d_a]`` in the model's units.
 
         Raises:
             ValueError: if none was given yet.
@@ -273,10 +264,7 @@ class WarmPriorAdapter:
 
     @contextmanager
     def _from_source(self) -> Iterator[None]:
-        with (
-            self.aside(),
-            self.port.sampling(self.policy, self._source, self._record, self.nfe),
-        ):
+        with self.aside(), self.port.sampling(self.policy, self._source, self._record, self.nfe):
             yield
 
     def _window(self, batch: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -338,10 +326,7 @@ class WarmPriorAdapter:
 
 
 def _std(
-    policy: Any,
-    unit: SigmaUnit,
-    stats: Mapping[str, Mapping[str, Any]] | None,
-    given: Tensor | None,
+    policy: Any, unit: SigmaUnit, stats: Mapping[str, Mapping[str, Any]] | None, given: Tensor | None
 ) -> Tensor | None:
     if unit not in ("model", "std"):
         raise ValueError(f"sigma_unit must be 'model' or 'std', got {unit!r}")

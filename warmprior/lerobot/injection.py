@@ -16,19 +16,14 @@ Source = Callable[[torch.Size, torch.dtype, torch.device], Tensor]
 
 
 class SourceInjection(TorchFunctionMode):
-    """Replaces the one draw of ``torch.randn`` or ``torch.randn_like`` of the shape of a chunk.
+    """Replaces the one draw by ``torch.randn`` or ``torch.randn_like`` of a chunk's shape, ``[B, T, D]``.
 
-    It raises if a policy draws no such noise, or more than once: its port was written for another one.
-
-    Args:
-        length: ``T``, the length of the noisy chunk.
-        width: ``D``, its width with padding.
-        source: replaces the draw. Raises:
-        RuntimeError: at the exit, if there was not exactly one draw of shape ``[B, T, D]``.
+    A ``RuntimeError`` at the exit if there was none, or more than one: the port was written for another
+    policy.
 
     Examples:
-        >>> from warmprior.lerobot.injection import SourceInjection
         >>> import torch
+        >>> from warmprior.lerobot.injection import SourceInjection
         >>> with SourceInjection(4, 2, lambda shape, dtype, device: torch.ones(shape)):
         ...     noise, other = torch.randn(3, 4, 2), torch.randn(3)
         >>> bool((noise == 1).all()), other.shape

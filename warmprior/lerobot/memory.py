@@ -84,11 +84,7 @@ class ActionMemory:
         return history
 
     def record(self, chunk: Tensor) -> None:
-        """Remember what was predicted at this decision.
-
-        Args:
-            chunk: ``[B, P, d_a]``.
-        """
+        """Remember what was predicted at this decision, ``[B, P, d_a]``."""
         self._history = self._decision
         self._chunk = chunk.detach().to(self._history["forecast"], copy=True)
         self._executed = torch.zeros_like(self._history["steps"])
@@ -125,10 +121,7 @@ class ActionMemory:
         self._executed = torch.where(counted, self._executed, count.reshape(-1, 1))
 
     def correct(self, action: Tensor) -> None:
-        """Replace the action executed last.
-
-        Args:
-            action: ``[B, d_a]``.
+        """Replace the action executed last by this one, ``[B, d_a]``.
 
         Raises:
             ValueError: if none was executed since the last decision.
@@ -139,10 +132,7 @@ class ActionMemory:
         self._chunk = self._chunk.scatter(1, last, action.to(self._chunk)[:, None])
 
     def forget(self, mask: Tensor | None = None) -> None:
-        """Begin new episodes.
-
-        Args:
-            mask: of environments, bool ``[B]``; all by default.
+        """Begin new episodes in the environments of a mask, bool ``[B]``; in all by default.
 
         Raises:
             ValueError: if the mask has another shape.

@@ -58,11 +58,7 @@ class FlowPort(ABC):
 
     @abstractmethod
     def check(self, policy: Any) -> None:
-        """Refuse options that would make the source inexact.
-
-        Raises:
-            ValueError: naming the option.
-        """
+        """Refuse options that would make the source inexact, with a ``ValueError`` that names one."""
 
     @abstractmethod
     def training(self, policy: Any, source: Source) -> AbstractContextManager[Any]:
@@ -74,11 +70,7 @@ class FlowPort(ABC):
     ) -> AbstractContextManager[Any]:
         """Context of ``select_action`` or ``predict_action_chunk``: new chunks start from the source.
 
-        Args:
-            policy: of the family.
-            source: what takes the place of the noise.
-            record: called with each chunk, its positions and dimensions of padding.
-            nfe: integration steps; the policy's own by default.
+        ``record`` is called with each chunk, its positions and dimensions of padding.
         """
 
     def predict(self, policy: Any, batch: dict[str, Any]) -> None:
@@ -99,11 +91,7 @@ def _known(release: str, name: str) -> FlowPort:
 
 
 def check_steps(nfe: int | None) -> None:
-    """Refuse a number of integration steps below 1.
-
-    Raises:
-        ValueError: if it is below 1.
-    """
+    """A ``ValueError`` for a number of integration steps below 1."""
     if nfe is not None and nfe < 1:
         raise ValueError(f"nfe is the number of integration steps: it must be at least 1, got {nfe}")
 
@@ -227,10 +215,7 @@ class GrootN15Port(DrawnPort):
 
             return predicted
 
-        with (
-            _replaced(policy, "predict_action_chunk", around),
-            super().sampling(policy, source, record, nfe),
-        ):
+        with _replaced(policy, "predict_action_chunk", around), super().sampling(policy, source, record, nfe):
             yield
 
 
@@ -379,7 +364,7 @@ PORTS: dict[str, dict[str, FlowPort]] = {
             model_config=lambda policy: policy._groot_model.action_head.config,
             predicted=lambda output: output["action_pred"],
             check=_check_groot_n15,
-        ),
+        )
     },
 }
 """By the release of LeRobot (``"0.6"`` is all of 0.6), and in it by LeRobot's name of the family.
@@ -389,10 +374,7 @@ PORTS: dict[str, dict[str, FlowPort]] = {
 
 
 def port_for(policy: Any) -> FlowPort:
-    """The port of a policy's family in the release of lerobot that is installed.
-
-    Args:
-        policy: of LeRobot, or of a subclass.
+    """The port of a policy's family, or of a subclass, in the release of lerobot that is installed.
 
     Raises:
         ValueError: if there is none, or it does not support the policy's options.

@@ -98,13 +98,10 @@ class ChunkSource:
         return slice(self.lead, self.lead + self.prior.prediction_length)
 
     def distribution(self, history: TensorDictBase) -> Source:
-        """The prior's source, in units of its ``sigma``.
-
-        Args:
-            history: ``[*B]``, the model's units; see :mod:`warmprior.history`.
+        """The prior's source, in units of its ``sigma``, at histories ``[*B]`` in the model's units.
 
         Raises:
-            KeyError: if an entry of it is missing.
+            KeyError: if an entry of the history is missing.
         """
         check_history(history, *self._lengths, self.prior)
         unit = self._unit(history["actions"])
@@ -112,22 +109,14 @@ class ChunkSource:
         return self.prior.distribution(history.copy().update(own))
 
     def scaled(self, values: Tensor, warm: Tensor) -> Tensor:
-        """Values of the source, such as draws, in the model's units.
+        """Values of the source ``[*B, P, d_a]``, such as draws, in the model's units.
 
-        Args:
-            values: ``[*B, P, d_a]``, in units of ``sigma`` on warm positions, and in the model's on cold
-                ones.
-            warm: bool ``[*B, P, 1]``.
+        They are in units of ``sigma`` where ``warm``, bool ``[*B, P, 1]``, and in the model's elsewhere.
         """
         return torch.where(warm, values * self._unit(values), values)
 
     def draw(self, history: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
-        """The prior's part of a source, ``[*B, P, d_a]``, the model's units.
-
-        Args:
-            history: see :meth:`distribution`.
-            generator: source of randomness on its device; PyTorch's global one by default.
-        """
+        """The prior's part of a source at a history, ``[*B, P, d_a]`` in the model's units."""
         source = self.distribution(history)
         return self.scaled(source.sample(generator), source.warm)
 
@@ -169,20 +158,9 @@ class ChunkSource:
         return self.place(a0, generator), target
 
     def place(self, a0: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        """The whole source: the prior's part, and ``N(0, 1)`` elsewhere.
-
-        Args:
-            a0: ``[B, P, d_a]``.
-            generator: see :meth:`draw`.
-
-        Returns:
-            ``[B, T, D]``.
-        """
+        """The whole source ``[B, T, D]``: the prior's part ``[B, P, d_a]``, and ``N(0, 1)`` elsewhere."""
         whole = torch.randn(
-            (len(a0), self.length, self.width),
-            dtype=a0.dtype,
-            device=a0.device,
-            generator=generator,
+            (len(a0), self.length, self.width), dtype=a0.dtype, device=a0.device, generator=generator
         )
         whole[:, self.positions, : self.action_dim] = a0
         return whole
@@ -193,11 +171,9 @@ class ChunkSource:
 
 
 def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Tensor:
-    """Standard deviation of a dataset's actions in the units of a policy, ``[d_a]``.
+    """Standard deviation of a dataset's actions in the units of a LeRobot policy, ``[d_a]``.
 
-    Args:
-        policy: of LeRobot.
-        stats: of the dataset (``dataset.meta.stats``).
+    The statistics are ``dataset.meta.stats``.
 
     Raises:
         ValueError: if needed statistics are missing, a dimension never varies, the policy normalises actions

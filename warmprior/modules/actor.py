@@ -142,10 +142,7 @@ class WarmPriorActor(TensorDictModuleBase):
         return self.ode.network
 
     def forward(
-        self,
-        tensordict: TensorDictBase,
-        nfe: int | None = None,
-        generator: torch.Generator | None = None,
+        self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
     ) -> TensorDictBase:
         """Sample the source and integrate it to the chunk."""
         return self.integrate(self.sampler(tensordict, generator=generator), nfe=nfe)
@@ -153,9 +150,7 @@ class WarmPriorActor(TensorDictModuleBase):
     def integrate(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
         """Integrate a given source sample to the chunk, with the policy's guidance.
 
-        Args:
-            tensordict: with the input keys and the source, ``[*B, P, d_a]``, under ``ode.in_keys[0]``.
-            nfe: network evaluations of this call; the policy's own by default.
+        The sample, ``[*B, P, d_a]``, stands under ``ode.in_keys[0]``.
         """
         return self.ode(tensordict, nfe=nfe, sigma=self._sigma(tensordict))
 

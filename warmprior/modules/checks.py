@@ -1,12 +1,16 @@
-"""Checks of numbers given to constructors."""
+"""Checks of numbers and tensors."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from numbers import Integral
 from typing import Any
 
-__all__ = ["check_finite_numbers", "check_whole_numbers"]
+import torch
+from torch import Tensor
+
+__all__ = ["check_finite", "check_finite_numbers", "check_positive", "check_whole_numbers"]
 
 
 def check_finite_numbers(**values: Any) -> None:
@@ -25,3 +29,21 @@ def check_whole_numbers(**values: Any) -> None:
     for name, value in values.items():
         if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
             raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+
+
+def check_positive(**values: float) -> None:
+    """Raise ValueError for the first of them that is not a finite number > 0."""
+    for name, value in values.items():
+        if not (value > 0 and math.isfinite(value)):
+            raise ValueError(f"{name} must be a finite number > 0, got {value}")
+
+
+def check_finite(
+    tensors: Mapping[Any, Tensor],
+    cause: str = "the training has diverged; lower the learning rate or check the rewards",
+) -> None:
+    """Stop at NaN or infinity with a ``FloatingPointError`` that names the tensors and what to check."""
+    wrong = [str(name) for name, value in tensors.items() if not torch.isfinite(value).all()]
+    if wrong:
+        more = f" and {len(wrong) - 4} more" if len(wrong) > 4 else ""
+        raise FloatingPointError(f"NaN or infinity in {', '.join(wrong[:4])}{more}: {cause}")

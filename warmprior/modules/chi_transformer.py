@@ -23,12 +23,7 @@ class _ModulatedLayer(nn.TransformerDecoderLayer):
         self.modulation = nn.Linear(dim, 6 * dim)
 
     def forward(
-        self,
-        tgt: Tensor,
-        memory: Tensor,
-        tgt_mask: Tensor | None = None,
-        *args: Any,
-        **kwargs: Any,
+        self, tgt: Tensor, memory: Tensor, tgt_mask: Tensor | None = None, *args: Any, **kwargs: Any
     ) -> Tensor:
         scale, shift, gate, scale_2, shift_2, gate_2 = self.modulation(memory[:, :1]).chunk(6, -1)
         x = self.norm1(tgt) * (1 + scale) + shift
@@ -105,8 +100,7 @@ class ChiTransformer(VelocityNetwork):
         if embedding_dim % num_heads:
             raise ValueError(f"num_heads must divide embedding_dim, got {num_heads} and {embedding_dim}")
         self.embed_time = nn.Sequential(
-            TimestepEmbedding(timestep_embedding_dim),
-            nn.Linear(timestep_embedding_dim, embedding_dim),
+            TimestepEmbedding(timestep_embedding_dim), nn.Linear(timestep_embedding_dim, embedding_dim)
         )
         self.embed_action = nn.Linear(action_dim, embedding_dim)
         self.embed_observation = nn.Linear(observation_dim, embedding_dim)

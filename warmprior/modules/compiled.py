@@ -17,12 +17,5 @@ def uncompiled(module: nn.Module) -> nn.Module:
 
 
 def without_compilation(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A state dict under the names of the uncompiled network.
-
-    Examples:
-        >>> from warmprior.modules.compiled import without_compilation
-        >>> import torch
-        >>> list(without_compilation({"net._orig_mod.weight": torch.zeros(1)}))
-        ['net.weight']
-    """
+    """A state dict under the names of the uncompiled network."""
     return {name.replace(_PREFIX, ""): value for name, value in tensors.items()}

@@ -243,9 +243,6 @@ def load_imagenet(encoder: ImageEncoder) -> None:
 
     Group norm, which replaces batch norm, starts from no effect.
 
-    Args:
-        encoder: with the backbone ``"resnet18"``.
-
     Raises:
         ValueError: if it has another backbone.
         OSError: see :func:`imagenet_weights`.

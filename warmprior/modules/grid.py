@@ -9,11 +9,7 @@ JUMP = 0.5
 
 
 def check_grid(grid: str) -> None:
-    """Check that a grid has this name, see :func:`grid_parts`.
-
-    Raises:
-        ValueError: if there is none, or its jump does not start in (0, 1).
-    """
+    """A ``ValueError`` if no grid has this name, or its jump does not start in (0, 1)."""
     _jump(grid)
 
 

@@ -75,14 +75,7 @@ class VelocityNetwork(nn.Module, Registered):
         self.observation_steps = observation_steps
 
     def check_chunk(self, a: Tensor) -> None:
-        """Compare a chunk with what the network was built for.
-
-        Args:
-            a: ``[B, P, d_a]``.
-
-        Raises:
-            ValueError: naming the expected and the given shape.
-        """
+        """A ``ValueError`` if the network was built for other chunks than ``a`` ``[B, P, d_a]``."""
         expected = (self.prediction_length, self.action_dim)
         if tuple(a.shape[1:]) != expected:
             raise ValueError(
@@ -91,14 +84,9 @@ class VelocityNetwork(nn.Module, Registered):
             )
 
     def check_shapes(self, a: Tensor, observation: Tensor | TensorDictBase) -> None:
-        """Compare the inputs with what the network was built for.
+        """A ``ValueError`` if the network was built for other inputs.
 
-        Args:
-            a: ``[B, P, d_a]``.
-            observation: ``[B, To, d_o]``.
-
-        Raises:
-            ValueError: naming the expected and the given shape.
+        Those are chunks ``a`` ``[B, P, d_a]`` and observations ``[B, To, d_o]``.
         """
         self.check_chunk(a)
         expected = (self.observation_steps, self.observation_dim)
@@ -112,45 +100,29 @@ class VelocityNetwork(nn.Module, Registered):
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """Encode an observation once, before the field is evaluated at it many times.
 
-        The network takes the result in place of the observation. By default this does nothing.
-
-        Args:
-            observation: ``[B, To, d_o]``, or a tensordict ``[B]``.
+        The network takes the result in place of the observation, ``[B, To, d_o]`` or a tensordict ``[B]``. By
+        default this does nothing.
         """
         return observation
 
     def parameter_groups(self, weight_decay: float) -> list[dict[str, Any]]:
-        """Optimiser groups: decay on matrix weights, none on biases, norms and embeddings.
-
-        Args:
-            weight_decay: decay of the first group.
-        """
+        """Optimiser groups: decay on matrix weights, none on biases, norms and embeddings."""
         decay: list[nn.Parameter] = []
         no_decay: list[nn.Parameter] = []
         for name, parameter in self.named_parameters():
             is_matrix = parameter.ndim >= 2 and not name.endswith("position")
             (decay if is_matrix else no_decay).append(parameter)
-        return [
-            {"params": decay, "weight_decay": weight_decay},
-            {"params": no_decay, "weight_decay": 0.0},
-        ]
+        return [{"params": decay, "weight_decay": weight_decay}, {"params": no_decay, "weight_decay": 0.0}]
 
 
 def velocity_field(
     network: nn.Module, observation: Tensor | TensorDictBase
 ) -> Callable[[Tensor, Tensor], Tensor]:
-    """A network's velocity ``(t, a) -> v`` at observations, in the dtype of ``a``.
+    """A network's velocity ``(t [B], a [B, P, d_a]) -> v`` at observations, in the dtype of ``a``.
 
-    The observations are encoded once (:meth:`VelocityNetwork.encode`), however often the field is evaluated.
-
-    The network computes in its own dtype (that of its first parameter), so float64 environments and bfloat16
-    networks need no casts elsewhere. The path is integrated, and its error measured, in the dtype of the
-    actions.
-
-    Args:
-        network: ``(t [B], a_t [B, P, d_a], observation) -> [B, P, d_a]``.
-        observation: ``[B, To, *]``, or a tensordict of such entries; whole numbers, such as pixels, are
-            left as they are.
+    The observations, ``[B, To, *]`` or a tensordict of such entries, are encoded once. The network computes
+    in its own dtype (that of its first parameter): float64 environments and bfloat16 networks need no casts
+    elsewhere, and the path is integrated, and its error measured, in the dtype of the actions.
     """
     dtype = _precision(network)
     seen = _encoded(network, observation, dtype)
@@ -160,12 +132,7 @@ def velocity_field(
 
 
 def encoded(network: nn.Module, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
-    """The observations as the network encodes them (:meth:`VelocityNetwork.encode`), in its own dtype.
-
-    Args:
-        network: see :func:`velocity_field`.
-        observation: see :func:`velocity_field`.
-    """
+    """The observations as the network encodes them (:meth:`VelocityNetwork.encode`), in its own dtype."""
     return _encoded(network, observation, _precision(network))
 
 
@@ -197,12 +164,7 @@ def _first_precision(module: nn.Module, kind: str) -> torch.dtype | None:
 
 
 def network_observation(observation: Tensor | TensorDictBase, batch: torch.Size) -> Tensor | TensorDictBase:
-    """The observation with a single batch dimension, as a network takes it.
-
-    Args:
-        observation: ``[*B, To, *]``, or a tensordict ``[*B]`` of such entries.
-        batch: ``*B``.
-    """
+    """An observation, ``[*B, To, *]`` or a tensordict ``[*B]``, with one batch dimension for ``*B``."""
     if len(batch) == 1:
         return observation
     if isinstance(observation, TensorDictBase):

@@ -133,9 +133,6 @@ class Normalizer(nn.Module):
 
         Observations are normalised on the way out and actions denormalised on the way in. Append them
         before :class:`~warmprior.ChunkStep`, so that they act on every control step.
-
-        Args:
-            action_key: which of the keys is the action.
         """
         transforms: list[Transform] = []
         for key in self.keys:

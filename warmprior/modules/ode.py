@@ -51,9 +51,7 @@ SOLVERS: dict[str, _Tableau] = {
     "midpoint": _Tableau((0.0, 0.5), ((), (0.5,)), (0.0, 1.0)),
     "heun": _Tableau((0.0, 1.0), ((), (1.0,)), (0.5, 0.5)),
     "rk4": _Tableau(
-        (0.0, 0.5, 0.5, 1.0),
-        ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
-        (1 / 6, 1 / 3, 1 / 3, 1 / 6),
+        (0.0, 0.5, 0.5, 1.0), ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
     ),
 }
 
@@ -236,11 +234,7 @@ class ODEActor(TensorDictModuleBase):
         self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
 
     def check_nfe(self, nfe: int) -> None:
-        """Check that solver and network support ``nfe`` network evaluations.
-
-        Raises:
-            ValueError: if one of them cannot.
-        """
+        """A ``ValueError`` unless solver and network support ``nfe`` network evaluations."""
         _steps(nfe, self.solver)
         if self.max_nfe is not None and nfe > self.max_nfe:
             raise ValueError(
@@ -249,18 +243,12 @@ class ODEActor(TensorDictModuleBase):
             )
 
     def forward(
-        self,
-        tensordict: TensorDictBase,
-        nfe: int | None = None,
-        sigma: Tensor | None = None,
+        self, tensordict: TensorDictBase, nfe: int | None = None, sigma: Tensor | None = None
     ) -> TensorDictBase:
         """Write the chunk (and the path, where asked for).
 
-        Args:
-            tensordict: with the input keys.
-            nfe: network evaluations of this call.
-            sigma: standard deviation of the source, broadcastable to ``[*B, P, d_a]``, for the guidance; 1
-                by default.
+        ``sigma`` is the source's standard deviation for the guidance, broadcastable to ``[*B, P, d_a]``; 1 by
+        default.
         """
         nfe = self.nfe if nfe is None else nfe
         self.check_nfe(nfe)

@@ -245,10 +245,7 @@ class PreconditionedNetwork(VelocityNetwork):
         if isinstance(interpolant, dict):
             interpolant = from_config(Interpolant, interpolant)
         super().__init__(
-            network.action_dim,
-            network.observation_dim,
-            network.prediction_length,
-            network.observation_steps,
+            network.action_dim, network.observation_dim, network.prediction_length, network.observation_steps
         )
         self.network = network
         self.encodes = getattr(network, "encodes", False)
@@ -291,13 +288,9 @@ class PreconditionedNetwork(VelocityNetwork):
         return self.network.parameter_groups(weight_decay)
 
     def remainder(self, t: Tensor) -> Tensor:
-        """Standard deviation of the remainder of the velocity, the unit of ``F``.
+        """Standard deviation of the remainder of the velocity at times ``[B]``, the unit of ``F``.
 
-        Args:
-            t: times, ``[B]``.
-
-        Returns:
-            ``[B, P, d_a]``, larger than 0.
+        ``[B, P, d_a]``, larger than 0.
         """
         coefficients = self.interpolant.coefficients(t[:, None, None])
         return self._remainder(*coefficients) * self._scale(*coefficients[:2])

@@ -127,11 +127,7 @@ class RealTimeChunking:
         return asdict(self)
 
     def check_delay(self, delay: int, left: int) -> None:
-        """Check that chunks with this delay can be guided.
-
-        Args:
-            delay: ``d``, control steps.
-            left: actions left of the old chunk when the new one begins.
+        """Check that chunks with this delay can be guided by so many actions of the old chunk.
 
         Raises:
             ValueError: if the delay exceeds the leftover or the horizon.
@@ -148,16 +144,10 @@ class RealTimeChunking:
             )
 
     def weights(self, delay: Tensor, left: Tensor, length: int, dtype: torch.dtype | None = None) -> Tensor:
-        """:math:`W`, by position.
+        """:math:`W` by position, ``[*B, P]``, between 0 and 1.
 
-        Args:
-            delay: ``d``, int64 ``[*B]``.
-            left: number of positions of the leftover, int64 ``[*B]``; the others have weight 0.
-            length: ``P``.
-            dtype: of the weights; PyTorch's default one by default.
-
-        Returns:
-            ``[*B, P]``, between 0 and 1.
+        For a ``delay`` and ``left`` positions of the leftover, each int64 ``[*B]``, of ``length`` ``P``; the
+        other positions have weight 0.
         """
         i = torch.arange(length, device=delay.device)
         end = (left if self.horizon is None else left.clamp(max=self.horizon)).unsqueeze(-1)
@@ -166,12 +156,7 @@ class RealTimeChunking:
         return torch.where(i < end, SCHEDULES[self.schedule](linear), 0.0)
 
     def guidance_weight(self, t: Tensor, sigma: Tensor | float = 1.0) -> Tensor:
-        r""":math:`\min(g(t), \beta)`.
-
-        Args:
-            t: times in [0, 1], ``[...]``.
-            sigma: standard deviation of the source, broadcastable to ``t``; see ``sigma`` above.
-        """
+        r""":math:`\min(g(t), \beta)` at times in [0, 1]; the source's deviation broadcasts to them."""
         if self.sigma is not None:
             sigma = self.sigma
         tiny = torch.finfo(t.dtype).tiny
@@ -180,12 +165,7 @@ class RealTimeChunking:
         return (source + data).clamp(max=self.max_guidance_weight)
 
     def guided(
-        self,
-        velocity: Velocity,
-        leftover: Tensor,
-        left: Tensor,
-        delay: Tensor,
-        sigma: Tensor | float = 1.0,
+        self, velocity: Velocity, leftover: Tensor, left: Tensor, delay: Tensor, sigma: Tensor | float = 1.0
     ) -> Velocity:
         """A velocity that makes chunks continue the leftover.
 

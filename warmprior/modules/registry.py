@@ -110,10 +110,6 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
 
     Importing runs code, so use this for names that a user typed, and never for names in a file.
 
-    Args:
-        base: of the registry.
-        name: of the subclass, or ``"module:Class"``.
-
     Raises:
         ValueError: if there is none, or it is a base class.
 
@@ -137,12 +133,9 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
 
 
 def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
-    """Build what a user typed.
+    """Build what a user typed: a name as for :func:`find`, and options behind it, as in :func:`options_of`.
 
-    Args:
-        base: of the registry.
-        text: as for :func:`find`, with options behind it if any, see :func:`options_of`.
-        args: further arguments of the constructor.
+    ``args`` are further arguments of the constructor.
 
     Raises:
         ValueError: if there is no such class, or an argument is out of range or unknown, naming it and what
@@ -166,12 +159,9 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
 
 
 def options_of(text: str) -> dict[str, Any]:
-    """The options behind a name, as JSON or plain text.
+    """The options of ``name,option=value,...``, as JSON or plain text.
 
     A comma separates options if ``option=`` follows, and belongs to the value otherwise.
-
-    Args:
-        text: ``name,option=value,...``.
 
     Raises:
         ValueError: if they are not written like this, or one is given twice.

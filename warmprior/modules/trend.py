@@ -75,8 +75,7 @@ class RestingAction(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """The action, ``[*B, 10 * arms]`` in normalised units; 0 for the gripper.
 
-        Args:
-            observation: ``[*B, d_o]``, normalised; further entries at its end are ignored.
+        Observations are ``[*B, d_o]``, normalised; further entries at their end are ignored.
         """
         pose = observation[..., self.columns] * self.scale + self.loc
         hand = quaternion_to_matrix(pose[..., 3:])
@@ -185,8 +184,7 @@ class PoseTrend(nn.Module):
     def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
         """The predicted deviations of source and target from their means, each ``[B, P, d_a]``.
 
-        Args:
-            observation: ``[B, To, d_o]``, normalised; the last step counts.
+        Of normalised observations ``[B, To, d_o]`` the last step counts.
         """
         deviation = (self.rest(observation[:, -1]) - self.centre).unsqueeze(1)
         return deviation * self.source, deviation * self.target

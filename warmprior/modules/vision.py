@@ -61,10 +61,7 @@ class VisionNetwork(VelocityNetwork):
                 f"gives {encoder.observation_dim}"
             )
         super().__init__(
-            network.action_dim,
-            network.observation_dim,
-            network.prediction_length,
-            network.observation_steps,
+            network.action_dim, network.observation_dim, network.prediction_length, network.observation_steps
         )
         self.encoder, self.network = encoder, network
 

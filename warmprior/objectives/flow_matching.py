@@ -33,24 +33,8 @@ DISTILLED_SHARE = 0.25
 """Share of a batch, as in shortcut models: each of these windows costs nine more forward passes."""
 
 
-def check_objective(
-    *,
-    times: str,
-    objective: str,
-    weighting: str | None,
-    self_distillation: float,
-) -> None:
-    """Check that there is a loss with these options.
-
-    Keyword Args:
-        times: name of the distribution of the times.
-        objective: see :class:`FlowMatchingLoss`.
-        weighting: see :class:`FlowMatchingLoss`.
-        self_distillation: see :class:`FlowMatchingLoss`.
-
-    Raises:
-        ValueError: naming the option.
-    """
+def check_objective(*, times: str, objective: str, weighting: str | None, self_distillation: float) -> None:
+    """A ``ValueError`` names the option if :class:`FlowMatchingLoss` has no such loss."""
     choices = {
         "times": (times, TIMES),
         "objective": (objective, get_args(Objective)),
@@ -61,10 +45,7 @@ def check_objective(
             raise ValueError(f"{name} must be one of {', '.join(filter(None, known))}, got {value!r}")
     if not (self_distillation >= 0 and math.isfinite(self_distillation)):
         raise ValueError(f"self_distillation must be a finite weight >= 0, got {self_distillation}")
-    needs = {
-        "objective": objective != "velocity" and objective,
-        "self_distillation": self_distillation,
-    }
+    needs = {"objective": objective != "velocity" and objective, "self_distillation": self_distillation}
     for name, asked in needs.items():
         if asked and times == "start":
             raise ValueError(
@@ -356,10 +337,7 @@ class FlowMatchingLoss(LossModule):
             point, _ = self.interpolant(a0, a1, a0.new_full((n,), near))
             teacher = self.velocity_network if self.teacher is None else self.teacher
             end = integrate(
-                velocity_field(teacher, observation),
-                point,
-                nfe=TEACHER_STEPS - 1,
-                start_time=near,
+                velocity_field(teacher, observation), point, nfe=TEACHER_STEPS - 1, start_time=near
             )
         t = a0.new_full((n,), begin)
         jump = velocity_field(self.velocity_network, observation)(t, start)

@@ -33,12 +33,6 @@ def uniform_times(
 ) -> Tensor:
     """All times alike, as in Algorithm 1.
 
-    Args:
-        shape: of the result.
-        generator: source of randomness on ``device``.
-        dtype: of the result.
-        device: of the result.
-
     See Also:
         - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
         - :class:`~warmprior.FlowMatchingLoss`: draws its times so.
@@ -66,12 +60,6 @@ def u_shaped_times(
     .. math::
         F(t) = \frac12 + \frac{\sinh(a(t - \frac12))}{2 \sinh\frac a2}.
 
-    Args:
-        shape: of the result.
-        generator: source of randomness on ``device``.
-        dtype: of the result.
-        device: of the result.
-
     See Also:
         - :func:`~warmprior.objectives.times.logit_normal_times`: prefers the middle.
         - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
@@ -94,12 +82,6 @@ def logit_normal_times(
 ) -> Tensor:
     r"""More often in the middle: :math:`\log\frac t{1-t} \sim N(0, 1)` (Esser et al., 2024).
 
-    Args:
-        shape: of the result.
-        generator: source of randomness on ``device``.
-        dtype: of the result.
-        device: of the result.
-
     See Also:
         - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
         - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
@@ -121,12 +103,6 @@ def start_times(
     r"""``t = 0`` alone: the network regresses :math:`a_1 - a_0`, and one step of Euler's method returns it.
 
     The field is not trained at any other time: build the policy with ``max_nfe=1``.
-
-    Args:
-        shape: of the result.
-        generator: not used.
-        dtype: of the result.
-        device: of the result.
 
     See Also:
         :class:`~warmprior.FlowMatchingLoss`: can be trained so.

@@ -15,9 +15,9 @@ from torchrl.objectives import LossModule, SACLoss, SoftUpdate, ValueEstimators
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_finite
 from warmprior.rl.anchor import has_anchor
 from warmprior.rl.box_normal import BoxTanhNormal
-from warmprior.rl.checks import check_finite
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.decoder import PriorDecoder
 from warmprior.rl.dsrl import DSRLNALoss
@@ -29,13 +29,10 @@ __all__ = ["PriorSpaceAgent"]
 
 
 class PriorSpaceAgent:
-    """An agent around a frozen policy, its critics, and one update of them.
+    """An agent around a copy of a frozen policy, its critics, and one update of them.
 
-    Initial weights follow from PyTorch's global generator.
-
-    Args:
-        actor: the frozen policy; copied.
-        config: the recipe.
+    Initial weights follow from PyTorch's global generator. A ``ValueError`` if the recipe does not suit the
+    policy.
 
     Attributes:
         decoder: the frozen policy as a decoder.
@@ -43,18 +40,6 @@ class PriorSpaceAgent:
         policy: the agent followed by the decoder.
         warmup: residuals from the prior, clipped to the agent's box, followed by the decoder.
         loss: DSRL-NA's or TorchRL's SAC.
-
-    Raises:
-        ValueError: if the recipe does not suit the policy.
-
-    Examples:
-        >>> from warmprior.rl.agent import PriorSpaceAgent
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.rl import PriorSpaceConfig
-        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4), nfe=1)
-        >>> agent = PriorSpaceAgent(actor, PriorSpaceConfig(hidden_dim=8))
-        >>> agent.decoder.delta, type(agent.loss).__name__
-        (0.5, 'DSRLNALoss')
     """
 
     def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
@@ -123,16 +108,10 @@ class PriorSpaceAgent:
         return iter([self.loss] * self.config.updates)
 
     def learn(self, buffer: ReplayBuffer) -> dict[str, float]:
-        """The updates for one vector step of the environment, each on its own batch.
+        """The updates for one vector step of the environment, each on its own batch from the agent's device.
 
-        Args:
-            buffer: transitions on the agent's device.
-
-        Returns:
-            The critic's loss ``"q"`` and the temperature ``"alpha"`` of the last update.
-
-        Raises:
-            FloatingPointError: if a loss is NaN or infinite, naming it, before it changes anything.
+        Of the last one the critic's loss ``"q"`` and the temperature ``"alpha"``. A ``FloatingPointError``
+        names a loss that is NaN or infinite before it changes anything.
         """
         values: dict[str, Tensor] = {}
         for compute in self._schedule():
@@ -154,11 +133,7 @@ class PriorSpaceAgent:
         return dict(self.loss.named_parameters()) | targets
 
     def state(self) -> dict[str, Tensor]:
-        """All that learning has changed, by name.
-
-        Raises:
-            FloatingPointError: if any of it is NaN or infinite: a finite loss may have an infinite gradient.
-        """
+        """All that learning has changed, by name, checked: a finite loss may have an infinite gradient."""
         tensors = {
             **named("loss", self._parameters()),
             **named("optimizer", snapshot_optimizer(self.optimizer)),

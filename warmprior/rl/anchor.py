@@ -26,9 +26,6 @@ def has_anchor(actor: Any) -> bool:
     It has if the policy has a start point, or its prior's mean is warm once the history is full. Otherwise
     agents search around zero, as in DSRL.
 
-    Args:
-        actor: the policy.
-
     See Also:
         :func:`~warmprior.rl.source_anchor`: returns that centre.
 
@@ -83,11 +80,7 @@ def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | Non
 
 
 def residual_sigma(actor: Any) -> float:
-    """Typical deviation of a policy's source from the centre of the search; 1 around zero.
-
-    Args:
-        actor: the policy.
-    """
+    """Typical deviation of a policy's source from the centre of the search; 1 around zero."""
     if not has_anchor(actor):
         return 1.0
     if actor.start is not None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_finite_numbers, check_positive, check_whole_numbers
 from warmprior.rl.anchor import has_anchor
-from warmprior.rl.checks import check_counts, check_positive
 from warmprior.rl.residual import ResidualDistribution
 
 __all__ = ["PriorSpaceConfig"]
@@ -98,9 +97,7 @@ class PriorSpaceConfig:
             raise ValueError("dsrl-sac has backup='min' and backup_entropy=True; leave them out")
         if self.algorithm == "dsrl-sac" and self.distillation is not None:
             raise ValueError("dsrl-sac has no noise critic: leave distillation out")
-        for name in ("target_entropy", "reward_offset"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"{name} must be a finite number, got {getattr(self, name)}")
+        check_finite_numbers(target_entropy=self.target_entropy, reward_offset=self.reward_offset)
         check_positive(learning_rate=self.learning_rate, alpha_init=self.alpha_init)
         if self.delta is not None:
             check_positive(delta=self.delta)
@@ -110,7 +107,7 @@ class PriorSpaceConfig:
         counts = ("environment_steps", "warmup_steps", "nfe", "updates", "batch_size")
         sizes = ("noise_critic_steps", "hidden_dim", "num_layers")
         names = (*counts, *sizes, "evaluate_every", "evaluation_episodes")
-        check_counts(**{name: getattr(self, name) for name in names})
+        check_whole_numbers(**{name: getattr(self, name) for name in names})
         if self.warmup_steps > self.environment_steps:
             raise ValueError(
                 f"warmup_steps ({self.warmup_steps}) exceed environment_steps ({self.environment_steps})"

@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.rl.checks import check_positive
+from warmprior.modules.checks import check_positive
 
 __all__ = ["PriorDecoder"]
 
@@ -149,10 +149,7 @@ class PriorDecoder(TensorDictModuleBase):
         return tensordict.set(self.chunk_key, chunk)
 
     def check_env(self, env: EnvBase) -> None:
-        """Compare the policy with an environment: chunk length and action width.
-
-        Args:
-            env: an environment whose action is the chunk.
+        """Compare the policy with an environment whose action is the chunk: its length and width.
 
         Raises:
             KeyError: if the environment takes no chunk.

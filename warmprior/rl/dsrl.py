@@ -9,11 +9,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModule,
-    TensorDictModuleBase,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -23,8 +19,8 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from warmprior import keys
+from warmprior.modules.checks import check_finite, check_positive, check_whole_numbers
 from warmprior.rl.box_normal import BoxTanhNormal
-from warmprior.rl.checks import check_counts, check_finite, check_positive
 from warmprior.rl.decoder import PriorDecoder
 from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 
@@ -182,7 +178,7 @@ class DSRLNALoss(LossModule):
             raise ValueError(f"backup must be 'min' or 'mean', got {backup!r}")
         if discount not in ("step", "decision"):
             raise ValueError(f"discount must be 'step' or 'decision', got {discount!r}")
-        check_counts(num_qvalue_nets=num_qvalue_nets, noise_critic_steps=noise_critic_steps)
+        check_whole_numbers(num_qvalue_nets=num_qvalue_nets, noise_critic_steps=noise_critic_steps)
         check_positive(alpha_init=alpha_init)
         if not math.isfinite(target_entropy):
             raise ValueError(f"target_entropy must be a finite number, got {target_entropy}")
@@ -253,52 +249,35 @@ class DSRLNALoss(LossModule):
     def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> None:
         """Choose the discount: ``make_value_estimator(ValueEstimators.TD0, gamma=0.99)``.
 
-        Args:
-            value_type: ``TD0``, the only one that fits, or an estimator of the user's.
-            hyperparams: ``gamma``, see the option ``discount``.
+        ``TD0`` is the only one that fits, besides an estimator of the user's.
         """
         value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if value_type is not None:
             dispatch_value_estimator(
-                self,
-                value_type,
-                supported=(ValueEstimators.TD0,),
-                value_network=None,
-                **hyperparams,
+                self, value_type, supported=(ValueEstimators.TD0,), value_network=None, **hyperparams
             )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """All four losses on one batch.
+        """All four losses on one batch of transitions ``[N]``.
 
-        Args:
-            tensordict: transitions ``[N]``, see the class docstring.
-
-        Returns:
-            TensorDict of scalars: ``loss_actor``, ``loss_alpha``, ``loss_qvalue`` and
-            ``loss_qvalue_noise``, and detached ``alpha``, ``entropy`` (units of the box) and ``td_error``.
+        They are scalars: ``loss_actor``, ``loss_alpha``, ``loss_qvalue`` and ``loss_qvalue_noise``, and
+        detached ``alpha``, ``entropy`` (units of the box) and ``td_error``.
         """
         return self.reinforcement_loss(tensordict).update(self.distillation_loss(tensordict))
 
     def schedule(self, updates: int) -> Iterator[Callable[[TensorDictBase], TensorDict]]:
         """The official order: the first three losses ``updates`` times, then the distillation.
 
-        Args:
-            updates: the official ``utd``: updates per vector step, 20 for four environments.
-
-        Returns:
-            The methods to call, each on a batch of its own.
-
-        Raises:
-            ValueError: if ``updates < 1``.
+        The methods to call, each on a batch of its own. ``updates`` is the official ``utd``: updates per
+        vector step, 20 for four environments. A ``ValueError`` if it is below 1.
         """
-        check_counts(updates=updates)
+        check_whole_numbers(updates=updates)
         return iter([self.reinforcement_loss] * updates + [self.distillation_loss] * self.noise_critic_steps)
 
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """The losses of the actor, the temperature and the action critic, and the diagnostics.
 
-        Args:
-            tensordict: transitions ``[N]``, see the class docstring. The TD errors are written to it.
+        On transitions ``[N]``, to which the TD errors are written.
         """
         self._check_keys(tensordict, self._reinforcement_keys())
         weights = self._maybe_get_priority_weight(tensordict)
@@ -314,11 +293,7 @@ class DSRLNALoss(LossModule):
         loss_actor = alpha * log_prob - self._combine(value)
         loss_alpha = -self.log_alpha * (log_prob.detach() + self.target_entropy)
         losses = {"loss_actor": loss_actor, "loss_alpha": loss_alpha, "loss_qvalue": loss_qvalue}
-        diagnostics = {
-            "alpha": alpha,
-            "entropy": -log_prob.detach().mean(),
-            "td_error": td_error.mean(),
-        }
+        diagnostics = {"alpha": alpha, "entropy": -log_prob.detach().mean(), "td_error": td_error.mean()}
         return self._finish(losses, tensordict, weights).update(diagnostics)
 
     def _qvalue_loss(self, tensordict: TensorDictBase, alpha: Tensor) -> tuple[Tensor, Tensor]:
@@ -339,8 +314,7 @@ class DSRLNALoss(LossModule):
     def distillation_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of the noise critic against the action critic on decoded residuals, head by head.
 
-        Args:
-            tensordict: any states ``[N]``; actions, rewards and next states are not read.
+        On any states ``[N]``; actions, rewards and next states are not read.
         """
         self._check_keys(tensordict, self._distillation_keys())
         weights = self._maybe_get_priority_weight(tensordict)
@@ -407,17 +381,9 @@ class DSRLNALoss(LossModule):
 
 
 def _check_networks(
-    actor: ProbabilisticTensorDictSequential,
-    chunk_critic: Any,
-    noise_critic: Any,
-    decoder: PriorDecoder,
+    actor: ProbabilisticTensorDictSequential, chunk_critic: Any, noise_critic: Any, decoder: PriorDecoder
 ) -> None:
-    """Check that the networks read and write the decoder's keys.
-
-    Raises:
-        TypeError: if the actor gives no distribution.
-        ValueError: naming the network and the key or size.
-    """
+    """Check that the networks read and write the decoder's keys; an error names what does not."""
     if not isinstance(actor, ProbabilisticTensorDictSequential):
         raise TypeError(
             f"the actor must be the ProbabilisticActor alone, without a decoder behind it, got "

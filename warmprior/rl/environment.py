@@ -72,9 +72,7 @@ class PriorSpace(Transform):
         chunk_key: NestedKey = keys.DECODED_CHUNK,
     ) -> None:
         super().__init__(
-            out_keys=[noise_key, chunk_key],
-            in_keys_inv=[decoder.chunk_key],
-            out_keys_inv=[decoder.delta_key],
+            out_keys=[noise_key, chunk_key], in_keys_inv=[decoder.chunk_key], out_keys_inv=[decoder.delta_key]
         )
         self.decoder = decoder
 

@@ -13,7 +13,7 @@ from torchrl.data import Bounded, Composite
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 
 from warmprior import keys
-from warmprior.rl.checks import check_counts, check_positive
+from warmprior.modules.checks import check_positive, check_whole_numbers
 
 __all__ = ["make_prior_space_actor", "make_prior_space_critic"]
 
@@ -37,7 +37,7 @@ class _Trunk(nn.Module):
         scales: Mapping[NestedKey, float],
     ) -> None:
         super().__init__()
-        check_counts(
+        check_whole_numbers(
             prediction_length=chunk[0],
             action_dim=chunk[1],
             observation_steps=observation[0],
@@ -133,13 +133,7 @@ def make_prior_space_actor(
     check_positive(delta=delta)
     chunk = (prediction_length, action_dim)
     trunk = _Trunk(
-        in_keys,
-        chunk,
-        (observation_steps, observation_dim),
-        2 * math.prod(chunk),
-        hidden_dim,
-        num_layers,
-        {},
+        in_keys, chunk, (observation_steps, observation_dim), 2 * math.prod(chunk), hidden_dim, num_layers, {}
     )
     parameters = ["delta_loc", "delta_scale"]
     return ProbabilisticActor(

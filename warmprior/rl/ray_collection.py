@@ -26,14 +26,9 @@ EPISODES_APART = 10_000
 
 
 class WarmUpSwitch(TensorDictModuleBase):
-    """Switches between two policies by a buffer, which collectors receive with the weights.
+    """Acts by ``warmup``, and by ``policy`` once ``learning`` is set.
 
-    Args:
-        warmup: acts until ``learning`` is set.
-        policy: acts then.
-
-    Attributes:
-        learning (Tensor): bool ``[]``.
+    That is a buffer, bool ``[]``, which collectors receive with the weights.
 
     See Also:
         - :func:`~warmprior.rl.ray_collection.ray_rounds`: collects with it.
@@ -78,9 +73,7 @@ def _actor_class() -> type:
         def __repr__(self) -> str:  # Ray writes it before every line that an actor prints
             return "collector"
 
-        def __bool__(
-            self,
-        ) -> bool:  # Ray asks for it, and the infinite length would raise
+        def __bool__(self) -> bool:  # Ray asks for it, and the infinite length would raise
             return True
 
     return Actor

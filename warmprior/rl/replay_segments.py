@@ -19,11 +19,7 @@ class ReplaySegments:
     """A folder of safetensors files, one per save, with the transitions since the one before.
 
     A segment is valid once :attr:`committed` counts it. If a process dies between writing a segment and its
-    training state, the next one replaces that segment.
-
-    Args:
-        directory: the folder; created with the first segment.
-        segments: how many of its segments are to be kept.
+    training state, the next one replaces that segment. Of a folder that exists ``segments`` are kept.
 
     See Also:
         :class:`~warmprior.rl.PriorSpaceTraining`: saves its replay buffer so.

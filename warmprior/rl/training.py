@@ -20,9 +20,9 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_finite
 from warmprior.rl.agent import PriorSpaceAgent
 from warmprior.rl.anchor import has_anchor
-from warmprior.rl.checks import check_finite
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
 from warmprior.rl.replay_segments import ReplaySegments
@@ -118,11 +118,7 @@ class PriorSpaceTraining:
         self.segments = ReplaySegments(self.directory / "buffer")
         self.steps = 0
         self.curve: list[dict[str, Any]] = []
-        self.identity = {
-            "config": asdict(config),
-            "prior": actor.prior.config(),
-            "policy": _digest(actor),
-        }
+        self.identity = {"config": asdict(config), "prior": actor.prior.config(), "policy": _digest(actor)}
         if self.state_path.exists():
             self._restore()
 

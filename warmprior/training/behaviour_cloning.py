@@ -95,9 +95,11 @@ class BehaviourCloning:
         - :func:`~warmprior.training.evaluate`: plays episodes with what it trained.
 
     Examples:
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.envs import navigation_demonstrations
+        >>> from warmprior.training import BehaviourCloning, TrainingConfig
         >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
         >>> actor = WarmPriorActor(network, PastPrior(4))
         >>> config = TrainingConfig(iterations=2, batch_size=8, checkpoints=1)
@@ -232,11 +234,7 @@ class BehaviourCloning:
         return policy_path(self.directory, self.config.iterations if iteration is None else iteration)
 
     def step(self) -> torch.Tensor:
-        """One gradient step: sample, loss, backward, optimiser, schedule, averaging.
-
-        Returns:
-            The loss of this process's part of the batch, a detached scalar.
-        """
+        """One gradient step; the loss of this process's part of the batch, a detached scalar."""
         if self._graphs:  # what the graphs of the last step have left may be overwritten
             torch.compiler.cudagraph_mark_step_begin()
         batch = self._prefetch() if self._prefetch else self.replay_buffer.sample()

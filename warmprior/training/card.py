@@ -30,7 +30,10 @@ def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
         ValueError: if they are damaged, or none is of the policy.
 
     Examples:
+        >>> import json
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.training import policy_results
         >>> row = {"task": "lift", "data": "ph", "policy": "lift-ph", "checkpoint": 20, "success_rate": 0.5}
         >>> with TemporaryDirectory() as folder:
         ...     _ = (Path(folder) / "results.jsonl").write_text(json.dumps(row))
@@ -81,7 +84,8 @@ def model_card(
         ImportError: if huggingface_hub is not installed.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.training import model_card
         >>> card = model_card(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), licence="mit")
         >>> "license: mit" in card, "`PastPrior(chunk_length=4, sigma=0.5, correlation=0.0)`" in card
         (True, True)

@@ -31,11 +31,7 @@ def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, An
 def load_state(
     path: Path, what: str = "training state", advice: str = "Remove it to train again"
 ) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Read what :func:`save_state` wrote, once: what is checked is what is given back.
-
-    Raises:
-        ValueError: if the file is damaged or was written by something else.
-    """
+    """Read what :func:`save_state` wrote, once: what is checked is what is given back."""
     check_regular(path)
     try:
         tensors, metadata = read_tensors(path.read_bytes())

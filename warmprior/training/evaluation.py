@@ -47,7 +47,9 @@ class Episode:
             ``D`` are a rollout for :func:`~warmprior.diagnostics.smoothness`.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
+        >>> from warmprior.training import Episode
         >>> solved = Episode(7, True, 90, decisions=TensorDict({}, [12]))
         >>> played = [solved, Episode(8, False, 400, decisions=TensorDict({}, [50]))]
         >>> sum(episode.success for episode in played) / len(played)
@@ -128,8 +130,10 @@ def parallel_env(
         - :class:`~warmprior.envs.RobosuiteEnv`: what its processes usually hold.
 
     Examples:
+        >>> from functools import partial
         >>> from warmprior import PastPrior, policy_transforms
         >>> from warmprior.envs import NavigationEnv
+        >>> from warmprior.training import parallel_env
         >>> def make_env(seed_offset, seed_stride):  # nothing in this one is random
         ...     return NavigationEnv()
         >>> make_transforms = partial(policy_transforms, PastPrior(8), observation_steps=1)
@@ -263,8 +267,10 @@ def play_episode(
         - :func:`~warmprior.training.record_video`: films one.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP, policy_transforms
+        >>> from torchrl.envs import TransformedEnv
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import GoalNavigationEnv
+        >>> from warmprior.training import play_episode
         >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
         >>> actor = WarmPriorActor(network, PastPrior(8))
         >>> transforms = policy_transforms(actor.prior, observation_steps=1)
@@ -346,8 +352,10 @@ def evaluate(
         - :func:`~warmprior.diagnostics.success_posterior`: what the successes tell about the rate.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP, policy_transforms
+        >>> from torchrl.envs import TransformedEnv
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import GoalNavigationEnv
+        >>> from warmprior.training import evaluate
         >>> prior = PastPrior(8)
         >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
         >>> transforms = policy_transforms(prior, observation_steps=1)

@@ -89,6 +89,8 @@ class Filmstrip:
         - :func:`~warmprior.training.record_video`: films one.
 
     Examples:
+        >>> import numpy as np
+        >>> from warmprior.training import Filmstrip
         >>> frames = [np.zeros((160, 160, 3), np.uint8) for _ in range(3)]
         >>> strip = Filmstrip(frames, steps=[0, 38, 76], success=True)
         >>> [f"step {step}" for step in strip.steps], np.hstack(strip.frames).shape
@@ -138,6 +140,8 @@ def record_filmstrip(
         ValueError: if the policy keeps no description of its environment, or the size of a video is odd.
 
     Examples:
+        >>> from pathlib import Path
+        >>> from warmprior.training import load_policy, record_filmstrip
         >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> record_filmstrip(actor, seed=10_000_000, nfe=1, frames=5).steps  # doctest: +SKIP
         [0, 24, 48, 71, 95]
@@ -189,13 +193,7 @@ def check_video(path: Path) -> None:
     check_writable(path.parent)
 
 
-def record_video(
-    actor: WarmPriorActor,
-    path: Path,
-    *,
-    size: int = 256,
-    **options: Any,
-) -> bool:
+def record_video(actor: WarmPriorActor, path: Path, *, size: int = 256, **options: Any) -> bool:
     """Play the episode of one seed and write it as an MP4, a frame per control step.
 
     Args:
@@ -215,6 +213,8 @@ def record_video(
         ValueError: if the policy keeps no description of its environment, or the size is odd.
 
     Examples:
+        >>> from pathlib import Path
+        >>> from warmprior.training import load_policy, record_video
         >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> record_video(actor, Path("film.mp4"), seed=10_000_000, nfe=1)  # doctest: +SKIP
         True

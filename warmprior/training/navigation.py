@@ -46,7 +46,8 @@ def play_navigation(
         - :class:`~warmprior.envs.NavigationEnv`: the toy.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.training import play_navigation
         >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
         >>> rollout = play_navigation(WarmPriorActor(network, PastPrior(4)), seed=0, nfe=1, rollouts=2)
         >>> rollout.shape  # 64 steps, four per decision
@@ -62,24 +63,15 @@ def play_navigation(
 
 
 def judge_navigation(actor: WarmPriorActor, seed: int, *, nfe: int, rollouts: int = 256) -> dict[str, Any]:
-    """Play a policy on the toy and measure what it did.
+    """Play a policy on the toy (:func:`play_navigation`) and measure what it did.
 
-    Args:
-        actor: the policy.
-        seed: see :func:`play_navigation`.
-
-    Keyword Args:
-        nfe: network evaluations per chunk.
-        rollouts: how many.
-
-    Returns:
-        Metrics of the rollouts (:class:`~warmprior.envs.NavigationMetrics`), ``jump_ratio`` and ``jerk``
-        (:class:`~warmprior.diagnostics.Smoothness`), and some metrics under history shift
-        (``"shifted_..."``). A policy whose actions become NaN or infinite collides, and has no other
-        metrics.
+    Metrics of the rollouts (:class:`~warmprior.envs.NavigationMetrics`), ``jump_ratio`` and ``jerk``
+    (:class:`~warmprior.diagnostics.Smoothness`), and some metrics under history shift (``"shifted_..."``). A
+    policy whose actions become NaN or infinite collides, and has no other metrics.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.training import judge_navigation
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 16, 1, hidden_dim=8), PastPrior(16))
         >>> 0.0 <= judge_navigation(actor, 0, nfe=1, rollouts=8)["collision_rate"] <= 1.0
         True

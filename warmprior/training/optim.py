@@ -43,6 +43,7 @@ def make_optimizer(
 
     Examples:
         >>> from warmprior import VelocityMLP
+        >>> from warmprior.training import make_optimizer
         >>> optimizer = make_optimizer(VelocityMLP(2, 3, 8))
         >>> [group["weight_decay"] for group in optimizer.param_groups]
         [1e-05, 0.0]
@@ -71,6 +72,7 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
 
     Examples:
         >>> import torch
+        >>> from warmprior.training import warmup_cosine
         >>> optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=1.0)
         >>> schedule = warmup_cosine(optimizer, iterations=10, warmup_ratio=0.2)
         >>> rates = []
@@ -107,6 +109,8 @@ def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
         :class:`~warmprior.training.BehaviourCloning`: saves the averaged weights.
 
     Examples:
+        >>> from torch import nn
+        >>> from warmprior.training import ema_of
         >>> network = nn.Linear(1, 1, bias=False)
         >>> average = ema_of(network, rate=0.9)
         >>> for weight in (0.0, 1.0):

@@ -76,6 +76,7 @@ class DataOptions:
         :func:`~warmprior.training.find_tasks`: reads what they name.
 
     Examples:
+        >>> from warmprior.training import DataOptions
         >>> options = DataOptions(data=("ph", "mh"), demonstrations=(20, 60))
         >>> options.count("ph"), options.count("mh"), options.generated
         (20, 60, True)
@@ -182,6 +183,7 @@ class NetworkOptions:
 
     Examples:
         >>> import torch
+        >>> from warmprior.training import NetworkOptions
         >>> options = NetworkOptions(network="chi_transformer", hidden_dim=48)
         >>> network = options.make(action_dim=7, observation_dim=23, prediction_length=8)
         >>> seen, noisy = torch.zeros(1, options.observation_steps, 23), torch.zeros(1, 8, 7)

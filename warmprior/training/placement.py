@@ -18,14 +18,12 @@ DEVICE_SHARE = 0.5
 
 
 def placed(data: TensorDictBase, device: torch.device | str) -> TensorDictBase:
-    """The demonstrations on a device if they fit, or where they are.
-
-    Args:
-        data: contiguous steps, see :class:`~warmprior.ActionWindow`.
-        device: of the network.
+    """The demonstrations, contiguous steps, on the network's device if they fit, or where they are.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
+        >>> from warmprior.training.placement import placed
         >>> placed(TensorDict({"action": torch.zeros(3, 2)}, [3]), "cpu").device
         device(type='cpu')
     """
@@ -46,16 +44,11 @@ class Prefetch:
 
     The prefetching of TorchRL's replay buffers cannot be used here: batches on their way have been drawn
     already, so that a stored random state would lose them. This one knows the state that belongs to the batch
-    it gave last.
-
-    Args:
-        sample: draws a batch; nothing else may draw from its generator.
-        generator: that it draws from.
-
-    Keyword Args:
-        device: where batches go; through pinned memory if that is a GPU.
+    it gave last. Nothing else may draw from the generator, and batches go to a GPU through pinned memory.
 
     Examples:
+        >>> import torch
+        >>> from warmprior.training.placement import Prefetch
         >>> generator = torch.Generator().manual_seed(0)
         >>> batches = Prefetch(lambda: torch.rand(2, generator=generator), generator)
         >>> first, state, second = batches(), batches.state(), batches()

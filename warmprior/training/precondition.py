@@ -50,6 +50,7 @@ def precondition(
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP
         >>> from warmprior.envs import navigation_demonstrations
+        >>> from warmprior.training import precondition
         >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
         >>> demos = navigation_demonstrations()
         >>> type(precondition(network, demos, PastPrior(4), observation_steps=1)).__name__

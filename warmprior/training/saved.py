@@ -99,11 +99,7 @@ def check_repository(name: str) -> None:
 
 
 def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
-    """JSON-serialisable description of everything but the weights.
-
-    Raises:
-        TypeError: if the network is not a :class:`VelocityNetwork`, or an option cannot be written as JSON.
-    """
+    """Everything but the weights as JSON; a ``TypeError`` if a part cannot be written so."""
     network = uncompiled(actor.network)
     if not isinstance(network, VelocityNetwork):
         raise TypeError(
@@ -172,7 +168,8 @@ def check_saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Ten
         ValueError: if a policy built from it has other tensors than this one.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.training import check_saveable
         >>> config, weights = check_saveable(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)))
     """
     config = policy_config(actor)
@@ -209,7 +206,8 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
 
     Examples:
         >>> from tempfile import TemporaryDirectory
-        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.training import load_policy, save_policy
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4))
         >>> with TemporaryDirectory() as folder:
         ...     save_policy(actor, folder)
@@ -258,6 +256,8 @@ def push_policy(
         ImportError: if huggingface_hub is not installed.
 
     Examples:
+        >>> from warmprior.training import load_policy, model_card, push_policy
+        >>> actor = load_policy("policy_010000")  # doctest: +SKIP
         >>> push_policy(actor, "user/square-past", card=model_card(actor))  # doctest: +SKIP
         '0123456789abcdef0123456789abcdef01234567'
     """
@@ -316,7 +316,8 @@ def load_policy(
 
     Examples:
         >>> from tempfile import TemporaryDirectory
-        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.training import load_policy, save_policy
         >>> with TemporaryDirectory() as folder:
         ...     save_policy(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), folder)
         ...     load_policy(folder).prior.chunk_length

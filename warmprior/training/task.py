@@ -77,6 +77,7 @@ class Task:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.envs import GymEnv
+        >>> from warmprior.training import Task
         >>> steps = {"observation": torch.rand(60, 3), "action": torch.rand(60, 1),
         ...          "episode": torch.arange(60) // 20}
         >>> task = Task.of("pendulum", TensorDict(steps, [60]), lambda: GymEnv("Pendulum-v1"))
@@ -164,7 +165,7 @@ class Task:
 
     @cached_property
     def identity(self) -> str:
-        """Of the data: part of the identity of every policy that is trained on them."""
+        """Digest of the data, part of the identity of every policy that is trained on them."""
         if self.digest:
             return self.digest
         # Data in other units may be equal once they are normalised.
@@ -245,9 +246,12 @@ def robosuite_task(
         - :class:`~warmprior.envs.RobosuiteEnv`: its environment.
 
     Examples:
+        >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory
         >>> import h5py
         >>> import torch
+        >>> from warmprior.envs import TASKS
+        >>> from warmprior.training import robosuite_task
         >>> lift = TASKS["lift"]
         >>> with TemporaryDirectory() as folder:
         ...     path = Path(folder) / "lift.hdf5"
@@ -404,6 +408,7 @@ def navigation_task() -> Task:
         - :func:`~warmprior.envs.navigation_demonstrations`: its data.
 
     Examples:
+        >>> from warmprior.training import navigation_task
         >>> task = navigation_task()
         >>> task.title, task.make_env(batch_size=[8]).batch_size
         ('navigation toy', torch.Size([8]))
@@ -428,6 +433,7 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
         :func:`~warmprior.training.find_tasks`: all that options name.
 
     Examples:
+        >>> from warmprior.training import DataOptions, load_task
         >>> load_task(DataOptions(), "navigation").title
         'navigation toy'
         >>> load_task(DataOptions(), "nowhere:pendulum")
@@ -452,16 +458,7 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
 
 
 def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tuple[Path, str]:
-    """Where the demonstrations of a robosuite task are, once they are downloaded or generated.
-
-    Args:
-        options: see :func:`load_task`.
-        name: likewise.
-        style: likewise.
-
-    Returns:
-        The file or dataset, and what made it: ``"file"``, ``"official"`` or ``"scripted"``.
-    """
+    """The file or dataset of a robosuite task, downloaded or generated if needed, and what made it."""
     if options.dataset is not None:
         return options.dataset, "file"
     if options.download:
@@ -474,10 +471,9 @@ def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tup
 def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
     """The tasks that options name, checked: for each what :func:`load_task` takes, a name and a style.
 
-    Raises:
-        ValueError: if the options do not go together.
-
     Examples:
+        >>> from warmprior.training import DataOptions
+        >>> from warmprior.training.task import task_places
         >>> task_places(DataOptions(task=("can", "tool_hang"), data=("ph", "mh"), download=True))
         Data: there are no official mh demonstrations of tool_hang.
         [('can', 'ph'), ('can', 'mh'), ('tool_hang', 'ph')]
@@ -506,11 +502,7 @@ def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
 
 
 def find_tasks(options: DataOptions, observation_steps: int = 2) -> list[Task]:
-    """Read, download or generate the demonstrations of all tasks that options name.
-
-    Args:
-        options: which.
-        observation_steps: ``To`` of the policies.
+    """Read, download or generate the demonstrations of all tasks that options name; see :func:`load_task`.
 
     Raises:
         ValueError: see :func:`task_places` and :func:`load_task`.
@@ -519,6 +511,7 @@ def find_tasks(options: DataOptions, observation_steps: int = 2) -> list[Task]:
         :func:`~warmprior.training.load_task`: one of them.
 
     Examples:
+        >>> from warmprior.training import DataOptions, find_tasks
         >>> [task.title for task in find_tasks(DataOptions(task=("navigation",)))]
         ['navigation toy']
     """

@@ -61,7 +61,7 @@ def new_policy(
 
     Examples:
         >>> from warmprior import PastPrior
-        >>> from warmprior.training import navigation_task
+        >>> from warmprior.training import NetworkOptions, TrainingConfig, navigation_task, new_policy
         >>> options = NetworkOptions(hidden_dim=8, observation_steps=1)
         >>> actor = new_policy(navigation_task(), PastPrior(4), options, TrainingConfig(seed=3))
         >>> type(actor.network).__name__
@@ -159,6 +159,7 @@ def train_policy(
         >>> from tensordict import TensorDict
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from warmprior import PastPrior, policy_transforms
+        >>> from warmprior.training import TrainingConfig, train_policy
         >>> steps = {"observation": torch.rand(60, 3), "action": torch.rand(60, 1),
         ...          "episode": torch.arange(60) // 20}
         >>> recipe = TrainingConfig(iterations=2)  # 10,000 by default

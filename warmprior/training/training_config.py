@@ -51,6 +51,7 @@ class TrainingConfig:
         - :class:`~warmprior.rl.PriorSpaceConfig`: the recipe of agents.
 
     Examples:
+        >>> from warmprior.training import TrainingConfig
         >>> config = TrainingConfig(iterations=1_000, batch_size=256, checkpoints=4)
         >>> config.checkpoint_iterations
         [250, 500, 750, 1000]
@@ -107,12 +108,7 @@ class TrainingConfig:
 
     @property
     def checkpoint_iterations(self) -> list[int]:
-        """After which iterations a policy is kept.
-
-        Examples:
-            >>> TrainingConfig(iterations=1000, checkpoints=4).checkpoint_iterations
-            [250, 500, 750, 1000]
-        """
+        """After which iterations a policy is kept."""
         n = min(self.checkpoints, self.iterations)
         return [round(self.iterations * (i + 1) / n) for i in range(n)]
 

@@ -104,14 +104,9 @@ class AbsoluteActions(Transform):
         return torch.cat((position, turn.expand(6), turn.new_zeros(1))).repeat(self.arms)
 
     def delta(self, action: Tensor, pose: Tensor) -> Tensor:
-        """The delta towards the pose that an action asks for, as far as one step goes.
+        """The delta ``[*B, 7 * arms]`` in ``[-1, 1]`` towards the pose that an action asks for.
 
-        Args:
-            action: ``[*B, 10 * arms]``.
-            pose: ``[*B, arms, 3, 4]``.
-
-        Returns:
-            ``[*B, 7 * arms]`` in ``[-1, 1]``, in the dtype of ``action``.
+        As far as one step goes, from actions ``[*B, 10 * arms]`` and poses ``[*B, arms, 3, 4]``.
         """
         target, now = action.double().unflatten(-1, (self.arms, _ABSOLUTE)), pose.double()
         move = target[..., :3] - now[..., 3]
@@ -160,11 +155,7 @@ class AbsoluteActions(Transform):
 
 
 def _rotvec(turn: Tensor) -> Tensor:
-    """Like :func:`matrix_to_rotvec`, three times as fast: this runs at every control step.
-
-    Args:
-        turn: ``[..., 3, 3]``.
-    """
+    """Like :func:`matrix_to_rotvec`, three times as fast: this runs at every control step."""
     cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
     if bool((cosine < _OBTUSE).any()):
         return matrix_to_rotvec(turn)

@@ -19,17 +19,7 @@ __all__ = ["InferenceDelay", "check_delay", "executed_chunk"]
 
 
 def check_delay(delay: int, execute: int, length: int | None = None) -> None:
-    """Check that chunks can take effect so late.
-
-    Args:
-        delay: ``d``, control steps until a chunk takes effect.
-        execute: actions executed per decision.
-        length: ``P``, if it is known.
-
-    Raises:
-        ValueError: if ``delay`` is no whole number, not ``0 <= delay <= execute``, or ``execute + delay``
-            exceeds ``length``.
-    """
+    """A ``ValueError`` if chunks of ``length`` cannot take effect ``delay`` control steps late."""
     if isinstance(delay, bool) or not isinstance(delay, Integral) or delay < 0:
         raise ValueError(f"a delay is a whole number of control steps, at least 0, got {delay!r}")
     if length is not None and 2 * delay > length:

@@ -44,10 +44,7 @@ class HistoryObservation(Transform):
     """
 
     def __init__(
-        self,
-        *,
-        observation_key: NestedKey = keys.OBSERVATION,
-        out_key: NestedKey = keys.CONDITIONED,
+        self, *, observation_key: NestedKey = keys.OBSERVATION, out_key: NestedKey = keys.CONDITIONED
     ) -> None:
         read = [unravel_key(observation_key), keys.ACTIONS, keys.STEPS]
         super().__init__(in_keys=read, out_keys=[unravel_key(out_key)])

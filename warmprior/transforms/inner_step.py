@@ -22,12 +22,6 @@ class InnerStep:
 
     ``Transform.parent`` is that environment too, but around *copies* of the transforms: what the copies
     count, record or estimate would be lost. This one runs the container's own transforms.
-
-    Args:
-        transform: one of an environment's transforms.
-
-    Raises:
-        RuntimeError: if ``transform`` is in no environment.
     """
 
     def __init__(self, transform: Transform) -> None:
@@ -53,13 +47,9 @@ class InnerStep:
         self._branches = {key[0] for key in (*inverse, *self.observed) if isinstance(key, tuple)}
 
     def __call__(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
-        """Take the step.
+        """Take the step: of all rows, or of those in ``rows``, bool ``[*B]``; the others are undefined.
 
-        Args:
-            tensordict: the step's input, ``[*B]``. Entries are added at its root; nested ones stay as they
-                are.
-            rows: which environments are stepped, bool ``[*B]``; all by default. The result is undefined for
-                the others.
+        Entries are added at the root of the input ``[*B]``; nested ones stay as they are.
         """
         for branch in self._branches:
             if branch in tensordict:
@@ -75,11 +65,7 @@ class InnerStep:
         return result
 
     def bare(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The result of a step of the environment itself, with all its flags.
-
-        Args:
-            tensordict: the step's input, ``[*B]``, as the environment takes it.
-        """
+        """The result of a step ``[*B]`` of the environment itself, with all its flags."""
         result = self.base._step(tensordict)
         found = dict(result.items())  # several times faster to ask
         for key, shape in self._done_shapes:
@@ -92,15 +78,10 @@ class InnerStep:
 
 
 def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None:
-    """Keep observations from a batched environment that takes a partial step.
+    """Keep observations, under :data:`KEPT`, from a batched environment that takes a partial step.
 
     For the rows that it leaves out it returns what it finds in the step's input, and fails, or casts
-    silently, if a transform gave that another shape or dtype than the environment's own. Whoever needs
-    the observations finds them under :data:`KEPT`.
-
-    Args:
-        tensordict: the input of a partial step, changed in place.
-        observed: keys of the environment's observations, without those that it needs as state.
+    silently, if a transform gave that another shape or dtype than the environment's own.
     """
     kept = tensordict.get(KEPT, None)
     if kept is None:
@@ -117,16 +98,7 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
 def keep_resting(
     tensordict: TensorDictBase, next_tensordict: TensorDictBase, names: Iterable[NestedKey]
 ) -> TensorDictBase:
-    """After a partial step, restore the rows that were not stepped.
-
-    Args:
-        tensordict: the step's input, ``[*B]``.
-        next_tensordict: what a transform made of all rows, changed in place.
-        names: of the entries that it wrote.
-
-    Raises:
-        KeyError: if a partial step's input lacks one.
-    """
+    """After a partial step, restore what a transform wrote in the rows that were not stepped, in place."""
     rows = tensordict.get("_step", None)
     for name in names if rows is not None else ():
         before, after = tensordict[name], next_tensordict[name]
@@ -136,13 +108,7 @@ def keep_resting(
 
 
 def rows_where(mask: Tensor, new: TensorDictBase, old: TensorDictBase) -> TensorDictBase:
-    """``new``, but with the rows of ``old`` where ``mask`` does not hold and ``old`` has the key.
-
-    Args:
-        mask: bool ``[*B]``.
-        new: ``[*B]``.
-        old: ``[*B]``.
-    """
+    """``new``, but with the rows of ``old`` where ``mask`` ``[*B]`` does not hold and ``old`` has the key."""
     result = new.copy()
     for key in new.keys(True, True):
         previous = old.get(key, None)

@@ -38,13 +38,8 @@ class LateTransforms:
 
     An environment without batch dimensions may offer ``control_steps(actions, keep)``, as
     :class:`~warmprior.envs.RobosuiteWrapper` does, which takes all steps in one call. It is used where
-    actions can be inverted at once, and doubles the speed.
-
-    Args:
-        step: the step of the environment, through its transforms.
-        action_key: the environment's action, at the root.
-        brief: whether only reward and flags of the first steps are read, all that ``control_steps`` returns
-            of them.
+    actions can be inverted at once and only reward and flags of the first steps are read (``brief``), and
+    doubles the speed.
     """
 
     def __init__(self, step: InnerStep, action_key: str, brief: bool) -> None:
@@ -63,13 +58,7 @@ class LateTransforms:
 
     @classmethod
     def of(cls, step: InnerStep, action_key: NestedKey, read: Iterable[NestedKey]) -> LateTransforms | None:
-        """Such steps, or ``None`` where every transform has to run at every step.
-
-        Args:
-            step: the step of the environment, through its transforms.
-            action_key: the environment's action.
-            read: keys of a step's result that are needed before the end.
-        """
+        """Such steps, or ``None`` where ``read`` needs every transform to run at every step."""
         transforms, base = step.transforms, step.base
         if not isinstance(action_key, str):
             return None
@@ -89,16 +78,9 @@ class LateTransforms:
     def __call__(
         self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
     ) -> list[TensorDictBase]:
-        """Take steps until an environment is done.
+        """Take steps with actions ``[*B, n, d_a]`` after ``first`` until an environment is done; all results.
 
-        Args:
-            current: the entries of the first step's input, of which the following are made in place.
-            first: what that step led to, transformed, ``[*B]``.
-            actions: of the following steps, ``[*B, n, d_a]``.
-            reward_key: the environment's reward.
-
-        Returns:
-            What all of them led to, ``first`` included; only the last one is transformed.
+        ``current`` becomes the input of the last one in place; only what that led to is transformed.
         """
         results, actions = [first], self._inverse(actions)
         if self._control_steps is None:
@@ -151,13 +133,7 @@ def _control_steps(base: EnvBase) -> Callable[[Tensor, int], list[TensorDictBase
 
 
 def advance(current: dict[str, Any], next_tensordict: TensorDictBase, reward_key: NestedKey) -> None:
-    """A lean ``step_mdp``, in place: it runs at every control step.
-
-    Args:
-        current: entries of a step's input, ``[*B]``, replaced by what the step led to.
-        next_tensordict: that, ``[*B]``.
-        reward_key: left out.
-    """
+    """A lean ``step_mdp``, in place and without the reward: it runs at every control step."""
     for key, value in next_tensordict.items():
         # The type first: nearly all are plain tensors, and the instance check is slow.
         if type(value) is not Tensor and isinstance(value, TensorDictBase) and key in current:

@@ -125,9 +125,7 @@ class ObservationStack(Transform):
 
 
 def _each(
-    function: Callable[..., Tensor],
-    value: Tensor | TensorDictBase,
-    *others: Tensor | TensorDictBase,
+    function: Callable[..., Tensor], value: Tensor | TensorDictBase, *others: Tensor | TensorDictBase
 ) -> Tensor | TensorDictBase:
     """Apply a function to an observation, or to every entry of one that has several."""
     if isinstance(value, TensorDictBase):

@@ -188,16 +188,7 @@ def _checked(
 
 
 def check_finite(key: NestedKey, value: Tensor, memory: int = 2**22) -> None:
-    """Check that an entry of a dataset is free of NaN and infinity.
-
-    Args:
-        key: its name.
-        value: ``[N, *]``, memory-mapped perhaps, and larger than the memory.
-        memory: how many numbers are checked at a time.
-
-    Raises:
-        ValueError: naming the first bad step.
-    """
+    """A ``ValueError`` names the first NaN or infinity of an entry ``[N, *]``, memory-mapped perhaps."""
     if not value.is_floating_point():
         return
     steps = max(1, memory * len(value) // max(1, value.numel()))
@@ -356,11 +347,7 @@ def window_replay_buffer(
 
 
 def without_images(data: TensorDictBase) -> TensorDictBase:
-    """Steps without images, which would fill the memory in thousands of windows.
-
-    Args:
-        data: contiguous steps, see :class:`ActionWindow`.
-    """
+    """Steps without images, which would fill the memory in thousands of windows."""
     observation = data.get(keys.OBSERVATION)
     if not isinstance(observation, TensorDictBase) or keys.STATE not in observation:
         return data

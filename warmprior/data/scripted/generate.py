@@ -75,6 +75,7 @@ def generate_demonstrations(
         RuntimeError: if the experts fail too often to reach ``n``.
 
     Examples:
+        >>> from warmprior.data import generate_demonstrations
         >>> path = generate_demonstrations("lift", n=20)  # doctest: +SKIP
         >>> path.name  # doctest: +SKIP
         'lift_ph_n20_seed0_v1.hdf5'

@@ -24,6 +24,8 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
     """Turn a rotation matrix ``[3, 3]`` into the shortest rotation vector ``[3]``.
 
     Examples:
+        >>> import numpy as np
+        >>> from warmprior.data.scripted.geometry import rotation_matrix, rotation_vector
         >>> rotation_vector(rotation_matrix(np.array([0.0, 3.0, 0.0]))).round(6).tolist()
         [0.0, 3.0, 0.0]
     """
