@@ -33,8 +33,11 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "centre": ("", "of the agent's box: the mean of the source, or zero"),
     "delta": ("g", "half the width of the agent's box"),
     "environment_steps": ("d", "control steps that the agent has learnt from"),
-    "evaluation": ("", "base: the frozen policy; greedy or stochastic: the agent"),
-    "mean": ("", "history of the source: of the training, or deployed, after the policy's own last decision"),
+    "evaluation": ("", "base: the frozen policy, around zero from N(0, I); greedy, stochastic: the agent"),
+    "mean": (
+        "",
+        "history of the source: of the training, or deployed, after the policy's own last decision",
+    ),
     "observations": ("d", "observations that the measure is the mean of"),
     # Success.
     "episodes": ("d", "evaluation episodes of the last checkpoint, of all seeds in a table"),

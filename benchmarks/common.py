@@ -332,7 +332,8 @@ def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
 
 def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
     """Observations that no policy was trained on, where there are some, and what they are in words."""
-    return held_out(options, policy.task(), policy.method.chunk_length, policy.network.observation_steps)
+    steps = policy.network.observation_steps
+    return held_out(options, policy.data, policy.task(), policy.method.chunk_length, steps)
 
 
 def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict[int, WarmPriorActor]]:
@@ -352,16 +353,20 @@ def finished_policies(run: Path, options: Options, **sources: Any) -> list[Polic
     """
     stored = stored_options(Options, run, None)
     check_typed(stored, run, (*options.sources.prior, *options.data.task))
-    if options.data.task not in ((), stored.data.task):
-        raise ValueError(f"--run {run} is of {' '.join(stored.data.task)}: leave out --task")
+    if options.sources.sigma not in ((), stored.sources.sigma):
+        raise ValueError(f"--run {run} has its own sigma: leave out --sigma")
     stored = with_parts(stored, run={"out": run}, sources=sources)
     check_single(stored, "task", "data", "chunk", "sigma")
     policies = policies_of(stored)
     for policy in policies:
+        # By the name of the task, or where that is one's own by its place.
+        if not {*options.data.task} <= {policy.facts["task"], policy.place[0]}:
+            raise ValueError(f"--run {run} is of {policy.facts['task']}: leave out --task")
         if not policy.is_trained:
             raise FileNotFoundError(
-                f"--run {run} has no trained policy {policy}: finish it with --resume --out {run}, or name "
-                f"its methods: --prior {' '.join(stored_options(Options, run, None).sources.prior)}"
+                f"--run {run} has no trained policy {policy} of these versions and data (options.json has "
+                f"its own): finish it with --resume --out {run}, or name its methods: --prior "
+                f"{' '.join(stored_options(Options, run, None).sources.prior)}"
             )
     return policies
 

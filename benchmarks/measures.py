@@ -30,7 +30,7 @@ from warmprior.diagnostics import (
     source_leak,
 )
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history, sees_history
-from warmprior.training import Task
+from warmprior.training import DataOptions, Task
 from warmprior.training.task import demonstrations_of, read_like
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
@@ -109,7 +109,7 @@ def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
 
 
 def held_out(
-    options: MeasuredOptions, task: Task, chunk_length: int, observation_steps: int
+    options: MeasuredOptions, trained_on: DataOptions, task: Task, chunk_length: int, observation_steps: int
 ) -> tuple[SharedObservations, str]:
     """Observations that no policy of a task was trained on, and what they are in words.
 
@@ -128,13 +128,13 @@ def held_out(
         return shared, "the TRAINING demonstrations (not held out)"
     if given is not None:
         place, words = given, ""
-    elif options.data.mask == "train":
-        place, words, mask = demonstrations_of(options.data, task.name, task.style)[0], "", "valid"
+    elif trained_on.mask == "train":
+        place, words, mask = demonstrations_of(trained_on, task.name, task.style)[0], "", "valid"
     elif facts.get("source") != "scripted":
         raise ValueError(
-            f"these policies are trained on all demonstrations of {facts['file']}: add --mask train, to "
-            "train on the file's own part for that and to measure on its part called valid, or --validation "
-            "FILE with others (or with the same file, to measure on the training data)"
+            f"these policies are trained on {facts['file']}: train them with --mask train, to measure "
+            "on the part of the file that is called valid, or add --validation FILE with others (or with the "
+            "same file, to measure on the training data)"
         )
     else:
         # As many as the training demonstrations suggest, with room to spare.

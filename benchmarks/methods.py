@@ -70,6 +70,11 @@ def reflow(teacher: WarmPriorActor, teacher_nfe: int = 9) -> ReflowCoupling:
     return ReflowCoupling(teacher, teacher_nfe)
 
 
+def bridge(noise: float = 0.5, observation_weight: float = 10.0) -> BridgeCoupling:
+    """Pairs of a Schroedinger bridge; its noise is not the sigma of a source."""
+    return BridgeCoupling(noise, observation_weight)
+
+
 @dataclass(frozen=True)
 class Composition:
     """The parts of a method."""
@@ -92,7 +97,7 @@ METHODS: dict[str, Composition] = {
     "history": Composition("History", "#6a51a3", sees_history=True),
     "regression": Composition("Regression", "#b8860b", PointPrior, regresses=True),
     "ot": Composition("OT-CFM", "#2ca02c", coupling=OTCoupling),
-    "bridge": Composition("SB-CFM", "#98df8a", coupling=BridgeCoupling),
+    "bridge": Composition("SB-CFM", "#98df8a", coupling=bridge),
     "reflow": Composition("2-rectified flow", "#17becf", coupling=reflow, teacher="gaussian"),
     "step": Composition("STEP", "#00695c", start=ForecastStart),
     "cvae": Composition("CVAE source", "#c51b7d", CVAEPrior),
@@ -229,9 +234,14 @@ class Method:
         return not self.parts.regresses
 
     @property
+    def is_straight(self) -> bool:
+        """Whether its path is the straight line, on which a velocity predicts the sample."""
+        return self.parts.coupling is not bridge
+
+    @property
     def pairs_in_batch(self) -> bool:
         """Whether the windows of a batch are paired, so that it needs two of them."""
-        return self.parts.coupling in (OTCoupling, BridgeCoupling)
+        return self.parts.coupling in (OTCoupling, bridge)
 
     @property
     def needs_vector(self) -> bool:

@@ -68,7 +68,7 @@ NAVIGATION_PRESETS = {
         sources=SOURCES,
         evaluation=PLAYED,
     ),
-    # The paper's width, iterations and batch size, and no preconditioning: hours on a CPU.
+    # The paper's width, iterations and batch size, and no preconditioning: days on a CPU.
     "paper": NavigationOptions(
         network=NetworkOptions(hidden_dim=1024, precondition=False, observation_steps=1),
         training=replace(PAPER, iterations=50_000, batch_size=256, checkpoints=1),

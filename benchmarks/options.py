@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 import torch
 import tyro
 from methods import Method
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from warmprior.data.opening import check_place, name_of_place, resolved_place
 from warmprior.io.distributed import check_batch, check_device, from_leader, launched, rank
@@ -105,12 +105,11 @@ class Run:
 
     def __post_init__(self) -> None:
         check_counts(self, "envs")
-        check_device(self.device)
         if self.ray_address is not None and self.engine != "ray":
             raise ValueError("--ray-address belongs to --engine ray")
         if self.engine == "ray" and launched():
             raise ValueError("--engine ray distributes the work itself: start it without torchrun")
-        if self.engine == "ray" and torch.device(self.device).index is not None:
+        if self.engine == "ray" and ":" in self.device:
             raise ValueError(f"--device {self.device}: with --engine ray, Ray chooses the GPU: use cuda")
 
     @property
@@ -169,6 +168,12 @@ class Options:
             raise ValueError("--no-precondition needs --weighting velocity")
         for method in self.sources.methods():
             method.nfes(self.evaluation.nfe)
+            if method.is_flow and self.training.times == "start":
+                raise ValueError(f"--times start trains no flow: leave out {method.name}, or take regression")
+            options = {"objective l1": self.training.objective == "l1"}
+            options |= {"self-distillation": self.training.self_distillation > 0}
+            for name in (name for name, asked in options.items() if asked and not method.is_straight):
+                raise ValueError(f"--{name} needs a straight path: leave out {method.name}")
             if self.data.obs == "image" and method.needs_vector:
                 raise ValueError(
                     f"{method.name} reads observations that are one vector: leave it out with --obs image"
@@ -309,6 +314,7 @@ def parse[O: Options](
                 "another --out"
             )
         check_typed(stored, out, (*argv, *base.sources.prior, *base.data.task))
+    check_device(options.run.device)
     name = options.run.logger
     if name in ("tensorboard", "wandb") and find_spec(name) is None:
         raise ImportError(f"--logger {name} needs the package {name}: pip install it")
@@ -389,21 +395,28 @@ def stored_options[O: Options](kind: type[O], out: Path, study: str | None) -> O
     if not path.is_file():
         raise ValueError(f"there is no run in {out}: name its folder")
     stored = read_json(path)
-    theirs = stored.get("study") if isinstance(stored, dict) else None
+    if not isinstance(stored, dict):
+        raise ValueError(f"{path} is damaged: it is no JSON object")
+    theirs = stored.get("study")
     if study not in (None, theirs):
         raise ValueError(
             f"{out} holds a run of {theirs}: continue it with that script, or choose another --out"
         )
     try:
-        options = from_record(kind, stored["options"])
+        options = from_record(kind, stored.get("options"))
         if changed := sorted(set(differences(recorded(options), stored["options"]))):
             raise ValueError(f"it differs in {', '.join(changed)}")
-    except (AttributeError, KeyError, ValueError) as error:
-        raise ValueError(f"{path} is damaged, or of another version: {error}") from error
+    except ValueError as error:
+        reason = str(error)
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            place = ".".join(map(str, ("options", *first["loc"])))
+            reason = f"{place}: {first['msg'].removeprefix('Value error, ')}"
+        raise ValueError(f"{path} is damaged, or of another version: {reason}") from error
     return options
 
 
-def from_record[O: Options](kind: type[O], tree: Mapping[str, Any]) -> O:
+def from_record[O: Options](kind: type[O], tree: Any) -> O:
     """The inverse of :func:`recorded`; a value of another type is refused."""
     return TypeAdapter(kind).validate_json(json.dumps(tree), strict=True)
 

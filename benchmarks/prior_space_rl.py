@@ -1,6 +1,6 @@
 """The paper's Fig. 7: reinforcement learning in the source space of a frozen policy.
 
-python benchmarks/prior_space_rl.py --preset unit            # the navigation toy, about two minutes
+python benchmarks/prior_space_rl.py --preset unit            # the navigation toy, about six minutes
 python benchmarks/prior_space_rl.py                          # lift from a weak policy, half an hour
 python benchmarks/prior_space_rl.py --preset paper --task square --run runs/square-ph-paper
 python benchmarks/prior_space_rl.py --resume                 # after an interruption
@@ -84,8 +84,16 @@ class Arm:
     centre: str  # of its box: the mean of the source, or zero
     delta: float | None  # half its box
 
+    def __post_init__(self) -> None:
+        if self.centre == "zero" and self.method.has_anchor:
+            prior = self.method.prior()
+            if self.method.parts.start is not None or prior.history_length != prior.chunk_length:
+                raise ValueError(f"--centre zero: {self.method.name} has a centre of its own, leave it out")
+
     def __str__(self) -> str:
-        source = ",".join(filter(None, (self.method.name, self.method.options)))
+        given = self.method.arguments.get("sigma")
+        sigma = "" if given is None else f"sigma={given:g}"
+        source = ",".join(filter(None, (self.method.name, sigma, self.method.options)))
         around = " around zero" if self.centre == "zero" and self.method.has_anchor else ""
         box = "" if self.delta is None else f", delta {self.delta:g}"
         return f"{self.algorithm} {source}{around}{box}"
@@ -94,10 +102,7 @@ class Arm:
         """The policy as the agent sees it: around zero its source is cold, and its field as it was."""
         if self.centre == "mean" or not self.method.has_anchor:
             return actor
-        prior = actor.prior
-        if actor.start is not None or prior.history_length != prior.chunk_length:
-            raise ValueError(f"--centre zero: the source of {self.method.name} has a centre of its own")
-        return actor.replace(prior=ColdPrior(prior.chunk_length, prior.prediction_chunks))
+        return actor.replace(prior=ColdPrior(actor.prior.chunk_length, actor.prior.prediction_chunks))
 
 
 @dataclass(frozen=True)
@@ -107,7 +112,7 @@ class AgentsOptions(Options):
     policies: FinishedRun = None  # a finished run of robomimic.py, whose policies to take instead of training
     rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
     algorithm: tuple[Algorithm, ...] = ("dsrl-na",)  # of the agents' learning
-    warm_algorithm: tuple[Algorithm, ...] = ()  # of those around a mean (default: as --algorithm)
+    warm_algorithm: tuple[Algorithm, ...] = ()  # of sources with a mean (default: as --algorithm)
     # Of policies whose source has a mean: where their agents search, around it or, as a control, around zero.
     centre: tuple[Literal["mean", "zero"], ...] = ("mean",)
     delta: tuple[float, ...] = ()  # half the agents' boxes (default: 0.5 around a mean, 1.5 around zero)
@@ -137,6 +142,9 @@ class AgentsOptions(Options):
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "data", "chunk", "sigma", "nfe")
+        for name in ("algorithm", "centre"):
+            if not getattr(self, name):
+                raise ValueError(f"--{name} needs at least one value")
         if self.collectors is not None and self.run.engine != "ray":
             raise ValueError("--collectors belongs to --engine ray")
         if not self.is_toy and self.policies is None:

@@ -301,7 +301,7 @@ NO_RECIPE |= {"seed", "seeds", "episodes", "nfe", "save_every", "log_every"}
 
 def unlike(options: Options, paper: Options) -> list[str]:
     """What a table says of the recipe where it is not the paper's; it is the same for all sources."""
-    if options.data.obs == "image":
+    if options.data.obs == "image" and paper.data.obs == "state":
         paper = with_parts(paper, **IMAGES["paper"], data={"obs": "image"})
 
     def recipe(one: Options) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from methods import METHODS, Method
 
 from warmprior import VelocityMLP, WarmPriorActor
 from warmprior.history import cold_history
-from warmprior.objectives import OTCoupling, ReflowCoupling
+from warmprior.objectives import BridgeCoupling, OTCoupling, ReflowCoupling
 from warmprior.training import TrainingConfig
 
 H = 3
@@ -55,6 +55,7 @@ def test_every_method_arrives_in_a_fresh_process():
         (("past,age=3", H), r"age is unknown to it.*its options are sigma, correlation"),
         (("gaussian,sigma=0.3", H), "sigma is unknown to it, or without effect"),
         (("past,sigma=0.3", H, 0.5), "both set sigma"),
+        (("bridge,sigma=1", H), "sigma is unknown to it.*its options are noise"),
         (("warmprior:PastPrior", H), "is a part of methods, and none itself"),
     ],
 )
@@ -82,6 +83,16 @@ def test_history_is_withheld_from_those_alone_that_remember():
     vector = {name for name in METHODS if Method(name, H).needs_vector}
     assert vector == {"forecast", "ot", "bridge", "step", "cvae", "leap"}
     assert not Method("ot,observation_weight=0", H).needs_vector
+
+
+def test_the_noise_of_a_bridge_is_an_option_with_a_name_of_its_own():
+    """It is no sigma of a source: rows name it, and --sigma leaves it alone."""
+    for noise, options in ((0.5, ""), (1.0, "noise=1.0"), (0.1, "noise=0.1")):
+        method = Method(f"bridge,noise={noise}", H, 0.3)
+        coupling = method.coupling()
+        assert isinstance(coupling, BridgeCoupling) and coupling.config()["sigma"] == noise
+        assert (method.options, method.sigma, method.is_straight) == (options, 1.0, False)
+    assert Method("bridge", H) == Method("bridge,noise=0.5", H) and Method("ot", H).is_straight
 
 
 def test_couplings_are_those_of_the_table():

@@ -17,7 +17,8 @@ import navigation1d
 import prior_space_rl
 import real_time_chunking
 import sigma
-from options import PRESETS, from_record, parse, recorded, started, study
+from mimicgen_tasks import FEW
+from options import PRESETS, Options, from_record, parse, recorded, started, stored_options, study
 from report import unlike
 
 STUDIES = (budget.BudgetOptions, real_time_chunking.DelayOptions)
@@ -89,8 +90,22 @@ def test_a_run_continues_with_its_options_and_refuses_others(tmp_path, monkeypat
         damaged = copy.deepcopy(stored)
         damaged["options"][part][name] = value
         (out / "options.json").write_text(json.dumps(damaged))
-        with pytest.raises(ValueError, match=rf"options\.json is damaged[^$]*{why}"):
+        with pytest.raises(ValueError, match=rf"^.*options\.json is damaged.*{why}.*$"):  # in one line
             read(*resume, out=out)
+    for damaged in (None, [], "x", {}, {"study": "robomimic", "options": []}):
+        (out / "options.json").write_text(json.dumps(damaged))
+        with pytest.raises(ValueError, match=r"options\.json is damaged"):
+            stored_options(Options, out, None)
+
+
+def test_a_run_of_another_machines_device_is_read_but_not_continued(tmp_path):
+    """Its policies can be measured here; a training needs the device."""
+    with started(read(out=tmp_path), "a-study"):
+        path = tmp_path / "options.json"
+        path.write_text(path.read_text().replace('"device": "cpu"', '"device": "cuda:99"'))
+    assert stored_options(Options, tmp_path, "a-study").run.device == "cuda:99"
+    with pytest.raises(ValueError, match="--device cuda:99 does not work here"):
+        read("--resume", out=tmp_path)
 
 
 def test_numbers_of_demonstrations_are_of_presets_only_where_they_are_generated(tmp_path):
@@ -119,6 +134,7 @@ def test_tables_name_what_is_not_the_papers():
         assert words in line
     (line,) = unlike(read("--obs", "image", "--encoder", "small"), PRESETS["paper"])
     assert "obs" not in line and "image size 48 (84)" in line
+    assert unlike(FEW["paper"], FEW["paper"]) == []  # its images have a batch size of their own
 
 
 @pytest.mark.parametrize("script", ["robomimic", "prior_space_rl", "real_time_chunking"])

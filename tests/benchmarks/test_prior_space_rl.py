@@ -155,7 +155,7 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
     """They bring task, data and normaliser, and are those asked for; in the simulator, in workers."""
     run, out = tmp_path / "main", tmp_path / "agents"
     prior = ["gaussian", "past,sigma=0.3", "past,sigma=0.3,correlation=0.5"]
-    assert robomimic.main(options(dataset, run, prior=prior, iterations=4)) == 0
+    assert robomimic.main(options(dataset, run, prior=prior, iterations=4, task=None)) == 0
     before = written(tmp_path)
 
     def frozen(priors):
@@ -169,6 +169,9 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
     for priors in ("past,sigma=0.5", "preview"):
         with pytest.raises(FileNotFoundError, match=f"name its methods: --prior gaussian {own}"):
             frozen(priors)
+    for words, why in (("--task can", "is of lift: leave out --task"), ("--sigma 0.3", "has its own sigma")):
+        with pytest.raises(ValueError, match=why):
+            frozen(f"past {words}")
     few = {"rl__environment_steps": 60, "rl__warmup_steps": 30, "rl__evaluate_every": 60, "episodes": 1}
     argv = command_line(run=run, out=out, horizon=20, seeds=2, prior=own, num_envs=1, **few)
     assert benchmark.main(argv) == 0
@@ -178,6 +181,15 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
     assert 60 <= first[-1]["environment_steps"] < 68
     assert written(tmp_path).items() >= before.items()
     assert len(list((tmp_path / "policies").iterdir())) == 3  # nothing was trained
+
+
+def test_every_agent_has_a_name_of_its_own():
+    recipe = read(
+        "--preset unit --prior past past,sigma=0.3 past,correlation=0.5 past,sigma=0.3,correlation=0.5"
+    )
+    arms = [arm for method in recipe.sources.methods() for arm in recipe.arms(method)]
+    assert len({str(arm) for arm in arms}) == len(arms) == 16
+    assert str(arms[0]) == "dsrl-na past, delta 0.5"
 
 
 @pytest.mark.slow

@@ -63,7 +63,7 @@ class DataOptions:
             Instead of generated data.
         download: fetch the official files from the hub instead.
         force_download: fetch them again, in place of a broken local copy.
-        mask: of the file, such as train: the demonstrations to take (default: all of them).
+        mask: name of a mask in the file, such as train; only its demonstrations are used.
         demonstrations: how many to generate, or to take of a file from its first on (default: all of it); two
             numbers for ph and mh.
         actions: of the policies: the recorded pose deltas, or the absolute poses that they ask for.
