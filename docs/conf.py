@@ -45,8 +45,9 @@ exclude_patterns = ["_build", "_templates", "tutorials/*.rst", "**.png"]
 autosummary_generate = True
 python_use_unqualified_type_names = True
 autodoc_member_order = "bysource"
+# Types of all parameters and results, those that the text speaks of in a sentence among them.
 autodoc_typehints = "description"
-autodoc_typehints_description_target = "documented"
+autodoc_typehints_description_target = "all"
 autodoc_inherit_docstrings = False
 # A dataclass field would otherwise be described twice: by its class and by itself.
 napoleon_use_ivar = True

@@ -119,7 +119,7 @@ def test_a_step_without_the_history():
 
 
 def test_lengths_that_do_not_go_together():
-    with pytest.raises(ValueError, match="history_length must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="history_length must be a whole number of at least 1, got 0"):
         ActionHistory(0)
     # More executed than remembered.
     env = TransformedEnv(CountingEnv(9), Compose(ChunkStep(3), ActionHistory(2)))

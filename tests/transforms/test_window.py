@@ -132,7 +132,7 @@ def test_a_share_that_is_none_and_a_history_that_is_missing():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"observation_steps": 0}, "observation_steps must be at least 1, got 0"),
+        ({"observation_steps": 0}, "observation_steps must be a whole number of at least 1, got 0"),
         ({"chunk_length": 0}, r"need 1 <= chunk_length <= .*chunk_length=0"),
         ({"prediction_length": 1}, "prediction_length=1"),
         ({"history_length": 1}, "history_length=1"),
@@ -169,7 +169,7 @@ def test_bad_values_are_located_in_every_part_of_the_data(bad):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"batch_size": 0}, "batch_size must be at least 1"),
+        ({"batch_size": 0}, "batch_size must be a whole number of at least 1"),
         ({"sampler": SliceSampler(num_slices=2, traj_key="episode")}, "take RandomSampler"),
     ],
 )

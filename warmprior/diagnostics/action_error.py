@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from tensordict import TensorDictBase
 
-from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, flat_windows, predict
+from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, judged, predict
 from warmprior.modules.actor import WarmPriorActor
 
 __all__ = ["action_error"]
@@ -58,17 +58,13 @@ def action_error(
         [1, 9]
     """
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
-    flat = flat_windows(policy, windows, target_needed=True)
-    assert flat.target is not None
-    if generator is None:
-        generator = torch.Generator(flat.loc.device).manual_seed(0)
-    rows = windows.select(*policy.in_keys).reshape(len(flat)).to(flat.loc.device)
+    flat, target, rows, generator = judged(policy, windows, generator)
     counted = flat.counted[:, : prior.chunk_length, 0]
     errors = {}
     with evaluation_mode(policy):
         a0 = drawn(policy, rows, generator)
         for nfe in allowed:
             chunk = predict(policy, rows, a0, nfe=nfe, split=split)
-            error = (chunk - flat.target)[:, : prior.chunk_length].square()
+            error = (chunk - target)[:, : prior.chunk_length].square()
             errors[nfe] = float(error[counted].mean())
     return errors

@@ -9,6 +9,7 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.diagnostics.flow import check_flow, evaluation_mode, field_of, flat_windows
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.prior import Prior, Source
 
@@ -69,8 +70,7 @@ def branching_cost(
         torch.Size([16])
     """
     check_flow(policy, 2)
-    if draws < 1 or split < 1:
-        raise ValueError(f"draws and split must be at least 1, got {draws} and {split}")
+    check_whole_numbers(draws=draws, split=split)
     windows = flat_windows(policy, batch, target_needed=True)
     n, steps = len(windows), executed_positions(policy.prior, executed)
     rows = windows.repeat(draws)

@@ -99,6 +99,17 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
     return Windows(batch.batch_size, observation, history, loc, warm, counted, target)
 
 
+def judged(
+    policy: WarmPriorActor, windows: TensorDictBase, generator: torch.Generator | None
+) -> tuple[Windows, Tensor, TensorDictBase, torch.Generator]:
+    """Windows, targets, what the policy reads, and the generator, which has a fixed seed by default."""
+    flat = flat_windows(policy, windows, target_needed=True)
+    assert flat.target is not None
+    device = flat.loc.device
+    rows = windows.select(*policy.in_keys).reshape(len(flat)).to(device)
+    return flat, flat.target, rows, generator or torch.Generator(device).manual_seed(0)
+
+
 def sees_history(policy: WarmPriorActor) -> bool:
     """Whether the network sees the last actions beside the observation."""
     return policy.in_keys[0] == keys.CONDITIONED
@@ -117,20 +128,11 @@ def drawn(policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generat
 
 
 def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: int = 256) -> TensorDictBase:
-    """Windows whose images are encoded by the policy's network.
+    """Windows ``[n]`` whose images are encoded by the policy's network, ``split`` at a time.
 
-    Diagnostics evaluate the network many times at the same observations and compare observations, so they
-    take vectors. Windows without images are returned as they are.
-
-    Args:
-        policy: the policy.
-        windows: ``[n]``, see :class:`~warmprior.ActionWindow`.
-
-    Keyword Args:
-        split: network batch size, for bounded memory.
-
-    Returns:
-        Windows ``[n]`` with features ``[n, To, d_o]`` as the observation.
+    Their observation becomes the features ``[n, To, d_o]``: diagnostics evaluate the network many times at
+    the same observations and compare observations, so they take vectors. Windows without images are returned
+    as they are.
 
     Raises:
         ValueError: if there are none.

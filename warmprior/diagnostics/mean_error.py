@@ -10,7 +10,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.flow import drawn, evaluation_mode, flat_windows, predict
+from warmprior.diagnostics.flow import drawn, evaluation_mode, judged, predict
 from warmprior.modules.actor import WarmPriorActor
 
 __all__ = ["MeanError", "mean_error", "mean_revision"]
@@ -81,16 +81,12 @@ def mean_error(
         >>> mean_error(untrained, shared.windows(untrained.prior)).target  # the target itself
         0.0
     """
-    flat = flat_windows(policy, windows, target_needed=True)
-    assert flat.target is not None
-    if generator is None:
-        generator = torch.Generator(flat.loc.device).manual_seed(0)
-    rows = windows.select(*policy.in_keys).reshape(len(flat)).to(flat.loc.device)
+    flat, target, rows, generator = judged(policy, windows, generator)
     with evaluation_mode(policy):
         nfe = policy.ode.nfe if nfe is None else nfe
         chunk = predict(policy, rows, drawn(policy, rows, generator), nfe=nfe, split=split)
     mean, known = flat.loc, (flat.warm & flat.counted).expand_as(flat.loc)
-    return MeanError(_rms((mean - flat.target)[known]), _rms((mean - chunk)[known]))
+    return MeanError(_rms((mean - target)[known]), _rms((mean - chunk)[known]))
 
 
 def mean_revision(rollout: TensorDictBase) -> float:

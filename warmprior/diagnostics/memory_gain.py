@@ -21,6 +21,7 @@ from warmprior.diagnostics.flow import (
     sees_history,
 )
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_positive, check_whole_numbers
 
 __all__ = ["memory_gain"]
 
@@ -94,10 +95,8 @@ def memory_gain(
         >>> measured(PastPrior(4)) > 0.5, measured(GaussianPrior(4))
         (True, 0.0)
     """
-    if not (math.isfinite(shift) and shift > 0):
-        raise ValueError(f"shift must be a finite number > 0, got {shift}")
-    if split < 1:
-        raise ValueError(f"split must be at least 1, got {split}")
+    check_positive(shift=shift)
+    check_whole_numbers(split=split)
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
     windows = windows.reshape(windows.batch_size.numel())
     encoded = encoded_windows(policy, windows)

@@ -185,13 +185,7 @@ def _mean(values: Tensor, mask: Tensor) -> float:
 def compare_smoothness(
     rollouts: Mapping[str, TensorDictBase], *, mode: Mode | None = None
 ) -> dict[str, Smoothness]:
-    """Smoothness of several policies that decide equally often.
-
-    Args:
-        rollouts: by name, see :func:`executed_actions`.
-
-    Keyword Args:
-        mode: see :func:`smoothness`.
+    """Smoothness of several policies that decide equally often, by name, see :func:`smoothness`.
 
     Raises:
         ValueError: if the policies execute different numbers of actions per decision: their boundaries

@@ -16,7 +16,7 @@ from warmprior.diagnostics.flow import (
     allowed_nfes,
     drawn,
     evaluation_mode,
-    flat_windows,
+    judged,
     observed,
     predict,
 )
@@ -173,8 +173,7 @@ def source_leak(
             f"need draws >= 2, neighbours >= 1 and split >= 1, got {draws}, {neighbours} and {split}"
         )
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
-    flat = flat_windows(policy, windows, target_needed=True)
-    assert flat.target is not None
+    flat, target, rows, generator = judged(policy, windows, generator)
     n, device, chunk_length = len(flat), flat.loc.device, prior.chunk_length
     if episodes is None:
         episodes = windows.get(keys.EPISODE, None)
@@ -186,10 +185,7 @@ def source_leak(
         raise ValueError(
             f"each window needs neighbours in {neighbours} other episode(s), but there are {others}"
         )
-    if generator is None:
-        generator = torch.Generator(device).manual_seed(0)
-    rows = windows.select(*policy.in_keys).reshape(n).to(device)
-    target, counted = flat.target[:, :chunk_length], flat.counted[:, :chunk_length, 0]
+    target, counted = target[:, :chunk_length], flat.counted[:, :chunk_length, 0]
     moments = {nfe: RunningVariance() for nfe in allowed}
     steps = {nfe: 0.0 for nfe in allowed}
     with evaluation_mode(policy):

@@ -98,9 +98,7 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
 def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
     """Exponential moving average of a network's weights; the averaged copy is ``.module``.
 
-    Args:
-        network: the network being trained.
-        rate: decay per update. The first update copies the weights.
+    ``rate`` is the decay per update. The first update copies the weights.
 
     Raises:
         ValueError: if ``rate`` is not in [0, 1).

@@ -11,7 +11,7 @@ from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.history import ENTRIES, advance, cold_history, without
-from warmprior.modules.checks import check_finite_numbers
+from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.transforms.inner_step import keep_resting
 
 __all__ = ["ActionHistory", "WithheldHistory"]
@@ -59,8 +59,7 @@ class ActionHistory(Transform):
         executed_key: NestedKey = keys.EXECUTED,
     ) -> None:
         super().__init__(in_keys=[chunk_key], out_keys=HISTORY_KEYS)
-        if history_length < 1:
-            raise ValueError(f"history_length must be at least 1, got {history_length}")
+        check_whole_numbers(history_length=history_length)
         self.history_length = history_length
         self.chunk_key = unravel_key(chunk_key)
         self.executed_key = unravel_key(executed_key)

@@ -13,6 +13,7 @@ from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
 from warmprior.history import window_history
+from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import WithheldHistory
 from warmprior.transforms.history_observation import HistoryObservation
@@ -96,8 +97,7 @@ class ActionWindow(Transform):
     ) -> None:
         out_keys = [observation_key, chunk_key, pad_key, keys.HISTORY]
         super().__init__(in_keys=[frame_key], out_keys=out_keys)
-        if observation_steps < 1:
-            raise ValueError(f"observation_steps must be at least 1, got {observation_steps}")
+        check_whole_numbers(observation_steps=observation_steps)
         prediction_length = chunk_length if prediction_length is None else prediction_length
         history_length = chunk_length if history_length is None else history_length
         if not 1 <= chunk_length <= min(prediction_length, history_length):
@@ -317,8 +317,7 @@ def window_replay_buffer(
         >>> batch["vla_action", "chunk"].shape, batch["observation"].shape
         (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
     """
-    if batch_size < 1:
-        raise ValueError(f"batch_size must be at least 1, got {batch_size}")
+    check_whole_numbers(batch_size=batch_size)
     if isinstance(sampler, SliceSampler):
         raise ValueError(
             "SliceSampler needs whole steps in the storage, and this one holds step numbers: every window is "
