@@ -140,7 +140,7 @@ def column(name: str) -> tuple[str, str]:
     for end, words in ENDS.items():
         if name.endswith(end) and name.removesuffix(end) in COLUMNS:
             return ".2f", f"{name.removesuffix(end)}: {words}"
-    raise KeyError(f"no column is called {name!r}: columns.py says what each of them means")
+    raise KeyError(f"no column is called {name!r}: add it to COLUMNS, with its format and meaning")
 
 
 def definitions(names: Iterable[str]) -> str:
