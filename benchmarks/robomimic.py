@@ -51,8 +51,8 @@ def run(
     options = parse(presets, argv, study, doc, **parsing)
     with started(options, study) as out:
         # Demonstrations: generated, downloaded, or read from --dataset. On them a policy per task, method and
-        # seed: network, recipe and data are equal, and the source (methods.py) differs. `train` in common.py is
-        # where it meets the loss.
+        # seed: network, recipe and data are equal, and the source (methods.py) differs. It meets the loss in
+        # common.py, in `train`.
         policies = policies_of(options)
 
         # A row per policy, checkpoint and NFE: what it is, how it was played, and what came out.
