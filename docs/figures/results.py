@@ -283,8 +283,8 @@ def human() -> None:
             pair[0].plot([place] * len(each), each, ".", ms=7, alpha=0.55, color=SOURCES[row["source"]][1])
         lines(pair[1], part, "nfe", [1, 3, 9])
         setting, steps = f"{count} demonstrations", "integration steps (NFE)"
-        finish(pair[0], f"{setting}: score\n(dots: seeds)", xlabel=steps)
-        finish(pair[1], f"{setting}: episodes solved\n(95% interval)", xlabel=steps)
+        finish(pair[0], f"{setting}:\nscore (dots: seeds)", xlabel=steps)
+        finish(pair[1], f"{setting}:\nsolved (95% interval)", xlabel=steps)
     axes[0].set_ylabel("percent")
     save(made, "human")
 
