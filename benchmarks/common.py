@@ -355,6 +355,7 @@ def finished_policies(run: Path, options: Options, **sources: Any) -> list[Polic
     check_typed(stored, run, (*options.sources.prior, *options.data.task))
     if options.sources.sigma not in ((), stored.sources.sigma):
         raise ValueError(f"--run {run} has its own sigma: leave out --sigma")
+    methods = " ".join(stored.sources.prior)
     stored = with_parts(stored, run={"out": run}, sources=sources)
     check_single(stored, "task", "data", "chunk", "sigma")
     policies = policies_of(stored)
@@ -365,8 +366,7 @@ def finished_policies(run: Path, options: Options, **sources: Any) -> list[Polic
         if not policy.is_trained:
             raise FileNotFoundError(
                 f"--run {run} has no trained policy {policy} of these versions and data (options.json has "
-                f"its own): finish it with --resume --out {run}, or name its methods: --prior "
-                f"{' '.join(stored_options(Options, run, None).sources.prior)}"
+                f"its own): finish it with --resume --out {run}, or name its methods: --prior {methods}"
             )
     return policies
 
