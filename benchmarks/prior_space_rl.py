@@ -2,7 +2,7 @@
 
 python benchmarks/prior_space_rl.py --preset unit            # the navigation toy, about six minutes
 python benchmarks/prior_space_rl.py                          # lift from a weak policy, half an hour
-python benchmarks/prior_space_rl.py --preset paper --task square --run runs/square-ph-paper
+python benchmarks/prior_space_rl.py --preset paper --run runs/square-ph-paper
 python benchmarks/prior_space_rl.py --resume                 # after an interruption
 
 A frozen policy per source and seed comes from --run (a finished run of robomimic.py) or is trained first.
@@ -123,11 +123,6 @@ class AgentsOptions(Options):
     # itself collects).
     collectors: int | None = None
 
-    def __post_init__(self) -> None:
-        check_counts(self, "horizon", "num_envs", "threads", "collectors")
-        if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
-            raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
-
     @property
     def is_toy(self) -> bool:
         """Whether it is of the navigation toy."""
@@ -139,6 +134,9 @@ class AgentsOptions(Options):
         return TOY if self.is_toy else super().name
 
     def check(self) -> None:
+        check_counts(self, "horizon", "num_envs", "threads", "collectors")
+        if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
+            raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "data", "chunk", "sigma", "nfe")
@@ -274,7 +272,7 @@ def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method
         policies = policies_of(options)
         train_all(options, policies)
     else:
-        policies = finished_policies(run, options, prior=options.sources.prior)
+        policies = finished_policies(run, options)
     actors = trained_actors(policies, options.run.device)
     for method, group in actors.items():
         if missing := sorted(set(options.seeds) - group.keys()):

@@ -159,19 +159,20 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
     before = written(tmp_path)
 
     def frozen(priors):
-        found = benchmark.frozen_policies(read(f"--run {run} --out {out} --seeds 1 --prior {priors}"))[1]
+        found = benchmark.frozen_policies(read(f"--run {run} --out {out} --seeds 1 {priors}"))[1]
         return [
             (actors[0].prior.name, getattr(actors[0].prior, "correlation", 0.0)) for actors in found.values()
         ]
 
     own = "past,sigma=0.3"
-    assert frozen(f"past,correlation=0.50,sigma=0.3 {own}") == [("past", 0.5), ("past", 0.0)]
-    for priors in ("past,sigma=0.5", "preview"):
+    assert frozen(f"--prior past,correlation=0.50,sigma=0.3 {own}") == [("past", 0.5), ("past", 0.0)]
+    for priors in ("--prior past,sigma=0.5", "--prior preview"):
         with pytest.raises(FileNotFoundError, match=f"name its methods: --prior gaussian {own}"):
             frozen(priors)
-    for words, why in (("--task can", "is of lift: leave out --task"), ("--sigma 0.3", "has its own sigma")):
-        with pytest.raises(ValueError, match=why):
-            frozen(f"past {words}")
+    for words, why in (("--task can", "--task"), ("--sigma 0.3 --chunk 4", "--chunk, --sigma")):
+        with pytest.raises(ValueError, match=f"has its own {why}: leave these out"):
+            frozen(words)
+    assert len(frozen("")) == 3  # all of its methods
     few = {"rl__environment_steps": 60, "rl__warmup_steps": 30, "rl__evaluate_every": 60, "episodes": 1}
     argv = command_line(run=run, out=out, horizon=20, seeds=2, prior=own, num_envs=1, **few)
     assert benchmark.main(argv) == 0

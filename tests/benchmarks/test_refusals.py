@@ -57,6 +57,7 @@ def no_work(monkeypatch):
         ("curvature", "--run {tmp}", "there is no run in"),
         ("real_time_chunking", "--delay 5", "too long"),
         ("real_time_chunking", "--prior regression --nfe 1 --guidance rtc", "regression is no flow to guide"),
+        ("prior_space_rl", "--preset unit --horizon 0", "--horizon must be a whole number of at least 1"),
         ("prior_space_rl", "--preset unit --delta 0", "delta must be a finite number > 0, got 0.0"),
         ("prior_space_rl", "--preset unit --task can", "navigation and --preset unit belong together"),
         ("prior_space_rl", "--preset unit --collectors 2", "--collectors belongs to --engine ray"),
