@@ -186,7 +186,7 @@ class Options:
                 raise ValueError(f"{method.name} pairs within a batch: --batch-size must be at least 2")
 
 
-# A finished run of robomimic.py, whose policies to take instead of training them.
+# A finished run, whose policies to take instead of training them.
 FinishedRun = Annotated[Path | None, tyro.conf.arg(name="run")]
 
 
@@ -319,8 +319,9 @@ def parse[O: Options](
         check_typed(stored, out, known)
     elif finished is not None:
         theirs: Any = {part: getattr(base, part) for part in POLICY_PARTS}
-        theirs["sources"] = replace(base.sources, prior=options.sources.prior)  # some of its methods
-        check_same(replace(options, **theirs), options, f"--run {finished} has its own", "train anew, without --run")
+        # Some of its methods will do.
+        theirs["sources"] = replace(base.sources, prior=options.sources.prior)
+        check_same(replace(options, **theirs), options, f"--run {finished} has its own", "leave out --run")
         check_typed(base, finished, known)
     check_device(options.run.device)
     name = options.run.logger

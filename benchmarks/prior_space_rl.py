@@ -5,7 +5,7 @@ python benchmarks/prior_space_rl.py                          # lift from a weak 
 python benchmarks/prior_space_rl.py --preset paper --run runs/square-ph-paper
 python benchmarks/prior_space_rl.py --resume                 # after an interruption
 
-A frozen policy per source and seed comes from --run (a finished run of robomimic.py) or is trained first.
+A frozen policy per source and seed comes from --run (a finished run) or is trained first.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Arm:
 class AgentsOptions(Options):
     """A comparison of agents; the frozen policies are those of a comparison of sources."""
 
-    policies: FinishedRun = None  # a finished run of robomimic.py, whose policies to take instead of training
+    policies: FinishedRun = None  # a finished run, whose policies to take instead of training
     rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
     algorithm: tuple[Algorithm, ...] = ("dsrl-na",)  # of the agents' learning
     warm_algorithm: tuple[Algorithm, ...] = ()  # of sources with a mean (default: as --algorithm)
