@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise
@@ -19,32 +18,16 @@ from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorS
 from tqdm import tqdm
 
 from warmprior.data.hdf5_members import DatasetError
-from warmprior.data.index import BLOCK, DatasetIndex
+from warmprior.data.index import BLOCK, DatasetIndex, DemonstrationReader
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 
-__all__ = ["DemonstrationReader", "DemonstrationReplay"]
+__all__ = ["DemonstrationReplay"]
 
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
-
-
-class DemonstrationReader(ABC):
-    """Gives the values of demonstrations, whose :class:`DatasetIndex` is known."""
-
-    @abstractmethod
-    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"`` into ``out``, and check them."""
-
-    @abstractmethod
-    def images(self, demo: str, key: str, out: Tensor) -> None:
-        """Read the first images of a demo into uint8 ``[rows, 3, size, size]``."""
-
-    @abstractmethod
-    def name(self, demo: str, key: str) -> str:
-        """What errors call an array of a demo, with the file that holds it."""
 
 
 def _allocate(

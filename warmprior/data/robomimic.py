@@ -7,13 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from torch import Tensor
-
 from warmprior.data.download import download_robomimic
-from warmprior.data.hdf5 import open_robomimic, read_index, read_rows
-from warmprior.data.hdf5_images import read_images
-from warmprior.data.replay import DemonstrationReader, DemonstrationReplay
+from warmprior.data.hdf5 import RobomimicReader, open_robomimic, read_index
+from warmprior.data.index import DemonstrationReader
+from warmprior.data.replay import DemonstrationReplay
 from warmprior.envs.tasks import TASKS
 
 __all__ = ["RobomimicExperienceReplay"]
@@ -30,24 +27,10 @@ def _locate(dataset: str | Path, style: str, download: bool, root: str | Path | 
     )
 
 
-class _FileReader(DemonstrationReader):
-    def __init__(self, file: Any) -> None:
-        self.file = file
-
-    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        read_rows(self.file, demo, key, out, first)
-
-    def images(self, demo: str, key: str, out: Tensor) -> None:
-        read_images(self.file, demo, key, out)
-
-    def name(self, demo: str, key: str) -> str:
-        return f"{self.file.filename}: data/{demo}/{key}"
-
-
 @contextmanager
 def _reader(path: Path) -> Iterator[DemonstrationReader]:
     with open_robomimic(path) as file:
-        yield _FileReader(file)
+        yield RobomimicReader(file)
 
 
 class RobomimicExperienceReplay(DemonstrationReplay):

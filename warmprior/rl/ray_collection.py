@@ -112,7 +112,7 @@ def ray_rounds(
         collectors: how many actors.
         num_envs: environments of each.
         seed: of all draws.
-        address: of the cluster, see :func:`~warmprior.io.ray_cluster.check_ray`.
+        address: of the cluster, see :func:`~warmprior.io.ray_cluster.ray_cluster`.
 
     Yields:
         An iterator over rounds, ``[collectors, num_envs, 1]``.

@@ -18,7 +18,7 @@ from torchrl.envs.transforms import Transform
 
 from warmprior.data import download_mimicgen, download_robomimic, generate_demonstrations
 from warmprior.data.index import DatasetIndex
-from warmprior.data.opening import Demonstrations, open_demonstrations
+from warmprior.data.opening import Demonstrations
 from warmprior.data.render import renderer_versions
 from warmprior.data.replay import DemonstrationReplay
 from warmprior.envs.description import environment_description, robosuite_parts
@@ -327,7 +327,7 @@ def robosuite_task(
 
 def _open(place: Path | str, task: str | None, mask: str | None = None) -> Demonstrations:
     """The demonstrations at a place; the task's environment is theirs where they do not say."""
-    return open_demonstrations(place, task_env_args(task) if task in TASKS else None, mask)
+    return Demonstrations(place, task_env_args(task) if task in TASKS else None, mask)
 
 
 def _names(images: Mapping[str, Any] | None) -> list[str]:
