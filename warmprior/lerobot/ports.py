@@ -18,6 +18,9 @@ from warmprior.lerobot.injection import Source, SourceInjection
 
 __all__ = ["PORTS", "FlowPort", "check_steps", "port_for"]
 
+Velocity = Callable[[Tensor, Tensor], Tensor]
+"""``(t [B], a_t [B, T, D]) -> [B, T, D]``."""
+
 Record = Callable[[Tensor], None]
 """Takes what a sampler returned, ``[B, T, >= d_a]``."""
 
@@ -139,6 +142,10 @@ class FlowPort:
         with SourceInjection(self.length(policy), self.width(policy), source):
             return sample(*args, **kwargs)
 
+    def guiding(self, policy: Any, guide: Callable[[Velocity], Velocity]) -> AbstractContextManager[Any]:
+        """Context in which ``guide`` changes the sampler's velocities, whose source is at time 0."""
+        raise ValueError(f"guidance is for pi0, pi05 and smolvla: leave it out with {type(policy).__name__}")
+
     def predict(self, policy: Any, batch: dict[str, Any]) -> None:
         """Sample a chunk for a batch of observations, without a queue."""
         policy.predict_action_chunk(batch)
@@ -187,6 +194,22 @@ class OpenPiPort(FlowPort):
         image = args[0][0]
         shape = torch.Size((len(image), self.length(policy), self.width(policy)))
         return sample(*args, **kwargs | {"noise": source(shape, torch.float32, image.device)})
+
+    def guiding(self, policy: Any, guide: Callable[[Velocity], Velocity]) -> AbstractContextManager[Any]:
+        """These families integrate from 1, the source, to 0: velocities have the other sign."""
+        rtc = getattr(policy.config, "rtc_config", None)
+        if rtc is not None and rtc.enabled:
+            raise ValueError("the policy's own rtc_config guides already: turn it off, or leave out guidance")
+
+        def guided(
+            step: Callable[..., Tensor], *args: Any, x_t: Tensor, timestep: Tensor, **kw: Any
+        ) -> Tensor:
+            def velocity(t: Tensor, a: Tensor) -> Tensor:
+                return -step(*args, x_t=a, timestep=1 - t, **kw)
+
+            return -guide(velocity)(1 - timestep, x_t)
+
+        return _replaced(policy, "model.denoise_step", guided)
 
 
 class GrootPort(FlowPort):
