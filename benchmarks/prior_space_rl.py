@@ -373,7 +373,7 @@ def main(argv: list[str] | None) -> None:
         draw(found, out / "curves.png", title, options.rl.warmup_steps)
         agents = ["algorithm", "method", "evaluation"]
         last = found.groupby([*agents, "seed"], sort=False).tail(1)
-        greedy = last[last.evaluation == "greedy"]
+        greedy = last[last.evaluation == "greedy"].assign(algorithm=last.algorithm.str.upper())
         plot_success(greedy, out / "success.png", f"{title}: greedy agents", group="algorithm")
         last = last.assign(seeds=last.groupby(agents)["seed"].transform("nunique"))
         text = table(last, agents, ["seeds", "delta", "environment_steps", "success_rate"])
