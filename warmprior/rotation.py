@@ -107,9 +107,6 @@ def rotation_6d_to_rotvec(rotation_6d: Tensor) -> Tensor:
     Raises:
         ValueError: if the last dimension is not 6.
 
-    See Also:
-        :func:`~warmprior.envs.absolute_to_env_action`: turns whole actions.
-
     Examples:
         >>> import torch
         >>> from warmprior.envs import rotation_6d_to_rotvec

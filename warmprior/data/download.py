@@ -51,10 +51,6 @@ def download_robomimic(
         OSError: if no repository delivers a readable file; names every attempt and its cause.
         ImportError: if h5py or huggingface_hub is not installed.
 
-    See Also:
-        - :class:`~warmprior.data.RobomimicExperienceReplay`: reads the file.
-        - :func:`~warmprior.data.download_mimicgen`: MimicGen's files.
-
     Examples:
         >>> from warmprior.data import download_robomimic
         >>> download_robomimic("square", "mh")  # doctest: +SKIP
@@ -124,9 +120,6 @@ def download_lerobot(
     Raises:
         OSError: if the repository, or one of this version, cannot be had.
         ImportError: if huggingface_hub is not installed.
-
-    See Also:
-        :class:`~warmprior.data.LeRobotExperienceReplay`: reads the dataset.
 
     Examples:
         >>> from warmprior.data import download_lerobot

@@ -78,10 +78,6 @@ def render_demonstrations(
         RuntimeError: if nothing here can render.
         OSError: if the disk is full; what is finished stays.
 
-    See Also:
-        - :class:`~warmprior.data.RobomimicExperienceReplay`: reads the images.
-        - :func:`~warmprior.data.generate_demonstrations`: makes files to render.
-
     Examples:
         >>> from warmprior.data import render_demonstrations
         >>> path = render_demonstrations("square.hdf5", ["agentview"])  # doctest: +SKIP

@@ -31,9 +31,6 @@ def history_indices(history_length: int, length: int, lead: int = 0) -> list[int
         length: ``T``, the length of the policy's chunk.
         lead: positions of the chunk before the current step.
 
-    See Also:
-        :class:`~warmprior.lerobot.WarmPriorAdapter`: reads these steps of a dataset.
-
     Examples:
         >>> from warmprior.lerobot import history_indices
         >>> history_indices(2, 3)

@@ -37,10 +37,6 @@ class ChunkSource:
     Raises:
         ValueError: if the prior does not fit the policy.
 
-    See Also:
-        - :class:`~warmprior.lerobot.LeRobotFlow`: integrates from its samples.
-        - :class:`~warmprior.lerobot.WarmPriorAdapter`: gives it to a policy of LeRobot.
-
     Examples:
         >>> from warmprior.lerobot import ChunkSource
         >>> import torch
@@ -178,9 +174,6 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
     Raises:
         ValueError: if needed statistics are missing, a dimension never varies, the policy normalises actions
             elsewhere, or it has no port.
-
-    See Also:
-        :class:`~warmprior.lerobot.WarmPriorAdapter`: uses these units for ``sigma``.
 
     Examples:
         >>> from warmprior.lerobot import action_std
