@@ -195,8 +195,8 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         ...             file[f"data/demo_0/{name}"] = np.ones(shape)
         ...         file["data"].attrs["env_args"] = '{"env_name": "Toy", "env_kwargs": {}}'
         ...     replay = RobomimicExperienceReplay(path, observation_keys=["object"], batch_size=4)
-        >>> replay.episode_lengths, replay.sample()["observation"].shape
-        (tensor([9]), torch.Size([4, 3]))
+        >>> replay.num_episodes, replay.sample()["observation"].shape
+        (1, torch.Size([4, 3]))
     """
 
     def __init__(
@@ -278,11 +278,6 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         return self._index.observation_keys
 
     @property
-    def image_keys(self) -> tuple[str, ...]:
-        """The images next to ``("observation", "state")``."""
-        return self._index.image_keys
-
-    @property
     def image_size(self) -> int:
         """Side of the images in pixels, 0 if there are none."""
         return self._index.image_size
@@ -305,8 +300,3 @@ class DemonstrationReplay(TensorDictReplayBuffer):
     def num_episodes(self) -> int:
         """The number of demos read."""
         return len(self._index.demos)
-
-    @property
-    def episode_lengths(self) -> Tensor:
-        """Steps of each episode, ``[num_episodes]`` int64 on the CPU."""
-        return torch.tensor(self._index.lengths)

@@ -265,41 +265,35 @@ class WarmPriorAdapter:
             yield
 
     def _window(self, batch: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        missing = [name for name in ("action", "action_is_pad") if name not in batch]
+        length, history, lead = self.source.length, self.prior.history_length, self.source.lead
+        expected = {"action": len(self.action_indices)}
+        if HISTORY in batch:
+            expected = {"action": length, HISTORY: history}
+        missing = [name for key in expected for name in (key, f"{key}_is_pad") if name not in batch]
         if missing:
             raise KeyError(
                 f"the batch lacks {' and '.join(missing)}: the history would leak the target without the "
                 "mask that LeRobotDataset gives with delta_timestamps"
             )
-        actions, is_pad = batch["action"], batch["action_is_pad"].bool()
-        length, history = self.source.length, self.prior.history_length
-        if HISTORY in batch:
-            if HISTORY_IS_PAD not in batch:
-                raise KeyError(f"the batch has {HISTORY}, but not {HISTORY_IS_PAD}")
-            past, past_is_pad = batch[HISTORY], batch[HISTORY_IS_PAD].bool()
-            expected = [length, history]
-        else:
-            past, past_is_pad = actions, is_pad
-            expected = [len(self.action_indices)]
-            if actions.shape[1] == expected[0]:
-                before = max(history, self.source.lead)
-                past, past_is_pad = (value[:, :before][:, -history:] for value in (actions, is_pad))
-        given = [actions.shape[1], *([past.shape[1]] if HISTORY in batch else [])]
+        given = {key: batch[key].shape[1] for key in expected}
         if given != expected:
             raise ValueError(
-                f"the batch has windows of {given} actions, expected {expected}: {history} before the "
-                f"current step and T={length} of the chunk. Take the steps of adapter.action_indices "
-                "from the dataset"
+                f"the batch has windows of {[*given.values()]} actions, expected {[*expected.values()]}: "
+                f"{history} before the current step and T={length} of the chunk. Take the steps of "
+                "adapter.action_indices from the dataset"
             )
-        for name, mask, values in (
-            ("action_is_pad", is_pad, actions),
-            (HISTORY_IS_PAD if HISTORY in batch else "action_is_pad", past_is_pad, past),
-        ):
-            if mask.shape != values.shape[:2]:
+        for key in expected:
+            mask, wanted = batch[f"{key}_is_pad"].shape, batch[key].shape[:2]
+            if mask != wanted:
                 raise ValueError(
-                    f"{name} has shape {tuple(mask.shape)}, expected {tuple(values.shape[:2])}: it marks "
-                    "padding among all actions of the window, those of the history included"
+                    f"{key}_is_pad has shape {tuple(mask)}, expected {tuple(wanted)}: it marks padding among "
+                    "all actions of the window, those of the history included"
                 )
+        actions, is_pad = batch["action"], batch["action_is_pad"].bool()
+        if HISTORY in batch:
+            past, past_is_pad = batch[HISTORY], batch[HISTORY_IS_PAD].bool()
+        else:
+            past, past_is_pad = (v[:, : max(history, lead)][:, -history:] for v in (actions, is_pad))
         return past, ~past_is_pad, actions[:, -length:], is_pad[:, -length:]
 
     def _source(self, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
