@@ -64,9 +64,9 @@ class RobomimicExperienceReplay(DemonstrationReplay):
             ``storage="memmap"`` where they are many.
         absolute_actions: turn the recorded pose deltas into absolute poses
             (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm.
-        **kwargs: those of :class:`~warmprior.data.replay.DemonstrationReplay`: ``storage``, ``scratch_dir``
-            and ``device``, and ``batch_size``, ``sampler``, ``transform``, ``prefetch``, ``pin_memory`` or
-            ``generator`` of TorchRL's.
+        **kwargs: ``storage``: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default
+            temporary ones; ``device`` of the tensors in memory; and ``batch_size``, ``sampler``,
+            ``transform``, ``prefetch``, ``pin_memory`` or ``generator`` of TorchRL's.
 
     Raises:
         FileNotFoundError: if there is no such file.
