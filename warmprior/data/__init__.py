@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from warmprior.data.convert import convert_robomimic
-from warmprior.data.download import download_lerobot, download_mimicgen, download_robomimic
+from warmprior.data.download import download_lerobot, download_robomimic
 from warmprior.data.hdf5 import DatasetError
 from warmprior.data.lerobot import LeRobotExperienceReplay, lerobot_steps
-from warmprior.data.mimicgen import MimicGenExperienceReplay
 from warmprior.data.render import render_demonstrations
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.data.scripted import generate_demonstrations
@@ -14,11 +13,9 @@ from warmprior.data.scripted import generate_demonstrations
 __all__ = [
     "DatasetError",
     "LeRobotExperienceReplay",
-    "MimicGenExperienceReplay",
     "RobomimicExperienceReplay",
     "convert_robomimic",
     "download_lerobot",
-    "download_mimicgen",
     "download_robomimic",
     "generate_demonstrations",
     "lerobot_steps",
