@@ -42,7 +42,6 @@ def render_demonstrations(
     demos: int | None = None,
     fast: bool = False,
     out: str | Path | None = None,
-    cache_dir: str | Path | None = None,
     workers: int | None = None,
     progress: bool = True,
 ) -> Path:
@@ -61,9 +60,9 @@ def render_demonstrations(
     Keyword Args:
         demos: how many to render and keep, the first ones by their numbers; all if ``None``.
         fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-        out: where to write, replacing what is there; may be ``path`` itself. ``None`` for the cache, from
-            which a file rendered earlier from the same file is returned at once.
-        cache_dir: ``None`` for ``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set.
+        out: where to write, replacing what is there; may be ``path`` itself. ``None`` for the cache
+            (``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set), from which a file rendered
+            earlier from the same file is returned at once.
         workers: number of processes; ``None`` for one per available core.
         progress: show a bar with the remaining time.
 
@@ -103,7 +102,7 @@ def render_demonstrations(
     if out is None:
         names = "-".join(cameras) if len(cameras) < 3 else f"{len(cameras)}cameras"
         name = f"{path.stem}_{names}{size}{'fast' if fast else ''}_{identity}.hdf5"
-        out = cache_folder(cache_dir) / "rendered" / name
+        out = cache_folder() / "rendered" / name
         if out.exists():
             return out
     out = Path(out)

@@ -12,7 +12,7 @@ from torch import Tensor
 from warmprior.lerobot.memory import ActionMemory
 from warmprior.lerobot.ports import check_steps, port_for
 from warmprior.lerobot.relative import RelativeActions
-from warmprior.lerobot.source import ChunkSource, SigmaUnit, action_std
+from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.prior import Prior
 
 __all__ = ["HISTORY", "HISTORY_IS_PAD", "WarmPriorAdapter", "history_indices"]
@@ -60,10 +60,9 @@ class WarmPriorAdapter:
             the policy, whose later positions then start cold.
 
     Keyword Args:
-        sigma_unit: unit of ``sigma``: ``"model"`` (the normalised action space, as in the paper) or ``"std"``
-            (the standard deviation of the data), which does not depend on the normalisation.
-        stats: of the dataset (``dataset.meta.stats``), for ``sigma_unit="std"``.
-        action_std: the standard deviation itself, ``[d_a]`` in the model's units, instead of ``stats``.
+        std: standard deviation of the data in the model's units, ``[d_a]`` (see :func:`action_std`), if
+            ``sigma`` is in units of it, which do not depend on the normalisation; by default ``sigma`` is in
+            the normalised action space, as in the paper.
         relative: expresses remembered actions at the next state, for policies with relative actions.
         coupling: pairs the sources and targets of a batch (:data:`~warmprior.objectives.Coupling`), without
             observations; in their order by default.
@@ -89,9 +88,7 @@ class WarmPriorAdapter:
         policy: Any,
         prior: Prior,
         *,
-        sigma_unit: SigmaUnit = "model",
-        stats: Mapping[str, Mapping[str, Any]] | None = None,
-        action_std: Tensor | None = None,
+        std: Tensor | None = None,
         relative: RelativeActions | None = None,
         coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         cold_probability: float = 0.0,
@@ -111,7 +108,7 @@ class WarmPriorAdapter:
             width=self.port.width(policy),
             action_dim=policy.config.action_feature.shape[0],
             lead=self.port.lead(policy),
-            std=_std(policy, sigma_unit, stats, action_std),
+            std=std,
         )
         steps = policy.config.n_action_steps
         if steps > prior.chunk_length:
@@ -314,15 +311,3 @@ class WarmPriorAdapter:
     def _record(self, actions: Tensor) -> None:
         self._state = self._now
         self._memory.record(actions[:, self.source.positions, : self.source.action_dim])
-
-
-def _std(
-    policy: Any, unit: SigmaUnit, stats: Mapping[str, Mapping[str, Any]] | None, given: Tensor | None
-) -> Tensor | None:
-    if unit not in ("model", "std"):
-        raise ValueError(f"sigma_unit must be 'model' or 'std', got {unit!r}")
-    if unit == "model":
-        if given is not None:
-            raise ValueError("action_std has no effect with sigma_unit='model': give sigma_unit='std'")
-        return None
-    return action_std(policy, stats) if given is None else torch.as_tensor(given)
