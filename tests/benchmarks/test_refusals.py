@@ -22,7 +22,7 @@ def no_work(monkeypatch):
     def never(*args, **options):
         raise AssertionError("work was begun")
 
-    loaders = ("generate_demonstrations", "download_robomimic", "download_mimicgen")
+    loaders = ("generate_demonstrations", "download_robomimic")
     for place in ("common.train_policy", *(f"warmprior.training.task.{name}" for name in loaders)):
         monkeypatch.setattr(place, never)
     for place in ("training.options.require_rendering", "envs.mimicgen.find_spec"):

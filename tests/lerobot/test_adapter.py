@@ -170,9 +170,7 @@ def test_withheld_histories_start_cold(policy):
 def test_sigma_in_units_of_the_data(policy):
     made = policy("xvla")  # raw units
     std = torch.linspace(0.1, 3.0, ACTION)
-    adapter = WarmPriorAdapter(
-        made, PastPrior(LENGTH, sigma=0.5), sigma_unit="std", action_std=std, generator=generator()
-    )
+    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.5), std=std, generator=generator())
     loc = torch.full((500, LENGTH, ACTION), 2.0)
     warm, cold = (window_history(loc, torch.full((500, 1), steps), loc, LENGTH) for steps in (LENGTH, 0))
     drawn = adapter.source.draw(warm, generator(1)) - loc
@@ -193,11 +191,11 @@ def test_the_standard_deviation_in_a_policys_units(policy):
     for family, normalised in by_hand.items():
         torch.testing.assert_close(action_std(policy(family), stats), normalised.std(0))
     with pytest.raises(ValueError, match="needs the statistics std, q01, q99 of 'action'"):
-        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit="std")
+        action_std(policy("pi05"), None)
     with pytest.raises(ValueError, match=r"by its own means \(IDENTITY\)"):
         action_std(policy("xvla"), stats)
-    with pytest.raises(ValueError, match="'model' or 'std'"):
-        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit="data")
+    with pytest.raises(ValueError, match="must be 7 finite numbers > 0"):
+        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), std=values.std(0) * 0)
 
 
 def pipelines(made, stats):

@@ -35,7 +35,6 @@ __all__ = [
     "DatasetError",
     "RobomimicReader",
     "open_robomimic",
-    "read_env_args",
     "read_index",
     "read_masks",
 ]
@@ -133,12 +132,6 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:  # not UTF-8 included
         raise DatasetError(f"{what} is not JSON ({error})") from error
     return check_env_args(what, parsed)
-
-
-def read_env_args(path: str | Path) -> dict[str, Any]:
-    """The environment that a robomimic file names, as the file has it: see :func:`check_env_args`."""
-    with open_robomimic(path) as file:
-        return _env_args(file, Path(path))
 
 
 def _demo(file: h5py.File, name: str) -> h5py.Group:

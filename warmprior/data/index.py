@@ -35,16 +35,6 @@ class DatasetIndex:
         action_dim: the width of the actions.
         env_args: the environment as it is described there; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from warmprior.data.index import DatasetIndex
-        >>> index = DatasetIndex(
-        ...     path=Path("square.hdf5"), demos=("demo_0", "demo_1"), lengths=(120, 131),
-        ...     observation_keys=("object",), observation_dims=(14,), image_keys=(), image_size=0,
-        ...     available_keys=("object", "agentview_image"), action_dim=7, env_args={}, task=None)
-        >>> sum(index.lengths), index.cameras
-        (251, ('agentview',))
     """
 
     path: Path

@@ -154,19 +154,13 @@ def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:
 class LeRobotExperienceReplay(DemonstrationReplay):
     """Demonstrations of a LeRobotDataset v3, as one immutable TorchRL replay buffer.
 
-    The counterpart of :class:`RobomimicExperienceReplay`, with the same entries and properties. Columns of
-    the parquet files are read whole, instead of item by item through
-    ``LeRobotDataset.__getitem__``; :class:`~warmprior.ActionWindow` makes windows of them, whose history and
-    padding are those of ``delta_timestamps``, but that what lies outside an episode is masked and zero
-    where LeRobot repeats its first action, which is part of the target.
+    The counterpart of :class:`RobomimicExperienceReplay`, with the same entries and properties.
+    :class:`~warmprior.ActionWindow` makes windows, whose history and padding are those of
+    ``delta_timestamps``, but that what lies outside an episode is masked and zero where LeRobot repeats its
+    first action, which is part of the target.
 
-    Of images only those that ``image_keys`` names are fetched and decoded, by LeRobot's own decoder, and of
-    the selected episodes alone; without images no video is opened. They are decoded once, into the uint8
-    storage: a training sees every frame many times in random order, where decoding a frame of 84 pixels
-    takes about ten times as long as gathering it (0.13 and 0.01 ms), and whatever reads the data, in any
-    process, finds plain tensors.
-
-    Without ``next.reward`` the rewards are ``next.success``, or zeros.
+    Of images only those that ``image_keys`` names are fetched and decoded, once and by LeRobot's own decoder,
+    and of the selected episodes alone. Without ``next.reward`` the rewards are ``next.success``, or zeros.
 
     Args:
         dataset: the dataset's folder, or its repository in the hub (``"user/name"``).

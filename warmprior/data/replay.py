@@ -161,42 +161,8 @@ def _understanding(what: str) -> Iterator[None]:
 class DemonstrationReplay(TensorDictReplayBuffer):
     """Demonstrations, as one immutable TorchRL replay buffer; formats are subclasses of it.
 
-    The entries are those that :class:`RobomimicExperienceReplay` tells, whatever the format.
-
-    Args:
-        index: what to read.
-        reader: the context in which it can be read.
-
-    Keyword Args:
-        described: what errors call the index's ``env_args``.
-        absolute_actions: turn the recorded pose deltas into absolute poses
-            (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm.
-        storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``.
-        scratch_dir: folder of the memory maps; temporary files if ``None``.
-        device: device of the tensors; ``"cpu"`` for ``"memmap"``.
-        **kwargs: arguments of :class:`~torchrl.data.TensorDictReplayBuffer`.
-
-    Raises:
-        DatasetError: if what is stored is not as it should be; says which file, demo and key.
-        ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
-            of a controller without pose deltas.
-        OSError: if there is no space for memory maps.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from tempfile import TemporaryDirectory
-        >>> import h5py
-        >>> import numpy as np
-        >>> from warmprior.data import RobomimicExperienceReplay
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "toy.hdf5"
-        ...     with h5py.File(path, "w") as file:
-        ...         for name, shape in {"actions": (9, 2), "rewards": (9,), "obs/object": (9, 3)}.items():
-        ...             file[f"data/demo_0/{name}"] = np.ones(shape)
-        ...         file["data"].attrs["env_args"] = '{"env_name": "Toy", "env_kwargs": {}}'
-        ...     replay = RobomimicExperienceReplay(path, observation_keys=["object"], batch_size=4)
-        >>> replay.episode_lengths, replay.sample()["observation"].shape
-        (tensor([9]), torch.Size([4, 3]))
+    Entries, options and errors are those that :class:`RobomimicExperienceReplay` tells. ``reader`` is the
+    context in which what ``index`` selects can be read, and ``described`` what errors call its ``env_args``.
     """
 
     def __init__(
@@ -278,11 +244,6 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         return self._index.observation_keys
 
     @property
-    def image_keys(self) -> tuple[str, ...]:
-        """The images next to ``("observation", "state")``."""
-        return self._index.image_keys
-
-    @property
     def image_size(self) -> int:
         """Side of the images in pixels, 0 if there are none."""
         return self._index.image_size
@@ -305,8 +266,3 @@ class DemonstrationReplay(TensorDictReplayBuffer):
     def num_episodes(self) -> int:
         """The number of demos read."""
         return len(self._index.demos)
-
-    @property
-    def episode_lengths(self) -> Tensor:
-        """Steps of each episode, ``[num_episodes]`` int64 on the CPU."""
-        return torch.tensor(self._index.lengths)

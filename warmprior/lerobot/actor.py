@@ -46,10 +46,6 @@ class LeRobotFlow(TensorDictModuleBase):
             another shape than the model's source.
         KeyError: if an input key is missing.
 
-    See Also:
-        - :class:`~warmprior.lerobot.LeRobotActor`: this with a prior and memory: a whole policy.
-        - :class:`~warmprior.lerobot.WarmPriorAdapter`: stays within LeRobot instead.
-
     Examples:
         >>> from warmprior import PastPrior
         >>> from warmprior.lerobot import LeRobotFlow, WarmPriorAdapter

@@ -12,7 +12,7 @@ from torch import Tensor
 from warmprior.lerobot.memory import ActionMemory
 from warmprior.lerobot.ports import Velocity, check_steps, port_for
 from warmprior.lerobot.relative import RelativeActions
-from warmprior.lerobot.source import ChunkSource, SigmaUnit, action_std
+from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
 
@@ -31,9 +31,6 @@ def history_indices(history_length: int, length: int, lead: int = 0) -> list[int
         history_length: of the prior, usually ``H``.
         length: ``T``, the length of the policy's chunk.
         lead: positions of the chunk before the current step.
-
-    See Also:
-        :class:`~warmprior.lerobot.WarmPriorAdapter`: reads these steps of a dataset.
 
     Examples:
         >>> from warmprior.lerobot import history_indices
@@ -64,10 +61,9 @@ class WarmPriorAdapter:
             the policy, whose later positions then start cold.
 
     Keyword Args:
-        sigma_unit: unit of ``sigma``: ``"model"`` (the normalised action space, as in the paper) or ``"std"``
-            (the standard deviation of the data), which does not depend on the normalisation.
-        stats: of the dataset (``dataset.meta.stats``), for ``sigma_unit="std"``.
-        action_std: the standard deviation itself, ``[d_a]`` in the model's units, instead of ``stats``.
+        std: standard deviation of the data in the model's units, ``[d_a]`` (see :func:`action_std`), if
+            ``sigma`` is in units of it, which do not depend on the normalisation; by default ``sigma`` is in
+            the normalised action space, as in the paper.
         relative: expresses remembered actions at the next state, for policies with relative actions.
         coupling: pairs the sources and targets of a batch (:data:`~warmprior.objectives.Coupling`), without
             observations; in their order by default.
@@ -95,9 +91,7 @@ class WarmPriorAdapter:
         policy: Any,
         prior: Prior,
         *,
-        sigma_unit: SigmaUnit = "model",
-        stats: Mapping[str, Mapping[str, Any]] | None = None,
-        action_std: Tensor | None = None,
+        std: Tensor | None = None,
         relative: RelativeActions | None = None,
         coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         cold_probability: float = 0.0,
@@ -118,7 +112,7 @@ class WarmPriorAdapter:
             width=self.port.width(policy),
             action_dim=policy.config.action_feature.shape[0],
             lead=self.port.lead(policy),
-            std=_std(policy, sigma_unit, stats, action_std),
+            std=std,
         )
         steps = policy.config.n_action_steps
         if steps > prior.chunk_length:
@@ -302,41 +296,35 @@ class WarmPriorAdapter:
         return with_leftover(chunk, rest[:, : chunk.shape[1], : chunk.shape[2]], delay)
 
     def _window(self, batch: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        missing = [name for name in ("action", "action_is_pad") if name not in batch]
+        length, history, lead = self.source.length, self.prior.history_length, self.source.lead
+        expected = {"action": len(self.action_indices)}
+        if HISTORY in batch:
+            expected = {"action": length, HISTORY: history}
+        missing = [name for key in expected for name in (key, f"{key}_is_pad") if name not in batch]
         if missing:
             raise KeyError(
                 f"the batch lacks {' and '.join(missing)}: the history would leak the target without the "
                 "mask that LeRobotDataset gives with delta_timestamps"
             )
-        actions, is_pad = batch["action"], batch["action_is_pad"].bool()
-        length, history = self.source.length, self.prior.history_length
-        if HISTORY in batch:
-            if HISTORY_IS_PAD not in batch:
-                raise KeyError(f"the batch has {HISTORY}, but not {HISTORY_IS_PAD}")
-            past, past_is_pad = batch[HISTORY], batch[HISTORY_IS_PAD].bool()
-            expected = [length, history]
-        else:
-            past, past_is_pad = actions, is_pad
-            expected = [len(self.action_indices)]
-            if actions.shape[1] == expected[0]:
-                before = max(history, self.source.lead)
-                past, past_is_pad = (value[:, :before][:, -history:] for value in (actions, is_pad))
-        given = [actions.shape[1], *([past.shape[1]] if HISTORY in batch else [])]
+        given = {key: batch[key].shape[1] for key in expected}
         if given != expected:
             raise ValueError(
-                f"the batch has windows of {given} actions, expected {expected}: {history} before the "
-                f"current step and T={length} of the chunk. Take the steps of adapter.action_indices "
-                "from the dataset"
+                f"the batch has windows of {[*given.values()]} actions, expected {[*expected.values()]}: "
+                f"{history} before the current step and T={length} of the chunk. Take the steps of "
+                "adapter.action_indices from the dataset"
             )
-        for name, mask, values in (
-            ("action_is_pad", is_pad, actions),
-            (HISTORY_IS_PAD if HISTORY in batch else "action_is_pad", past_is_pad, past),
-        ):
-            if mask.shape != values.shape[:2]:
+        for key in expected:
+            mask, wanted = batch[f"{key}_is_pad"].shape, batch[key].shape[:2]
+            if mask != wanted:
                 raise ValueError(
-                    f"{name} has shape {tuple(mask.shape)}, expected {tuple(values.shape[:2])}: it marks "
-                    "padding among all actions of the window, those of the history included"
+                    f"{key}_is_pad has shape {tuple(mask)}, expected {tuple(wanted)}: it marks padding among "
+                    "all actions of the window, those of the history included"
                 )
+        actions, is_pad = batch["action"], batch["action_is_pad"].bool()
+        if HISTORY in batch:
+            past, past_is_pad = batch[HISTORY], batch[HISTORY_IS_PAD].bool()
+        else:
+            past, past_is_pad = (v[:, : max(history, lead)][:, -history:] for v in (actions, is_pad))
         return past, ~past_is_pad, actions[:, -length:], is_pad[:, -length:]
 
     def _source(self, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -368,15 +356,3 @@ class WarmPriorAdapter:
     def _record(self, actions: Tensor) -> None:
         self._state = self._now
         self._memory.record(self._spliced(actions)[:, self.source.positions, : self.source.action_dim])
-
-
-def _std(
-    policy: Any, unit: SigmaUnit, stats: Mapping[str, Mapping[str, Any]] | None, given: Tensor | None
-) -> Tensor | None:
-    if unit not in ("model", "std"):
-        raise ValueError(f"sigma_unit must be 'model' or 'std', got {unit!r}")
-    if unit == "model":
-        if given is not None:
-            raise ValueError("action_std has no effect with sigma_unit='model': give sigma_unit='std'")
-        return None
-    return action_std(policy, stats) if given is None else torch.as_tensor(given)

@@ -327,10 +327,6 @@ def port_for(policy: Any) -> FlowPort:
         ValueError: if there is none, or it does not support the policy's options.
         ImportError: if there is none for this release.
 
-    See Also:
-        - :class:`~warmprior.lerobot.FlowPort`: what it returns.
-        - :data:`~warmprior.lerobot.PORTS`: all of them.
-
     Examples:
         >>> from warmprior.lerobot import port_for
         >>> port_for(policy).length(policy)  # a SmolVLAPolicy  # doctest: +SKIP

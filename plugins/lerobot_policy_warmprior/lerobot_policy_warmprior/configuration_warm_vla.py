@@ -22,8 +22,7 @@ class WarmConfigMixin:
     Attributes:
         prior: its name, with options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
         prior_chunk: ``H``, the actions that it remembers; by default as many as the chunk allows.
-        sigma_unit: what sigma is in units of: ``model`` or ``std``, see
-            :class:`~warmprior.lerobot.WarmPriorAdapter`.
+        sigma_unit: what sigma is in units of: ``model`` (normalised actions) or ``std`` (deviations of data).
         action_std: taken from the dataset for ``std``, and kept with the policy.
         cold_probability: share of the training windows whose history is withheld.
     """

@@ -27,6 +27,8 @@ class WarmPolicyMixin:
             )
         self.__dict__["warm_adapter"] = None  # the policy's own constructor resets
         super().__init__(config, *args, **kwargs)
+        if config.sigma_unit not in ("model", "std"):
+            raise ValueError(f"sigma_unit must be 'model' or 'std', got {config.sigma_unit!r}")
         if config.sigma_unit == "std" and config.action_std is None:
             config.action_std = action_std(self, dataset_stats).tolist()
         std = torch.tensor(config.action_std) if config.sigma_unit == "std" else None
@@ -35,8 +37,7 @@ class WarmPolicyMixin:
         self.__dict__["warm_adapter"] = WarmPriorAdapter(
             self,
             prior,
-            sigma_unit=config.sigma_unit,
-            action_std=std,
+            std=std,
             cold_probability=config.cold_probability,
         )
 
