@@ -195,6 +195,7 @@ def test_every_agent_has_a_name_of_its_own():
 
 @pytest.mark.slow
 def test_the_toy_is_solved_in_the_benchmarks_budget(tmp_path):
-    assert benchmark.main(["--preset", "unit", "--seeds", "1", "--out", str(tmp_path / "out")]) == 0
+    argv = command_line(preset="unit", centre="mean", delta=0.5, seeds=1, out=tmp_path / "out")
+    assert benchmark.main(argv) == 0
     (points,) = agents(stored(tmp_path / "out")).values()
     assert rates(points, "base")[0] <= 0.6 and rates(points, "greedy")[-1] >= 0.9
