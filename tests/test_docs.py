@@ -20,7 +20,6 @@ DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
 SHOWN_ALONE = {
     "warmprior.training.push_policy": "needs the hub",
-    "warmprior.data.download_lerobot": "fetches from the hub",
     "warmprior.data.lerobot_steps": "needs a dataset",
     "warmprior.modules.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",
@@ -30,7 +29,6 @@ SHOWN_ALONE = {
     "warmprior.io.ray_cluster.ray_cluster": "starts a cluster",
     "warmprior.rl.ray_collection.ray_rounds": "starts a cluster",
     "warmprior.lerobot.LeRobotActor": "needs a policy of LeRobot",
-    "warmprior.lerobot.LeRobotFlow": "needs a policy of LeRobot",
     "warmprior.lerobot.RelativeActions": "needs a policy of LeRobot",
     "warmprior.lerobot.WarmPriorAdapter": "needs a policy of LeRobot",
 }

@@ -13,7 +13,6 @@ from warmprior.envs.gymnasium import gym_env
 from warmprior.envs.navigation1d import (
     NavigationEnv,
     NavigationMetrics,
-    navigation_collides,
     navigation_demonstrations,
     navigation_heights,
     navigation_metrics,
@@ -40,7 +39,6 @@ __all__ = [
     "get_task",
     "gym_env",
     "modernize_env_args",
-    "navigation_collides",
     "navigation_demonstrations",
     "navigation_heights",
     "navigation_metrics",

@@ -98,15 +98,6 @@ def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
     """Whether the straight segments between consecutive points enter an obstacle, bool ``[*B, T - 1]``.
 
     The points are at positions ``[*B, T]``, increasing, and heights ``[*B, T]``.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.envs import navigation_collides
-        >>> x = torch.tensor([-0.6, -0.3, 0.0])
-        >>> navigation_collides(x, torch.tensor([0.0, 0.0, 0.0])).tolist()
-        [True, False]
-        >>> navigation_collides(x, torch.tensor([0.5, 0.5, 0.0])).tolist()
-        [False, False]
     """
     x0, x1, y0, y1 = x[..., :-1], x[..., 1:], y[..., :-1], y[..., 1:]
     hit = torch.zeros_like(y0, dtype=torch.bool)

@@ -26,32 +26,10 @@ class LeRobotFlow(TensorDictModuleBase):
 
     A deterministic map ``(noise, observation) -> chunk``, source and chunk ``[*B, P, d_a]`` in the model's
     units: the padding around the prior's part of the source is one fixed draw, unless a call passes its own.
-    The observation is ``[*B, To, d]`` (LeRobot's ``observation.state``), or a tensordict of such entries.
-    Images of bytes become floats in [0, 1]. The policy's weights are not among the parameters of this module.
+    The policy's weights are not among the parameters of this module. Options as of :class:`LeRobotActor`.
 
-    Args:
-        policy: of LeRobot, see :class:`WarmPriorAdapter`.
-        source: of its chunks.
-
-    Keyword Args:
-        names: LeRobot's name of each entry of the observation, such as
-            ``{"state": "observation.state", "agentview_image": "observation.images.top"}``.
-        preprocess: turns raw observations into the policy's batch, such as LeRobot's preprocessor; none by
-            default.
-        nfe: integration steps per chunk; the policy's own by default.
-        seed: of the padding.
-
-    Raises:
-        ValueError: if gradients are required, which LeRobot's samplers do not compute, or ``padding`` has
-            another shape than the model's source.
-        KeyError: if an input key is missing.
-
-    Examples:
-        >>> from warmprior import PastPrior
-        >>> from warmprior.lerobot import LeRobotFlow, WarmPriorAdapter
-        >>> adapter = WarmPriorAdapter(policy, PastPrior(8))  # doctest: +SKIP
-        >>> flow = LeRobotFlow(policy, adapter.source, nfe=1)  # doctest: +SKIP
-        >>> chunk = flow(data)["vla_action", "chunk"]  # doctest: +SKIP
+    A ``ValueError`` if gradients are required, which LeRobot's samplers do not compute, or ``padding`` has
+    another shape than the model's source; a ``KeyError`` if an input key is missing.
     """
 
     guidance = None
@@ -177,7 +155,14 @@ class LeRobotActor(TensorDictModuleBase):
     Keyword Args:
         std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it.
         generator: source of randomness; per call: ``actor(data, generator=...)``.
-        kwargs: further arguments of :class:`LeRobotFlow`, such as ``names``, ``preprocess`` and ``nfe``.
+        names: LeRobot's name of each entry of the observation, such as
+            ``{"state": "observation.state", "agentview_image": "observation.images.top"}``; an observation
+            that is a tensor ``[*B, To, d]`` is ``observation.state``. Images of bytes become floats in
+            [0, 1].
+        preprocess: turns raw observations into the policy's batch, such as LeRobot's preprocessor; none by
+            default.
+        nfe: integration steps per chunk; the policy's own by default.
+        seed: of the padding under a decoder.
 
     Raises:
         ValueError: see :class:`WarmPriorAdapter`.

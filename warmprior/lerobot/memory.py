@@ -25,7 +25,7 @@ class ActionMemory:
         action_dim: ``d_a``.
 
     Examples:
-        >>> from warmprior.lerobot import ActionMemory
+        >>> from warmprior.lerobot.memory import ActionMemory
         >>> import torch
         >>> from warmprior import PastPrior
         >>> memory = ActionMemory(PastPrior(2), action_dim=1)

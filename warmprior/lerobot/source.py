@@ -34,18 +34,6 @@ class ChunkSource:
 
     Raises:
         ValueError: if the prior does not fit the policy.
-
-    Examples:
-        >>> from warmprior.lerobot import ChunkSource
-        >>> import torch
-        >>> from warmprior import PastPrior
-        >>> from warmprior.history import window_history
-        >>> source = ChunkSource(PastPrior(4, sigma=0.0), length=6, width=3, action_dim=2, lead=1)
-        >>> executed, target = torch.full((1, 4, 2), 7.0), torch.zeros(1, 4, 2)
-        >>> history = window_history(executed, torch.tensor([[4]]), target, chunk_length=4)
-        >>> a0 = source.place(source.draw(history))
-        >>> a0.shape, (a0 == 7).sum(1).tolist()
-        (torch.Size([1, 6, 3]), [[4, 4, 0]])
     """
 
     def __init__(
