@@ -20,7 +20,7 @@ from warmprior.envs.navigation1d import (
 )
 from warmprior.envs.navigation_goal import GoalNavigationEnv
 from warmprior.envs.rendering import rendering_backend
-from warmprior.envs.robosuite import RobosuiteEnv, RobosuiteWrapper
+from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.envs.tasks import TASKS, TaskSpec, get_task
 
 __all__ = [
@@ -29,7 +29,6 @@ __all__ = [
     "NavigationEnv",
     "NavigationMetrics",
     "RobosuiteEnv",
-    "RobosuiteWrapper",
     "TaskSpec",
     "absolute_actions",
     "absolute_to_env_action",
