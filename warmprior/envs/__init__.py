@@ -18,14 +18,12 @@ from warmprior.envs.navigation1d import (
     navigation_metrics,
     navigation_positions,
 )
-from warmprior.envs.navigation_goal import GoalNavigationEnv
 from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.envs.tasks import TASKS, TaskSpec, get_task
 
 __all__ = [
     "TASKS",
-    "GoalNavigationEnv",
     "NavigationEnv",
     "NavigationMetrics",
     "RobosuiteEnv",
