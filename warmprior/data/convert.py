@@ -40,23 +40,9 @@ def convert_robomimic(
 ) -> Path:
     """Write the demonstrations of a robomimic HDF5 file as a LeRobotDataset v3, which LeRobot reads.
 
-    ==================================  ===============================================================
-    robomimic                           LeRobot
-    ==================================  ===============================================================
-    ``actions``                         ``action``, named ``robot0_x`` and so on
-    ``rewards``                         ``next.reward``; positive, also ``next.success``
-    the last step                       ``next.done``
-    ``obs/object``                      ``observation.environment_state``
-    ``obs/robot0_eef_pos`` and so on    ``observation.state``, side by side
-    ``obs/agentview_image``             ``observation.images.agentview``
-    ``control_freq`` of ``env_args``    ``fps``
-    the name of the task                ``task``
-    ``env_args``, ``mask``              ``meta/warmprior.json``, which LeRobot ignores
-    ==================================  ===============================================================
-
-    Numbers become float32. Simulator states are left out but for the first one, by which images are compared
-    with the simulator's before a training. The folder appears under its name when it is complete; an
-    interrupted call leaves nothing, and is begun again.
+    :doc:`/data` has a table of what becomes what. Numbers become float32. Simulator states are left out
+    but for the first one, by which images are compared with the simulator's before a training. The folder
+    appears under its name when it is complete; an interrupted call leaves nothing, and is begun again.
 
     Args:
         path: a robomimic HDF5 file, such as one of scripted demonstrations.
