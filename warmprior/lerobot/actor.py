@@ -13,7 +13,7 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.history import ENTRIES
-from warmprior.lerobot.ports import check_steps, port_for
+from warmprior.lerobot.ports import check_steps
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.network import network_observation
 from warmprior.modules.prior import Prior
@@ -47,7 +47,6 @@ class LeRobotFlow(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         check_steps(nfe)
-        self._port = port_for(policy)
         # Not a submodule: LeRobot trains and saves policies of billions of weights, not the agents that
         # contain this.
         self._policy = (policy,)
@@ -109,9 +108,9 @@ class LeRobotFlow(TensorDictModuleBase):
         own = getattr(self.policy, "warm_adapter", None)
         with (
             nullcontext() if own is None else own.aside(),
-            self._port.sampling(self.policy, draw, chunks.append, nfe),
+            self.source.port.sampling(self.policy, draw, chunks.append, nfe),
         ):
-            self._port.predict(self.policy, inputs)
+            self.source.port.predict(self.policy, inputs)
         chunk = chunks[0][:, self.source.positions, : self.source.action_dim]
         return tensordict.set(keys.CHUNK, chunk.to(noise).reshape(noise.shape))
 
@@ -192,20 +191,11 @@ class LeRobotActor(TensorDictModuleBase):
         **kwargs: Any,
     ) -> None:
         super().__init__()
-        port = port_for(policy)
         if getattr(policy.config, "use_relative_actions", False):
             raise ValueError(
                 "ActionHistory cannot express relative actions at the next state: use WarmPriorAdapter"
             )
-        source = ChunkSource(
-            prior,
-            length=port.length(policy),
-            width=port.width(policy),
-            action_dim=policy.config.action_feature.shape[0],
-            lead=port.lead(policy),
-            std=std,
-        )
-        self.ode = LeRobotFlow(policy, source, **kwargs)
+        self.ode = LeRobotFlow(policy, ChunkSource(policy, prior, std), **kwargs)
         self.generator = generator
         self.in_keys = [keys.OBSERVATION, *((keys.HISTORY, name) for name in ENTRIES)]
         self.out_keys = [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from warmprior.lerobot.memory import ActionMemory
-from warmprior.lerobot.ports import check_steps, port_for
+from warmprior.lerobot.ports import check_steps
 from warmprior.lerobot.relative import RelativeActions
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.prior import Prior
@@ -95,21 +95,13 @@ class WarmPriorAdapter:
         nfe: int | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        self.port = port_for(policy)
+        self.source = ChunkSource(policy, prior, std)
         if getattr(policy, "warm_adapter", None) is not None:
             raise ValueError(
                 f"{type(policy).__name__} starts from {policy.warm_adapter.prior} by itself: use its own "
                 "methods, or policy.warm_adapter"
             )
         self.policy, self.prior, self.generator = policy, prior, generator
-        self.source = ChunkSource(
-            prior,
-            length=self.port.length(policy),
-            width=self.port.width(policy),
-            action_dim=policy.config.action_feature.shape[0],
-            lead=self.port.lead(policy),
-            std=std,
-        )
         steps = policy.config.n_action_steps
         if steps > prior.chunk_length:
             raise ValueError(
@@ -170,7 +162,7 @@ class WarmPriorAdapter:
                 )
             return a0.to(dtype=dtype, device=device)
 
-        with self.port.training(self.policy, source):
+        with self.source.port.training(self.policy, source):
             return (self.policy.forward if forward is None else forward)(inputs, **kwargs)
 
     def select_action(
@@ -258,7 +250,7 @@ class WarmPriorAdapter:
 
     @contextmanager
     def _from_source(self) -> Iterator[None]:
-        with self.aside(), self.port.sampling(self.policy, self._source, self._record, self.nfe):
+        with self.aside(), self.source.port.sampling(self.policy, self._source, self._record, self.nfe):
             yield
 
     def _window(self, batch: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
