@@ -37,6 +37,7 @@ __all__ = [
     "open_robomimic",
     "read_index",
     "read_masks",
+    "read_origin",
 ]
 
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
@@ -132,6 +133,16 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:  # not UTF-8 included
         raise DatasetError(f"{what} is not JSON ({error})") from error
     return check_env_args(what, parsed)
+
+
+def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
+    """How the images of a file were rendered, and the first simulator state of a demo, if it says so."""
+    with open_robomimic(path) as file:
+        rendering = file["data"].attrs.get("rendering")
+        states = member(file, f"data/{demo}/states", "dataset")
+        with reading(file, f"data/{demo}/states"):
+            state = np.asarray(states[0], np.float64) if states is not None and states.size else None
+    return None if rendering is None else json.loads(rendering), state
 
 
 def _demo(file: h5py.File, name: str) -> h5py.Group:

@@ -124,12 +124,6 @@ def ray_cluster(
 
     Yields the module ``ray``. Errors are those of :func:`check_ray`; a ``WorkerError`` if a machine has other
     versions or cannot start the library, and an ``OSError`` if it does not see a folder.
-
-    Examples:
-        >>> from warmprior.io.ray_cluster import ray_cluster
-        >>> with ray_cluster(num_cpus=2) as ray:  # of this machine  # doctest: +SKIP
-        ...     ray.cluster_resources()["CPU"]
-        2.0
     """
     ray = require("ray", "ray")
     with contextlib.ExitStack() as stack:
