@@ -50,7 +50,7 @@ class LeRobotFlow(TensorDictModuleBase):
         # Not a submodule: LeRobot trains and saves policies of billions of weights, not the agents that
         # contain this.
         self._policy = (policy,)
-        self.source = source
+        self.source = self.network = source  # which has the width of actions
         self.names = dict(names or {})
         self.preprocess = preprocess
         self.nfe = nfe
@@ -62,11 +62,6 @@ class LeRobotFlow(TensorDictModuleBase):
     def policy(self) -> Any:
         """LeRobot's policy."""
         return self._policy[0]
-
-    @property
-    def network(self) -> ChunkSource:
-        """The source, which has the width of actions."""
-        return self.source
 
     def check_nfe(self, nfe: int | None) -> None:
         """A ``ValueError`` unless ``nfe`` is a number of integration steps."""
@@ -196,6 +191,7 @@ class LeRobotActor(TensorDictModuleBase):
                 "ActionHistory cannot express relative actions at the next state: use WarmPriorAdapter"
             )
         self.ode = LeRobotFlow(policy, ChunkSource(policy, prior, std), **kwargs)
+        self.network = self.ode.network
         self.generator = generator
         self.in_keys = [keys.OBSERVATION, *((keys.HISTORY, name) for name in ENTRIES)]
         self.out_keys = [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK]
@@ -204,11 +200,6 @@ class LeRobotActor(TensorDictModuleBase):
     def prior(self) -> Prior:
         """The source distribution."""
         return self.ode.source.prior
-
-    @property
-    def network(self) -> ChunkSource:
-        """The source, which has the width of actions."""
-        return self.ode.source
 
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None
