@@ -73,15 +73,12 @@ class LeRobotFlow(TensorDictModuleBase):
         """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source outside of the prior's part."""
         nfe = self.nfe if nfe is None else nfe
         check_steps(nfe)
-        missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
-        if missing:
-            raise KeyError(f"LeRobotFlow needs the keys {self.in_keys}; missing: {missing}")
-        noise = tensordict.get(keys.NOISE)
+        noise = tensordict[keys.NOISE]
         if torch.is_grad_enabled() and noise.requires_grad:
             raise ValueError("LeRobot's samplers compute no gradients: use no_grad or detach the source")
         batch = noise.shape[:-2]
         a0 = noise.reshape(-1, *noise.shape[-2:])
-        inputs = self._batch(network_observation(tensordict.get(keys.OBSERVATION), batch))
+        inputs = self._batch(network_observation(tensordict[keys.OBSERVATION], batch))
         if padding is None:
             # One draw for all rows, so that a chunk does not depend on the other rows.
             generator = torch.Generator(a0.device).manual_seed(self.seed)
