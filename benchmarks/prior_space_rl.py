@@ -44,7 +44,7 @@ from torchrl.envs.transforms import Compose
 
 from warmprior import PriorAnchor, WarmPriorActor, policy_transforms
 from warmprior.diagnostics.flow import sees_history
-from warmprior.envs import GoalNavigationEnv
+from warmprior.envs import NavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.files import read_json
@@ -295,7 +295,7 @@ def toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
     """The toy, in which nothing but the anchor is random."""
     transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
     transforms.append(PriorAnchor(actor))
-    return TransformedEnv(GoalNavigationEnv(batch_size=[num_envs]), transforms)
+    return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
 
 
 def simulators(

@@ -20,17 +20,12 @@ DOCS = Path(__file__).parents[1] / "docs"
 PACKAGES = sorted(m.name for m in pkgutil.iter_modules(warmprior.__path__) if m.ispkg)
 SHOWN_ALONE = {
     "warmprior.training.push_policy": "needs the hub",
-    "warmprior.data.download_lerobot": "fetches from the hub",
     "warmprior.data.lerobot_steps": "needs a dataset",
     "warmprior.modules.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",
     "warmprior.envs.mimicgen.register_mimicgen": "needs a package that is not on the package index",
-    "warmprior.io.processes.fresh_processes": "starts a process, for seconds",
-    "warmprior.io.processes.working": "starts a process, for seconds",
-    "warmprior.io.ray_cluster.ray_cluster": "starts a cluster",
     "warmprior.rl.ray_collection.ray_rounds": "starts a cluster",
     "warmprior.lerobot.LeRobotActor": "needs a policy of LeRobot",
-    "warmprior.lerobot.LeRobotFlow": "needs a policy of LeRobot",
     "warmprior.lerobot.RelativeActions": "needs a policy of LeRobot",
     "warmprior.lerobot.WarmPriorAdapter": "needs a policy of LeRobot",
 }

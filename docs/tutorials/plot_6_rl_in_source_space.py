@@ -34,7 +34,7 @@ from warmprior import (
 )
 from warmprior.diagnostics import executed_actions
 from warmprior.envs import (
-    GoalNavigationEnv,
+    NavigationEnv,
     navigation_demonstrations,
     navigation_heights,
     navigation_positions,
@@ -87,7 +87,7 @@ colors = dict(zip(policies, ("#7f7f7f", "#1f77b4"), strict=True))
 # %%
 # The goal
 # --------
-# :class:`~warmprior.envs.GoalNavigationEnv` is the same environment with a reward: 1 at the end of
+# :class:`~warmprior.envs.NavigationEnv` with a route is the same environment with a reward: 1 at the end of
 # the route *above both* obstacles. An episode ends, without reward, where it collides or passes on
 # the wrong side. An agent needs one more transform than usual:
 # :class:`~warmprior.PriorAnchor` writes the point around which the agent acts.
@@ -99,9 +99,7 @@ colors = dict(zip(policies, ("#7f7f7f", "#1f77b4"), strict=True))
 def make_env(actor, seed):  # of the simulator; nothing in this one is random
     transforms = policy_transforms(actor.prior, observation_steps=1)
     transforms.append(PriorAnchor(actor))
-    return TransformedEnv(
-        GoalNavigationEnv((1, 1), batch_size=[32]), transforms
-    )
+    return TransformedEnv(NavigationEnv((1, 1), batch_size=[32]), transforms)
 
 
 def draw_task(axis):

@@ -210,7 +210,7 @@ def replaced(path, value, key=f"data/demo_1/obs/{IMAGES[0]}"):
         (lambda images: images[..., :2], r"\(4, 16, 16, 2\).*images are uint8"),
         (lambda images: images[:3], "but actions has 4 rows"),
         (lambda images: images[:, :8], "only square images"),
-        (lambda images: images[:, :8, :8], "images of several sizes: agentview_image 8"),
+        (lambda images: images[:, :8, :8], "obs/agentview_image, 16 .*several sizes"),
         (None, "no images 'agentview_image'; it has robot0_eye_in_hand_image"),
     ],
 )

@@ -15,12 +15,12 @@ from tests.toy_env import ChunkPolicy
 from warmprior import GaussianPrior, PastPrior, policy_transforms, window_replay_buffer
 from warmprior.envs import (
     NavigationEnv,
-    navigation_collides,
     navigation_demonstrations,
     navigation_heights,
     navigation_metrics,
     navigation_positions,
 )
+from warmprior.envs.navigation1d import navigation_collides
 
 
 @pytest.mark.parametrize("batch_size", [(), (3,), (2, 2)])

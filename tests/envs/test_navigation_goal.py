@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchrl.envs.utils import check_env_specs
 
-from warmprior.envs import GoalNavigationEnv, navigation_heights
+from warmprior.envs import NavigationEnv, navigation_heights
 
 ROUTES = list(itertools.product((1, -1), repeat=2))
 STEPS = 64
@@ -44,7 +44,7 @@ def play(env, paths):
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("batch", [[], [3]])
 def test_specs(route, batch):
-    check_env_specs(GoalNavigationEnv(route, batch_size=batch))
+    check_env_specs(NavigationEnv(route, batch_size=batch))
 
 
 @pytest.mark.parametrize("route", ROUTES)
@@ -53,7 +53,7 @@ def test_which_demonstrations_succeed(route):
     paths = crossing_paths()
     x = torch.linspace(-1, 1, STEPS)
     middles = [int((x - c).abs().argmin()) for c in (-0.45, 0.45)]
-    rewards, length, solved = play(GoalNavigationEnv(route, batch_size=[len(paths)]), paths)
+    rewards, length, solved = play(NavigationEnv(route, batch_size=[len(paths)]), paths)
     sides = paths[:, middles].sign()
     for i, sign in enumerate(sides.tolist()):
         wrong = [m for m, got, asked in zip(middles, sign, route, strict=True) if got != asked]

@@ -143,7 +143,7 @@ def test_built_from_the_env_args_of_a_file(lift):
     ("options", "message"),
     [
         ({"task": "juggle"}, "unknown task 'juggle'; choose one of lift, can"),
-        ({}, "give either task or env_args"),
+        ({}, "give one of task, env_args and env"),
         ({"task": "lift", "style": "mg"}, "style is one of ph, mh, source, core, got 'mg'"),
         ({"task": "lift", "horizon": 0}, "horizon must be at least 1"),
         ({"task": "lift", "control_loop": "fast"}, "control_loop is lean or robosuite"),

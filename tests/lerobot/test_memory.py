@@ -6,7 +6,7 @@ import torch
 
 from warmprior import PreviewPrior
 from warmprior.history import ENTRIES
-from warmprior.lerobot import ActionMemory
+from warmprior.lerobot.memory import ActionMemory
 
 
 def chunk(first, length, size=2):

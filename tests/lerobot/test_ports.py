@@ -8,7 +8,8 @@ import torch
 from tests.lerobot.seen import at_times, watch
 from tests.lerobot.tiny import ACTION, LENGTH, MAKERS, STEPS, observations, width, windows
 from warmprior import GaussianPrior, PastPrior
-from warmprior.lerobot import WarmPriorAdapter, port_for
+from warmprior.lerobot import WarmPriorAdapter
+from warmprior.lerobot.ports import port_for
 
 FAMILIES = list(MAKERS)
 NOISE_AT_ONE = ("smolvla", "pi0", "pi05", "xvla")

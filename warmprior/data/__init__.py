@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from warmprior.data.convert import convert_robomimic
-from warmprior.data.download import download_lerobot, download_robomimic
+from warmprior.data.download import download_robomimic
 from warmprior.data.hdf5 import DatasetError
 from warmprior.data.lerobot import LeRobotExperienceReplay, lerobot_steps
 from warmprior.data.render import render_demonstrations
@@ -15,7 +15,6 @@ __all__ = [
     "LeRobotExperienceReplay",
     "RobomimicExperienceReplay",
     "convert_robomimic",
-    "download_lerobot",
     "download_robomimic",
     "generate_demonstrations",
     "lerobot_steps",

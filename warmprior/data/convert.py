@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from warmprior.data.hdf5 import open_robomimic, read_index, read_masks
-from warmprior.data.hdf5_members import DatasetError, member
+from warmprior.data.hdf5 import DatasetError, read_index, read_masks, read_origin
 from warmprior.data.index import DatasetIndex
 from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
 from warmprior.data.robomimic import RobomimicExperienceReplay
@@ -40,23 +39,9 @@ def convert_robomimic(
 ) -> Path:
     """Write the demonstrations of a robomimic HDF5 file as a LeRobotDataset v3, which LeRobot reads.
 
-    ==================================  ===============================================================
-    robomimic                           LeRobot
-    ==================================  ===============================================================
-    ``actions``                         ``action``, named ``robot0_x`` and so on
-    ``rewards``                         ``next.reward``; positive, also ``next.success``
-    the last step                       ``next.done``
-    ``obs/object``                      ``observation.environment_state``
-    ``obs/robot0_eef_pos`` and so on    ``observation.state``, side by side
-    ``obs/agentview_image``             ``observation.images.agentview``
-    ``control_freq`` of ``env_args``    ``fps``
-    the name of the task                ``task``
-    ``env_args``, ``mask``              ``meta/warmprior.json``, which LeRobot ignores
-    ==================================  ===============================================================
-
-    Numbers become float32. Simulator states are left out but for the first one, by which images are compared
-    with the simulator's before a training. The folder appears under its name when it is complete; an
-    interrupted call leaves nothing, and is begun again.
+    :doc:`/data` has a table of what becomes what. Numbers become float32. Simulator states are left out
+    but for the first one, by which images are compared with the simulator's before a training. The folder
+    appears under its name when it is complete; an interrupted call leaves nothing, and is begun again.
 
     Args:
         path: a robomimic HDF5 file, such as one of scripted demonstrations.
@@ -211,10 +196,7 @@ def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -
     for feature, widths in layout.items():
         borders = pairwise(np.cumsum([0, *widths.values()]).tolist())
         observations |= {key: (feature, *border) for key, border in zip(widths, borders, strict=True)}
-    with open_robomimic(index.path) as file:
-        rendering = file["data"].attrs.get("rendering")
-        states = member(file, f"data/{index.demos[0]}/states", "dataset")
-        first_state = None if states is None else np.asarray(states[0], np.float64).tolist()
+    rendering, state = read_origin(index.path, index.demos[0])
     masks = {
         name: [index.demos.index(demo) for demo in demos if demo in index.demos]
         for name, demos in read_masks(index.path).items()
@@ -225,8 +207,8 @@ def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -
         "env_args": index.env_args,
         "observations": {key: observations[key] for key in index.observation_keys},
         "masks": {name: sorted(numbers) for name, numbers in masks.items()},
-        "rendering": None if rendering is None else json.loads(rendering),
-        "first_state": first_state,
+        "rendering": rendering,
+        "first_state": None if state is None else state.tolist(),
     }
 
 

@@ -79,29 +79,11 @@ LEROBOT_VERSION = "v3.0"
 def download_lerobot(
     repository: str, files: Sequence[str] = ("meta/*",), *, revision: str | None = None
 ) -> Path:
-    """Fetch files of a LeRobotDataset, unless they are here already.
+    """Fetch files of a LeRobotDataset, by their patterns, unless they are here already; the dataset's folder.
 
     A dataset that was recorded here lies in ``$HF_LEROBOT_HOME/REPOSITORY`` and is taken from there, as
-    LeRobot does. Any other is kept in LeRobot's own cache, and read from it without a connection.
-
-    Args:
-        repository: such as ``"lerobot/libero"``.
-        files: patterns of what is needed; by default what describes the dataset.
-
-    Keyword Args:
-        revision: branch, tag or commit; the tag of version 3 of the format by default.
-
-    Returns:
-        The dataset's folder.
-
-    Raises:
-        OSError: if the repository, or one of this version, cannot be had.
-        ImportError: if huggingface_hub is not installed.
-
-    Examples:
-        >>> from warmprior.data import download_lerobot
-        >>> download_lerobot("lerobot/libero")  # doctest: +SKIP
-        PosixPath('.../hub/datasets--lerobot--libero/snapshots/...')
+    LeRobot does. Any other is kept in LeRobot's own cache, and read from it without a connection. An
+    ``OSError`` if the repository, or its ``revision`` (by default one of this version), cannot be had.
     """
     default = Path(require("huggingface_hub.constants", "lerobot").HF_HOME) / "lerobot"
     home = Path(os.environ.get("HF_LEROBOT_HOME") or default).expanduser()

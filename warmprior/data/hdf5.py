@@ -37,6 +37,7 @@ __all__ = [
     "open_robomimic",
     "read_index",
     "read_masks",
+    "read_origin",
 ]
 
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
@@ -134,6 +135,16 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
     return check_env_args(what, parsed)
 
 
+def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
+    """How the images of a file were rendered, and the first simulator state of a demo, if it says so."""
+    with open_robomimic(path) as file:
+        rendering = file["data"].attrs.get("rendering")
+        states = member(file, f"data/{demo}/states", "dataset")
+        with reading(file, f"data/{demo}/states"):
+            state = np.asarray(states[0], np.float64) if states is not None and states.size else None
+    return None if rendering is None else json.loads(rendering), state
+
+
 def _demo(file: h5py.File, name: str) -> h5py.Group:
     demo = member(file["data"], name, "group")
     if demo is None:  # listed, but not to be found: its index is damaged
@@ -200,8 +211,8 @@ def _check_widths(
             )
 
 
-def _image_size(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) -> int:
-    """Side in pixels of a demo's images, after checking that they are what they should be."""
+def _image_sizes(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int, str]:
+    """The sides in pixels of a demo's images, after checking that they are what they should be."""
     name, sizes = demo.name[1:], {}
     for key in keys:
         images = member(demo, f"obs/{key}", "dataset")
@@ -212,21 +223,20 @@ def _image_size(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) -
                 f"them: python -m warmprior render {path} --cameras {key.removesuffix('_image')}"
             )
         shape: tuple[int, ...] = images.shape or ()
-        what = f"{path}: {name}/obs/{key} has shape {shape} and type {images.dtype}"
+        wrong = ""
         if images.dtype != "uint8" or len(shape) != 4 or shape[-1] != 3:
+            wrong = "images are uint8 [steps, height, width, 3]"
+        elif shape[0] != steps:
+            wrong = f"but actions has {steps} rows"
+        elif shape[1] != shape[2]:
+            wrong = "only square images can be used"
+        if wrong:
             raise DatasetError(
-                f"{what}; images are uint8 [steps, height, width, 3]. Render them anew: python -m warmprior "
-                "render"
+                f"{path}: {name}/obs/{key} has shape {shape} and type {images.dtype}; {wrong}. Render them "
+                "anew: python -m warmprior render"
             )
-        if shape[0] != steps:
-            raise DatasetError(f"{what}, but actions has {steps} rows. Render the file anew")
-        if shape[1] != shape[2]:
-            raise DatasetError(f"{what}; only square images can be used. Render them anew")
-        sizes[key] = shape[1]
-    if len(set(sizes.values())) > 1:
-        listed = ", ".join(f"{key} {size}" for key, size in sizes.items())
-        raise DatasetError(f"{path}: {name} has images of several sizes: {listed}. Render them anew")
-    return next(iter(sizes.values()))
+        sizes[shape[1]] = f"{name}/obs/{key}"
+    return sizes
 
 
 def read_index(
@@ -283,11 +293,10 @@ def read_index(
             reference = reference or widths
             _check_widths(path, demo, widths, reference, f"data/{selected[0]}")
             lengths.append(steps)
-            if image_keys:
-                sides.setdefault(_image_size(path, demo, image_keys, steps), name)
+            sides = _image_sizes(path, demo, image_keys, steps) | sides
     if len(sides) > 1:
-        listed = ", ".join(f"{size} in data/{name}" for size, name in sides.items())
-        raise DatasetError(f"{path}: images have several sizes: {listed}. Render them anew")
+        listed = ", ".join(f"{size} in {name}" for size, name in sides.items())
+        raise DatasetError(f"{path}: images have sides of {listed}, several sizes. Render them anew")
     return DatasetIndex(
         path=path,
         demos=selected,

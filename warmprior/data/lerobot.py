@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ from torch import Tensor
 from warmprior.data.hdf5_members import DatasetError
 from warmprior.data.index import DemonstrationReader, store_finite
 from warmprior.data.lerobot_index import (
-    DESCRIPTION,
     REWARD,
     SUCCESS,
     LeRobotIndex,
@@ -223,13 +222,7 @@ class LeRobotExperienceReplay(DemonstrationReplay):
             demos=demos,
             env_args=env_args,
         )
-        super().__init__(
-            index,
-            nullcontext(LeRobotReader(index)),
-            described=f"{index.path / DESCRIPTION}: env_args" if index.described else "env_args",
-            absolute_actions=absolute_actions,
-            **kwargs,
-        )
+        super().__init__(index, LeRobotReader(index), absolute_actions=absolute_actions, **kwargs)
 
 
 def lerobot_steps(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from warmprior.data.hdf5 import open_robomimic, read_index
+from warmprior.data.hdf5 import open_robomimic, read_index, read_origin
 from warmprior.data.hdf5_members import DatasetError, member, reading
 from warmprior.data.index import DatasetIndex
 from warmprior.envs.env_args import modernize_env_args
@@ -240,16 +240,9 @@ class _Illustrator:
                 )
 
 
-def _rendering(file: Any) -> dict[str, Any] | None:
-    """How the images of an open file were rendered, where it says so."""
-    written = file["data"].attrs.get("rendering")
-    return None if written is None else json.loads(written)
-
-
 def _rendered_before(path: Path, index: DatasetIndex, cameras: Sequence[str], fast: bool) -> list[str]:
     """Other cameras whose images are known to be of the quality that is asked for: one goes for a file."""
-    with open_robomimic(path) as file:
-        before = _rendering(file)
+    before, _ = read_origin(path, index.demos[0])
     if before is None:
         return []
     kept = [c for c in index.cameras if c in before["cameras"] and c not in cameras]
@@ -293,12 +286,9 @@ def _write(path: Path, illustrator: _Illustrator, kept: Sequence[str]) -> None:
 def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) -> None:
     """Compare the first images of a file with the simulator's, see :func:`compare_first_images`."""
     index = read_index(path, image_keys=image_keys)
-    first = f"data/{index.demos[0]}"
+    rendering, state = read_origin(path, index.demos[0])
     with open_robomimic(path) as file:
-        rendering = _rendering(file)
-        states = member(file, f"{first}/states", "dataset")
-        state = None if states is None else states[0]
-        images = {key: file[f"{first}/obs/{key}"][0] for key in image_keys}
+        images = {key: file[f"data/{index.demos[0]}/obs/{key}"][0] for key in image_keys}
     compare_first_images(
         index,
         images,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -148,29 +147,17 @@ def _fill(index: DatasetIndex, data: TensorDictBase, reader: DemonstrationReader
         flag[last] = value
 
 
-@contextmanager
-def _understanding(what: str) -> Iterator[None]:
-    """Name the ``env_args`` that are not understood."""
-    try:
-        yield
-    except Exception as error:  # whatever their unexpected structure leads to
-        reason = str(error) if isinstance(error, ValueError) else repr(error)
-        raise DatasetError(f"{what} describes no environment as these actions need it: {reason}") from error
-
-
 class DemonstrationReplay(TensorDictReplayBuffer):
     """Demonstrations, as one immutable TorchRL replay buffer; formats are subclasses of it.
 
-    Entries, options and errors are those that :class:`RobomimicExperienceReplay` tells. ``reader`` is the
-    context in which what ``index`` selects can be read, and ``described`` what errors call its ``env_args``.
+    Entries, options and errors are those that :class:`RobomimicExperienceReplay` tells.
     """
 
     def __init__(
         self,
         index: DatasetIndex,
-        reader: AbstractContextManager[DemonstrationReader],
+        reader: DemonstrationReader,
         *,
-        described: str,
         absolute_actions: bool = False,
         storage: Literal["memory", "memmap"] = "memory",
         scratch_dir: str | Path | None = None,
@@ -185,9 +172,14 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         action_dim = index.action_dim
         self._env_args: dict[str, Any] = {}
         if index.env_args or absolute_actions:
-            with _understanding(described):
+            try:
                 self._env_args = modernize_env_args(index.env_args, absolute=absolute_actions)
                 arms = len(delta_conventions(index.env_args)[1]) if absolute_actions else 0
+            except Exception as error:  # whatever their unexpected structure leads to
+                reason = str(error) if isinstance(error, ValueError) else repr(error)
+                raise DatasetError(
+                    f"{index.path}: env_args describes no environment as these actions need it: {reason}"
+                ) from error
         if absolute_actions:
             if action_dim != 7 * arms:
                 raise DatasetError(
@@ -196,8 +188,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
                 )
             action_dim = 10 * arms
         data = _allocate(index, action_dim, storage, scratch_dir)
-        with reader as opened:
-            _fill(index, data, opened, absolute_actions)
+        _fill(index, data, reader, absolute_actions)
         self._index = index
         super().__init__(
             storage=TensorStorage(data if storage == "memmap" else data.to(device)),

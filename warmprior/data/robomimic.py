@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from warmprior.data.download import download_robomimic
 from warmprior.data.hdf5 import RobomimicReader, open_robomimic, read_index
-from warmprior.data.index import DemonstrationReader
 from warmprior.data.replay import DemonstrationReplay
 from warmprior.envs.tasks import TASKS
 
@@ -25,12 +23,6 @@ def _locate(dataset: str | Path, style: str | None, download: bool, root: str | 
     raise FileNotFoundError(
         f"{dataset}: no such file. To fetch the official file of this task, pass download=True."
     )
-
-
-@contextmanager
-def _reader(path: Path) -> Iterator[DemonstrationReader]:
-    with open_robomimic(path) as file:
-        yield RobomimicReader(file)
 
 
 class RobomimicExperienceReplay(DemonstrationReplay):
@@ -109,10 +101,5 @@ class RobomimicExperienceReplay(DemonstrationReplay):
             poses=absolute_actions,
             demos=demos,
         )
-        super().__init__(
-            index,
-            _reader(path),
-            described=f"{path}: data.attrs['env_args']",
-            absolute_actions=absolute_actions,
-            **kwargs,
-        )
+        with open_robomimic(path) as file:
+            super().__init__(index, RobomimicReader(file), absolute_actions=absolute_actions, **kwargs)

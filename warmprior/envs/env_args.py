@@ -1,9 +1,4 @@
-"""What robomimic's files say about their environment and actions, in the terms of robosuite 1.5.
-
-:func:`modernize_env_args` rewrites the ``env_args`` of a robomimic file. :func:`absolute_actions`
-turns its pose deltas into poses in the world frame, and :func:`absolute_to_env_action` turns those
-into what an environment with absolute inputs takes.
-"""
+"""What robomimic's files say about their environment and actions, in the terms of robosuite 1.5."""
 
 from __future__ import annotations
 
@@ -65,12 +60,9 @@ def _modernize_controller(config: dict[str, Any], absolute: bool) -> dict[str, A
 def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> dict[str, Any]:
     """Rewrite the ``env_args`` of any robomimic file for robosuite 1.5.
 
-    Files of robosuite 1.4 and earlier name one arm controller; robosuite 1.5 wants a composite one,
-    has renamed the damping options, replaced ``control_delta`` with ``input_type``, changed the
-    default frame of a delta and the names of the two-arm layouts. Some files published for 1.5
-    still carry the old description, so what the file contains decides, not its version. The
-    dynamics of old data are kept (``lite_physics=False``). Applying the function twice changes
-    nothing more.
+    :doc:`/data` has a table of what changes. Some files published for 1.5 still carry the old
+    description, so what the file contains decides, not its version. The dynamics of old data are kept
+    (``lite_physics=False``). Applying the function twice changes nothing more.
 
     Args:
         env_args: the parsed JSON of the attribute ``data.attrs["env_args"]``: a dict with

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -62,6 +63,11 @@ def navigation_heights() -> Tensor:
     return torch.stack([s * side * profile for side in (1.0, -1.0) for s in SCALES])
 
 
+def _middles() -> list[int]:
+    """The steps above the middles of the obstacles."""
+    return [int((navigation_positions() - c).abs().argmin()) for c in OBSTACLES]
+
+
 def _features(x: Tensor) -> Tensor:
     # Raw positions underfit at small budgets: sines and cosines of four octaves stand beside them.
     angle = x.unsqueeze(-1) * math.pi * 2.0 ** torch.arange(-1, OCTAVES - 1, device=x.device)
@@ -98,15 +104,6 @@ def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
     """Whether the straight segments between consecutive points enter an obstacle, bool ``[*B, T - 1]``.
 
     The points are at positions ``[*B, T]``, increasing, and heights ``[*B, T]``.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.envs import navigation_collides
-        >>> x = torch.tensor([-0.6, -0.3, 0.0])
-        >>> navigation_collides(x, torch.tensor([0.0, 0.0, 0.0])).tolist()
-        [True, False]
-        >>> navigation_collides(x, torch.tensor([0.5, 0.5, 0.0])).tolist()
-        [False, False]
     """
     x0, x1, y0, y1 = x[..., :-1], x[..., 1:], y[..., :-1], y[..., 1:]
     hit = torch.zeros_like(y0, dtype=torch.bool)
@@ -132,16 +129,27 @@ class NavigationEnv(EnvBase):
     =================  ==================  ===============================================
     ``"observation"``  ``[*B, 9]`` float   position in [-1, 1], its sines and cosines
     ``"action"``       ``[*B, 1]`` float   height, in units of the normalised action space
-    ``"reward"``       ``[*B, 1]`` float   1 at the end of an episode without collision
+    ``"reward"``       ``[*B, 1]`` float   1 at the end of an episode that succeeds
     ``"step_index"``   ``[*B, 1]`` int64   steps done, 0 to 64
     ``"height"``       ``[*B, 1]`` float   the last action
     ``"collided"``     ``[*B, 1]`` bool    whether the path entered an obstacle
-    ``"success"``      ``[*B, 1]`` bool    whether the episode ended without collision
+    ``"success"``      ``[*B, 1]`` bool    whether it ended without collision, on the route
     =================  ==================  ===============================================
+
+    With a route it is a small task with a sparse reward, solved on that route alone. The demonstrations know
+    the goal as little as a policy cloned from them does, so that such a policy succeeds on a share of the
+    episodes and reinforcement learning has something to find. Then an episode ends at the first collision,
+    and at the first obstacle passed on the wrong side, with reward 0.
+
+    Args:
+        route: for each of the two obstacles ``1`` (pass above) or ``-1`` (below); either by default.
 
     Keyword Args:
         batch_size: ``*B``, independent agents.
         device: of all tensors.
+
+    Raises:
+        ValueError: if the route is not two of these numbers.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -159,9 +167,16 @@ class NavigationEnv(EnvBase):
     """Every seed starts the same episode, so each row plays whichever :func:`evaluate` expects."""
 
     def __init__(
-        self, *, batch_size: tuple[int, ...] | list[int] | torch.Size = (), device: torch.device | str = "cpu"
+        self,
+        route: Sequence[int] | None = None,
+        *,
+        batch_size: tuple[int, ...] | list[int] | torch.Size = (),
+        device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(device=device, batch_size=torch.Size(batch_size))
+        if route is not None and (len(route) != len(OBSTACLES) or any(side not in (1, -1) for side in route)):
+            raise ValueError(f"a route is {len(OBSTACLES)} numbers 1 or -1, got {tuple(route)}")
+        self.route = None if route is None else dict(zip(_middles(), route, strict=True))
         shape = (*self.batch_size, 1)
 
         def flag() -> Categorical:
@@ -193,20 +208,7 @@ class NavigationEnv(EnvBase):
 
     def _reset(self, tensordict: TensorDictBase | None, **kwargs: object) -> TensorDictBase:
         zero = torch.zeros(*self.batch_size, 1, device=self.device)
-        step = zero.long()
-        return TensorDict(
-            {
-                keys.OBSERVATION: _features(self._at(step).squeeze(-1)),
-                "success": zero.bool(),
-                "step_index": step,
-                "height": zero,
-                "collided": zero.bool(),
-                "done": zero.bool(),
-                "terminated": zero.bool(),
-            },
-            batch_size=self.batch_size,
-            device=self.device,
-        )
+        return self._tell(zero.long(), zero, zero.bool(), zero.bool(), zero.bool())
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         step, height = tensordict["step_index"], tensordict[keys.ACTION]
@@ -214,23 +216,30 @@ class NavigationEnv(EnvBase):
         # Before the first action there is no segment; the start is far from the obstacles.
         before = torch.where(step > 0, tensordict["height"], height)
         x = torch.cat([here - 2.0 / (STEPS - 1), here], dim=-1)
-        hit = navigation_collides(x, torch.cat([before, height], dim=-1))
-        collided = tensordict["collided"] | hit
-        step = step + 1
-        done = step >= STEPS
-        success = done & ~collided
+        collided = tensordict["collided"] | navigation_collides(x, torch.cat([before, height], dim=-1))
+        done, failed = step + 1 >= STEPS, collided
+        if self.route is not None:
+            for middle, side in self.route.items():
+                failed = failed | (step == middle) & (height * side <= 0)
+            done = done | failed
+        success = done & ~failed
+        told = self._tell(step + 1, height.clone(), collided, success, done)
+        return told.set("reward", success.to(height.dtype))
+
+    def _tell(
+        self, step: Tensor, height: Tensor, collided: Tensor, success: Tensor, done: Tensor
+    ) -> TensorDict:
         return TensorDict(
             {
                 keys.OBSERVATION: _features(self._at(step).squeeze(-1)),
                 "success": success,
                 "step_index": step,
-                "height": height.clone(),
+                "height": height,
                 "collided": collided,
-                "reward": success.to(height.dtype),
                 "done": done,
                 "terminated": done.clone(),
             },
-            batch_size=tensordict.batch_size,
+            batch_size=self.batch_size,
             device=self.device,
         )
 
@@ -302,8 +311,7 @@ def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
     known = side[:, 1:] * side[:, :-1] != 0
     boundary = torch.arange(chunk_length - 1, STEPS - 1, chunk_length)
     at_boundary = known[:, boundary]
-    nearest = [int((x - c).abs().argmin()) for c in OBSTACLES]
-    above = (heights[:, nearest] > 0).long()
+    above = (heights[:, _middles()] > 0).long()
     routes = torch.bincount(2 * above[:, 0] + above[:, 1], minlength=4).double() / len(heights)
     taken = routes[routes > 0]
     hit = navigation_collides(x.expand_as(heights), heights).any(1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from warmprior.io.extras import require
 __all__ = ["Arm", "check_supported", "compiled_torques"]
 
 
-@dataclass(init=False)
 class Arm:
     """One robot's indices, controller and current goal.
 
@@ -24,11 +22,6 @@ class Arm:
         goal_pos: ``[3]`` where the hand is to be, in the world, metres.
         goal_mat: ``[3, 3]`` its orientation there.
     """
-
-    site: int
-    constants: tuple[np.ndarray, ...]
-    goal_pos: np.ndarray
-    goal_mat: np.ndarray
 
     def __init__(self, env: Any, robot: Any) -> None:
         composite = robot.composite_controller

@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs.common import _EnvWrapper
+from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import EnvRenderers, require_rendering
-from warmprior.envs.simulator import action_limits, import_robosuite, make_simulator, task_env_args
+from warmprior.envs.simulator import action_limits, make_simulator, task_env_args
 from warmprior.envs.tasks import STYLES, task_of_env
 from warmprior.envs.tasks import low_dim_keys as default_keys
 
-__all__ = ["RobosuiteEnv", "RobosuiteWrapper"]
+__all__ = ["RobosuiteEnv"]
 
 _LOOPS = {"lean": ControlLoop, "robosuite": StepLoop}
 
@@ -30,8 +30,8 @@ _Flags = tuple[bool, bool, bool, bool]
 """Of a control step, in the order of the above."""
 
 
-class RobosuiteWrapper(_EnvWrapper):
-    """Wraps a robosuite environment.
+class RobosuiteEnv(EnvBase):
+    """A robosuite task by its short name, the environment of a robomimic file, or any of your own.
 
     ==================  =============================================================
     key                 shape, dtype
@@ -55,15 +55,21 @@ class RobosuiteWrapper(_EnvWrapper):
     The global generators of numpy and Python are left as they were.
 
     Args:
-        env: the robosuite environment. Its own time limit, reward and renderer are not used.
+        task: a name of :data:`warmprior.envs.TASKS`. Those that end in ``_d0`` are MimicGen's and need its
+            package (see :func:`~warmprior.envs.mimicgen.register_mimicgen`).
+        env_args: instead of ``task``: the parsed ``data.attrs["env_args"]`` of a robomimic or
+            MimicGen file of any version.
+        env: instead of both: a robosuite environment. Its own time limit, reward and renderer are not used.
+        style: of the data whose time limit applies: ``"ph"``, ``"mh"``, ``"source"`` or ``"core"``.
         low_dim_keys: robomimic names of the observations to concatenate; ``None`` for
             ``"object"`` and each arm's pose and gripper.
-        horizon: time limit in control steps; ``None`` for the environment's own.
+        horizon: time limit in control steps; ``None`` for the task's, or for an environment that is
+            not in the table its own.
         control_loop: ``"lean"`` for :class:`~warmprior.envs.control_loop.ControlLoop`,
             ``"robosuite"`` for ``env.step``.
         from_pixels: render ``camera`` at every step. Policies that see images need them at decisions alone,
             where :class:`~warmprior.transforms.CameraImages` renders them.
-        camera: the camera rendered, or several.
+        camera: the camera rendered, or several; ``None`` for the task's first, or ``"agentview"``.
         camera_size: side of the image in pixels, or its height and width.
         fast_rendering: see :class:`~warmprior.envs.rendering.CameraRenderer`.
         sim_state: tell the simulator's state.
@@ -76,30 +82,35 @@ class RobosuiteWrapper(_EnvWrapper):
         device: of the tensordicts.
 
     Raises:
-        ValueError: if an option is out of range, an observation or camera does not exist, or the
-            lean loop does not support the robots.
+        ImportError: if robosuite is not installed, or MimicGen is not where the task is one of its.
+        ValueError: if the task is unknown, not exactly one of ``task``, ``env_args`` and ``env`` is given, an
+            option is out of range, an observation or camera does not exist, or the lean loop does not support
+            the robots.
         RuntimeError: if pixels are asked for and nothing here can render.
 
     Examples:
-        >>> from warmprior.envs import RobosuiteWrapper
-        >>> import robosuite  # doctest: +SKIP
-        >>> options = {"has_renderer": False, "has_offscreen_renderer": False}
-        >>> door = robosuite.make("Door", "Panda", use_camera_obs=False, **options)  # doctest: +SKIP
-        >>> RobosuiteWrapper(door).rollout(3)["observation"].shape  # doctest: +SKIP
-        torch.Size([3, 23])
+        >>> from warmprior.envs import RobosuiteEnv
+        >>> env = RobosuiteEnv("lift", seed=3)  # doctest: +SKIP
+        >>> env.rollout(5)["observation"].shape  # doctest: +SKIP
+        torch.Size([5, 19])
+        >>> RobosuiteEnv("life")
+        Traceback (most recent call last):
+            ...
+        ValueError: unknown task 'life'; choose one of lift, can, square, stack, transport, ...
     """
-
-    libname = "robosuite"
 
     def __init__(
         self,
-        env: Any = None,
+        task: str | None = None,
         *,
+        env_args: Mapping[str, Any] | None = None,
+        env: Any = None,
+        style: str = "ph",
         low_dim_keys: Sequence[str] | None = None,
         horizon: int | None = None,
         control_loop: Literal["lean", "robosuite"] = "lean",
         from_pixels: bool = False,
-        camera: str | Sequence[str] = "agentview",
+        camera: str | Sequence[str] | None = None,
         camera_size: int | tuple[int, int] = 84,
         fast_rendering: bool = False,
         sim_state: bool = False,
@@ -109,8 +120,11 @@ class RobosuiteWrapper(_EnvWrapper):
         seed_stride: int = 1,
         terminate_on_success: bool = True,
         device: torch.device | str | None = None,
-        **kwargs: Any,
     ) -> None:
+        if sum(given is not None for given in (task, env_args, env)) != 1:
+            raise ValueError("give one of task, env_args and env")
+        if style not in STYLES:
+            raise ValueError(f"style is one of {', '.join(STYLES)}, got {style!r}")
         if control_loop not in _LOOPS:
             raise ValueError(f"control_loop is {' or '.join(_LOOPS)}, got {control_loop!r}")
         if horizon is not None and horizon < 1:
@@ -120,11 +134,30 @@ class RobosuiteWrapper(_EnvWrapper):
         size = (camera_size, camera_size) if isinstance(camera_size, int) else tuple(camera_size)
         if len(size) != 2 or min(size) < 1:
             raise ValueError(f"camera_size is a side or (height, width), got {camera_size!r}")
+        if task is not None:
+            env_args = task_env_args(task)
+        elif env_args is not None:
+            env_args = modernize_env_args(env_args)
+        spec = None if env_args is None else task_of_env(env_args)
+        if spec is not None and horizon is None:
+            horizon = spec.horizon(style)
+        if camera is None:
+            camera = "agentview" if spec is None else spec.cameras[0]
         cameras = (camera,) if isinstance(camera, str) else tuple(camera)
         if not cameras or len(set(cameras)) < len(cameras):
             raise ValueError(f"camera is a name, or different ones, got {camera!r}")
-        if env is not None:
-            kwargs["env"] = env
+        super().__init__(device=device)
+        self.task = spec
+        self._env = env if env_args is None else make_simulator(env_args)
+        if horizon is None:
+            # Even if the environment itself would go on (``ignore_done``): without a limit an evaluation
+            # waits for a success that may never come.
+            horizon = self._env.horizon
+            if not isinstance(horizon, int) or horizon < 1:
+                raise ValueError(
+                    f"the environment's horizon must be a number of steps, got {horizon!r}; give one with "
+                    "horizon="
+                )
         self.low_dim_keys = None if low_dim_keys is None else tuple(low_dim_keys)
         self.horizon = horizon
         self.control_loop = control_loop
@@ -135,12 +168,7 @@ class RobosuiteWrapper(_EnvWrapper):
         self.terminate_on_success = terminate_on_success
         self._seed, self._offset, self._stride = seed, seed_offset, seed_stride
         self._episode, self._elapsed = 0, 0
-        super().__init__(device=device, **kwargs)
-
-    @property
-    def lib(self) -> Any:
-        """The module ``robosuite``."""
-        return import_robosuite()
+        self._make_specs(self._env)
 
     @property
     def episode_seed(self) -> int:
@@ -172,24 +200,11 @@ class RobosuiteWrapper(_EnvWrapper):
         qpos = None if state is None else state[1 : 1 + self._env.sim.model.nq]
         return self._renderers.render(camera or self.cameras[0], height, width, qpos)
 
-    def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
-        if "env" not in kwargs:
-            raise TypeError("RobosuiteWrapper needs a robosuite environment: RobosuiteWrapper(env)")
-
-    def _build_env(self, env: Any) -> Any:  # type: ignore[override]
-        if self.horizon is None:
-            # Even if the environment itself would go on (``ignore_done``): without a limit an evaluation
-            # waits for a success that may never come.
-            if not isinstance(env.horizon, int) or env.horizon < 1:
-                raise ValueError(
-                    f"the environment's horizon must be a number of steps, got {env.horizon!r}; give "
-                    "one with horizon="
-                )
-            self.horizon = env.horizon
-        return env
-
-    def _init_env(self) -> None:
-        """Nothing to prepare: the first reset does."""
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Free the simulator."""
+        if not self.is_closed:
+            self._env.close()
+        super().close(raise_if_closed=raise_if_closed)
 
     def _make_specs(self, env: Any) -> None:
         if self.low_dim_keys is None:
@@ -317,62 +332,3 @@ class RobosuiteWrapper(_EnvWrapper):
             # One more than asked for: see ControlLoop.look_back.
             measured.extend(map(self._measure, self._late.look_back(states[-keep - 1 :])))
         return self._tell(flags, measured)
-
-
-class RobosuiteEnv(RobosuiteWrapper):
-    """A robosuite task by its short name, or the environment of a robomimic file.
-
-    See :class:`RobosuiteWrapper` for keys and seeds.
-
-    Args:
-        task: a name of :data:`warmprior.envs.TASKS`. Those that end in ``_d0`` are MimicGen's and need its
-            package (see :func:`~warmprior.envs.mimicgen.register_mimicgen`).
-        env_args: instead of ``task``: the parsed ``data.attrs["env_args"]`` of a robomimic or
-            MimicGen file of any version.
-        style: of the data whose time limit applies: ``"ph"``, ``"mh"``, ``"source"`` or ``"core"``.
-        horizon: time limit in control steps; ``None`` for the task's, or for an environment that is
-            not in the table that of ``env_args["env_kwargs"]``, or else robosuite's own.
-        camera: ``None`` for the task's first.
-        **options: further ones of :class:`RobosuiteWrapper`.
-
-    Raises:
-        ImportError: if robosuite is not installed, or MimicGen is not where the task is one of its.
-        ValueError: if the task is unknown, or not exactly one of ``task`` and ``env_args`` is given.
-
-    Examples:
-        >>> from warmprior.envs import RobosuiteEnv
-        >>> env = RobosuiteEnv("lift", seed=3)  # doctest: +SKIP
-        >>> env.rollout(5)["observation"].shape  # doctest: +SKIP
-        torch.Size([5, 19])
-        >>> RobosuiteEnv("life")
-        Traceback (most recent call last):
-            ...
-        ValueError: unknown task 'life'; choose one of lift, can, square, stack, transport, ...
-    """
-
-    def __init__(
-        self,
-        task: str | None = None,
-        *,
-        env_args: Mapping[str, Any] | None = None,
-        style: str = "ph",
-        horizon: int | None = None,
-        camera: str | Sequence[str] | None = None,
-        **options: Any,
-    ) -> None:
-        if (task is None) == (env_args is None):
-            raise ValueError("give either task or env_args")
-        if style not in STYLES:
-            raise ValueError(f"style is one of {', '.join(STYLES)}, got {style!r}")
-        env_args = task_env_args(str(task)) if env_args is None else modernize_env_args(env_args)
-        self.task = task_of_env(env_args)
-        if self.task is not None:
-            horizon = self.task.horizon(style) if horizon is None else horizon
-            camera = self.task.cameras[0] if camera is None else camera
-        super().__init__(env_args=env_args, horizon=horizon, camera=camera or "agentview", **options)
-
-    def _check_kwargs(self, kwargs: dict[str, Any]) -> None:
-        """The constructor has checked them."""
-
-    def _build_env(self, env_args: Mapping[str, Any]) -> Any:  # type: ignore[override]
-        return super()._build_env(make_simulator(env_args))

@@ -133,10 +133,7 @@ def write_atomic(path: Path, write: Callable[[Path], object]) -> None:
     """Call ``write(temporary_path)``, then put the result in place in one step.
 
     A reader, or a process killed at any moment, sees the old file or the new one, never a part. The folder is
-    created if needed.
-
-    Raises:
-        OSError: if the file cannot be written, naming ``path``.
+    created if needed. An ``OSError`` names ``path`` if it cannot be written.
 
     Examples:
         >>> from pathlib import Path
@@ -203,9 +200,6 @@ def exclusive(directory: Path) -> Iterator[None]:
 
     The lock lies on the folder itself: it leaves no file, and ends with the process however that ends.
     Where the file system has no locks there is none.
-
-    Raises:
-        BlockingIOError: if another process is in there.
 
     Examples:
         >>> from pathlib import Path

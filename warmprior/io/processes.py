@@ -25,12 +25,6 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
 
     They are no forks: nothing of this process, such as its threads, simulators and gradients, is in them.
     Ctrl-C is left to this process, and they end when it ends, however that happens.
-
-    Examples:
-        >>> from warmprior.io.processes import fresh_processes
-        >>> with fresh_processes(1) as executor:  # doctest: +SKIP
-        ...     executor.submit(pow, 2, 3).result()
-        8
     """
 
     def begin(parent: int) -> None:
@@ -59,18 +53,7 @@ def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]],
     Leaving the context with an error, such as Ctrl-C, ends all of them at once, whatever they do.
 
     Yields a function of a job, which gives the future of ``job(state)``; both are picklable. What a job
-    changes in the state stays in its process.
-
-    Raises:
-        WorkerError: if a process dies.
-
-    Examples:
-        >>> from functools import partial
-        >>> from operator import add
-        >>> from warmprior.io.processes import working
-        >>> with working(1, 40) as call:  # doctest: +SKIP
-        ...     call(partial(add, 2)).result()
-        42
+    changes in the state stays in its process. A ``WorkerError`` if a process dies.
     """
     executor, name, pickled = fresh_processes(count), uuid.uuid4().hex, pickle.dumps(state)
     try:

@@ -122,21 +122,8 @@ def ray_cluster(
         num_cpus: of the cluster that is started; one per core by default.
         folders: that all machines have to share.
 
-    Yields:
-        The module ``ray``.
-
-    Raises:
-        ImportError: if Ray is not installed.
-        ValueError: if this is no address.
-        ConnectionError: if there is no such cluster, or its Ray or Python is another.
-        WorkerError: if a machine has other versions or cannot start the library.
-        OSError: if a machine does not see a folder.
-
-    Examples:
-        >>> from warmprior.io.ray_cluster import ray_cluster
-        >>> with ray_cluster(num_cpus=2) as ray:  # of this machine  # doctest: +SKIP
-        ...     ray.cluster_resources()["CPU"]
-        2.0
+    Yields the module ``ray``. Errors are those of :func:`check_ray`; a ``WorkerError`` if a machine has other
+    versions or cannot start the library, and an ``OSError`` if it does not see a folder.
     """
     ray = require("ray", "ray")
     with contextlib.ExitStack() as stack:

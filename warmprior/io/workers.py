@@ -18,10 +18,6 @@ _forks = True
 class WorkerError(RuntimeError):
     """A worker process died, or cannot do the work.
 
-    See Also:
-        - :func:`~warmprior.training.parallel_env`: its processes.
-        - :func:`~warmprior.io.processes.working`: its workers.
-
     Examples:
         >>> from warmprior.training import WorkerError
         >>> raise WorkerError("worker 0 of 2 (exit code 9) died")

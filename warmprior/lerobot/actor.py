@@ -13,7 +13,7 @@ from torch import Tensor
 
 from warmprior import keys
 from warmprior.history import ENTRIES
-from warmprior.lerobot.ports import check_steps, port_for
+from warmprior.lerobot.ports import check_steps
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.network import network_observation
 from warmprior.modules.prior import Prior
@@ -26,32 +26,10 @@ class LeRobotFlow(TensorDictModuleBase):
 
     A deterministic map ``(noise, observation) -> chunk``, source and chunk ``[*B, P, d_a]`` in the model's
     units: the padding around the prior's part of the source is one fixed draw, unless a call passes its own.
-    The observation is ``[*B, To, d]`` (LeRobot's ``observation.state``), or a tensordict of such entries.
-    Images of bytes become floats in [0, 1]. The policy's weights are not among the parameters of this module.
+    The policy's weights are not among the parameters of this module. Options as of :class:`LeRobotActor`.
 
-    Args:
-        policy: of LeRobot, see :class:`WarmPriorAdapter`.
-        source: of its chunks.
-
-    Keyword Args:
-        names: LeRobot's name of each entry of the observation, such as
-            ``{"state": "observation.state", "agentview_image": "observation.images.top"}``.
-        preprocess: turns raw observations into the policy's batch, such as LeRobot's preprocessor; none by
-            default.
-        nfe: integration steps per chunk; the policy's own by default.
-        seed: of the padding.
-
-    Raises:
-        ValueError: if gradients are required, which LeRobot's samplers do not compute, or ``padding`` has
-            another shape than the model's source.
-        KeyError: if an input key is missing.
-
-    Examples:
-        >>> from warmprior import PastPrior
-        >>> from warmprior.lerobot import LeRobotFlow, WarmPriorAdapter
-        >>> adapter = WarmPriorAdapter(policy, PastPrior(8))  # doctest: +SKIP
-        >>> flow = LeRobotFlow(policy, adapter.source, nfe=1)  # doctest: +SKIP
-        >>> chunk = flow(data)["vla_action", "chunk"]  # doctest: +SKIP
+    A ``ValueError`` if gradients are required, which LeRobot's samplers do not compute, or ``padding`` has
+    another shape than the model's source; a ``KeyError`` if an input key is missing.
     """
 
     guidance = None
@@ -69,11 +47,10 @@ class LeRobotFlow(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         check_steps(nfe)
-        self._port = port_for(policy)
         # Not a submodule: LeRobot trains and saves policies of billions of weights, not the agents that
         # contain this.
         self._policy = (policy,)
-        self.source = source
+        self.source = self.network = source  # which has the width of actions
         self.names = dict(names or {})
         self.preprocess = preprocess
         self.nfe = nfe
@@ -86,11 +63,6 @@ class LeRobotFlow(TensorDictModuleBase):
         """LeRobot's policy."""
         return self._policy[0]
 
-    @property
-    def network(self) -> ChunkSource:
-        """The source, which has the width of actions."""
-        return self.source
-
     def check_nfe(self, nfe: int | None) -> None:
         """A ``ValueError`` unless ``nfe`` is a number of integration steps."""
         check_steps(nfe)
@@ -101,15 +73,12 @@ class LeRobotFlow(TensorDictModuleBase):
         """Write the chunk; ``padding`` ``[prod(B), T, D]`` is the source outside of the prior's part."""
         nfe = self.nfe if nfe is None else nfe
         check_steps(nfe)
-        missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
-        if missing:
-            raise KeyError(f"LeRobotFlow needs the keys {self.in_keys}; missing: {missing}")
-        noise = tensordict.get(keys.NOISE)
+        noise = tensordict[keys.NOISE]
         if torch.is_grad_enabled() and noise.requires_grad:
             raise ValueError("LeRobot's samplers compute no gradients: use no_grad or detach the source")
         batch = noise.shape[:-2]
         a0 = noise.reshape(-1, *noise.shape[-2:])
-        inputs = self._batch(network_observation(tensordict.get(keys.OBSERVATION), batch))
+        inputs = self._batch(network_observation(tensordict[keys.OBSERVATION], batch))
         if padding is None:
             # One draw for all rows, so that a chunk does not depend on the other rows.
             generator = torch.Generator(a0.device).manual_seed(self.seed)
@@ -131,9 +100,9 @@ class LeRobotFlow(TensorDictModuleBase):
         own = getattr(self.policy, "warm_adapter", None)
         with (
             nullcontext() if own is None else own.aside(),
-            self._port.sampling(self.policy, draw, chunks.append, nfe),
+            self.source.port.sampling(self.policy, draw, chunks.append, nfe),
         ):
-            self._port.predict(self.policy, inputs)
+            self.source.port.predict(self.policy, inputs)
         chunk = chunks[0][:, self.source.positions, : self.source.action_dim]
         return tensordict.set(keys.CHUNK, chunk.to(noise).reshape(noise.shape))
 
@@ -177,7 +146,14 @@ class LeRobotActor(TensorDictModuleBase):
     Keyword Args:
         std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it.
         generator: source of randomness; per call: ``actor(data, generator=...)``.
-        kwargs: further arguments of :class:`LeRobotFlow`, such as ``names``, ``preprocess`` and ``nfe``.
+        names: LeRobot's name of each entry of the observation, such as
+            ``{"state": "observation.state", "agentview_image": "observation.images.top"}``; an observation
+            that is a tensor ``[*B, To, d]`` is ``observation.state``. Images of bytes become floats in
+            [0, 1].
+        preprocess: turns raw observations into the policy's batch, such as LeRobot's preprocessor; none by
+            default.
+        nfe: integration steps per chunk; the policy's own by default.
+        seed: of the padding under a decoder.
 
     Raises:
         ValueError: see :class:`WarmPriorAdapter`.
@@ -207,20 +183,12 @@ class LeRobotActor(TensorDictModuleBase):
         **kwargs: Any,
     ) -> None:
         super().__init__()
-        port = port_for(policy)
         if getattr(policy.config, "use_relative_actions", False):
             raise ValueError(
                 "ActionHistory cannot express relative actions at the next state: use WarmPriorAdapter"
             )
-        source = ChunkSource(
-            prior,
-            length=port.length(policy),
-            width=port.width(policy),
-            action_dim=policy.config.action_feature.shape[0],
-            lead=port.lead(policy),
-            std=std,
-        )
-        self.ode = LeRobotFlow(policy, source, **kwargs)
+        self.ode = LeRobotFlow(policy, ChunkSource(policy, prior, std), **kwargs)
+        self.network = self.ode.network
         self.generator = generator
         self.in_keys = [keys.OBSERVATION, *((keys.HISTORY, name) for name in ENTRIES)]
         self.out_keys = [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK]
@@ -229,11 +197,6 @@ class LeRobotActor(TensorDictModuleBase):
     def prior(self) -> Prior:
         """The source distribution."""
         return self.ode.source.prior
-
-    @property
-    def network(self) -> ChunkSource:
-        """The source, which has the width of actions."""
-        return self.ode.source
 
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from warmprior.lerobot.memory import ActionMemory
-from warmprior.lerobot.ports import Velocity, check_steps, port_for
+from warmprior.lerobot.ports import Velocity, check_steps
 from warmprior.lerobot.relative import RelativeActions
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.prior import Prior
@@ -99,21 +99,13 @@ class WarmPriorAdapter:
         guidance: RealTimeChunking | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
-        self.port = port_for(policy)
+        self.source = ChunkSource(policy, prior, std)
         if getattr(policy, "warm_adapter", None) is not None:
             raise ValueError(
                 f"{type(policy).__name__} starts from {policy.warm_adapter.prior} by itself: use its own "
                 "methods, or policy.warm_adapter"
             )
         self.policy, self.prior, self.generator = policy, prior, generator
-        self.source = ChunkSource(
-            prior,
-            length=self.port.length(policy),
-            width=self.port.width(policy),
-            action_dim=policy.config.action_feature.shape[0],
-            lead=self.port.lead(policy),
-            std=std,
-        )
         steps = policy.config.n_action_steps
         if steps > prior.chunk_length:
             raise ValueError(
@@ -131,7 +123,7 @@ class WarmPriorAdapter:
         check_steps(nfe)
         self.guidance = guidance
         if guidance is not None:
-            self.port.guiding(policy, self._guided)  # refuses what cannot be guided
+            self.source.port.guiding(policy, self._guided)  # refuses what cannot be guided
         self._relative = relative
         self._memory = ActionMemory(prior, self.source.action_dim)
         # Raw states at the last decision, and at the one under way.
@@ -181,7 +173,7 @@ class WarmPriorAdapter:
                 )
             return a0.to(dtype=dtype, device=device)
 
-        with self.port.training(self.policy, source):
+        with self.source.port.training(self.policy, source):
             return (self.policy.forward if forward is None else forward)(inputs, **kwargs)
 
     def select_action(
@@ -279,9 +271,9 @@ class WarmPriorAdapter:
 
     @contextmanager
     def _from_source(self) -> Iterator[None]:
-        guided = self.guidance is not None
-        guiding = self.port.guiding(self.policy, self._guided) if guided else nullcontext()
-        with self.aside(), guiding, self.port.sampling(self.policy, self._source, self._record, self.nfe):
+        port, guided = self.source.port, self.guidance is not None
+        guiding = port.guiding(self.policy, self._guided) if guided else nullcontext()
+        with self.aside(), guiding, port.sampling(self.policy, self._source, self._record, self.nfe):
             yield
 
     def _guided(self, velocity: Velocity) -> Velocity:

@@ -25,7 +25,7 @@ class ActionMemory:
         action_dim: ``d_a``.
 
     Examples:
-        >>> from warmprior.lerobot import ActionMemory
+        >>> from warmprior.lerobot.memory import ActionMemory
         >>> import torch
         >>> from warmprior import PastPrior
         >>> memory = ActionMemory(PastPrior(2), action_dim=1)
@@ -78,8 +78,12 @@ class ActionMemory:
             # The rest of the chunk belongs to an episode that is over.
             cold = without(history, self._new)
             history.update(cold.select("forecast", "forecast_steps"))
-            if move is not None:
-                _move(history, move)
+            if move is not None:  # where there is no action, it stays empty
+                line = torch.cat([history["actions"], history["forecast"]], 1)
+                step = torch.arange(line.shape[1], device=line.device) - history["actions"].shape[1]
+                known = (step >= -history["steps"]) & (step < history["forecast_steps"])
+                line = torch.where(known[..., None], move(line).to(line), 0.0)
+                history.update({"actions": line[:, step < 0], "forecast": line[:, step >= 0]})
         self._decision = history
         return history
 
@@ -152,13 +156,3 @@ class ActionMemory:
             self._history = without(self._history, rows)
             self._executed = self._executed.masked_fill(rows[:, None], 0)
             self._new = self._new | rows
-
-
-def _move(history: TensorDict, move: Callable[[Tensor], Tensor]) -> None:
-    """Express the actions of a history anew; where it has none, it stays empty."""
-    actions, forecast = history["actions"], history["forecast"]
-    line = torch.cat([actions, forecast], 1)
-    step = torch.arange(-actions.shape[1], forecast.shape[1], device=line.device)
-    known = (step >= -history["steps"]) & (step < history["forecast_steps"])
-    line = torch.where(known[..., None], move(line).to(line), 0.0)
-    history.update({"actions": line[:, step < 0], "forecast": line[:, step >= 0]})

@@ -323,20 +323,8 @@ PORTS: dict[str, dict[str, FlowPort]] = {
 def port_for(policy: Any) -> FlowPort:
     """The port of a policy's family, or of a subclass, in the release of lerobot that is installed.
 
-    Raises:
-        ValueError: if there is none, or it does not support the policy's options.
-        ImportError: if there is none for this release.
-
-    Examples:
-        >>> from warmprior.lerobot import port_for
-        >>> port_for(policy).length(policy)  # a SmolVLAPolicy  # doctest: +SKIP
-        50
-        >>> class ACTPolicy:
-        ...     name = "act"  # no flow
-        >>> port_for(ACTPolicy())
-        Traceback (most recent call last):
-            ...
-        ValueError: ACTPolicy of lerobot ... is not supported: supported are, by release, 0.6: pi0, pi05, ...
+    An ``ImportError`` if there are none for this release, and a ``ValueError`` if there is none for the
+    family, or it does not support the policy's options.
     """
     installed = version("lerobot")
     ports = next((PORTS[known] for known in PORTS if f"{installed}.".startswith(f"{known}.")), None)

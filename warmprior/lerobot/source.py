@@ -24,41 +24,21 @@ class ChunkSource:
     other positions and the padded dimensions stay ``N(0, 1)``, as in pretrained checkpoints.
 
     Args:
+        policy: of LeRobot, of which only the chunk's shape is kept.
         prior: the source distribution; any that needs no observation.
-        length: ``T``.
-        width: ``D``.
-        action_dim: ``d_a``.
-        lead: positions before the current step.
         std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it;
             by default ``sigma`` is in the model's units, as in the paper.
 
     Raises:
-        ValueError: if the prior does not fit the policy.
-
-    Examples:
-        >>> from warmprior.lerobot import ChunkSource
-        >>> import torch
-        >>> from warmprior import PastPrior
-        >>> from warmprior.history import window_history
-        >>> source = ChunkSource(PastPrior(4, sigma=0.0), length=6, width=3, action_dim=2, lead=1)
-        >>> executed, target = torch.full((1, 4, 2), 7.0), torch.zeros(1, 4, 2)
-        >>> history = window_history(executed, torch.tensor([[4]]), target, chunk_length=4)
-        >>> a0 = source.place(source.draw(history))
-        >>> a0.shape, (a0 == 7).sum(1).tolist()
-        (torch.Size([1, 6, 3]), [[4, 4, 0]])
+        ValueError: if the prior does not fit the policy, or :func:`port_for` refuses that.
     """
 
-    def __init__(
-        self,
-        prior: Prior,
-        *,
-        length: int,
-        width: int,
-        action_dim: int,
-        lead: int = 0,
-        std: Tensor | None = None,
-    ) -> None:
-        room = length - lead
+    def __init__(self, policy: Any, prior: Prior, std: Tensor | None = None) -> None:
+        self.port = port_for(policy)
+        self.length, self.width = self.port.length(policy), self.port.width(policy)
+        self.lead, self.action_dim = self.port.lead(policy), policy.config.action_feature.shape[0]
+        self.prior, self._std = prior, std
+        room = self.length - self.lead
         if prior.prediction_length > room:
             raise ValueError(
                 f"{prior} predicts {prior.prediction_length} actions, but the policy's chunks have {room} "
@@ -69,22 +49,19 @@ class ChunkSource:
         device = next((weight.device for weight in weights), None)
         self._lengths = prior.history_length, prior.prediction_length
         try:
-            prior.distribution(cold_history([1], *self._lengths, action_dim, device=device))
+            prior.distribution(cold_history([1], *self._lengths, self.action_dim, device=device))
         except Exception as error:
             raise ValueError(
                 f"{prior} cannot be the source of a policy of LeRobot, where it gets the history and no "
                 f"observation: {error}"
             ) from error
         if std is not None and not (
-            tuple(std.shape) == (action_dim,) and (std > 0).all() and std.isfinite().all()
+            tuple(std.shape) == (self.action_dim,) and (std > 0).all() and std.isfinite().all()
         ):
             raise ValueError(
-                f"the standard deviation of the actions must be {action_dim} finite numbers > 0, one per "
-                f"dimension, got {std.tolist()}"
+                f"the standard deviation of the actions must be {self.action_dim} finite numbers > 0, one "
+                f"per dimension, got {std.tolist()}"
             )
-        self.prior = prior
-        self.length, self.width, self.action_dim, self.lead = length, width, action_dim, lead
-        self._std = std
 
     @property
     def positions(self) -> slice:

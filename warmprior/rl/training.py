@@ -74,13 +74,13 @@ class PriorSpaceTraining:
         >>> from tempfile import TemporaryDirectory
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, PriorAnchor, VelocityMLP, WarmPriorActor, policy_transforms
-        >>> from warmprior.envs import GoalNavigationEnv
+        >>> from warmprior.envs import NavigationEnv
         >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
         >>> actor = WarmPriorActor(network, PastPrior(8))
         >>> def make_env(seed):
         ...     transforms = policy_transforms(actor.prior, observation_steps=1)
         ...     transforms.append(PriorAnchor(actor))
-        ...     return TransformedEnv(GoalNavigationEnv((1, 1), batch_size=[2]), transforms)
+        ...     return TransformedEnv(NavigationEnv((1, 1), batch_size=[2]), transforms)
         >>> config = PriorSpaceConfig(
         ...     environment_steps=40, warmup_steps=20, evaluate_every=40, evaluation_episodes=2,
         ...     batch_size=4, updates=1, noise_critic_steps=1, hidden_dim=8, num_layers=1)

@@ -269,12 +269,12 @@ def play_episode(
     Examples:
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
-        >>> from warmprior.envs import GoalNavigationEnv
+        >>> from warmprior.envs import NavigationEnv
         >>> from warmprior.training import play_episode
         >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
         >>> actor = WarmPriorActor(network, PastPrior(8))
         >>> transforms = policy_transforms(actor.prior, observation_steps=1)
-        >>> env = TransformedEnv(GoalNavigationEnv((1, 1)), transforms)
+        >>> env = TransformedEnv(NavigationEnv((1, 1)), transforms)
         >>> one, again = (play_episode(actor, env, seed=7, nfe=1) for _ in range(2))
         >>> bool((one.decisions == again.decisions).all())
         True
@@ -354,12 +354,12 @@ def evaluate(
     Examples:
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
-        >>> from warmprior.envs import GoalNavigationEnv
+        >>> from warmprior.envs import NavigationEnv
         >>> from warmprior.training import evaluate
         >>> prior = PastPrior(8)
         >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
         >>> transforms = policy_transforms(prior, observation_steps=1)
-        >>> env = TransformedEnv(GoalNavigationEnv((1, 1), batch_size=[4]), transforms)
+        >>> env = TransformedEnv(NavigationEnv((1, 1), batch_size=[4]), transforms)
         >>> played = evaluate(WarmPriorActor(network, prior), env, episodes=6, first_seed=100)
         >>> [episode.seed for episode in played]
         [100, 101, 102, 103, 104, 105]

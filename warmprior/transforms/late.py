@@ -37,7 +37,7 @@ class LateTransforms:
     here beside a fast simulator. The result equals that of transforming every step, bit by bit.
 
     An environment without batch dimensions may offer ``control_steps(actions, keep)``, as
-    :class:`~warmprior.envs.RobosuiteWrapper` does, which takes all steps in one call. It is used where
+    :class:`~warmprior.envs.RobosuiteEnv` does, which takes all steps in one call. It is used where
     actions can be inverted at once and only reward and flags of the first steps are read (``brief``), and
     doubles the speed.
     """

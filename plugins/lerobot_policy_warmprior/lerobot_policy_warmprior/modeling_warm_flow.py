@@ -30,7 +30,7 @@ from warmprior import (
 )
 from warmprior.data import lerobot_steps
 from warmprior.history import window_history
-from warmprior.lerobot import ActionMemory
+from warmprior.lerobot.memory import ActionMemory
 from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.training import ema_of, precondition

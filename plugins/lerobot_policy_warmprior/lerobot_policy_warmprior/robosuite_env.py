@@ -16,16 +16,7 @@ __all__ = ["RobosuiteGymEnv"]
 
 
 class RobosuiteGymEnv(gymnasium.Env):
-    """One environment of :class:`~warmprior.envs.RobosuiteEnv`.
-
-    Args:
-        task: a name of ``warmprior.envs.TASKS``.
-        style: of the demonstrations; decides the time limit.
-        cameras: to render.
-        image_size: side of the images in pixels.
-        horizon: time limit in control steps; the task's by default.
-        render_mode: ``"rgb_array"`` for films.
-    """
+    """One environment of :class:`~warmprior.envs.RobosuiteEnv`; see ``RobosuiteEnvConfig`` for options."""
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 20}
 
