@@ -154,7 +154,7 @@ def test_a_guided_policy_is_measured_as_it_acts():
     found = memory_gain(guided, data, nfes=(4,), shift=0.05)[4]
 
     def act(moved, generator):
-        return guided(moved, generator=generator)[guided.chunk_key]
+        return guided(moved, generator=generator)["vla_action", "chunk"]
 
     assert found == pytest.approx(by_hand(act, data), rel=1e-3)
 

@@ -54,4 +54,4 @@ def test_the_forecast_of_a_guided_policy_is_what_it_would_do():
     data = remember(batch(rtc={"delay": torch.ones(5, 1, dtype=torch.int64)}), torch.rand(5, H, D_A))
     found = deployed_history(actor, data, generator=torch.Generator().manual_seed(0))
     acted = actor(data.clone(), generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(found["history", "actions"], acted[actor.chunk_key].detach())
+    torch.testing.assert_close(found["history", "actions"], acted["vla_action", "chunk"].detach())

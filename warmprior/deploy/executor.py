@@ -99,7 +99,6 @@ class AsyncExecutor:
     ) -> None:
         if isinstance(actor, WarmPriorActor):
             prior = actor.prior if prior is None else prior
-            chunk_key = actor.chunk_key if chunk_key is None else chunk_key
             if action_dim is None:
                 action_dim = getattr(actor.network, "action_dim", None)
         if prior is None or action_dim is None:

@@ -113,8 +113,8 @@ def deployed_history(
         raise ValueError(f"at most H = {prior.chunk_length} actions are executed, got {k}")
     data = previous.select(*policy.in_keys).to(windows.loc.device)
     with evaluation_mode(policy):
-        data.set(policy.ode.in_keys[0], drawn(policy, data, generator))
-        chunk = policy.integrate(data, nfe).get(policy.chunk_key)
+        data.set(keys.NOISE, drawn(policy, data, generator))
+        chunk = policy.integrate(data, nfe).get(keys.CHUNK)
         steps = torch.full((*data.batch_size, 1), k, device=chunk.device)
         history = advance(data[keys.HISTORY], chunk, steps)
     return TensorDict({keys.HISTORY: history}, batch_size=data.batch_size, device=chunk.device)

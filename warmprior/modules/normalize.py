@@ -128,7 +128,7 @@ class Normalizer(nn.Module):
                 data.set(key, data.get(key) * self.scale(key) + self.loc(key))
         return data
 
-    def env_transforms(self, action_key: NestedKey = keys.ACTION) -> list[Transform]:
+    def env_transforms(self) -> list[Transform]:
         """TorchRL transforms that do the same next to the base environment.
 
         Observations are normalised on the way out and actions denormalised on the way in. Append them
@@ -137,7 +137,7 @@ class Normalizer(nn.Module):
         transforms: list[Transform] = []
         for key in self.keys:
             loc, scale = self.loc(key).clone(), self.scale(key).clone()
-            if key == action_key:
+            if key == keys.ACTION:
                 transforms.append(ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
             else:
                 transforms.append(ObservationNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))

@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from warmprior import keys
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
@@ -209,6 +210,5 @@ class ReflowCoupling:
             if tensor.device != a0.device:
                 self.teacher.to(a0.device)
                 break
-        noise_key, observation_key = ode.in_keys[:2]
-        data = TensorDict({noise_key: a0, observation_key: observation}, a0.shape[:-2])
-        return a0, ode(data, nfe=self.nfe)[ode.out_keys[0]]
+        data = TensorDict({keys.NOISE: a0, ode.in_keys[1]: observation}, a0.shape[:-2])
+        return a0, ode(data, nfe=self.nfe)[keys.CHUNK]

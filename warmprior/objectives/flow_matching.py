@@ -231,7 +231,7 @@ class FlowMatchingLoss(LossModule):
                 raise ValueError(f"a velocity predicts the sample {straight}")
         self.reduction = reduction
         self.generator = actor_network.sampler.generator if generator is None else generator
-        self.set_keys(observation=actor_network.in_keys[0], chunk=actor_network.chunk_key)
+        self.set_keys(observation=actor_network.in_keys[0])
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         self._in_keys = None

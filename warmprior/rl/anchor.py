@@ -7,15 +7,13 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.history import check_history, window_history
 from warmprior.modules.prior import Prior, checked_mean
-from warmprior.transforms.inner_step import keep_resting
+from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
 __all__ = ["PriorAnchor", "has_anchor", "residual_sigma", "source_anchor"]
 
@@ -89,8 +87,8 @@ def residual_sigma(actor: Any) -> float:
     return actor.prior.sigma * float(getattr(actor.prior, "typical_scale", 1.0))
 
 
-class PriorAnchor(Transform):
-    r"""Writes the anchor around which an agent acts in source space: the mean, and noise where it is cold.
+class PriorAnchor(EnvTransform):
+    r"""Writes the anchor, ``[*B, P, d_a]``, around which agents act: the mean, and noise where it is cold.
 
     .. math::
         c_\tau = \mu_\tau \;\; (\tau \in W), \qquad
@@ -121,7 +119,6 @@ class PriorAnchor(Transform):
             :math:`a_0 = \Delta`.
         generator: source of the noise, on the CPU, so that a seed gives the same noise on every device;
             PyTorch's global one by default. Copies of the environment continue from its state.
-        anchor_key: where the anchor is written, ``[*B, P, d_a]``.
 
     Raises:
         ValueError: for an unknown ``cold``, or if the environment's history has other lengths than the
@@ -150,9 +147,8 @@ class PriorAnchor(Transform):
         *,
         cold: Literal["noise", "zero"] | None = None,
         generator: torch.Generator | None = None,
-        anchor_key: NestedKey = keys.ANCHOR,
     ) -> None:
-        super().__init__(in_keys=list(actor.in_keys), out_keys=[anchor_key])
+        super().__init__(in_keys=list(actor.in_keys), out_keys=[keys.ANCHOR])
         if cold not in (None, "noise", "zero"):
             raise ValueError(f"cold must be 'noise' or 'zero', got {cold!r}")
         # Copies, so that moving the environment does not move the policy's own.
@@ -164,7 +160,6 @@ class PriorAnchor(Transform):
         self.cold = cold or ("noise" if self.moves else "zero")
         self.observation_key = actor.in_keys[0]
         self.generator = generator
-        self.anchor_key = unravel_key(anchor_key)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         history = next_tensordict.get(keys.HISTORY, None)
@@ -180,22 +175,14 @@ class PriorAnchor(Transform):
             with torch.no_grad():
                 mean, known = source_anchor(self, history, next_tensordict.get(self.observation_key, None))
             anchor = torch.where(known, mean, cold)
-        return next_tensordict.set(self.anchor_key, anchor)
+        return next_tensordict.set(keys.ANCHOR, anchor)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return keep_resting(tensordict, self._call(next_tensordict), [self.anchor_key])
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        # For all sub-environments: TorchRL keeps the rows of those that were reset.
-        return self._call(tensordict_reset)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing: the key is already in the data."""
-        return tensordict
+        return keep_resting(tensordict, self._call(next_tensordict), [keys.ANCHOR])
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the anchor."""
         if keys.FORECAST not in observation_spec.keys(True, True):
             raise KeyError(f"PriorAnchor found no {keys.FORECAST}: append it after ActionHistory")
-        observation_spec[self.anchor_key] = observation_spec[keys.FORECAST].clone()
+        observation_spec[keys.ANCHOR] = observation_spec[keys.FORECAST].clone()
         return observation_spec

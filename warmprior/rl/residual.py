@@ -10,6 +10,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch.nn.init import trunc_normal_
 
+from warmprior import keys
 from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.rl.decoder import PriorDecoder
 
@@ -91,8 +92,8 @@ class ResidualSampler(TensorDictModuleBase):
         self.sigma = sigma
         self.delta = decoder.delta
         self.generator = generator
-        self.in_keys = [decoder.anchor_key]
-        self.out_keys = [decoder.delta_key]
+        self.in_keys = [keys.ANCHOR]
+        self.out_keys = [keys.DELTA]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the residual."""

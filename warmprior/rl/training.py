@@ -118,7 +118,12 @@ class PriorSpaceTraining:
         self.segments = ReplaySegments(self.directory / "buffer")
         self.steps = 0
         self.curve: list[dict[str, Any]] = []
-        self.identity = {"config": asdict(config), "prior": actor.prior.config(), "policy": _digest(actor)}
+        self.identity = {
+            "config": asdict(config),
+            "prior": actor.prior.config(),
+            "policy": _digest(actor),
+            "transitions": self._keys,
+        }
         if self.state_path.exists():
             self._restore()
 
@@ -327,31 +332,12 @@ class PriorSpaceTraining:
         self.segments = ReplaySegments(self.directory / "buffer", facts["segments"])
         transitions = self.segments.load()
         if transitions is not None:
-            self._check_wiring(transitions)
             self.buffer.extend(transitions)
         self.agent.load(tensors)
         self.steps, self.curve = facts["steps"], facts["curve"]
         torch.set_rng_state(tensors["rng"])
         if "rng_cuda" in tensors:
             torch.cuda.set_rng_state(tensors["rng_cuda"], self.device)
-
-    def _check_wiring(self, transitions: TensorDictBase) -> None:
-        found = set(transitions.keys(True, True))
-        missing = [key for key in self._keys if key not in found]
-        if missing:
-            raise ValueError(
-                f"the replay buffer in {self.segments.directory} comes from another wiring: it lacks "
-                f"{missing} and holds {sorted(map(str, found))}. Choose another output folder."
-            )
-        length = self.decoder.prediction_length
-        for key in (keys.ANCHOR, keys.DELTA, keys.CHUNK):
-            shape = transitions[key].shape
-            if shape[1:] != (length, self.decoder.action_dim or shape[-1]):
-                raise ValueError(
-                    f"the replay buffer in {self.segments.directory} belongs to another policy: its "
-                    f"{key} is {tuple(shape)}, this policy predicts chunks of (P, d_a) = "
-                    f"{(length, self.decoder.action_dim)}. Choose another output folder."
-                )
 
 
 def _digest(actor: WarmPriorActor) -> str:

@@ -155,7 +155,6 @@ class BehaviourCloning:
             withhold=config.cold_probability,
             generator=windows,
             observation_key=observation_key,
-            chunk_key=actor.chunk_key,
         )
         self._prefetch = Prefetch(self.replay_buffer.sample, windows, device=device) if prefetch else None
         #: The network, and the prior where it has weights as well.

@@ -22,7 +22,6 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.io.workers import end_with_parent, start_method, worker_died
-from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.threads import torch_threads
 
 __all__ = ["Episode", "evaluate", "parallel_env", "play_episode"]
@@ -293,7 +292,7 @@ def play_episode(
         data = env.reset()
         while True:
             data = env.step(act(data))
-            tally.add(data["next"], _decision(data, policy, env))
+            tally.add(data["next"], _decision(data))
             if data["next", "done"].all():
                 return tally.episode(seed)
             data = env.step_mdp(data)
@@ -420,7 +419,7 @@ def _play_batched(
             data = env.step(act(data))
             after = data["next"].select("done", success, keys.EXECUTED, *measures).cpu()
             done = after["done"].flatten() & active
-            decided = _decision(data, policy, env)
+            decided = _decision(data)
             for i in active.nonzero().flatten().tolist():
                 tallies[i].add(after[i], decided[i])
             for i in done.nonzero().flatten().tolist():
@@ -507,10 +506,8 @@ def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
                 )
 
 
-def _decision(data: TensorDictBase, policy: TensorDictModuleBase, env: EnvBase) -> TensorDictBase:
+def _decision(data: TensorDictBase) -> TensorDictBase:
     """What :attr:`Episode.decisions` keeps of a step, on the CPU."""
-    # What the environment takes, if the policy does not tell where it writes its chunks.
-    chunk_key = policy.chunk_key if isinstance(policy, WarmPriorActor) else env.action_key
     late = [keys.DELAY, keys.FORECAST] if data.get(keys.DELAY, None) is not None else []
-    kept = data.select(keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED), strict=False).cpu()
-    return kept.set(keys.CHUNK, data[chunk_key].cpu())
+    kept = (keys.CHUNK, keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED))
+    return data.select(*kept, strict=False).cpu()

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior.io.extras import require
@@ -121,7 +120,6 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
             "max_nfe": actor.ode.max_nfe,
             "guidance": None if guidance is None else guidance.config(),
             "observation_key": actor.in_keys[0],
-            "chunk_key": actor.chunk_key,
         },
         "normalizer": None if actor.normalizer is None else actor.normalizer.config(),
         "environment": actor.environment,
@@ -355,8 +353,8 @@ def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorA
 def _from_config(config: dict[str, Any]) -> WarmPriorActor:
     """An actor with fresh weights."""
     options: dict[str, Any] = dict(config["actor"])
-    for name in ("observation_key", "chunk_key"):
-        options[name] = _key_from_json(options[name])
+    key = options["observation_key"]
+    options["observation_key"] = tuple(key) if isinstance(key, list) else key  # nested, as JSON holds it
     if options["guidance"] is not None:
         options["guidance"] = RealTimeChunking(**options["guidance"])
     normalizer, start = config["normalizer"], config["start"]
@@ -375,11 +373,6 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
         if _dtype(parts[name]) != dtype:
             parts[name].to(dtype)
     return actor
-
-
-def _key_from_json(value: Any) -> NestedKey:
-    """A key as JSON holds it: text, or a list of texts for a nested one."""
-    return tuple(value) if isinstance(value, list) else value
 
 
 def _dtype(part: nn.Module) -> torch.dtype | None:

@@ -10,14 +10,14 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
+from warmprior.transforms.inner_step import EnvTransform
 
 __all__ = ["CameraImages"]
 
 
-class CameraImages(Transform):
+class CameraImages(EnvTransform):
     """Adds an image per camera to an observation vector.
 
     The images are rendered from the environment's state (``RobosuiteEnv(..., sim_state=True)``). That takes
@@ -83,13 +83,6 @@ class CameraImages(Transform):
         vector = next_tensordict.get(keys.OBSERVATION)
         entries = {keys.STATE: vector, **{k: v.to(vector.device) for k, v in images.items()}}
         return next_tensordict.set(keys.OBSERVATION, TensorDict(entries))
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing: demonstrations hold their images."""
-        return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Replace the vector by the vector and images."""
