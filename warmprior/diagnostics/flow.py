@@ -18,6 +18,9 @@ from warmprior.transforms.history_observation import HistoryObservation
 
 Field = Callable[[Tensor, Tensor], Tensor]
 
+SPLIT = 4096
+"""Largest batch of the network, for bounded memory; it changes nothing else."""
+
 
 @dataclass
 class Windows:
@@ -99,14 +102,14 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
 
 
 def judged(
-    policy: WarmPriorActor, windows: TensorDictBase, generator: torch.Generator | None
+    policy: WarmPriorActor, windows: TensorDictBase
 ) -> tuple[Windows, Tensor, TensorDictBase, torch.Generator]:
-    """Windows, targets, what the policy reads, and the generator, which has a fixed seed by default."""
+    """Windows, targets, what the policy reads, and a generator with a fixed seed."""
     flat = flat_windows(policy, windows, target_needed=True)
     assert flat.target is not None
     device = flat.loc.device
     rows = windows.select(*policy.in_keys).reshape(len(flat)).to(device)
-    return flat, flat.target, rows, generator or torch.Generator(device).manual_seed(0)
+    return flat, flat.target, rows, torch.Generator(device).manual_seed(0)
 
 
 def sees_history(policy: WarmPriorActor) -> bool:
@@ -224,9 +227,9 @@ def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
     return allowed
 
 
-def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, *, nfe: int, split: int) -> Tensor:
-    """The chunks ``[N, P, d_a]`` from windows ``[N]`` and sources, ``split`` at a time; all finite."""
-    parts = rows.clone(recurse=False).set(keys.NOISE, a0).split(split)
+def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, nfe: int) -> Tensor:
+    """The chunks ``[N, P, d_a]`` from windows ``[N]`` and sources; all finite."""
+    parts = rows.clone(recurse=False).set(keys.NOISE, a0).split(SPLIT)
     chunk = torch.cat([policy.integrate(part, nfe).get(keys.CHUNK) for part in parts])
     if not torch.isfinite(chunk).all():
         raise FloatingPointError(f"at NFE {nfe} a prediction is NaN or infinite")

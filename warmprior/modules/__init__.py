@@ -7,8 +7,6 @@ from warmprior.modules.interpolant import (
     BridgeInterpolant,
     Interpolant,
     LinearInterpolant,
-    PolynomialInterpolant,
-    TrigonometricInterpolant,
 )
 from warmprior.modules.mlp import VelocityMLP
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
@@ -32,7 +30,6 @@ __all__ = [
     "Normalizer",
     "ODEActor",
     "PastPrior",
-    "PolynomialInterpolant",
     "PoseTrend",
     "PreconditionedNetwork",
     "PreviewPrior",
@@ -44,7 +41,6 @@ __all__ = [
     "SourceMoments",
     "StartPoint",
     "TimestepEmbedding",
-    "TrigonometricInterpolant",
     "VelocityMLP",
     "VelocityNetwork",
     "VisionNetwork",
