@@ -156,11 +156,11 @@ def test_missing_files(tmp_path):
         load_policy(tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize("version", [4, None, "5"])
+@pytest.mark.parametrize("version", [5, None, "6"])
 def test_another_format(tmp_path, version):
     saved(tmp_path)
     rewrite(tmp_path, lambda tensors, config: config.update(format=version))
-    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 5"):
+    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 6"):
         load_policy(tmp_path)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -26,7 +25,7 @@ from warmprior.rl.anchor import has_anchor
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
 from warmprior.rl.replay_segments import ReplaySegments
-from warmprior.training.checkpoint import check_identity, load_state, save_state
+from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state
 from warmprior.training.evaluation import Episode, evaluate, watched
 
 __all__ = ["PriorSpaceTraining"]
@@ -121,7 +120,7 @@ class PriorSpaceTraining:
         self.identity = {
             "config": asdict(config),
             "prior": actor.prior.config(),
-            "policy": _digest(actor),
+            "policy": digest_of_state(None, {n: v.detach().cpu() for n, v in actor.state_dict().items()}),
             "transitions": self._keys,
         }
         if self.state_path.exists():
@@ -338,11 +337,3 @@ class PriorSpaceTraining:
         torch.set_rng_state(tensors["rng"])
         if "rng_cuda" in tensors:
             torch.cuda.set_rng_state(tensors["rng_cuda"], self.device)
-
-
-def _digest(actor: WarmPriorActor) -> str:
-    digest = hashlib.sha256()
-    for name, value in sorted(actor.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]

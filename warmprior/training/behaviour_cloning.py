@@ -78,7 +78,6 @@ class BehaviourCloning:
         observation_steps: ``To``.
         coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`.
         logger: a TorchRL logger for the loss, the learning rate and the speed.
-        resume: continue from the folder's state if there is one; otherwise start over.
         compile: compile the velocity network with :func:`torch.compile`; on a GPU, as CUDA graphs.
         prefetch: gather batches ahead in a thread, drawn by a generator of their own; always where data on
             the CPU train a network that is not.
@@ -121,7 +120,6 @@ class BehaviourCloning:
         observation_steps: int = 2,
         coupling: Coupling | None = None,
         logger: Logger | None = None,
-        resume: bool = True,
         compile: bool = False,
         prefetch: bool = False,
     ) -> None:
@@ -141,8 +139,9 @@ class BehaviourCloning:
         device = next((p.device for p in actor.network.parameters()), home)
         self.generator = torch.Generator(device).manual_seed(config.seed)
         windows = self.generator
-        if prefetch := prefetch or home.type != device.type:
-            # What is drawn ahead cannot be drawn by the generator of what follows.
+        if (
+            prefetch := prefetch or home.type != device.type
+        ):  # what is drawn ahead cannot be drawn by the generator of what follows
             windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
         see_history = actor.in_keys[0] == CONDITIONED  # made of the data's observation
         observation_key = OBSERVATION if see_history else actor.in_keys[0]
@@ -181,11 +180,7 @@ class BehaviourCloning:
             cache_enabled=False,
         )
         self.optimizer = make_optimizer(
-            actor.network,
-            learning_rate=config.learning_rate,
-            weight_decay=config.weight_decay,
-            betas=config.betas,
-            eps=config.eps,
+            actor.network, learning_rate=config.learning_rate, weight_decay=config.weight_decay
         )
         learning = _learning(actor.prior)
         if learning:
@@ -195,7 +190,7 @@ class BehaviourCloning:
         self.losses: list[tuple[int, float]] = []
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
-            "config": asdict(config) | {"betas": list(config.betas), "weighting": self.loss_module.weighting},
+            "config": asdict(config) | {"weighting": self.loss_module.weighting},
             "prior": actor.prior.config() | fixed_identity(actor.prior),
             "start": None if actor.start is None else actor.start.config() | fixed_identity(actor.start),
             "coupling": coupling_identity(coupling),
@@ -211,7 +206,6 @@ class BehaviourCloning:
         }
         torch.manual_seed(config.seed)
         self._differ()
-        self._resume = resume
         self._restored: float | None = None  # when the state that was restored had been written
         self._restore()
         self._graphs = compile and device.type == "cuda"
@@ -387,7 +381,7 @@ class BehaviourCloning:
 
     def _restore(self) -> None:
         """Continue from the folder's state, if there is one that is not continued already."""
-        if not self._resume or not self.state_path.exists():
+        if not self.state_path.exists():
             return
         written = self.state_path.stat().st_mtime
         if written == self._restored:

@@ -23,8 +23,6 @@ def make_optimizer(
     *,
     learning_rate: float = 1e-4,
     weight_decay: float = 1e-5,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-8,
 ) -> AdamW:
     """AdamW with the paper's values; no decay on biases, norms and position embeddings.
 
@@ -34,8 +32,6 @@ def make_optimizer(
     Keyword Args:
         learning_rate: peak learning rate.
         weight_decay: decay of matrix weights.
-        betas: decay rates of the moments.
-        eps: added to the root of the second moment.
 
     See Also:
         - :func:`~warmprior.training.warmup_cosine`: the schedule of its learning rate.
@@ -53,7 +49,7 @@ def make_optimizer(
         groups = network.parameter_groups(weight_decay)
     else:
         groups = [{"params": list(network.parameters()), "weight_decay": weight_decay}]
-    return AdamW(groups, lr=learning_rate, betas=betas, eps=eps, fused=True)
+    return AdamW(groups, lr=learning_rate, fused=True)
 
 
 def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0.2) -> LambdaLR:

@@ -36,7 +36,7 @@ __all__ = [
     "save_policy",
 ]
 
-FORMAT = 5
+FORMAT = 6
 """Version of the layout that :func:`save_policy` writes."""
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
