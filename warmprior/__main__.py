@@ -17,8 +17,9 @@ from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import make
-from warmprior.training import DataOptions, NetworkOptions, Task, TrainingConfig, find_tasks, train_policy
+from warmprior.training import DataOptions, NetworkOptions, Task, TrainingConfig, load_task, train_policy
 from warmprior.training.behaviour_cloning import policy_path
+from warmprior.training.task import task_places
 
 
 def _policy(args: argparse.Namespace) -> WarmPriorActor:
@@ -143,7 +144,8 @@ class Train:
 def _tasks(options: Train) -> list[Task]:
     data, keys = options.data, options.observation_keys
     if not keys:
-        return find_tasks(data, options.network.observation_steps)
+        steps = options.network.observation_steps
+        return [load_task(data, *place, steps) for place in task_places(data)]
     place = str(data.dataset)
     if not place.startswith(LEROBOT):
         raise ValueError("--observation-keys belongs to --dataset lerobot:FOLDER or lerobot:USER/NAME")

@@ -14,8 +14,9 @@ import torch
 
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, run_until, same, training, weights
 from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
-from warmprior.training import TrainingConfig, load_policy, make_optimizer
+from warmprior.training import TrainingConfig, load_policy
 from warmprior.training.checkpoint import load_state
+from warmprior.training.optim import make_optimizer
 from warmprior.training.training_config import PAPER
 
 LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}

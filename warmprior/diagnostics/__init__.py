@@ -8,7 +8,7 @@ from warmprior.diagnostics.flow import encoded_windows
 from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revision
 from warmprior.diagnostics.memory_gain import memory_gain
-from warmprior.diagnostics.paths import deployed_history, flow_paths
+from warmprior.diagnostics.paths import flow_paths
 from warmprior.diagnostics.shared_observations import SharedObservations
 from warmprior.diagnostics.smoothness import Smoothness, executed_actions, smoothness
 from warmprior.diagnostics.source_leak import SourceLeak, source_leak
@@ -31,7 +31,6 @@ __all__ = [
     "branching_bound",
     "branching_cost",
     "curvature",
-    "deployed_history",
     "encoded_windows",
     "executed_actions",
     "flow_paths",

@@ -55,7 +55,7 @@ def curvature(
         policy: the policy; its ``nfe`` and solver play no role.
         batch: ``[*B]`` with observation and history: windows of the policy's own lengths or a
             rollout. In windows WP-Preview's mean is the target itself; see
-            :func:`~warmprior.diagnostics.deployed_history` for the history at deployment.
+            :meth:`SharedObservations.deployed` for the history at deployment.
         n_steps: Euler steps.
 
     Keyword Args:

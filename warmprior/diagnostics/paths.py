@@ -71,35 +71,8 @@ def deployed_history(
 ) -> TensorDict:
     """The history at deployment, from the policy's own prediction one decision earlier.
 
-    ``batch.update(deployed_history(policy, previous))`` replaces that of windows. For a network that sees the
-    history, :class:`~warmprior.HistoryObservation` then updates the observation.
-
-    Args:
-        policy: the policy.
-        previous: windows ``[*B]`` of the decision before each window of interest, ``H`` steps earlier in the
-            same episode, with the history of the training.
-
-    Keyword Args:
-        generator: source of randomness on the policy's device; the policy's own by default.
-
-    Returns:
-        TensorDict ``[*B]`` with ``"history"``.
-
-    Raises:
-        KeyError: if the batch lacks a key.
-        ValueError: for bad batches or options.
-
-    Examples:
-        >>> from warmprior.diagnostics import deployed_history
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.history import cold_history
-        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 16), PreviewPrior(8))
-        >>> previous = TensorDict({"observation": torch.zeros(5, 2, 3),
-        ...                        "history": cold_history([5], 8, 16, action_dim=2)}, [5])
-        >>> deployed_history(actor, previous)["history", "forecast_steps"].flatten().tolist()
-        [8, 8, 8, 8, 8]
+    ``previous`` are windows ``[*B]``, ``H`` steps before those of interest in the same episodes, with the
+    history of the training. Returns ``[*B]`` with ``"history"``.
     """
     windows = flat_windows(policy, previous)
     data = previous.select(*policy.in_keys).to(windows.loc.device)

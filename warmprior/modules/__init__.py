@@ -2,19 +2,19 @@
 
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.chi_transformer import ChiTransformer
-from warmprior.modules.encoder import ImageEncoder, imagenet_weights, load_imagenet
+from warmprior.modules.encoder import ImageEncoder
 from warmprior.modules.interpolant import (
     BridgeInterpolant,
     Interpolant,
     LinearInterpolant,
 )
 from warmprior.modules.mlp import VelocityMLP
-from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
+from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor, integrate
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
-from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
+from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.sampler import PriorSampler
 from warmprior.modules.start import StartPoint
 from warmprior.modules.trend import PoseTrend, RestingAction
@@ -40,13 +40,9 @@ __all__ = [
     "Source",
     "SourceMoments",
     "StartPoint",
-    "TimestepEmbedding",
     "VelocityMLP",
     "VelocityNetwork",
     "VisionNetwork",
     "WarmPriorActor",
-    "imagenet_weights",
     "integrate",
-    "load_imagenet",
-    "with_leftover",
 ]

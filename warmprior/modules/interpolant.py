@@ -67,10 +67,6 @@ class Interpolant(Registered):
 class LinearInterpolant(Interpolant):
     r"""Straight line: :math:`\alpha = 1 - t`, :math:`\beta = t` (Lipman et al., 2023; the paper's).
 
-    See Also:
-        - :class:`~warmprior.TrigonometricInterpolant`: keeps the variance of uncorrelated ends.
-        - :class:`~warmprior.PolynomialInterpolant`: starts at rest.
-
     Examples:
         >>> from warmprior import LinearInterpolant
         >>> import torch

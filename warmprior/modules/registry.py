@@ -112,12 +112,6 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
 
     Raises:
         ValueError: if there is none, or it is a base class.
-
-    Examples:
-        >>> from warmprior.modules.registry import find
-        >>> from warmprior import Prior
-        >>> find(Prior, "past").__name__
-        'PastPrior'
     """
     module, colon, attribute = name.partition(":")
     if not colon:
@@ -165,11 +159,6 @@ def options_of(text: str) -> dict[str, Any]:
 
     Raises:
         ValueError: if they are not written like this, or one is given twice.
-
-    Examples:
-        >>> from warmprior.modules.registry import options_of
-        >>> options_of("preview,correlation=0.5,words=one, two")
-        {'correlation': 0.5, 'words': 'one, two'}
     """
     options: dict[str, Any] = {}
     _, comma, rest = text.partition(",")
@@ -188,17 +177,7 @@ def options_of(text: str) -> dict[str, Any]:
 
 
 def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
-    """Build what :meth:`Registered.config` describes, without importing anything.
-
-    Raises:
-        ValueError: if no imported class has that name.
-
-    Examples:
-        >>> from warmprior.modules.registry import from_config
-        >>> from warmprior import Prior
-        >>> from_config(Prior, {"name": "past", "chunk_length": 8})
-        PastPrior(chunk_length=8, sigma=0.5, correlation=0.0)
-    """
+    """Build what :meth:`Registered.config` describes, without importing anything; an unknown name raises."""
     arguments = dict(config)
     name = arguments.pop("name", None)
     return _known(base, name, "import the module that defines it")(**arguments)

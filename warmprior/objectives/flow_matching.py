@@ -94,7 +94,7 @@ class FlowMatchingLoss(LossModule):
         coupling: pairs the sources and targets of a batch, see :data:`~warmprior.objectives.Coupling`; in
             their order by default (Algorithm 1).
         times: how training times are distributed: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
-            ``"logit-normal"``, ``"start"`` (regression) (:mod:`warmprior.objectives.times`), or a function
+            ``"logit-normal"``, ``"start"`` (regression) (``warmprior.objectives.times``), or a function
             of their signature.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) takes errors as they are. ``"standardised"`` divides them by

@@ -24,9 +24,6 @@ def has_anchor(actor: Any) -> bool:
     It has if the policy has a start point, or its prior's mean is warm once the history is full. Otherwise
     agents search around zero, as in DSRL.
 
-    See Also:
-        :func:`~warmprior.rl.source_anchor`: returns that centre.
-
     Examples:
         >>> from warmprior.rl import has_anchor
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
@@ -47,28 +44,8 @@ def has_anchor(actor: Any) -> bool:
 def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
     """The centre of the source at decisions: the mean where it is warm, or that of the start point.
 
-    Args:
-        actor: the policy, or another object with ``prior`` and ``start``.
-        history: ``[*B]``, see :mod:`warmprior.history`.
-        observation: what the policy's network sees, ``[*B, To, d_o]``.
-
-    Returns:
-        The anchor, ``[*B, P, d_a]``, and where it is known, bool ``[*B, P, 1]``.
-
-    See Also:
-        :class:`~warmprior.PriorAnchor`: writes it in an environment, with noise elsewhere.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.history import window_history
-        >>> from warmprior.rl import source_anchor
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> target, steps = torch.zeros(4, 2), torch.tensor([4])
-        >>> history = window_history(torch.ones(4, 2), steps, target, chunk_length=4)
-        >>> anchor, known = source_anchor(
-        ...     WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), history, None)
-        >>> anchor.unique().tolist(), bool(known.all())
-        ([1.0], True)
+    Of histories ``[*B]`` and what the policy's network sees, ``[*B, To, d_o]``: the anchor, ``[*B, P, d_a]``,
+    and where it is known, bool ``[*B, P, 1]``.
     """
     if actor.start is not None:
         centre = actor.start.centre(history, observation)

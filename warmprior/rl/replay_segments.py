@@ -20,23 +20,6 @@ class ReplaySegments:
 
     A segment is valid once :attr:`committed` counts it. If a process dies between writing a segment and its
     training state, the next one replaces that segment. Of a folder that exists ``segments`` are kept.
-
-    See Also:
-        :class:`~warmprior.rl.PriorSpaceTraining`: saves its replay buffer so.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from warmprior.rl import ReplaySegments
-        >>> from tempfile import TemporaryDirectory
-        >>> with TemporaryDirectory() as folder:
-        ...     segments = ReplaySegments(Path(folder))
-        ...     for k in range(2):
-        ...         segments.append(TensorDict({"next": {"reward": torch.full((3, 1), float(k))}}, [3]))
-        ...         segments.write()
-        ...     ReplaySegments(Path(folder), segments.committed).load()["next", "reward"].flatten()
-        tensor([0., 0., 0., 1., 1., 1.])
     """
 
     def __init__(self, directory: Path, segments: int = 0) -> None:

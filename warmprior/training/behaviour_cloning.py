@@ -85,7 +85,7 @@ class BehaviourCloning:
     Raises:
         ValueError: if a batch cannot be divided among the processes, the folder's
             state is damaged or belongs to another recipe, prior, network or dataset, the policy could not be
-            loaded again (:func:`~warmprior.training.check_saveable`).
+            loaded again.
         TypeError: if the policy cannot be saved.
 
     See Also:

@@ -18,10 +18,9 @@ from warmprior.modules import (
     VelocityMLP,
     VelocityNetwork,
     VisionNetwork,
-    imagenet_weights,
-    load_imagenet,
 )
 from warmprior.modules.checks import check_whole_numbers
+from warmprior.modules.encoder import imagenet_weights, load_imagenet
 
 __all__ = ["GENERATED", "PRETRAINED", "DataOptions", "NetworkOptions", "check_counts"]
 
@@ -73,7 +72,7 @@ class DataOptions:
         fast_rendering: render without reflections, shadows and smooth edges, three to five times faster.
 
     See Also:
-        :func:`~warmprior.training.find_tasks`: reads what they name.
+        :func:`~warmprior.training.load_task`: reads what they name.
 
     Examples:
         >>> from warmprior.training import DataOptions

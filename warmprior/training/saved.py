@@ -164,11 +164,6 @@ def check_saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Ten
     Raises:
         TypeError: if there is no :func:`policy_config`.
         ValueError: if a policy built from it has other tensors than this one.
-
-    Examples:
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.training import check_saveable
-        >>> config, weights = check_saveable(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)))
     """
     config = policy_config(actor)
     tensors = without_compilation(actor.state_dict())
@@ -197,7 +192,7 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
     Raises:
         OSError: if the folder cannot be written to.
         TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed).
-        ValueError: if the policy could not be loaded again, see :func:`check_saveable`.
+        ValueError: if the policy could not be loaded again, as is checked before.
 
     See Also:
         :func:`~warmprior.training.load_policy`: reads it.
