@@ -56,7 +56,7 @@ def evaluate(args: argparse.Namespace) -> None:
     from warmprior.diagnostics.statistics import success_posterior
     from warmprior.envs.description import environment_of
     from warmprior.training.evaluation import evaluate as play
-    from warmprior.training.film import check_video, record_video
+    from warmprior.training.film import check_video, record_filmstrip
 
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {args.episodes}")
@@ -89,10 +89,17 @@ def evaluate(args: argparse.Namespace) -> None:
         f"between {100 * low:.1f}% and {100 * high:.1f}%), {steps:.0f} control steps on average"
     )
     if args.video is not None:
-        outcome = record_video(
-            actor, args.video, seed=args.first_seed, nfe=nfe, policy_seed=args.policy_seed, **options
+        film = record_filmstrip(
+            actor,
+            seed=args.first_seed,
+            nfe=nfe,
+            policy_seed=args.policy_seed,
+            frames=1,
+            size=256,
+            video=args.video,
+            **options,
         )
-        print(f"{args.video}: episode {args.first_seed}, {'' if outcome else 'not '}solved")
+        print(f"{args.video}: episode {args.first_seed}, {'' if film.success else 'not '}solved")
 
 
 def push(args: argparse.Namespace) -> None:

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from warmprior import GaussianPrior, HistoryObservation, PastPrior, VelocityMLP, WarmPriorActor, keys
-from warmprior.diagnostics import HistoryShift, executed_actions, smoothness
+from warmprior.diagnostics import executed_actions, smoothness
+from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.history import cold_history
 
 

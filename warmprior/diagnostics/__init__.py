@@ -5,7 +5,6 @@ from warmprior.diagnostics.branching import branching_bound, branching_cost
 from warmprior.diagnostics.coverage import source_coverage
 from warmprior.diagnostics.curvature import curvature
 from warmprior.diagnostics.flow import encoded_windows
-from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revision
 from warmprior.diagnostics.memory_gain import memory_gain
 from warmprior.diagnostics.paths import flow_paths
@@ -21,7 +20,6 @@ from warmprior.diagnostics.statistics import (
 )
 
 __all__ = [
-    "HistoryShift",
     "MeanError",
     "SharedObservations",
     "Smoothness",

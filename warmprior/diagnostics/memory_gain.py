@@ -76,8 +76,7 @@ def memory_gain(
         FloatingPointError: if a prediction is NaN or infinite.
 
     See Also:
-        - :func:`~warmprior.diagnostics.source_leak`: the same for the noise of the source.
-        - :class:`~warmprior.diagnostics.HistoryShift`: plays a policy with a disturbed memory.
+        :func:`~warmprior.diagnostics.source_leak`: the same for the noise of the source.
 
     Examples:
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor

@@ -77,15 +77,17 @@ class Registered:
         """Name and constructor arguments as JSON holds them; :func:`from_config` reverses it.
 
         An argument that the constructor chose, as for ``sigma=None``, is taken from the object's attribute of
-        that name, if it is a number or text. All others are as given.
+        that name, if it is a number or text. Arguments that have a ``config()`` are saved as that, and all
+        others as given.
 
         Raises:
             TypeError: if JSON cannot hold an argument.
         """
         if "name" in self._arguments:
             raise TypeError(f"{type(self).__name__} takes an argument called name: rename it")
+        values = {n: v.config() if hasattr(v, "config") else v for n, v in self._resolved().items()}
         try:
-            return json.loads(json.dumps({"name": self.name, **self._resolved()}, allow_nan=False))
+            return json.loads(json.dumps({"name": self.name, **values}, allow_nan=False))
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"{type(self).__name__} has an argument that cannot be saved ({error}): take numbers, text, "

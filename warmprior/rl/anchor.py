@@ -94,8 +94,6 @@ class PriorAnchor(EnvTransform):
         cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise if the policy
             has an anchor (:func:`~warmprior.rl.has_anchor`), and zero otherwise, which gives vanilla DSRL:
             :math:`a_0 = \Delta`.
-        generator: source of the noise, on the CPU, so that a seed gives the same noise on every device;
-            PyTorch's global one by default. Copies of the environment continue from its state.
 
     Raises:
         ValueError: for an unknown ``cold``, or if the environment's history has other lengths than the
@@ -118,13 +116,7 @@ class PriorAnchor(EnvTransform):
     prior: Any
     start: Any
 
-    def __init__(
-        self,
-        actor: Any,
-        *,
-        cold: Literal["noise", "zero"] | None = None,
-        generator: torch.Generator | None = None,
-    ) -> None:
+    def __init__(self, actor: Any, *, cold: Literal["noise", "zero"] | None = None) -> None:
         super().__init__(in_keys=list(actor.in_keys), out_keys=[keys.ANCHOR])
         if cold not in (None, "noise", "zero"):
             raise ValueError(f"cold must be 'noise' or 'zero', got {cold!r}")
@@ -136,15 +128,14 @@ class PriorAnchor(EnvTransform):
         self.moves = has_anchor(actor)
         self.cold = cold or ("noise" if self.moves else "zero")
         self.observation_key = actor.in_keys[0]
-        self.generator = generator
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         history = next_tensordict.get(keys.HISTORY, None)
         check_history(history, self.prior.history_length, self.prior.prediction_length, self.prior)
         forecast = history["forecast"]
         if self.cold == "noise":
-            cold = torch.randn(forecast.shape, generator=self.generator, dtype=forecast.dtype)
-            cold = cold.to(forecast.device)
+            # On the CPU, so that a seed gives the same noise on every device.
+            cold = torch.randn(forecast.shape, dtype=forecast.dtype).to(forecast.device)
         else:
             cold = torch.zeros_like(forecast)
         anchor = cold

@@ -4,7 +4,7 @@ from warmprior.io.workers import WorkerError
 from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.card import model_card, policy_results
 from warmprior.training.evaluation import Episode, evaluate, parallel_env, play_episode
-from warmprior.training.film import Filmstrip, record_filmstrip, record_video
+from warmprior.training.film import Filmstrip, record_filmstrip
 from warmprior.training.navigation import judge_navigation, play_navigation
 from warmprior.training.optim import ema_of, warmup_cosine
 from warmprior.training.options import DataOptions, NetworkOptions
@@ -37,7 +37,6 @@ __all__ = [
     "precondition",
     "push_policy",
     "record_filmstrip",
-    "record_video",
     "save_policy",
     "train_policy",
     "warmup_cosine",

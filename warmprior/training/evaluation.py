@@ -263,7 +263,7 @@ def play_episode(
 
     See Also:
         - :func:`~warmprior.training.evaluate`: many of them, one by one or side by side.
-        - :func:`~warmprior.training.record_video`: films one.
+        - :func:`~warmprior.training.record_filmstrip`: films one.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv

@@ -278,7 +278,6 @@ def push_policy(
 def load_policy(
     directory: str | Path,
     *,
-    prior: Prior | None = None,
     device: torch.device | str = "cpu",
     generator: torch.Generator | None = None,
     revision: str | None = None,
@@ -294,7 +293,6 @@ def load_policy(
             repository at the Hugging Face hub, where there is no such folder.
 
     Keyword Args:
-        prior: the prior that the policy must have been trained with, if any.
         device: where to put the weights.
         generator: source of randomness of the sampler.
         revision: branch, tag or commit of the repository; its main branch by default.
@@ -302,8 +300,7 @@ def load_policy(
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if it is damaged, of another format version, or has another prior; or if a revision of a
-            folder is asked for.
+        ValueError: if it is damaged or of another format version; or if a revision of a folder is asked for.
         OSError: the hub client's own, if the hub does not have it, or does not give it to this user.
         ImportError: if the hub has to be asked, and huggingface_hub is not installed.
 
@@ -325,8 +322,6 @@ def load_policy(
     except Exception as error:  # whatever options of another version lead to
         reason = str(error) if type(error) is ValueError else repr(error)
         raise ValueError(f"the policy at {folder} cannot be built here: {reason}") from error
-    if prior is not None and as_json(prior.config()) != config["prior"]:
-        raise ValueError(f"the policy at {folder} was trained with {actor.prior}, not with {prior}")
     actor.sampler.generator = generator
     return actor.to(device).eval()
 

@@ -7,7 +7,6 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer, TensorStorage
-from torchrl.data.replay_buffers.samplers import Sampler, SliceSampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 from torchrl.envs.transforms import Compose, Transform
 
@@ -264,7 +263,6 @@ def window_replay_buffer(
     observation_steps: int = 2,
     see_history: bool = False,
     withhold: float = 0.0,
-    sampler: Sampler | None = None,
     generator: torch.Generator | None = None,
     observation_key: NestedKey = keys.OBSERVATION,
 ) -> TensorDictReplayBuffer:
@@ -283,12 +281,11 @@ def window_replay_buffer(
         observation_steps: ``To``.
         see_history: see :func:`window_transforms`.
         withhold: see :func:`window_transforms`.
-        sampler: ``RandomSampler()`` by default; ``SamplerWithoutReplacement()`` for epochs.
         generator: source of randomness of sampler and what is withheld; PyTorch's global one by default.
         observation_key: see :class:`ActionWindow`.
 
     Raises:
-        ValueError: if ``batch_size < 1``, for a ``SliceSampler``, or see :class:`ActionWindow`.
+        ValueError: if ``batch_size < 1``, or see :class:`ActionWindow`.
 
     See Also:
         - :func:`~warmprior.window_transforms`: its transforms, for a buffer of your own.
@@ -305,11 +302,6 @@ def window_replay_buffer(
         (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
     """
     check_whole_numbers(batch_size=batch_size)
-    if isinstance(sampler, SliceSampler):
-        raise ValueError(
-            "SliceSampler needs whole steps in the storage, and this one holds step numbers: every window is "
-            "a slice already, so take RandomSampler or SamplerWithoutReplacement"
-        )
     windows = window_transforms(
         data,
         prior,
@@ -324,7 +316,7 @@ def window_replay_buffer(
     return TensorDictReplayBuffer(
         # The sampler draws on the storage's device, where the generator has to be too.
         storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
-        sampler=RandomSampler() if sampler is None else sampler,
+        sampler=RandomSampler(),
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
         transform=windows,
