@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import nn
 
 from warmprior import keys
 from warmprior.modules.normalize import Normalizer
@@ -141,11 +141,8 @@ class WarmPriorActor(TensorDictModuleBase):
 
         The sample, ``[*B, P, d_a]``, stands under ``keys.NOISE``.
         """
-        return self.ode(tensordict, nfe=nfe, sigma=self._sigma(tensordict))
-
-    def _sigma(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Standard deviation of the source, broadcastable to ``[*B, P, d_a]``, for the guidance."""
-        return None if self.ode.guidance is None else self.sampler.source(tensordict).scale
+        sigma = None if self.ode.guidance is None else self.sampler.source(tensordict).scale
+        return self.ode(tensordict, nfe=nfe, sigma=sigma)
 
     def replace(self, **changes: Any) -> WarmPriorActor:
         """A copy of the policy, with the same parts, and some constructor arguments changed.

@@ -164,8 +164,7 @@ class ODEActor(TensorDictModuleBase):
         KeyError: if an input key is missing.
 
     See Also:
-        - :class:`~warmprior.WarmPriorActor`: this with a source before it: a whole policy.
-        - :func:`~warmprior.integrate`: the integration alone.
+        :class:`~warmprior.WarmPriorActor`: this with a source before it: a whole policy.
 
     Examples:
         >>> import torch

@@ -122,9 +122,6 @@ class BridgeCoupling(OTCoupling):
     Raises:
         ValueError: as :class:`OTCoupling`, or if ``sigma`` is not a finite number > 0.
 
-    See Also:
-        :class:`~warmprior.objectives.OTCoupling`: the limit without noise.
-
     Examples:
         >>> import torch
         >>> from warmprior.objectives import BridgeCoupling

@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 
 from warmprior.io.files import read_tensors, save_file, write_atomic
 
@@ -64,11 +63,9 @@ class ReplaySegments:
                     "or choose another output folder"
                 ) from error
             size = len(next(iter(tensors.values())))
-            nested = {_key(name): value for name, value in tensors.items()}
-            parts.append(TensorDict(nested, batch_size=[size]))
+            part = TensorDict({}, batch_size=[size])
+            for name, value in tensors.items():
+                key = json.loads(name)
+                part.set(tuple(key) if isinstance(key, list) else key, value)
+            parts.append(part)
         return torch.cat(parts) if parts else None
-
-
-def _key(name: str) -> NestedKey:
-    key = json.loads(name)
-    return tuple(key) if isinstance(key, list) else key

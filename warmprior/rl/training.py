@@ -26,7 +26,7 @@ from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
 from warmprior.rl.replay_segments import ReplaySegments
 from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state
-from warmprior.training.evaluation import Episode, evaluate, watched
+from warmprior.training.evaluation import evaluate, watched
 
 __all__ = ["PriorSpaceTraining"]
 
@@ -65,7 +65,6 @@ class PriorSpaceTraining:
 
     See Also:
         - :class:`~warmprior.rl.PriorSpaceConfig`: its recipe.
-        - :class:`~warmprior.PriorAnchor`: what the environment needs.
         - :func:`~warmprior.training.evaluate`: plays episodes with ``agent.policy``.
 
     Examples:
@@ -152,7 +151,13 @@ class PriorSpaceTraining:
         with (
             self._environment(0) as evaluation_env,
             self._rounds(evaluation_env.batch_size.numel()) as rounds,
-            self._bar() as bar,
+            tqdm(
+                total=config.environment_steps,
+                initial=self.steps,
+                desc=self.description,
+                unit="step",
+                disable=self.description is None,
+            ) as bar,
         ):
             self.decoder.check_env(evaluation_env)
             if keys.ANCHOR not in evaluation_env.observation_spec.keys(True, True):
@@ -166,7 +171,8 @@ class PriorSpaceTraining:
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
                     found = self.agent.learn(self.buffer)
-                    bar.set_postfix(found | self._last_success(), refresh=False)
+                    last = {row["evaluation"]: row["success_rate"] for row in self.curve}
+                    bar.set_postfix(found | last, refresh=False)
                 due = self.steps // config.evaluate_every > before // config.evaluate_every
                 if due or self.steps >= config.environment_steps:
                     self.agent.state()  # Raises if the agent's state is not finite.
@@ -216,19 +222,6 @@ class PriorSpaceTraining:
     def _learns(self) -> bool:
         return self.steps >= self.config.warmup_steps
 
-    def _bar(self) -> Any:
-        return tqdm(
-            total=self.config.environment_steps,
-            initial=self.steps,
-            desc=self.description,
-            unit="step",
-            disable=self.description is None,
-        )
-
-    def _last_success(self) -> dict[str, float]:
-        """Of the last evaluations, for the progress bar."""
-        return {row["evaluation"]: row["success_rate"] for row in self.curve}
-
     def _seed(self) -> int:
         # Apart from the seeds of evaluation and demonstrations; a resumed training plays new episodes.
         if self.steps:
@@ -247,10 +240,14 @@ class PriorSpaceTraining:
 
     def _keep(self, data: TensorDictBase) -> int:
         """Add decisions to the replay buffer; returns the number of their control steps."""
-        transitions = self._transitions(data)
+        transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
+        following = transitions["next"]
+        following["reward"] = following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
+        if not self.config.bootstrap_timeouts:
+            following["terminated"] = following["done"].clone()
         # Checked before saving: they would end every later training.
         self._check_finite(transitions)
-        self._check_executed(transitions["next"])
+        self._check_executed(following)
         self.buffer.extend(transitions)
         self.segments.append(transitions)
         return int(data["next", keys.EXECUTED].sum())
@@ -279,14 +276,6 @@ class PriorSpaceTraining:
         after = [*states, "reward", "done", "terminated", keys.EXECUTED]
         return [*states, keys.DELTA, keys.CHUNK, *(unravel_key(("next", key)) for key in after)]
 
-    def _transitions(self, data: TensorDictBase) -> TensorDictBase:
-        transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
-        following = transitions["next"]
-        following["reward"] = following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
-        if not self.config.bootstrap_timeouts:
-            following["terminated"] = following["done"].clone()
-        return transitions
-
     def _evaluate(self, env: EnvBase, policies: dict[str, TensorDictModuleBase]) -> None:
         for name, policy in policies.items():
             kind = ExplorationType.DETERMINISTIC if name == "greedy" else ExplorationType.RANDOM
@@ -299,18 +288,16 @@ class PriorSpaceTraining:
                     nfe=self.config.nfe if name == "base" else None,
                     policy_seed=self.config.seed,
                 )
-            self.curve.append(self._row(name, episodes))
+            successes = sum(episode.success for episode in episodes)
+            row = {
+                "environment_steps": self.steps,
+                "evaluation": name,
+                "episodes": len(episodes),
+                "successes": successes,
+                "success_rate": successes / len(episodes),
+            }
+            self.curve.append(row)
         self.agent.policy.train()
-
-    def _row(self, name: str, episodes: list[Episode]) -> dict[str, Any]:
-        successes = sum(episode.success for episode in episodes)
-        return {
-            "environment_steps": self.steps,
-            "evaluation": name,
-            "episodes": len(episodes),
-            "successes": successes,
-            "success_rate": successes / len(episodes),
-        }
 
     def _save(self) -> None:
         tensors = {**self.agent.state(), "rng": torch.get_rng_state()}

@@ -22,7 +22,6 @@ from warmprior.io.files import exclusive
 from warmprior.io.workers import count_devices
 from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
 from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
@@ -90,7 +89,6 @@ class BehaviourCloning:
 
     See Also:
         - :class:`~warmprior.training.TrainingConfig`: its recipe.
-        - :class:`~warmprior.FlowMatchingLoss`: the loss alone, for a loop of your own.
         - :func:`~warmprior.training.evaluate`: plays episodes with what it trained.
 
     Examples:
@@ -182,8 +180,9 @@ class BehaviourCloning:
         self.optimizer = make_optimizer(
             actor.network, learning_rate=config.learning_rate, weight_decay=config.weight_decay
         )
-        learning = _learning(actor.prior)
-        if learning:
+        # A prior that learnt before is fixed by then.
+        prior = actor.prior.parameters() if isinstance(actor.prior, nn.Module) else ()
+        if learning := [parameter for parameter in prior if parameter.requires_grad]:
             self.optimizer.add_param_group({"params": learning, "weight_decay": 0.0})
         self.schedule = warmup_cosine(self.optimizer, config.iterations, config.warmup_ratio)
         self.iteration = 0
@@ -307,7 +306,10 @@ class BehaviourCloning:
 
     def _keep(self) -> None:
         """Keep the policy of this iteration."""
-        save_policy(self._averaged_actor(), self.policy_path(self.iteration))
+        averaged, prior = cast(Any, self.ema.module), self.actor.prior
+        prior = averaged["prior"] if isinstance(prior, nn.Module) else prior
+        actor = self.actor.replace(network=averaged["network"], prior=prior)
+        save_policy(actor, self.policy_path(self.iteration))
 
     def _is_kept(self) -> bool:
         """Whether the policy of this iteration is on disk and whole."""
@@ -349,13 +351,6 @@ class BehaviourCloning:
             except OSError as error:  # which names no file: a full disk
                 place = getattr(self.logger, "log_dir", type(self.logger).__name__)
                 raise OSError(error.errno, f"cannot write the log: {error.strerror}", str(place)) from error
-
-    def _averaged_actor(self) -> WarmPriorActor:
-        averaged = cast(Any, self.ema.module)
-        prior = self.actor.prior
-        return self.actor.replace(
-            network=averaged["network"], prior=averaged["prior"] if isinstance(prior, nn.Module) else prior
-        )
 
     def _save(self) -> None:
         tensors = {
@@ -429,13 +424,6 @@ class _Loss(nn.Module):
     def forward(self, batch: TensorDictBase) -> Tensor:
         losses = self.loss_module(batch)
         return torch.stack([losses[key] for key in self.loss_module.out_keys]).sum()
-
-
-def _learning(prior: Prior) -> list[nn.Parameter]:
-    """Parameters of a prior that are trained with the flow; one that learnt before is fixed by then."""
-    if not isinstance(prior, nn.Module):
-        return []
-    return [parameter for parameter in prior.parameters() if parameter.requires_grad]
 
 
 def policy_path(directory: Path, iteration: int) -> Path:

@@ -125,8 +125,7 @@ def parallel_env(
         ValueError: if ``num_envs < 1``.
 
     See Also:
-        - :func:`~warmprior.training.evaluate`: plays episodes in it.
-        - :class:`~warmprior.envs.RobosuiteEnv`: what its processes usually hold.
+        :func:`~warmprior.training.evaluate`: plays episodes in it.
 
     Examples:
         >>> from functools import partial
@@ -262,8 +261,7 @@ def play_episode(
         KeyError: if it lacks ``success``, one of ``measures``, or the policy's transforms.
 
     See Also:
-        - :func:`~warmprior.training.evaluate`: many of them, one by one or side by side.
-        - :func:`~warmprior.training.record_filmstrip`: films one.
+        :func:`~warmprior.training.record_filmstrip`: films one.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -346,9 +344,7 @@ def evaluate(
         WorkerError: if a worker process dies, a ``RuntimeError``.
 
     See Also:
-        - :func:`~warmprior.training.play_episode`: a single one.
-        - :func:`~warmprior.training.parallel_env`: several simulators at a time.
-        - :func:`~warmprior.diagnostics.success_posterior`: what the successes tell about the rate.
+        :func:`~warmprior.diagnostics.success_posterior`: what the successes tell about the rate.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv

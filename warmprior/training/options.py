@@ -177,8 +177,7 @@ class NetworkOptions:
         share_encoder: one encoder for all cameras.
 
     See Also:
-        - :class:`~warmprior.PreconditionedNetwork`: what ``precondition`` does.
-        - :class:`~warmprior.ChiTransformer`: the paper's network.
+        :class:`~warmprior.ChiTransformer`: the paper's network.
 
     Examples:
         >>> import torch

@@ -123,7 +123,12 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
         },
         "normalizer": None if actor.normalizer is None else actor.normalizer.config(),
         "environment": actor.environment,
-        "precision": _precision(actor),
+        # Of each part its own: half precision is too coarse for statistics.
+        "precision": {
+            name: str(dtype).removeprefix("torch.")
+            for name, part in _parts(actor).items()
+            if (dtype := _dtype(part))
+        },
     }
     try:
         return as_json(config)
@@ -143,12 +148,6 @@ def _parts(actor: WarmPriorActor) -> dict[str, nn.Module]:
         "start": actor.start,
     }
     return {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
-
-
-def _precision(actor: WarmPriorActor) -> dict[str, str]:
-    """Names of the parts' precisions. Each its own: half precision is too coarse for statistics."""
-    found = {name: _dtype(part) for name, part in _parts(actor).items()}
-    return {name: str(dtype).removeprefix("torch.") for name, dtype in found.items() if dtype}
 
 
 def policy_file(place: str | Path, *, revision: str | None = None) -> dict[str, Any]:
@@ -193,9 +192,6 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
         OSError: if the folder cannot be written to.
         TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed).
         ValueError: if the policy could not be loaded again, as is checked before.
-
-    See Also:
-        :func:`~warmprior.training.load_policy`: reads it.
 
     Examples:
         >>> from tempfile import TemporaryDirectory

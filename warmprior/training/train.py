@@ -126,7 +126,6 @@ def train_policy(
         ValueError: if the demonstrations have another form, or the folder holds another training.
 
     See Also:
-        - :class:`~warmprior.training.BehaviourCloning`: the training loop.
         - :func:`~warmprior.training.evaluate`: plays episodes.
         - :func:`~warmprior.training.save_policy`: keeps the policy.
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.data import Bounded, Composite
 
 from warmprior import keys
@@ -76,12 +75,11 @@ class CameraImages(EnvTransform):
                 "sim_state=True"
             )
         simulator, numbers = self._simulator, state.cpu().numpy()
-        images = {
-            f"{camera}_image": _channels_first(simulator.render_frame(camera, self.size, numbers))
-            for camera in self.cameras
-        }
         vector = next_tensordict.get(keys.OBSERVATION)
-        entries = {keys.STATE: vector, **{k: v.to(vector.device) for k, v in images.items()}}
+        entries = {keys.STATE: vector}
+        for camera in self.cameras:
+            image = simulator.render_frame(camera, self.size, numbers).transpose(2, 0, 1)
+            entries[f"{camera}_image"] = torch.from_numpy(np.ascontiguousarray(image)).to(vector.device)
         return next_tensordict.set(keys.OBSERVATION, TensorDict(entries))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -95,7 +93,3 @@ class CameraImages(EnvTransform):
         images = {f"{camera}_image": image.clone() for camera in self.cameras}
         observation_spec[keys.OBSERVATION] = Composite({keys.STATE: vector, **images})
         return observation_spec
-
-
-def _channels_first(image: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))

@@ -288,8 +288,7 @@ def window_replay_buffer(
         ValueError: if ``batch_size < 1``, or see :class:`ActionWindow`.
 
     See Also:
-        - :func:`~warmprior.window_transforms`: its transforms, for a buffer of your own.
-        - :class:`~warmprior.FlowMatchingLoss`: takes its batches.
+        :class:`~warmprior.FlowMatchingLoss`: takes its batches.
 
     Examples:
         >>> import torch
