@@ -38,7 +38,7 @@ from warmprior.training.checkpoint import (
     select,
     snapshot_optimizer,
 )
-from warmprior.training.identity import coupling_identity, data_digest, fixed_identity, network_identity
+from warmprior.training.identity import data_digest, fixed_identity, part_identity
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.placement import Prefetch
 from warmprior.training.saved import check_saveable, load_policy, save_policy
@@ -190,10 +190,10 @@ class BehaviourCloning:
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
             "config": asdict(config) | {"weighting": self.loss_module.weighting},
-            "prior": actor.prior.config() | fixed_identity(actor.prior),
-            "start": None if actor.start is None else actor.start.config() | fixed_identity(actor.start),
-            "coupling": coupling_identity(coupling),
-            "network": network_identity(actor.network),
+            "prior": part_identity(actor.prior),
+            "start": part_identity(actor.start),
+            "coupling": part_identity(coupling),
+            "network": part_identity(actor.network),
             "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
             "policy": {
                 "observation_steps": observation_steps,

@@ -396,10 +396,6 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
         >>> from warmprior.training import DataOptions, load_task
         >>> load_task(DataOptions(), "navigation").title
         'navigation toy'
-        >>> load_task(DataOptions(), "nowhere:pendulum")
-        Traceback (most recent call last):
-            ...
-        ValueError: --task nowhere:pendulum: No module named 'nowhere'
     """
     if name == "navigation":
         return navigation_task()
