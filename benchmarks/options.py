@@ -27,7 +27,7 @@ from warmprior.io.distributed import check_batch, check_device, from_leader, lau
 from warmprior.io.files import check_writable, exclusive, read_json, write_atomic
 from warmprior.io.machine import facts_of_machine
 from warmprior.io.script import run_script
-from warmprior.modules.encoder import imagenet_weights
+from warmprior.modules import imagenet_weights
 from warmprior.modules.grid import check_grid
 from warmprior.training import DataOptions, NetworkOptions, TrainingConfig
 from warmprior.training.options import GENERATED, PRETRAINED, check_counts, is_simulated

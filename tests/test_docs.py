@@ -23,6 +23,7 @@ SHOWN_ALONE = {
     "warmprior.data.download_lerobot": "fetches from the hub",
     "warmprior.data.lerobot_steps": "needs a dataset",
     "warmprior.data.lerobot_index.LeRobotIndex": "needs a dataset",
+    "warmprior.modules.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",
     "warmprior.envs.mimicgen.register_mimicgen": "needs a package that is not on the package index",
     "warmprior.io.processes.fresh_processes": "starts a process, for seconds",

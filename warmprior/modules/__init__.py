@@ -2,7 +2,7 @@
 
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.chi_transformer import ChiTransformer
-from warmprior.modules.encoder import ImageEncoder
+from warmprior.modules.encoder import ImageEncoder, imagenet_weights, load_imagenet
 from warmprior.modules.interpolant import (
     BridgeInterpolant,
     Interpolant,
@@ -44,5 +44,7 @@ __all__ = [
     "VelocityNetwork",
     "VisionNetwork",
     "WarmPriorActor",
+    "imagenet_weights",
     "integrate",
+    "load_imagenet",
 ]

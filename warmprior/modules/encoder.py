@@ -213,6 +213,14 @@ def imagenet_weights() -> dict[str, Tensor]:
     Raises:
         OSError: if the weights are not stored here and cannot be downloaded, or the stored file is damaged.
         ImportError: if torchvision is missing.
+
+    See Also:
+        :func:`~warmprior.modules.load_imagenet`: puts them into an encoder.
+
+    Examples:
+        >>> from warmprior.modules import imagenet_weights
+        >>> imagenet_weights()["conv1.weight"].shape  # doctest: +SKIP
+        torch.Size([64, 3, 7, 7])
     """
     torchvision: Any = require("torchvision.models", "vision")
     weights = torchvision.ResNet18_Weights.IMAGENET1K_V1
@@ -237,6 +245,15 @@ def load_imagenet(encoder: ImageEncoder) -> None:
     Raises:
         ValueError: if it has another backbone.
         OSError: see :func:`imagenet_weights`.
+
+    Examples:
+        >>> from warmprior import ImageEncoder
+        >>> from warmprior.modules import load_imagenet
+        >>> load_imagenet(ImageEncoder(["agentview_image"], 9))  # doctest: +SKIP
+        >>> load_imagenet(ImageEncoder(["agentview_image"], 9, backbone="small"))
+        Traceback (most recent call last):
+            ...
+        ValueError: ImageNet's weights are for resnet18, not for 'small'
     """
     if encoder.backbone != "resnet18":
         raise ValueError(f"ImageNet's weights are for resnet18, not for {encoder.backbone!r}")
