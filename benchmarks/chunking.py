@@ -1,7 +1,7 @@
 """The paper's H = 1 study (Fig. 6), and all chunk lengths: success and jumps at chunk boundaries.
 
 python benchmarks/chunking.py                             # square ph, one seed, over an hour on two cores
-python benchmarks/chunking.py --chunk 1 8 --nfe 1         # the paper's figure alone
+python benchmarks/chunking.py --chunk 1 8 --nfe 1 --task square transport --data ph mh    # the paper's figure
 python benchmarks/chunking.py --resume                    # after an interruption
 
 The policies of robomimic.py with the same options are used, not trained again.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import sys
 
-from common import policies_of
+from common import policies_of, slug
 from options import PRESETS, check_single, parse, script, started, with_parts
 from plots import plot_bars, plot_lines, plot_success
 from report import labelled, per_seed, table, write_report
@@ -26,22 +26,26 @@ def main(argv: list[str] | None) -> None:
     chunks = {"sources": {"chunk": (1, 2, 4, 8, 16)}}
     presets = {name: with_parts(preset, **chunks) for name, preset in PRESETS.items()}
     options = parse(presets, argv, "chunking", __doc__)
-    check_single(options, "task", "data", "sigma")
+    check_single(options, "sigma")
     with started(options, "chunking") as out:
         policies = policies_of(options)
         rows, failures = compare(options, policies)
         seeds = per_seed(labelled(rows, "chunk"), options.evaluation.top_k)
         seeds = seeds.sort_values(["chunk", "nfe"], ascending=[True, False], kind="stable")
-        title = f"{policies[0].task().title}, {options.evaluation.seeds} seed(s)"
         lines = {"success": "success rate", JUMPS: "jump at boundaries (dotted: inside)"}
-        plot_lines(seeds, out / "chunk_lengths.png", title, "chunk", lines)
+        problems = dict(list(seeds.groupby("problem", sort=False)))
+        for name, mine in problems.items():
+            end = f"_{slug(name)}" if len(problems) > 1 else ""
+            plot_lines(mine, out / f"chunk_lengths{end}.png", name, "chunk", lines)
+        # All tasks beside each other, at the fewest network evaluations.
         fewest, shortest = seeds[seeds.nfe == min(seeds.nfe)], min(seeds.chunk)
+        title = f"NFE {min(seeds.nfe)}, {options.evaluation.seeds} seed(s)"
         pair = fewest[fewest.chunk.isin((shortest, 8))]
-        bars = {"success": f"success rate (NFE {min(seeds.nfe)})"}
+        bars = {"success": "success rate"}
         plot_bars(pair.assign(chunk="H = " + pair.chunk.astype(str)), out / "bars.png", title, "chunk", bars)
-        short = seeds[seeds.chunk == shortest]
-        plot_success(short, out / "violins.png", f"{title}, H = {shortest}")
-        text = table(seeds, ["chunk", "nfe", "method"], ["success", *JUMPS])
+        short = fewest[fewest.chunk == shortest]
+        plot_success(short, out / "violins.png", f"{title}, H = {shortest}", group="problem")
+        text = table(seeds, ["problem", "chunk", "nfe", "method"], ["success", *JUMPS])
         write_report(out, text, text, rows, failures)
 
 

@@ -29,8 +29,6 @@ from options import (
     MeasuredOptions,
     Options,
     Run,
-    check_single,
-    check_typed,
     stored_options,
     with_parts,
 )
@@ -346,23 +344,12 @@ def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict
     return {method: actors for method, actors in found.items() if actors.keys() == seeds}
 
 
-def finished_policies(run: Path, options: Options, **sources: Any) -> list[Policy]:
-    """The policies of a finished run of one task, found by the options of the run; its data are read again.
-
-    `sources` replace some of its options.
-    """
+def finished_policies(run: Path, options: Options) -> list[Policy]:
+    """The policies of a finished run by the methods that are asked for; its data are read again."""
     stored = stored_options(Options, run, None)
-    check_typed(stored, run, (*options.sources.prior, *options.data.task))
-    if options.sources.sigma not in ((), stored.sources.sigma):
-        raise ValueError(f"--run {run} has its own sigma: leave out --sigma")
     methods = " ".join(stored.sources.prior)
-    stored = with_parts(stored, run={"out": run}, sources=sources)
-    check_single(stored, "task", "data", "chunk", "sigma")
-    policies = policies_of(stored)
+    policies = policies_of(with_parts(stored, run={"out": run}, sources={"prior": options.sources.prior}))
     for policy in policies:
-        # By the name of the task, or where that is one's own by its place.
-        if not {*options.data.task} <= {policy.facts["task"], policy.place[0]}:
-            raise ValueError(f"--run {run} is of {policy.facts['task']}: leave out --task")
         if not policy.is_trained:
             raise FileNotFoundError(
                 f"--run {run} has no trained policy {policy} of these versions and data (options.json has "

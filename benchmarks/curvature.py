@@ -1,6 +1,6 @@
 """Curvature of the flow (the paper's Table 2 and Fig. 4): how straight each source makes it.
 
-python benchmarks/curvature.py --run runs/square-ph-quick     # the policies of a run of robomimic.py
+python benchmarks/curvature.py --run runs/square-ph-quick     # the policies of a finished run
 python benchmarks/curvature.py --data mh --preset cpu         # of these options, trained if they are not yet
 """
 
@@ -28,7 +28,7 @@ SHOWN = 40
 class CurvatureOptions(MeasuredOptions):
     """What to measure."""
 
-    policies: FinishedRun = None  # a finished run of robomimic.py, whose policies to take instead of training
+    policies: FinishedRun = None  # a finished run, whose policies to take instead of training
     coordinate: int = 0  # of the action, in flow_paths.png
 
     @property

@@ -186,7 +186,7 @@ class Options:
                 raise ValueError(f"{method.name} pairs within a batch: --batch-size must be at least 2")
 
 
-# A finished run of robomimic.py, whose policies to take instead of training them.
+# A finished run, whose policies to take instead of training them.
 FinishedRun = Annotated[Path | None, tyro.conf.arg(name="run")]
 
 
@@ -283,6 +283,9 @@ def study[O: Options](kind: type[O], preset: Options, **parts: Any) -> O:
     return kind(**mine | parts)
 
 
+POLICY_PARTS = ("data", "network", "training", "sources")  # of options: what determines the policies
+
+
 def parse[O: Options](
     presets: Mapping[str, O],
     argv: Sequence[str] | None,
@@ -302,18 +305,24 @@ def parse[O: Options](
     base = adapt(presets[asked.run.preset], asked)
     if not asked.data.generated:  # the demonstrations of presets are numbers to generate
         base = with_parts(base, data={"demonstrations": ()})
+    known = (*argv, *base.sources.prior, *base.data.task)
+    finished: Path | None = getattr(asked, "policies", None)
+    if finished is not None:
+        of_run = stored_options(Options, finished, None)
+        base = with_parts(base, **{part: getattr(of_run, part) for part in POLICY_PARTS})
     options = read(base, argv, description)
     out = from_leader(lambda: output_folder(options, study))
     if options.run.resume:
         stored = stored_options(type(base), out, study)
         options = read(stored, argv, description)
-        changed = sorted(set(differences(recorded(stored), recorded(options))))
-        if changed:
-            raise ValueError(
-                f"{out} was started with other values of {', '.join(changed)}: leave these out, or choose "
-                "another --out"
-            )
-        check_typed(stored, out, (*argv, *base.sources.prior, *base.data.task))
+        check_same(stored, options, f"{out} was started with other values of", "choose another --out")
+        check_typed(stored, out, known)
+    elif finished is not None:
+        theirs: Any = {part: getattr(base, part) for part in POLICY_PARTS}
+        # Some of its methods will do.
+        theirs["sources"] = replace(base.sources, prior=options.sources.prior)
+        check_same(replace(options, **theirs), options, f"--run {finished} has its own", "leave out --run")
+        check_typed(base, finished, known)
     check_device(options.run.device)
     name = options.run.logger
     if name in ("tensorboard", "wandb") and find_spec(name) is None:
@@ -389,8 +398,14 @@ def differences(mine: Mapping[str, Any], theirs: Mapping[str, Any]) -> Iterator[
             yield "--run" if name == "policies" else "--" + name.replace("_", "-")
 
 
+def check_same(one: Options, two: Options, said: str, otherwise: str) -> None:
+    """Refuse options that differ where a run has its own."""
+    if changed := sorted(set(differences(recorded(one), recorded(two)))):
+        raise ValueError(f"{said} {', '.join(changed)}: leave these out, or {otherwise}")
+
+
 def stored_options[O: Options](kind: type[O], out: Path, study: str | None) -> O:
-    """The options of the run in a folder, of one study or any."""
+    """The options of the run in a folder: of one study, or what any study shares."""
     path = out / "options.json"
     if not path.is_file():
         raise ValueError(f"there is no run in {out}: name its folder")
@@ -402,9 +417,12 @@ def stored_options[O: Options](kind: type[O], out: Path, study: str | None) -> O
         raise ValueError(
             f"{out} holds a run of {theirs}: continue it with that script, or choose another --out"
         )
+    tree = stored.get("options")
+    if study is None and isinstance(tree, dict):
+        tree = {part: value for part, value in tree.items() if part in {f.name for f in fields(kind)}}
     try:
-        options = from_record(kind, stored.get("options"))
-        if changed := sorted(set(differences(recorded(options), stored["options"]))):
+        options = from_record(kind, tree)
+        if changed := sorted(set(differences(recorded(options), tree))):
             raise ValueError(f"it differs in {', '.join(changed)}")
     except ValueError as error:
         reason = str(error)

@@ -114,7 +114,8 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
 
     The width at height p is the density Beta(k + 1, n - k + 1), the tick its mean; k/n stands below.
     """
-    rows = rows.assign(group=group.upper() + " " + rows[group].astype(str).str.upper())
+    names = rows[group].map(lambda value: value if isinstance(value, str) else f"{group.upper()} {value}")
+    rows = rows.assign(group=names)
     width = 2.2 + 0.55 * (rows["method"].nunique() + 1) * rows[group].nunique()
     figure, (axis,) = new_figure(width, 4.2)
     grid = np.linspace(0.0, 1.0, 801)

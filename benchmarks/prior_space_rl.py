@@ -2,10 +2,10 @@
 
 python benchmarks/prior_space_rl.py --preset unit            # the navigation toy, about six minutes
 python benchmarks/prior_space_rl.py                          # lift from a weak policy, half an hour
-python benchmarks/prior_space_rl.py --preset paper --task square --run runs/square-ph-paper
+python benchmarks/prior_space_rl.py --preset paper --run runs/square-ph-paper
 python benchmarks/prior_space_rl.py --resume                 # after an interruption
 
-A frozen policy per source and seed comes from --run (a finished run of robomimic.py) or is trained first.
+A frozen policy per source and seed comes from --run (a finished run) or is trained first.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class Arm:
 class AgentsOptions(Options):
     """A comparison of agents; the frozen policies are those of a comparison of sources."""
 
-    policies: FinishedRun = None  # a finished run of robomimic.py, whose policies to take instead of training
+    policies: FinishedRun = None  # a finished run, whose policies to take instead of training
     rl: Annotated[AgentOptions, tyro.conf.arg(name="rl")] = field(default_factory=AgentOptions)
     algorithm: tuple[Algorithm, ...] = ("dsrl-na",)  # of the agents' learning
     warm_algorithm: tuple[Algorithm, ...] = ()  # of sources with a mean (default: as --algorithm)
@@ -123,11 +123,6 @@ class AgentsOptions(Options):
     # itself collects).
     collectors: int | None = None
 
-    def __post_init__(self) -> None:
-        check_counts(self, "horizon", "num_envs", "threads", "collectors")
-        if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
-            raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
-
     @property
     def is_toy(self) -> bool:
         """Whether it is of the navigation toy."""
@@ -139,6 +134,9 @@ class AgentsOptions(Options):
         return TOY if self.is_toy else super().name
 
     def check(self) -> None:
+        check_counts(self, "horizon", "num_envs", "threads", "collectors")
+        if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
+            raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "data", "chunk", "sigma", "nfe")
@@ -274,7 +272,7 @@ def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method
         policies = policies_of(options)
         train_all(options, policies)
     else:
-        policies = finished_policies(run, options, prior=options.sources.prior)
+        policies = finished_policies(run, options)
     actors = trained_actors(policies, options.run.device)
     for method, group in actors.items():
         if missing := sorted(set(options.seeds) - group.keys()):
@@ -375,7 +373,7 @@ def main(argv: list[str] | None) -> None:
         draw(found, out / "curves.png", title, options.rl.warmup_steps)
         agents = ["algorithm", "method", "evaluation"]
         last = found.groupby([*agents, "seed"], sort=False).tail(1)
-        greedy = last[last.evaluation == "greedy"]
+        greedy = last[last.evaluation == "greedy"].assign(algorithm=last.algorithm.str.upper())
         plot_success(greedy, out / "success.png", f"{title}: greedy agents", group="algorithm")
         last = last.assign(seeds=last.groupby(agents)["seed"].transform("nunique"))
         text = table(last, agents, ["seeds", "delta", "environment_steps", "success_rate"])

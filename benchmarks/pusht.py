@@ -2,6 +2,7 @@
 
 python benchmarks/pusht.py                                         # demonstrations from the hub
 python benchmarks/pusht.py --dataset lerobot:FOLDER --demonstrations 25
+python benchmarks/pusht.py --task pusht:relative                   # actions are offsets from the agent
 python benchmarks/sigma.py --task pusht:task --dataset lerobot:FOLDER
 
 It needs the extra pusht (pip install -e '.[pusht]'). An episode's `coverage` is the best share of the goal
@@ -11,7 +12,10 @@ that the block covers; it is solved above 0.95.
 from __future__ import annotations
 
 import sys
+from functools import partial
+from typing import Any
 
+import numpy as np
 from options import PRESETS, script, with_parts
 from robomimic import run
 from torchrl.envs import EnvBase
@@ -21,27 +25,40 @@ from warmprior.envs import gym_env
 from warmprior.io.extras import require
 from warmprior.training import DataOptions, Task
 
+SIDE = 512.0  # of the field, in pixels
 OBSERVATION = ["observation.state", "observation.environment_state"]  # the agent, the block's corners
 
 
-def make_env() -> EnvBase:
-    """The environment, in raw units."""
+def make_env(relative: bool = False) -> EnvBase:
+    """The environment, in raw units: pixels, in which actions are where the agent is to go."""
     require("gym_pusht", "pusht")
     import gymnasium
 
     name, seen = "gym_pusht/PushT-v0", "environment_state_agent_pos"
     env = gymnasium.make(name, obs_type=seen, render_mode="rgb_array")
+    if relative:
+        offsets, base = gymnasium.spaces.Box(-SIDE, SIDE, (2,)), env.unwrapped
+        env = gymnasium.wrappers.TransformAction(env, lambda a: a + np.array(base.agent.position), offsets)
     keys = ["agent_pos", "environment_state"]
     return gym_env(env, success="is_success", measures=["coverage"], observation_keys=keys)
 
 
-def task(options: DataOptions) -> Task:
+def task(options: DataOptions, relative: bool = False) -> Task:
     """The demonstrations, and where policies are played."""
     place = str(options.dataset or "lerobot/pusht_keypoints").removeprefix("lerobot:")
     steps = lerobot_steps(place, OBSERVATION)
     if options.demonstrations:
         steps = steps[steps["episode"] < options.demonstrations[0]]
-    return Task.of("pusht", steps, make_env, success="is_success", measures={"coverage": "max"}, film_rate=10)
+    if relative:
+        steps["action"] = steps["action"] - steps["observation"][:, :2]
+    ends: Any = {"success": "is_success", "measures": {"coverage": "max"}, "film_rate": 10}
+    style = "relative" if relative else "human"
+    return Task.of("pusht", steps, partial(make_env, relative), style=style, **ends)
+
+
+def relative(options: DataOptions) -> Task:
+    """The same with actions as offsets from where the agent is, as `--task pusht:relative`."""
+    return task(options, relative=True)
 
 
 # All human demonstrations, unless --demonstrations says how many. On 25,650 steps of theirs the usual 10,000

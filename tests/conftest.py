@@ -52,10 +52,9 @@ def lift_demonstrations(tmp_path_factory):
     folder = tmp_path_factory.getbasetemp()
     folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
     generate = "warmprior.data.scripted.generate"
-    with FileLock(folder / "demonstrations.lock"), patch(f"{generate}.working", here):
-        return generate_demonstrations(
-            "lift", n=3, cache_dir=folder / "demonstrations", workers=1, progress=False
-        )
+    cache = patch.dict(os.environ, WARMPRIOR_CACHE=str(folder / "demonstrations"))
+    with FileLock(folder / "demonstrations.lock"), patch(f"{generate}.working", here), cache:
+        return generate_demonstrations("lift", n=3, workers=1, progress=False)
 
 
 CLUSTER = """

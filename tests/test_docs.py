@@ -22,7 +22,6 @@ SHOWN_ALONE = {
     "warmprior.training.push_policy": "needs the hub",
     "warmprior.data.download_lerobot": "fetches from the hub",
     "warmprior.data.lerobot_steps": "needs a dataset",
-    "warmprior.data.lerobot_index.LeRobotIndex": "needs a dataset",
     "warmprior.modules.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",
     "warmprior.envs.mimicgen.register_mimicgen": "needs a package that is not on the package index",

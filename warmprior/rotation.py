@@ -20,7 +20,6 @@ __all__ = [
     "matrix_to_rotvec",
     "quaternion_to_matrix",
     "rotation_6d_to_matrix",
-    "rotation_6d_to_rotvec",
     "rotvec_to_matrix",
 ]
 
@@ -93,27 +92,3 @@ def rotation_6d_to_matrix(rotation_6d: Tensor) -> Tensor:
     second = rotation_6d[..., 3:]
     second = normalize(second - (first * second).sum(-1, keepdim=True) * first, dim=-1)
     return torch.stack((first, second, torch.linalg.cross(first, second)), -2)
-
-
-def rotation_6d_to_rotvec(rotation_6d: Tensor) -> Tensor:
-    """Turn 6-d rotations into rotation vectors of length at most pi.
-
-    Args:
-        rotation_6d: ``[..., 6]``, as :func:`rotation_6d_to_matrix` takes.
-
-    Returns:
-        ``[..., 3]`` in radians.
-
-    Raises:
-        ValueError: if the last dimension is not 6.
-
-    See Also:
-        :func:`~warmprior.envs.absolute_to_env_action`: turns whole actions.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.envs import rotation_6d_to_rotvec
-        >>> rotation_6d_to_rotvec(torch.tensor([0.0, -1.0, 0.0, 1.0, 0.0, 0.0]))
-        tensor([0.0000, 0.0000, 1.5708])
-    """
-    return matrix_to_rotvec(rotation_6d_to_matrix(rotation_6d))

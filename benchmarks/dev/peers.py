@@ -115,14 +115,16 @@ def ours(name: str, make: Callable[[int], VelocityNetwork], width: int, device: 
     )
 
 
-def warmprior_transformer(parameters: float, device: str) -> Peer:
-    """The paper's network."""
+def warmprior_transformer(parameters: float, device: str, dropout: float | None = None) -> Peer:
+    """The paper's network, with its own dropout by default."""
+    options = {} if dropout is None else {"dropout": dropout}
 
     def make(width: int) -> VelocityNetwork:
-        return ChiTransformer(D_A, D_O, H, TO, embedding_dim=width)
+        return ChiTransformer(D_A, D_O, H, TO, embedding_dim=width, **options)
 
     width = nearest(make, range(48, 1024, 24), parameters)
-    return ours("ChiTransformer", make, width, device)
+    name = "ChiTransformer" if dropout is None else f"ChiTransformer, dropout {dropout:g}"
+    return ours(name, make, width, device)
 
 
 def warmprior_mlp(parameters: float, device: str) -> Peer:
@@ -266,6 +268,7 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
 
 PEERS: dict[str, tuple[Callable[[float, str], Peer], tuple[str, ...]]] = {
     "warmprior_transformer": (warmprior_transformer, ()),
+    "warmprior_transformer_no_dropout": (partial(warmprior_transformer, dropout=0.0), ()),
     "warmprior_mlp": (warmprior_mlp, ()),
     "torchrl": (torchrl, ()),
     "lerobot_diffusion": (lerobot_diffusion, ("lerobot", "diffusers")),
@@ -374,7 +377,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     speed, latency = figure.subplots(1, 2)
     names = [row["policy"].replace(": ", ":\n") for row in rows]
-    palette = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3"]
+    palette = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3", "#e7298a"]
     colors = palette[: len(rows)]
     speed.barh(names, [row["samples_per_second"] for row in rows], color=colors)
     speed.set(xlabel="training, samples/s")

@@ -29,7 +29,6 @@ import prior_space_figures as prior_space
 import torch
 import training_figures as training
 from tensordict import TensorDict
-from torch import nn
 from torchrl.envs import TransformedEnv
 from tqdm import tqdm
 from training_figures import BATCH, D_A, D_O, PRIOR, TO, H, paper_network, small_network, step_of, steps
@@ -178,37 +177,9 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
     return ratio * 20 * BATCH / 64
 
 
-class Unmodulated(nn.Module):
-    """The small network in bare torch, with time as one more input instead of adaptive norms."""
-
-    def __init__(self, width: int = 384, chunk: int = H * D_A) -> None:
-        super().__init__()
-
-        def layers(before: int, after: int) -> list[nn.Module]:
-            return [nn.Linear(before, width), nn.GELU(), nn.Linear(width, after)]
-
-        self.embed = nn.Linear(chunk + 1, width)
-        self.encode = nn.Sequential(*layers(TO * D_O, width))
-        self.blocks = nn.ModuleList(
-            nn.Sequential(nn.LayerNorm(width), *layers(width, width)) for _ in range(2)
-        )
-        self.head = nn.Sequential(nn.LayerNorm(width), nn.Linear(width, chunk))
-
-    def forward(self, t: torch.Tensor, a: torch.Tensor, o: torch.Tensor) -> torch.Tensor:
-        """The velocity, as of any velocity network."""
-        x = self.embed(torch.cat([a.flatten(1), t[:, None]], dim=-1)) + self.encode(o.flatten(1))
-        for block in self.blocks:
-            x = x + block(x)
-        return self.head(x).view_as(a)
-
-
 def preconditioning_over_network(clock: Clock) -> float:
     network = precondition(small_network(), steps(400, 200), PRIOR, observation_steps=TO)
     return clock.ratio(step_of(network), step_of(small_network()), calls=20)
-
-
-def modulation_over_input(clock: Clock) -> float:
-    return clock.ratio(step_of(small_network()), step_of(Unmodulated()), calls=20)
 
 
 def actor_over_network(clock: Clock, compiled: bool = False) -> dict[str, float]:
@@ -388,7 +359,6 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "cuda_train_step_over_network": (training.cuda_train_step_over_network, "<= 1.05"),
     "cuda_latency": (training.cuda_latency, ""),
     "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
-    "modulation_over_input": (modulation_over_input, "<= 1.20"),
     "actor_over_network": (actor_over_network, "<= 1.10"),
     "actor_over_network_compiled": (partial(actor_over_network, compiled=True), ""),
     "env_over_robosuite": (env_over_robosuite, ">= 2"),

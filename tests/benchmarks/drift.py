@@ -76,6 +76,11 @@ def other(options):
     return task(options, seed=1)
 
 
+def renamed(options):
+    """The same as another task."""
+    return replace(task(options), name="Drift 2")
+
+
 class Widening(PastPrior, torch.nn.Module):
     """A source whose noise is learnt with the flow."""
 

@@ -159,19 +159,20 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
     before = written(tmp_path)
 
     def frozen(priors):
-        found = benchmark.frozen_policies(read(f"--run {run} --out {out} --seeds 1 --prior {priors}"))[1]
+        found = benchmark.frozen_policies(read(f"--run {run} --out {out} --seeds 1 {priors}"))[1]
         return [
             (actors[0].prior.name, getattr(actors[0].prior, "correlation", 0.0)) for actors in found.values()
         ]
 
     own = "past,sigma=0.3"
-    assert frozen(f"past,correlation=0.50,sigma=0.3 {own}") == [("past", 0.5), ("past", 0.0)]
-    for priors in ("past,sigma=0.5", "preview"):
+    assert frozen(f"--prior past,correlation=0.50,sigma=0.3 {own}") == [("past", 0.5), ("past", 0.0)]
+    for priors in ("--prior past,sigma=0.5", "--prior preview"):
         with pytest.raises(FileNotFoundError, match=f"name its methods: --prior gaussian {own}"):
             frozen(priors)
-    for words, why in (("--task can", "is of lift: leave out --task"), ("--sigma 0.3", "has its own sigma")):
-        with pytest.raises(ValueError, match=why):
-            frozen(f"past {words}")
+    for words, why in (("--task can", "--task"), ("--sigma 0.3 --chunk 4", "--chunk, --sigma")):
+        with pytest.raises(ValueError, match=f"has its own {why}: leave these out"):
+            frozen(words)
+    assert len(frozen("")) == 3  # all of its methods
     few = {"rl__environment_steps": 60, "rl__warmup_steps": 30, "rl__evaluate_every": 60, "episodes": 1}
     argv = command_line(run=run, out=out, horizon=20, seeds=2, prior=own, num_envs=1, **few)
     assert benchmark.main(argv) == 0
@@ -194,6 +195,7 @@ def test_every_agent_has_a_name_of_its_own():
 
 @pytest.mark.slow
 def test_the_toy_is_solved_in_the_benchmarks_budget(tmp_path):
-    assert benchmark.main(["--preset", "unit", "--seeds", "1", "--out", str(tmp_path / "out")]) == 0
+    argv = command_line(preset="unit", centre="mean", delta=0.5, seeds=1, out=tmp_path / "out")
+    assert benchmark.main(argv) == 0
     (points,) = agents(stored(tmp_path / "out")).values()
     assert rates(points, "base")[0] <= 0.6 and rates(points, "greedy")[-1] >= 0.9

@@ -22,7 +22,7 @@ def no_work(monkeypatch):
     def never(*args, **options):
         raise AssertionError("work was begun")
 
-    loaders = ("generate_demonstrations", "download_robomimic", "download_mimicgen")
+    loaders = ("generate_demonstrations", "download_robomimic")
     for place in ("common.train_policy", *(f"warmprior.training.task.{name}" for name in loaders)):
         monkeypatch.setattr(place, never)
     for place in ("training.options.require_rendering", "envs.mimicgen.find_spec"):
@@ -57,6 +57,7 @@ def no_work(monkeypatch):
         ("curvature", "--run {tmp}", "there is no run in"),
         ("real_time_chunking", "--delay 5", "too long"),
         ("real_time_chunking", "--prior regression --nfe 1 --guidance rtc", "regression is no flow to guide"),
+        ("prior_space_rl", "--preset unit --horizon 0", "--horizon must be a whole number of at least 1"),
         ("prior_space_rl", "--preset unit --delta 0", "delta must be a finite number > 0, got 0.0"),
         ("prior_space_rl", "--preset unit --task can", "navigation and --preset unit belong together"),
         ("prior_space_rl", "--preset unit --collectors 2", "--collectors belongs to --engine ray"),

@@ -20,6 +20,7 @@ import real_time_chunking
 import robomimic
 import sigma
 
+from tests.benchmarks import drift
 from warmprior.data import RobomimicExperienceReplay
 from warmprior.diagnostics import SharedObservations, action_error
 from warmprior.training import load_policy
@@ -84,14 +85,20 @@ def test_sigma_study(finished, dataset, validation):
     assert stored(out) == rows and (out / "report.md").read_text() == report
 
 
-def test_chunk_length_study(dataset, tmp_path):
-    argv = options(dataset, tmp_path / "out", chunk=[1, 8], prior=["gaussian", "past"])
+def test_chunk_lengths_of_two_tasks(tmp_path):
+    """Bars and violins of both are in one picture, and each has its lines."""
+    out, tasks = tmp_path / "out", [f"{drift.__name__}:{name}" for name in ("task", "renamed")]
+    argv = drift.arguments(out, task=tasks, chunk=[1, 8], prior=["gaussian", "past"], seeds=1, nfe=1)
     assert chunking.main(argv) == 0
-    rows = stored(tmp_path / "out")
-    assert [row["chunk"] for row in rows] == [1, 1, 8, 8]
-    for row in rows:
+    rows = stored(out)
+    last = [row for row in rows if row["checkpoint"] == 20]
+    assert {(row["task"], row["chunk"]) for row in last} == {
+        (t, h) for t in ("drift", "Drift 2") for h in (1, 8)
+    }
+    for row in last:
         assert row["boundary_jump"] > 0 and (row["inner_jump"] is None) == (row["chunk"] == 1)
-    assert all(is_png(tmp_path / "out" / f"{name}.png") for name in ("chunk_lengths", "bars", "violins"))
+    names = ("chunk_lengths_Drift-OWN", "chunk_lengths_Drift-2-OWN-*", "bars", "violins")
+    assert all(is_png(next(out.glob(f"{name}.png"))) for name in names)
 
 
 def test_every_budget_is_a_training_of_its_own(dataset, validation, tmp_path):
@@ -126,10 +133,7 @@ def test_a_file_with_masks_is_its_own_validation(tmp_path):
     assert "10 observations of lift.hdf5 (mask valid)" in (out / "report.md").read_text()
     # So of the finished run, whose options are not typed again.
     again = tmp_path / "runs" / "again"
-    more = {"observations": 10, "steps": 8, "out": again}
-    assert curvature.main(command_line(run=out, **more)) != 0  # it is no run of robomimic.py
-    assert robomimic.main(options(path, tmp_path / "runs" / "main", mask="train", prior=few["prior"])) == 0
-    assert curvature.main(command_line(run=tmp_path / "runs" / "main", **more)) == 0
+    assert curvature.main(command_line(run=out, observations=10, steps=8, out=again)) == 0
     assert stored(again, "curvature") == stored(out, "curvature")
     # As from a file of those demonstrations alone, beside one of the others.
     for name, kept in masks.items():

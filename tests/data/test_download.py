@@ -7,7 +7,7 @@ import pytest
 
 from tests.data.synthetic import write_robomimic_file
 from tests.io.hub_server import Loopback, reachable
-from warmprior.data.download import REPOSITORIES, download_mimicgen, download_robomimic
+from warmprior.data.download import REPOSITORIES, download_robomimic
 
 pytest.importorskip("huggingface_hub")
 
@@ -111,15 +111,14 @@ def test_a_broken_file_is_refused_and_does_not_stay_in_the_way(hub, content, tmp
 
 
 @pytest.mark.parametrize(
-    ("download", "args", "said"),
+    ("args", "said"),
     [
-        (download_robomimic, ["stack"], "choose one of lift, can, square, transport, tool_hang"),
-        (download_robomimic, ["lift", "mg"], "'mg' data; it has: ph, mh"),
-        (download_mimicgen, ["square"], r"\(download_robomimic has square\); choose one of stack_d0"),
-        (download_mimicgen, ["coffee_d0", "ph"], "no official 'ph' data; it has: source, core"),
+        (["stack"], "choose one of lift, can, square, transport, tool_hang, stack_d0"),
+        (["lift", "mg"], "'mg' data; it has: ph, mh"),
+        (["coffee_d0", "ph"], "no official 'ph' data; it has: source, core"),
     ],
 )
-def test_unknown_task_or_style_asks_nobody(hub, download, args, said):
+def test_unknown_task_or_style_asks_nobody(hub, args, said):
     with pytest.raises(ValueError, match=said):
-        download(*args)
+        download_robomimic(*args)
     assert not hub.requests

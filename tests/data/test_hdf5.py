@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
-from warmprior.data.hdf5 import DatasetError, read_index, read_rows
+from warmprior.data.hdf5 import DatasetError, RobomimicReader, read_index
 
 
 def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):
@@ -14,9 +14,9 @@ def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):
     (demo,) = write_robomimic_file(path, lengths=(40,))
     with h5py.File(path) as file:
         out = np.empty((40, 7), np.float32)
-        read_rows(file, "demo_0", "actions", out)
+        RobomimicReader(file).numbers("demo_0", "actions", out)
         part = np.empty((9, 7), np.float32)
-        read_rows(file, "demo_0", "actions", part, first=20)
+        RobomimicReader(file).numbers("demo_0", "actions", part, first=20)
     np.testing.assert_array_equal(out, demo["actions"].astype(np.float32))
     np.testing.assert_array_equal(part, demo["actions"][20:29].astype(np.float32))
 
@@ -93,4 +93,4 @@ def test_corrupt_values(tmp_path):
         raw.write(b"\x01\x02\x03")
     read_index(path)
     with h5py.File(path) as file, pytest.raises(DatasetError, match=r"data/demo_0/actions cannot be read"):
-        read_rows(file, "demo_0", "actions", np.empty((12, 7)))
+        RobomimicReader(file).numbers("demo_0", "actions", np.empty((12, 7)))

@@ -220,6 +220,6 @@ def test_a_disk_without_space_for_memory_maps(square_file, tmp_path, monkeypatch
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "posix_fallocate", full)
-    monkeypatch.setattr("warmprior.data.robomimic.read_rows", lambda *a: pytest.fail("was filled"))
+    monkeypatch.setattr("warmprior.data.hdf5.RobomimicReader.numbers", lambda *a: pytest.fail("was filled"))
     with pytest.raises(OSError, match=r"(maps|temporary files): cannot take .*scratch_dir"):
         RobomimicExperienceReplay(path, **options)

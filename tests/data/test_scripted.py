@@ -136,9 +136,10 @@ def in_threads(count, state):
         ("lift", {"seed": 100}, "seed must be between 0 and 99, got 100"),
     ],
 )
-def test_bad_arguments(task, options, message, tmp_path):
+def test_bad_arguments(task, options, message, tmp_path, monkeypatch):
+    monkeypatch.setenv("WARMPRIOR_CACHE", str(tmp_path))
     with pytest.raises(ValueError, match=message):
-        generate_demonstrations(task, cache_dir=tmp_path, **options)
+        generate_demonstrations(task, **options)
     assert not list(tmp_path.iterdir())
 
 

@@ -8,7 +8,7 @@ import torch
 from tests.lerobot.seen import at_times, watch
 from tests.lerobot.tiny import ACTION, LENGTH, observations, windows
 from tests.toy_env import Momentum, window_histories
-from warmprior import PastPrior, PreviewPrior
+from warmprior import PastPrior, PreviewPrior, RealTimeChunking
 from warmprior.history import window_history
 from warmprior.lerobot import RelativeActions, WarmPriorAdapter, action_std
 
@@ -55,6 +55,49 @@ def test_the_preview_is_the_last_forecast(built):
             assert torch.equal(source[:, :half], chunks[-2][:, every : every + half])
         # The second half is cold, always.
         assert abs(source[:, half:].std() - 1) < 0.6
+
+
+@pytest.mark.parametrize("family", ["pi05", "smolvla"])
+def test_chunks_are_guided_towards_the_rest_of_the_last_one(built, monkeypatch, family):
+    """On a linear field, whose Jacobian is known, with LeRobot's own weights of positions."""
+    from lerobot.configs import RTCAttentionSchedule
+    from lerobot.policies.rtc import RTCConfig
+    from lerobot.policies.rtc.modeling_rtc import RTCProcessor
+
+    made, executed, delay, nfe, sigma, slope = built(family), 3, 2, 4, 0.3, 0.8
+    monkeypatch.setattr(made.model, "denoise_step", lambda *args, x_t, timestep, **kw: slope * (x_t - 0.2))
+    rtc = RealTimeChunking(schedule="linear")
+    prior = PastPrior(LENGTH, sigma=sigma)
+    adapter = WarmPriorAdapter(made, prior, nfe=nfe, guidance=rtc, generator=generator())
+    sources, draw = [], adapter.source.place
+    monkeypatch.setattr(adapter.source, "place", lambda *args: sources.append(draw(*args)) or sources[-1])
+    batch = observations(family, 2)
+    chunks = [adapter.predict_action_chunk(dict(batch))]  # nothing to be guided by, nor to wait for
+    for decision in range(3):
+        now = delay if decision else 0
+        chunks.append(adapter.predict_action_chunk(dict(batch), executed_steps=executed, delay=now))
+        rest = torch.zeros_like(sources[-1])
+        left = LENGTH - executed
+        rest[:, :left, :ACTION] = chunks[-2][:, executed:]
+        processor = RTCProcessor(RTCConfig(prefix_attention_schedule=RTCAttentionSchedule.LINEAR))
+        weights = processor.get_prefix_weights(now, left, LENGTH)[:, None]
+        width = torch.ones_like(rest)
+        if executed * (decision + 1) >= LENGTH:  # warm
+            width[..., :ACTION] = sigma
+        a = sources[-1]
+        for step in range(nfe):
+            t = step / nfe
+            v = -slope * (a - 0.2)
+            g = width**2 * (1 - t) / max(t, 1e-30) + t / (1 - t)
+            g = g.clamp(max=rtc.max_guidance_weight)
+            a = a + (v + g * (1 - (1 - t) * slope) * weights * (rest - (a + (1 - t) * v))) / nfe
+        expected = a[..., :ACTION]
+        expected[:, :now] = chunks[-2][:, executed : executed + now]
+        torch.testing.assert_close(chunks[-1], expected)
+    with pytest.raises(ValueError, match="a delay of 4 control steps needs as many actions"):
+        adapter.predict_action_chunk(dict(batch), executed_steps=LENGTH - 1, delay=4)
+    with pytest.raises(ValueError, match="guidance is for pi0, pi05 and smolvla"):
+        WarmPriorAdapter(built("multi_task_dit"), PastPrior(4), guidance=rtc)
 
 
 def test_an_environment_that_is_reset_starts_cold(policy):
@@ -127,9 +170,7 @@ def test_withheld_histories_start_cold(policy):
 def test_sigma_in_units_of_the_data(policy):
     made = policy("xvla")  # raw units
     std = torch.linspace(0.1, 3.0, ACTION)
-    adapter = WarmPriorAdapter(
-        made, PastPrior(LENGTH, sigma=0.5), sigma_unit="std", action_std=std, generator=generator()
-    )
+    adapter = WarmPriorAdapter(made, PastPrior(LENGTH, sigma=0.5), std=std, generator=generator())
     loc = torch.full((500, LENGTH, ACTION), 2.0)
     warm, cold = (window_history(loc, torch.full((500, 1), steps), loc, LENGTH) for steps in (LENGTH, 0))
     drawn = adapter.source.draw(warm, generator(1)) - loc
@@ -150,11 +191,11 @@ def test_the_standard_deviation_in_a_policys_units(policy):
     for family, normalised in by_hand.items():
         torch.testing.assert_close(action_std(policy(family), stats), normalised.std(0))
     with pytest.raises(ValueError, match="needs the statistics std, q01, q99 of 'action'"):
-        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit="std")
+        action_std(policy("pi05"), None)
     with pytest.raises(ValueError, match=r"by its own means \(IDENTITY\)"):
         action_std(policy("xvla"), stats)
-    with pytest.raises(ValueError, match="'model' or 'std'"):
-        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), sigma_unit="data")
+    with pytest.raises(ValueError, match="must be 7 finite numbers > 0"):
+        WarmPriorAdapter(policy("pi05"), PastPrior(LENGTH), std=values.std(0) * 0)
 
 
 def pipelines(made, stats):

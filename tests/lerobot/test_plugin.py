@@ -155,13 +155,16 @@ def test_lerobot_trains_and_evaluates_it(found, tmp_path, monkeypatch):
     assert results["overall"]["n_episodes"] == 1
 
 
-def flow_policy(found, **options):
+def flow_policy(found, images=None, **options):
     from lerobot.configs.types import FeatureType, PolicyFeature
 
     inputs = {
         "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(3,)),
         "observation.environment_state": PolicyFeature(type=FeatureType.ENV, shape=(2,)),
     }
+    if images is not None:
+        inputs["observation.images.top"] = PolicyFeature(type=FeatureType.VISUAL, shape=images)
+        options = {"encoder": "small", "image_size": 16, "crop_size": 12} | options
     outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(2,))}
     chosen = {"embedding_dim": 24, "num_layers": 1, "nfe": 1, "n_action_steps": 4, "device": "cpu"}
     config = found["warm_flow"].config_class(
@@ -254,6 +257,40 @@ def test_the_flow_policy_remembers(found):
     chunks = [policy.predict_action_chunk(dict(batch)) for _ in range(2)]
     assert not torch.equal(sources[3], actions[:, 4:8])
     assert torch.equal(sources[4], chunks[0])
+
+
+def test_the_flow_policy_sees_images(found, tmp_path):
+    """Resized, in a random window in training and the central one else; saved and loaded with its encoder."""
+    policy = flow_policy(found, images=(3, 16, 16), precondition=False)
+    batch = flow_batch(8)
+    pictures = torch.randint(256, (3, 2, 3, 16, 16), generator=torch.Generator().manual_seed(1))
+    batch["observation.images.top"] = pictures / 255
+    policy.train().forward(batch)[0].backward()
+    assert all(weight.grad is not None for weight in policy.actor.network.encoder.parameters())
+    torch.manual_seed(3)
+    loss = policy.eval().forward(batch)[0]
+    vector = torch.cat([batch["observation.environment_state"], batch["observation.state"]], -1)
+    observation = TensorDict({"state": vector, "observation.images.top": pictures.to(torch.uint8)}, [3])
+    features = policy.actor.network.encoder(observation)
+    torch.manual_seed(3)
+    a0, t = torch.randn(3, 4, 2), torch.rand(3)
+    history, target = batch["action"].split(4, 1)
+    a0 = history + 0.5 * a0
+    error = policy.actor.network.network(t, a0 + t[:, None, None] * (target - a0), features) - (target - a0)
+    torch.testing.assert_close(loss, error.square().mean())
+
+    policy.save_pretrained(tmp_path / "saved")
+    again = found["warm_flow"].from_pretrained(tmp_path / "saved").eval()
+    flat = torch.full((2, 3, 20, 24), 0.4)  # any size and shape is resized
+    start = {"observation.state": torch.zeros(2, 3), "observation.environment_state": torch.zeros(2, 2)}
+    actions = []
+    for one in (policy, again):
+        one.reset()
+        torch.manual_seed(7)
+        actions.append(one.select_action({**start, "observation.images.top": flat}))
+    assert actions[0].shape == (2, 2) and torch.equal(*actions)
+    with pytest.raises(ValueError, match=r"sees images \[3, h, w\], and observation.images.top is \[1, 16"):
+        flow_policy(found, images=(1, 16, 16))
 
 
 class Halfway(StartPoint):

@@ -65,6 +65,14 @@ def gaussian_bridge(s0, s1, sigma):
     return (math.sqrt(4 * s0**2 * s1**2 + sigma**4) - sigma**2) / 2
 
 
+def test_a_bridge_of_little_noise_is_the_optimal_assignment():
+    generator = torch.Generator().manual_seed(0)
+    a0, a1 = (torch.randn(128, 8, 7, generator=generator) for _ in range(2))
+    torch.manual_seed(0)
+    pairs = [couple(a0, a1, None)[0] for couple in (BridgeCoupling(0.03, 0.0), OTCoupling(0.0))]
+    assert (pairs[0] == pairs[1]).all(-1).all(-1).float().mean() > 0.95
+
+
 @pytest.mark.parametrize("sigma", [0.3, 1.0])
 def test_bridge_of_gaussians(sigma):
     """Pairs, path and velocity against the closed form of the bridge."""

@@ -79,10 +79,6 @@ def convert_robomimic(
         OSError: if the disk is full, or another process converts to the same folder.
         ImportError: if lerobot is not installed.
 
-    See Also:
-        - :class:`~warmprior.data.LeRobotExperienceReplay`: reads the result.
-        - :class:`~warmprior.data.RobomimicExperienceReplay`: reads the file as it is.
-
     Examples:
         >>> from warmprior.data import convert_robomimic
         >>> convert_robomimic("square.hdf5", "square_lerobot")  # doctest: +SKIP

@@ -13,13 +13,7 @@ from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
 
-__all__ = [
-    "MIMICGEN_REPOSITORY",
-    "REPOSITORIES",
-    "download_lerobot",
-    "download_mimicgen",
-    "download_robomimic",
-]
+__all__ = ["MIMICGEN_REPOSITORY", "REPOSITORIES", "download_lerobot", "download_robomimic"]
 
 REPOSITORIES = ("robomimic/robomimic_datasets", "amandlek/robomimic")
 """The hub's dataset repositories that hold robomimic's files, in the order of trying."""
@@ -29,17 +23,22 @@ MIMICGEN_REPOSITORY = "amandlek/mimicgen_datasets"
 
 
 def download_robomimic(
-    task: str, style: str = "ph", *, root: str | Path | None = None, force: bool = False
+    task: str, style: str | None = None, *, root: str | Path | None = None, force: bool = False
 ) -> Path:
-    """Download an official low-dimensional file, unless it is there already.
+    """Download an official low-dimensional file of robomimic or MimicGen, unless it is there already.
 
-    The file is ``v1.5/{task}/{style}/low_dim_v15.hdf5`` of the first of :data:`REPOSITORIES` that
-    delivers it. Before its path is returned it is compared with the digest that the hub gives, where
-    the hub can be reached, and opened; a file that fails is fetched once more.
+    robomimic's is ``v1.5/{task}/{style}/low_dim_v15.hdf5`` of the first of :data:`REPOSITORIES` that
+    delivers it, and MimicGen's ``source/stack.hdf5`` or ``core/stack_d0.hdf5`` (and the like) of
+    :data:`MIMICGEN_REPOSITORY`, whose licence, CC BY-NC-SA 4.0, excludes commercial use. Before its path is
+    returned it is compared with the digest that the hub gives, where the hub can be reached, and opened; a
+    file that fails is fetched once more.
 
     Args:
-        task: ``lift``, ``can``, ``square``, ``transport`` or ``tool_hang``.
-        style: ``"ph"`` (one proficient operator) or ``"mh"`` (six operators).
+        task: ``lift``, ``can``, ``square``, ``transport`` or ``tool_hang``; ``stack_d0``, ``coffee_d0`` or
+            ``threading_d0`` of MimicGen.
+        style: ``"ph"`` (one proficient operator) or ``"mh"`` (six operators); of MimicGen ``"source"`` (ten
+            human demonstrations) or ``"core"`` (a thousand that MimicGen made of them). The former by
+            default.
         root: the folder under which to keep the file; by default the hub client's cache.
         force: download again even if the file is there.
 
@@ -51,10 +50,6 @@ def download_robomimic(
         OSError: if no repository delivers a readable file; names every attempt and its cause.
         ImportError: if h5py or huggingface_hub is not installed.
 
-    See Also:
-        - :class:`~warmprior.data.RobomimicExperienceReplay`: reads the file.
-        - :func:`~warmprior.data.download_mimicgen`: MimicGen's files.
-
     Examples:
         >>> from warmprior.data import download_robomimic
         >>> download_robomimic("square", "mh")  # doctest: +SKIP
@@ -64,36 +59,14 @@ def download_robomimic(
             ...
         ValueError: tool_hang has no official 'mh' data; it has: ph
     """
-    _check_official(task, style, mimicgen=False)
-    name = f"v1.5/{task}/{style}/low_dim_v15.hdf5"
-    return _download(name, REPOSITORIES, root, force)
-
-
-def download_mimicgen(
-    task: str, style: str = "source", *, root: str | Path | None = None, force: bool = False
-) -> Path:
-    """Download an official file of MimicGen, unless it is there already.
-
-    The file is ``source/stack.hdf5`` or ``core/stack_d0.hdf5`` (and the like) of
-    :data:`MIMICGEN_REPOSITORY`, in robomimic's layout, and checked as by :func:`download_robomimic`. Its
-    licence is CC BY-NC-SA 4.0, which excludes commercial use.
-
-    Args:
-        task: ``stack_d0``, ``coffee_d0`` or ``threading_d0``.
-        style: ``"source"`` (ten human demonstrations) or ``"core"`` (a thousand that MimicGen made of them).
-        root: see :func:`download_robomimic`, also for errors and what is returned.
-        force: likewise.
-
-    Examples:
-        >>> from warmprior.data import download_mimicgen
-        >>> download_mimicgen("coffee_d0")  # doctest: +SKIP
-        PosixPath('.../source/coffee.hdf5')
-        >>> download_mimicgen("stack")
-        Traceback (most recent call last):
-            ...
-        ValueError: no official data for task 'stack' here; choose one of stack_d0, coffee_d0, ...
-    """
-    _check_official(task, style, mimicgen=True)
+    official = {name: spec.official for name, spec in TASKS.items() if spec.official}
+    if task not in official:
+        raise ValueError(f"no official data for task {task!r}; choose one of {', '.join(official)}")
+    style = official[task][0] if style is None else style
+    if style not in official[task]:
+        raise ValueError(f"{task} has no official {style!r} data; it has: {', '.join(official[task])}")
+    if not is_mimicgen(TASKS[task].env_name):
+        return _download(f"v1.5/{task}/{style}/low_dim_v15.hdf5", REPOSITORIES, root, force)
     # The human demonstrations belong to the task, those made of them to a variant of it.
     name = task.removesuffix("_d0") if style == "source" else task
     return _download(f"{style}/{name}.hdf5", (MIMICGEN_REPOSITORY,), root, force)
@@ -125,9 +98,6 @@ def download_lerobot(
         OSError: if the repository, or one of this version, cannot be had.
         ImportError: if huggingface_hub is not installed.
 
-    See Also:
-        :class:`~warmprior.data.LeRobotExperienceReplay`: reads the dataset.
-
     Examples:
         >>> from warmprior.data import download_lerobot
         >>> download_lerobot("lerobot/libero")  # doctest: +SKIP
@@ -155,24 +125,6 @@ def download_lerobot(
             "can be given by its path."
         ) from error
     return Path(found)
-
-
-def _check_official(task: str, style: str, *, mimicgen: bool) -> None:
-    official = {
-        name: spec.official
-        for name, spec in TASKS.items()
-        if spec.official and is_mimicgen(spec.env_name) is mimicgen
-    }
-    if task not in official:
-        theirs = "download_robomimic" if mimicgen else "download_mimicgen"
-        meant = [t for t in (task, f"{task}_d0") if t in TASKS and TASKS[t].official]
-        hint = f" ({theirs} has {meant[0]})" if meant and meant[0] not in official else ""
-        raise ValueError(
-            f"no official data for task {task!r} here{hint}; choose one of {', '.join(official)}"
-        )
-    if style not in official[task]:
-        known = ", ".join(official[task])
-        raise ValueError(f"{task} has no official {style!r} data; it has: {known}")
 
 
 def _download(name: str, repositories: Sequence[str], root: str | Path | None, force: bool) -> Path:

@@ -1,8 +1,8 @@
 """Reading robomimic's HDF5 layout, with errors that say which demo, key and row is wrong.
 
 :func:`read_index` looks at names, shapes and attributes only, and finds all that is wrong with them
-before anything big is read. :func:`read_rows` then reads values, block by block, into memory that
-the caller owns.
+before anything big is read. :class:`RobomimicReader` then reads values, block by block, into memory
+that the caller owns.
 """
 
 from __future__ import annotations
@@ -14,19 +14,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from torch import Tensor
 
-from warmprior.data.hdf5_images import image_size
 from warmprior.data.hdf5_members import DatasetError, member, names, reading
-from warmprior.data.index import BLOCK, DatasetIndex, check_count, check_env_args, store_finite
+from warmprior.data.index import (
+    BLOCK,
+    DatasetIndex,
+    DemonstrationReader,
+    check_count,
+    check_env_args,
+    store_finite,
+)
 from warmprior.envs.tasks import task_of_env
 from warmprior.io.extras import require
 
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["DatasetError", "open_robomimic", "read_env_args", "read_index", "read_masks", "read_rows"]
+__all__ = [
+    "DatasetError",
+    "RobomimicReader",
+    "open_robomimic",
+    "read_index",
+    "read_masks",
+]
 
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
+_IMAGE_BYTES = 2**24  # of images read at once
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
 
 
@@ -120,12 +134,6 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
     return check_env_args(what, parsed)
 
 
-def read_env_args(path: str | Path) -> dict[str, Any]:
-    """The environment that a robomimic file names, as the file has it: see :func:`check_env_args`."""
-    with open_robomimic(path) as file:
-        return _env_args(file, Path(path))
-
-
 def _demo(file: h5py.File, name: str) -> h5py.Group:
     demo = member(file["data"], name, "group")
     if demo is None:  # listed, but not to be found: its index is damaged
@@ -192,6 +200,35 @@ def _check_widths(
             )
 
 
+def _image_size(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) -> int:
+    """Side in pixels of a demo's images, after checking that they are what they should be."""
+    name, sizes = demo.name[1:], {}
+    for key in keys:
+        images = member(demo, f"obs/{key}", "dataset")
+        if images is None:
+            known = ", ".join(k for k in names(demo["obs"]) if k.endswith("_image")) or "none"
+            raise DatasetError(
+                f"{path}: {name} has no images {key!r}; it has {known}. Choose other cameras, or render "
+                f"them: python -m warmprior render {path} --cameras {key.removesuffix('_image')}"
+            )
+        shape: tuple[int, ...] = images.shape or ()
+        what = f"{path}: {name}/obs/{key} has shape {shape} and type {images.dtype}"
+        if images.dtype != "uint8" or len(shape) != 4 or shape[-1] != 3:
+            raise DatasetError(
+                f"{what}; images are uint8 [steps, height, width, 3]. Render them anew: python -m warmprior "
+                "render"
+            )
+        if shape[0] != steps:
+            raise DatasetError(f"{what}, but actions has {steps} rows. Render the file anew")
+        if shape[1] != shape[2]:
+            raise DatasetError(f"{what}; only square images can be used. Render them anew")
+        sizes[key] = shape[1]
+    if len(set(sizes.values())) > 1:
+        listed = ", ".join(f"{key} {size}" for key, size in sizes.items())
+        raise DatasetError(f"{path}: {name} has images of several sizes: {listed}. Render them anew")
+    return next(iter(sizes.values()))
+
+
 def read_index(
     path: str | Path,
     *,
@@ -247,7 +284,7 @@ def read_index(
             _check_widths(path, demo, widths, reference, f"data/{selected[0]}")
             lengths.append(steps)
             if image_keys:
-                sides.setdefault(image_size(path, demo, image_keys, steps), name)
+                sides.setdefault(_image_size(path, demo, image_keys, steps), name)
     if len(sides) > 1:
         listed = ", ".join(f"{size} in data/{name}" for size, name in sides.items())
         raise DatasetError(f"{path}: images have several sizes: {listed}. Render them anew")
@@ -266,19 +303,33 @@ def read_index(
     )
 
 
-def read_rows(file: h5py.File, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-    """Read and check rows, from ``first`` on, of one array of a demo, such as ``"obs/object"``.
+class RobomimicReader(DemonstrationReader):
+    """The values of an open file."""
 
-    They go, block by block, to ``out`` ``[rows, width]``, which may be a strided view; see
-    :func:`store_finite` for errors.
-    """
-    name = f"data/{demo}/{key}"
-    dataset = member(file, name, "dataset")
-    if dataset is None:
-        raise DatasetError(f"{file.filename}: there is no {name}")
-    for start in range(0, len(out), BLOCK):
-        rows = out[start : start + BLOCK]
-        with reading(file, name):
-            block = dataset[first + start : first + start + len(rows)]
-        what = f"{file.filename}: {name} (shape {dataset.shape})"
-        store_finite(block, rows, what, first + start, _LEAVE_OUT)
+    def __init__(self, file: h5py.File) -> None:
+        self.file = file
+
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """Read rows of one array of a demo, block by block; ``out`` may be a strided view."""
+        dataset = member(self.file, f"data/{demo}/{key}", "dataset")
+        if dataset is None:
+            raise DatasetError(f"{self.file.filename}: there is no data/{demo}/{key}")
+        what = f"{self.name(demo, key)} (shape {dataset.shape})"
+        for start in range(0, len(out), BLOCK):
+            rows = out[start : start + BLOCK]
+            with reading(self.file, f"data/{demo}/{key}"):
+                block = dataset[first + start : first + start + len(rows)]
+            store_finite(block, rows, what, first + start, _LEAVE_OUT)
+
+    def images(self, demo: str, key: str, out: Tensor) -> None:
+        """Read the images of a demo, block by block."""
+        name, target = f"data/{demo}/obs/{key}", out.numpy()
+        images: Any = member(self.file, name, "dataset")
+        rows = max(1, _IMAGE_BYTES // max(1, out[0].numel()))
+        for start in range(0, len(out), rows):
+            with reading(self.file, name):
+                target[start : start + rows] = images[start : start + rows].transpose(0, 3, 1, 2)
+
+    def name(self, demo: str, key: str) -> str:
+        """What errors call an array of a demo."""
+        return f"{self.file.filename}: data/{demo}/{key}"

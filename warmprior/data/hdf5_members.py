@@ -28,9 +28,6 @@ _AGAIN = "Copy or download the file again."
 class DatasetError(ValueError):
     """A demonstration file is not what it should be; the message says where and what to do.
 
-    See Also:
-        :class:`~warmprior.data.RobomimicExperienceReplay`: raises it.
-
     Examples:
         >>> from pathlib import Path
         >>> from tempfile import TemporaryDirectory

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
 from warmprior.data.hdf5_members import DatasetError
 from warmprior.envs.tasks import TaskSpec
 
-__all__ = ["BLOCK", "DatasetIndex", "check_count", "check_env_args", "store_finite"]
+__all__ = ["BLOCK", "DatasetIndex", "DemonstrationReader", "check_count", "check_env_args", "store_finite"]
 
 BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
 LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
@@ -33,16 +35,6 @@ class DatasetIndex:
         action_dim: the width of the actions.
         env_args: the environment as it is described there; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from warmprior.data.index import DatasetIndex
-        >>> index = DatasetIndex(
-        ...     path=Path("square.hdf5"), demos=("demo_0", "demo_1"), lengths=(120, 131),
-        ...     observation_keys=("object",), observation_dims=(14,), image_keys=(), image_size=0,
-        ...     available_keys=("object", "agentview_image"), action_dim=7, env_args={}, task=None)
-        >>> sum(index.lengths), index.cameras
-        (251, ('agentview',))
     """
 
     path: Path
@@ -62,6 +54,22 @@ class DatasetIndex:
         """The cameras whose images there are."""
         ending = "_image"
         return tuple(k.removesuffix(ending) for k in self.available_keys if k.endswith(ending))
+
+
+class DemonstrationReader(ABC):
+    """Gives the values of demonstrations, whose :class:`DatasetIndex` is known."""
+
+    @abstractmethod
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """Read rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"`` into ``out``, and check them."""
+
+    @abstractmethod
+    def images(self, demo: str, key: str, out: Tensor) -> None:
+        """Read the first images of a demo into uint8 ``[rows, 3, size, size]``."""
+
+    @abstractmethod
+    def name(self, demo: str, key: str) -> str:
+        """What errors call an array of a demo, with the file that holds it."""
 
 
 def check_env_args(what: str, env_args: Any) -> dict[str, Any]:

@@ -5,18 +5,16 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDictBase
 from torch import Tensor
 
-from warmprior.data.download import download_lerobot
 from warmprior.data.hdf5_members import DatasetError
-from warmprior.data.index import store_finite
+from warmprior.data.index import DemonstrationReader, store_finite
 from warmprior.data.lerobot_index import (
     DESCRIPTION,
     REWARD,
@@ -24,91 +22,16 @@ from warmprior.data.lerobot_index import (
     LeRobotIndex,
     episode_file,
     read_lerobot_index,
-    read_metadata,
-    vector_widths,
 )
-from warmprior.data.replay import DemonstrationReader, DemonstrationReplay
+from warmprior.data.replay import DemonstrationReplay
 from warmprior.io.extras import require
-from warmprior.io.files import is_repository
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
-__all__ = [
-    "LeRobotExperienceReplay",
-    "LeRobotReader",
-    "fetch_lerobot",
-    "find_lerobot",
-    "is_remote",
-    "lerobot_steps",
-]
+__all__ = ["LeRobotExperienceReplay", "LeRobotReader", "lerobot_steps"]
 
 DECODED = 2**26  # bytes of frames unpacked at once
 TOLERANCE = 1e-4  # seconds between a step and its frame, LeRobot's own
 _REBUILD = "Record the episode again or remove it (lerobot-edit-dataset), or leave it out."
-
-
-def is_remote(dataset: str | Path) -> bool:
-    """Whether a name is a repository of the hub, ``user/name``, and no folder here."""
-    return is_repository(str(dataset)) and not Path(dataset).exists()
-
-
-def _root(dataset: str | Path, files: Sequence[str] = ("meta/*",), revision: str | None = None) -> Path:
-    """The folder of a dataset, with files of it fetched if it is in the hub."""
-    if is_remote(dataset):
-        return download_lerobot(str(dataset), files, revision=revision)
-    return Path(dataset).expanduser()
-
-
-def find_lerobot(dataset: str | Path, *, revision: str | None = None, **options: Any) -> LeRobotIndex:
-    """Read what describes a LeRobotDataset, by :func:`~warmprior.data.lerobot_index.read_lerobot_index`.
-
-    Of one in the hub nothing else is fetched; ``OSError`` if that fails.
-    """
-    return read_lerobot_index(_root(dataset, revision=revision), **options)
-
-
-def fetch_lerobot(dataset: str | Path, *, revision: str | None = None, **options: Any) -> LeRobotIndex:
-    """As :func:`find_lerobot`, and then fetch what is to be read, where the dataset is in the hub."""
-    index = find_lerobot(dataset, revision=revision, **options)
-    if not all((index.path / file).is_file() for file in index.files):
-        index = replace(index, path=_root(dataset, index.files, revision))
-    return index
-
-
-class _Columns:
-    """The numbers of a dataset's features: one file at a time, of it each column that is asked for, once."""
-
-    def __init__(self, root: Path, metadata: Any) -> None:
-        self.root, self.metadata = root, metadata
-        self._file, self._read = "", {}  # type: ignore[var-annotated]
-
-    def of(self, episode: Mapping[str, Any], feature: str) -> np.ndarray:
-        """All rows of an episode, ``[rows, width]``."""
-        file = episode_file(self.metadata, episode)
-        if file != self._file:
-            self._file, self._read = file, {}
-        start, number = episode["dataset_from_index"], episode["episode_index"]
-        with _reading(self.root / file):
-            index, numbers = self._column("index")[:, 0], self._column("episode_index")[:, 0]
-            first = int(np.searchsorted(index, start))
-            rows = slice(first, first + episode["length"])
-            expected = np.arange(start, start + episode["length"])
-            if not np.array_equal(index[rows], expected) or (numbers[rows] != number).any():
-                raise ValueError(f"episode {number} is not where meta/episodes says")
-            return self._column(feature)[rows]
-
-    def _column(self, name: str) -> np.ndarray:
-        """A column of the file, ``[rows, width]``."""
-        if name not in self._read:
-            arrow = require("pyarrow", "lerobot")
-            parquet = require("pyarrow.parquet", "lerobot")
-            table = parquet.read_table(self.root / self._file, columns=[name])
-            column, width = (table.column(name).combine_chunks(), self.metadata.features[name]["shape"][0])
-            if hasattr(column, "flatten") and arrow.types.is_nested(column.type):
-                # The cast refuses rows of another length.
-                column = column.cast(arrow.list_(column.type.value_type, width)).flatten()
-            values = column.to_numpy(zero_copy_only=False).reshape(len(table), width)
-            self._read[name] = values
-        return self._read[name]
 
 
 @contextmanager
@@ -130,7 +53,8 @@ class LeRobotReader(DemonstrationReader):
 
     def __init__(self, index: LeRobotIndex) -> None:
         self.index = index
-        self._columns = _Columns(index.path, index.metadata)
+        self._file = ""
+        self._read: dict[str, np.ndarray] = {}
         self._episodes = dict(zip(index.demos, index.episodes, strict=True))
         features = index.metadata.features
         self._reward = next((name for name in (REWARD, SUCCESS) if name in features), None)
@@ -144,8 +68,35 @@ class LeRobotReader(DemonstrationReader):
         if feature is None:
             out[...] = 0
             return
-        block = self._columns.of(self._episodes[demo], feature)[first : first + len(out), part]
+        block = self._rows(self._episodes[demo], feature)[first : first + len(out), part]
         store_finite(block, out, self.name(demo, key), first, _REBUILD)
+
+    def _rows(self, episode: Mapping[str, Any], feature: str) -> np.ndarray:
+        """All rows of an episode, ``[rows, width]``."""
+        file = episode_file(self.index.metadata, episode)
+        if file != self._file:  # one at a time
+            self._file, self._read = file, {}
+        start, number = episode["dataset_from_index"], episode["episode_index"]
+        with _reading(self.index.path / file):
+            index, numbers = self._column("index")[:, 0], self._column("episode_index")[:, 0]
+            first = int(np.searchsorted(index, start))
+            rows = slice(first, first + episode["length"])
+            expected = np.arange(start, start + episode["length"])
+            if not np.array_equal(index[rows], expected) or (numbers[rows] != number).any():
+                raise ValueError(f"episode {number} is not where meta/episodes says")
+            return self._column(feature)[rows]
+
+    def _column(self, name: str) -> np.ndarray:
+        """A column of the file, ``[rows, width]``, read once."""
+        if name not in self._read:
+            arrow, parquet = (require(module, "lerobot") for module in ("pyarrow", "pyarrow.parquet"))
+            column = parquet.read_table(self.index.path / self._file, columns=[name]).column(name)
+            rows, width = len(column), self.index.metadata.features[name]["shape"][0]
+            column = column.combine_chunks()
+            if arrow.types.is_nested(column.type):  # the cast refuses rows of another length
+                column = column.cast(arrow.list_(column.type.value_type, width)).flatten()
+            self._read[name] = column.to_numpy(zero_copy_only=False).reshape(rows, width)
+        return self._read[name]
 
     def _place(self, key: str) -> tuple[str | None, slice]:
         if key == "rewards":
@@ -181,7 +132,7 @@ class LeRobotReader(DemonstrationReader):
 
     def _video(self, episode: Mapping[str, Any], path: Path, feature: str) -> Any:
         decode = require("lerobot.datasets.video_utils", "lerobot").decode_video_frames
-        times = self._columns.of(episode, "timestamp")[:, 0].astype(np.float64)
+        times = self._rows(episode, "timestamp")[:, 0].astype(np.float64)
         times += episode[f"videos/{feature}/from_timestamp"]
         return lambda first, stop: decode(path, times[first:stop].tolist(), TOLERANCE, return_uint8=True)
 
@@ -203,19 +154,13 @@ def _pictures(episode: Mapping[str, Any], path: Path, feature: str) -> Any:
 class LeRobotExperienceReplay(DemonstrationReplay):
     """Demonstrations of a LeRobotDataset v3, as one immutable TorchRL replay buffer.
 
-    The counterpart of :class:`RobomimicExperienceReplay`, with the same entries and properties. Columns of
-    the parquet files are read whole, instead of item by item through
-    ``LeRobotDataset.__getitem__``; :class:`~warmprior.ActionWindow` makes windows of them, whose history and
-    padding are those of ``delta_timestamps``, but that what lies outside an episode is masked and zero
-    where LeRobot repeats its first action, which is part of the target.
+    The counterpart of :class:`RobomimicExperienceReplay`, with the same entries and properties.
+    :class:`~warmprior.ActionWindow` makes windows, whose history and padding are those of
+    ``delta_timestamps``, but that what lies outside an episode is masked and zero where LeRobot repeats its
+    first action, which is part of the target.
 
-    Of images only those that ``image_keys`` names are fetched and decoded, by LeRobot's own decoder, and of
-    the selected episodes alone; without images no video is opened. They are decoded once, into the uint8
-    storage: a training sees every frame many times in random order, where decoding a frame of 84 pixels
-    takes about ten times as long as gathering it (0.13 and 0.01 ms), and whatever reads the data, in any
-    process, finds plain tensors.
-
-    Without ``next.reward`` the rewards are ``next.success``, or zeros.
+    Of images only those that ``image_keys`` names are fetched and decoded, once and by LeRobot's own decoder,
+    and of the selected episodes alone. Without ``next.reward`` the rewards are ``next.success``, or zeros.
 
     Args:
         dataset: the dataset's folder, or its repository in the hub (``"user/name"``).
@@ -267,9 +212,10 @@ class LeRobotExperienceReplay(DemonstrationReplay):
         absolute_actions: bool = False,
         **kwargs: Any,
     ) -> None:
-        index = fetch_lerobot(
+        index = read_lerobot_index(
             dataset,
             revision=revision,
+            fetch=True,
             filter_key=filter_key,
             observation_keys=observation_keys,
             image_keys=image_keys,
@@ -287,14 +233,13 @@ class LeRobotExperienceReplay(DemonstrationReplay):
 
 
 def lerobot_steps(
-    dataset: str | Path, observation_keys: Sequence[str] = ("observation.state",), action_key: str = "action"
-) -> TensorDict:
+    dataset: str | Path, observation_keys: Sequence[str] = ("observation.state",)
+) -> TensorDictBase:
     """Read the steps of a LeRobotDataset of any robot, in raw units.
 
     Args:
         dataset: its folder, or ``user/name`` of its repository at the hub.
         observation_keys: features that make the observation, concatenated in this order.
-        action_key: the feature that is the action.
 
     Returns:
         ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]``, float32, and ``"episode"`` ``[N]``, as
@@ -306,40 +251,11 @@ def lerobot_steps(
         OSError: if a download fails.
         ImportError: if LeRobot is not installed.
 
-    See Also:
-        :class:`~warmprior.training.Task`: takes them, with an environment.
-
     Examples:
         >>> from warmprior.data import lerobot_steps
         >>> steps = lerobot_steps("lerobot/pusht_keypoints")  # doctest: +SKIP
         >>> steps["action"].shape  # doctest: +SKIP
         torch.Size([25650, 2])
     """
-    root = _root(dataset)
-    metadata = read_metadata(root)
-    widths = vector_widths(metadata.features)
-    for key in (*observation_keys, action_key):
-        if key not in widths:
-            raise DatasetError(f"{dataset} has no vector {key!r} of numbers: it has {widths}")
-    episodes = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
-    files = sorted({episode_file(metadata, episode) for episode in episodes})
-    if not all((root / file).is_file() for file in files):
-        root = _root(dataset, files)
-    columns = _Columns(root, metadata)
-
-    def vectors(keys: Sequence[str]) -> Tensor:
-        rows = torch.from_numpy(
-            np.concatenate([np.concatenate([columns.of(e, key) for key in keys], -1) for e in episodes])
-        ).float()
-        bad = (~rows.isfinite()).nonzero()
-        if len(bad):
-            raise DatasetError(f"{dataset}: {' or '.join(keys)} is not finite at step {int(bad[0, 0])}")
-        return rows
-
-    lengths = torch.tensor([episode["length"] for episode in episodes])
-    steps = {
-        OBSERVATION: vectors(observation_keys),
-        ACTION: vectors([action_key]),
-        EPISODE: torch.arange(len(episodes)).repeat_interleave(lengths),
-    }
-    return TensorDict(steps, [int(lengths.sum())])
+    data = LeRobotExperienceReplay(dataset, observation_keys=observation_keys).data
+    return data.select(OBSERVATION, ACTION, EPISODE)

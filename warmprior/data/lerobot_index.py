@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
+from warmprior.data.download import download_lerobot
 from warmprior.data.hdf5_members import DatasetError
 from warmprior.data.index import DatasetIndex, check_count, check_env_args
 from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
-from warmprior.io.files import digest_of, file_digest, read_json
+from warmprior.io.files import digest_of, file_digest, is_repository, read_json
 
 __all__ = [
     "DESCRIPTION",
@@ -23,11 +24,10 @@ __all__ = [
     "LeRobotIndex",
     "action_names",
     "episode_file",
+    "is_remote",
     "layout_of",
     "read_lerobot_index",
-    "read_metadata",
     "state_names",
-    "vector_widths",
 ]
 
 DESCRIPTION = "meta/warmprior.json"
@@ -48,12 +48,6 @@ class LeRobotIndex(DatasetIndex):
         columns: of each observation the feature that holds it, and where in it.
         images: the feature of each of the images to read.
         described: what ``meta/warmprior.json`` says; empty for datasets that were not converted.
-
-    Examples:
-        >>> from warmprior.data.lerobot_index import read_lerobot_index
-        >>> index = read_lerobot_index("square_lerobot")  # doctest: +SKIP
-        >>> index.files  # doctest: +SKIP
-        ['data/chunk-000/file-000.parquet']
     """
 
     metadata: Any
@@ -92,7 +86,12 @@ def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = 
     return file
 
 
-def read_metadata(root: Path) -> Any:
+def is_remote(dataset: str | Path) -> bool:
+    """Whether a name is a repository of the hub, ``user/name``, and no folder here."""
+    return is_repository(str(dataset)) and not Path(dataset).exists()
+
+
+def _metadata(root: Path) -> Any:
     """Let LeRobot read what describes a dataset in a folder, checked; the hub is never asked."""
     if not (root / "meta" / "info.json").is_file():
         raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
@@ -121,34 +120,13 @@ def read_metadata(root: Path) -> Any:
     return metadata
 
 
-def vector_widths(features: Mapping[str, Mapping[str, Any]]) -> dict[str, int]:
-    """The widths of the features that are vectors of numbers."""
-    return {
-        name: feature["shape"][0]
-        for name, feature in features.items()
-        if len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint"))
-    }
-
-
 def action_names(arms: int) -> list[str]:
-    """What the pose deltas of so many arms of robosuite are called in a dataset, in their order.
-
-    Examples:
-        >>> from warmprior.data.lerobot_index import action_names
-        >>> action_names(1)[3:]
-        ['robot0_rx', 'robot0_ry', 'robot0_rz', 'robot0_gripper']
-    """
+    """What the pose deltas of so many arms of robosuite are called in a dataset, such as ``robot0_rx``."""
     return [f"robot{arm}_{name}" for arm in range(arms) for name in _ARM_ACTIONS]
 
 
 def state_names(widths: Mapping[str, int]) -> list[str]:
-    """What the numbers of observations of these widths are called in a dataset, in the same order.
-
-    Examples:
-        >>> from warmprior.data.lerobot_index import state_names
-        >>> state_names({"robot0_gripper_qpos": 2})
-        ['robot0_gripper_qpos_0', 'robot0_gripper_qpos_1']
-    """
+    """What the numbers of observations of these widths are called in a dataset, in the same order."""
     return [f"{key}_{i}" for key, width in widths.items() for i in range(width)]
 
 
@@ -161,8 +139,10 @@ def layout_of(widths: Mapping[str, int]) -> dict[str, dict[str, int]]:
 
 
 def read_lerobot_index(
-    root: str | Path,
+    dataset: str | Path,
     *,
+    revision: str | None = None,
+    fetch: bool = False,
     filter_key: str | None = None,
     observation_keys: Sequence[str] | None = None,
     image_keys: Sequence[str] = (),
@@ -172,35 +152,23 @@ def read_lerobot_index(
 ) -> LeRobotIndex:
     """Say what a LeRobotDataset v3 holds, by its ``meta/``. No values are read.
 
+    Of a dataset in the hub nothing else is fetched, unless ``fetch`` asks for what is to be read.
+
     A dataset that :func:`warmprior.data.convert_robomimic` wrote says in which environment it was recorded,
     and where each of robomimic's observations is. In any other ``env_args`` says the former, and of a task of
     :data:`warmprior.envs.TASKS` the observations are looked for, by their widths, in
     ``observation.environment_state`` (objects) beside ``observation.state`` (robots), in
-    ``observation.state`` alone, or each in ``observation.<key>``. Where no environment is known an
-    observation is a whole feature.
+    ``observation.state`` alone, or each in ``observation.<key>``. Beside these every whole feature is an
+    observation, under its own name.
 
-    Options are those of :class:`~warmprior.data.LeRobotExperienceReplay`; ``poses`` also requires the hand
-    pose of every arm, from which absolute actions are built.
-
-    Raises:
-        FileNotFoundError: if there is no such dataset.
-        DatasetError: if LeRobot cannot read it, it does not fit the environment, or a key is missing.
-        ValueError: if no demos are to be taken.
-
-    Examples:
-        >>> from warmprior.data.lerobot_index import read_lerobot_index
-        >>> index = read_lerobot_index("square_lerobot")  # doctest: +SKIP
-        >>> len(index.demos), index.action_dim  # doctest: +SKIP
-        (200, 7)
-        >>> read_lerobot_index("nowhere")
-        Traceback (most recent call last):
-            ...
-        FileNotFoundError: nowhere: no meta/info.json there, so no LeRobotDataset; check the path
+    Options and errors are those of :class:`~warmprior.data.LeRobotExperienceReplay`; ``poses`` also requires
+    the hand pose of every arm, from which absolute actions are built.
     """
-    root = Path(root)
+    remote = is_remote(dataset)
+    root = download_lerobot(str(dataset), revision=revision) if remote else Path(dataset).expanduser()
     if demos is not None and demos < 1:
         raise ValueError(f"demos must be at least 1, got {demos}")
-    metadata = read_metadata(root)
+    metadata = _metadata(root)
     described = _description(root)
     recorded = described.get("env_args") or dict(env_args or {})
     if env_args and recorded["env_name"] != env_args["env_name"]:
@@ -209,14 +177,20 @@ def read_lerobot_index(
             "leave the task (env_args) out or correct it"
         )
     task = task_of_env(recorded) if recorded else None
-    widths = vector_widths(metadata.features)
+    widths = {
+        name: feature["shape"][0]
+        for name, feature in metadata.features.items()
+        if len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint"))
+    }
     if "action" not in widths:
         raise DatasetError(f"{root}: there is no feature 'action' that is a vector of numbers, but {widths}")
     if recorded:
         _check_actions(root, metadata, recorded, task)
-    columns = _columns(root, metadata.features, widths, described, task)
+    named = _named_columns(root, metadata.features, widths, described, task)
+    whole = {name: (name, slice(0, width)) for name, width in widths.items() if name != "action"}
+    columns = named | whole
     if observation_keys is None:
-        observation_keys = tuple(columns)
+        observation_keys = tuple(named)
         if task is not None:
             observation_keys = task.low_dim_keys
         elif not described:
@@ -247,7 +221,7 @@ def read_lerobot_index(
         episodes = [row for row in episodes if row["episode_index"] in masks[filter_key]]
     check_count(root, demos, len(episodes))
     episodes = episodes[:demos]
-    return LeRobotIndex(
+    index = LeRobotIndex(
         path=root,
         demos=tuple(str(row["episode_index"]) for row in episodes),
         lengths=tuple(row["length"] for row in episodes),
@@ -265,6 +239,9 @@ def read_lerobot_index(
         images={key: cameras[key] for key in image_keys},
         described=described,
     )
+    if fetch and remote and not all((root / file).is_file() for file in index.files):
+        index = replace(index, path=download_lerobot(str(dataset), index.files, revision=revision))
+    return index
 
 
 def _description(root: Path) -> dict[str, Any]:
@@ -314,14 +291,14 @@ def _check_actions(root: Path, metadata: Any, env_args: Mapping[str, Any], task:
     _check_names(root, action, action_names(task.arms), f"the actions of {task.env_name} are")
 
 
-def _columns(
+def _named_columns(
     root: Path,
     features: Mapping[str, Any],
     widths: Mapping[str, int],
     described: Mapping[str, Any],
     task: TaskSpec | None,
 ) -> dict[str, tuple[str, slice]]:
-    """Where the observations are."""
+    """Where robomimic's observations are."""
     theirs = {name: width for name, width in widths.items() if name.startswith("observation.")}
     if described:
         found = {key: (name, slice(*ends)) for key, (name, *ends) in described["observations"].items()}
@@ -335,7 +312,7 @@ def _columns(
                 )
         return found
     if task is None:
-        return {name: (name, slice(0, width)) for name, width in theirs.items()}
+        return {}
     layouts: list[dict[str, dict[str, int]]] = [
         {f"observation.{key}": {key: width} for key, width in task.low_dim_widths.items()},
         layout_of(task.low_dim_widths),

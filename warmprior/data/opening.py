@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,27 +12,14 @@ import torch
 from warmprior.data.hdf5 import read_index
 from warmprior.data.hdf5_members import DatasetError
 from warmprior.data.index import DatasetIndex
-from warmprior.data.lerobot import (
-    LeRobotExperienceReplay,
-    LeRobotReader,
-    fetch_lerobot,
-    find_lerobot,
-    is_remote,
-)
-from warmprior.data.lerobot_index import LeRobotIndex
+from warmprior.data.lerobot import LeRobotExperienceReplay, LeRobotReader
+from warmprior.data.lerobot_index import LeRobotIndex, is_remote, read_lerobot_index
 from warmprior.data.replay import DemonstrationReplay
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest
 
-__all__ = [
-    "LEROBOT",
-    "Demonstrations",
-    "check_place",
-    "name_of_place",
-    "open_demonstrations",
-    "resolved_place",
-]
+__all__ = ["LEROBOT", "Demonstrations", "check_place", "name_of_place", "resolved_place"]
 
 LEROBOT = "lerobot:"
 """What stands before the folder or repository of a LeRobotDataset where a file could be meant."""
@@ -88,52 +74,61 @@ def resolved_place(place: Path) -> str:
     return str(place) if is_remote(dataset) else f"{LEROBOT}{Path(dataset).expanduser().resolve()}"
 
 
-def open_demonstrations(
-    place: str | Path, env_args: Mapping[str, Any] | None = None, mask: str | None = None
-) -> Demonstrations:
-    """What reads the demonstrations at a place, see :func:`check_place`.
-
-    All of them, or those of a mask, such as ``"train"``. ``env_args`` are of the environment, for a
-    LeRobotDataset that does not describe its own.
-
-    Examples:
-        >>> from warmprior.data.opening import open_demonstrations
-        >>> open_demonstrations("lerobot:user/square").name  # nothing is fetched yet
-        'lerobot:square'
-    """
-    dataset = _lerobot(place)
-    return _RobomimicFile(place, mask) if dataset is None else _LeRobotFolder(dataset, env_args, mask)
-
-
-class Demonstrations(ABC):
+class Demonstrations:
     """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
 
+    Args:
+        place: see :func:`check_place`.
+        env_args: of the environment, for a LeRobotDataset that does not describe its own.
+        mask: which of them, such as ``"train"``; all by default.
+
+    Attributes:
+        name: what results call the place.
+
     Examples:
-        >>> from warmprior.data.opening import open_demonstrations
-        >>> place = open_demonstrations("nowhere.hdf5")  # not looked at yet
-        >>> place.index()
+        >>> from warmprior.data.opening import Demonstrations
+        >>> Demonstrations("lerobot:user/square").name  # nothing is fetched yet
+        'lerobot:square'
+        >>> Demonstrations("nowhere.hdf5").index()
         Traceback (most recent call last):
             ...
         FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
 
-    name: str
-    """What results call the place."""
+    def __init__(
+        self, place: str | Path, env_args: Mapping[str, Any] | None = None, mask: str | None = None
+    ) -> None:
+        dataset = _lerobot(place)
+        self._lerobot, self._path = dataset is not None, Path(place) if dataset is None else dataset
+        self._mask = mask
+        self._options: dict[str, Any] = {"filter_key": mask}
+        if self._lerobot:
+            self._options["env_args"] = env_args
+        name = f"{LEROBOT}{name_of_place(place)}" if self._lerobot else Path(place).name
+        self.name = name if mask is None else f"{name} (mask {mask})"
 
-    @abstractmethod
     def index(self, **options: Any) -> DatasetIndex:
         """What is there; options (``image_keys``, ``demos`` and so on) as of ``read_index``."""
+        read = read_lerobot_index if self._lerobot else read_index
+        return read(self._path, **self._options, **options)
 
-    @abstractmethod
     def replay(self, **options: Any) -> DemonstrationReplay:
         """Read them; options as of :class:`RobomimicExperienceReplay`."""
+        kind = LeRobotExperienceReplay if self._lerobot else RobomimicExperienceReplay
+        return kind(self._path, **self._options, **options)
 
-    @abstractmethod
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
         """SHA-256 of the contents, as far as these images and that many demonstrations are used."""
+        used = {"image_keys": image_keys, "demos": demos}
+        whole = self._fetched(**used).digest() if self._lerobot else file_digest(Path(self._path))
+        return whole if self._mask is None else digest_of(whole, self._mask)
 
-    @abstractmethod
-    def with_images(self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool) -> Self:
+    def _fetched(self, **options: Any) -> LeRobotIndex:
+        return read_lerobot_index(self._path, fetch=True, **self._options, **options)
+
+    def with_images(
+        self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
+    ) -> Demonstrations:
         """The same demonstrations with images of some cameras.
 
         Those that are there are compared with the simulator's; others are rendered where states are known.
@@ -141,68 +136,20 @@ class Demonstrations(ABC):
         Raises:
             DatasetError: if the images show something else than the simulator, or cannot be rendered.
         """
-
-
-def _called(name: str, mask: str | None) -> str:
-    return name if mask is None else f"{name} (mask {mask})"
-
-
-class _RobomimicFile(Demonstrations):
-    def __init__(self, path: str | Path, mask: str | None = None) -> None:
-        self.path, self.mask = Path(path), mask
-        self.name = _called(self.path.name, mask)
-
-    def index(self, **options: Any) -> DatasetIndex:
-        return read_index(self.path, filter_key=self.mask, **options)
-
-    def replay(self, **options: Any) -> RobomimicExperienceReplay:
-        return RobomimicExperienceReplay(self.path, filter_key=self.mask, **options)
-
-    def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        whole = file_digest(self.path)
-        return whole if self.mask is None else digest_of(whole, self.mask)
-
-    def with_images(
-        self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
-    ) -> _RobomimicFile:
-        from warmprior.data.render import compare_images, render_demonstrations
-
-        if set(cameras) <= set(self.index(demos=demos).cameras):
-            compare_images(self.path, [f"{camera}_image" for camera in cameras], fast)
-            return self
-        if self.mask is not None:
-            raise DatasetError(
-                f"{self.path} has no images of {', '.join(cameras)}, and files are rendered whole: render it "
-                "first (python -m warmprior render), or leave the mask out"
-            )
-        return _RobomimicFile(render_demonstrations(self.path, cameras, size, demos=demos, fast=fast))
-
-
-class _LeRobotFolder(Demonstrations):
-    def __init__(self, dataset: str, env_args: Mapping[str, Any] | None, mask: str | None) -> None:
-        self.dataset, self.mask = dataset, mask
-        self._given: dict[str, Any] = {"env_args": env_args, "filter_key": mask}
-        self.name = _called(f"{LEROBOT}{name_of_place(LEROBOT + dataset)}", mask)
-
-    def index(self, **options: Any) -> LeRobotIndex:
-        return find_lerobot(self.dataset, **self._given, **options)
-
-    def _fetched(self, **options: Any) -> LeRobotIndex:
-        return fetch_lerobot(self.dataset, **self._given, **options)
-
-    def replay(self, **options: Any) -> LeRobotExperienceReplay:
-        return LeRobotExperienceReplay(self.dataset, **self._given, **options)
-
-    def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
-        whole = self._fetched(image_keys=image_keys, demos=demos).digest()
-        return whole if self.mask is None else digest_of(whole, self.mask)
-
-    def with_images(
-        self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
-    ) -> _LeRobotFolder:
-        from warmprior.data.render import compare_first_images
+        from warmprior.data.render import compare_first_images, compare_images, render_demonstrations
 
         keys = [f"{camera}_image" for camera in cameras]
+        if not self._lerobot:
+            path = Path(self._path)
+            if set(cameras) <= set(self.index(demos=demos).cameras):
+                compare_images(path, keys, fast)
+                return self
+            if self._mask is not None:
+                raise DatasetError(
+                    f"{path} has no images of {', '.join(cameras)}, and files are rendered whole: render it "
+                    "first (python -m warmprior render), or leave the mask out"
+                )
+            return Demonstrations(render_demonstrations(path, cameras, size, demos=demos, fast=fast))
         index, images = self._fetched(image_keys=keys, demos=1), {}
         for key in keys:
             image = torch.empty(1, 3, index.image_size, index.image_size, dtype=torch.uint8)

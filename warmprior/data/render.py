@@ -42,7 +42,6 @@ def render_demonstrations(
     demos: int | None = None,
     fast: bool = False,
     out: str | Path | None = None,
-    cache_dir: str | Path | None = None,
     workers: int | None = None,
     progress: bool = True,
 ) -> Path:
@@ -61,9 +60,9 @@ def render_demonstrations(
     Keyword Args:
         demos: how many to render and keep, the first ones by their numbers; all if ``None``.
         fast: see :class:`~warmprior.envs.rendering.CameraRenderer`.
-        out: where to write, replacing what is there; may be ``path`` itself. ``None`` for the cache, from
-            which a file rendered earlier from the same file is returned at once.
-        cache_dir: ``None`` for ``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set.
+        out: where to write, replacing what is there; may be ``path`` itself. ``None`` for the cache
+            (``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set), from which a file rendered
+            earlier from the same file is returned at once.
         workers: number of processes; ``None`` for one per available core.
         progress: show a bar with the remaining time.
 
@@ -77,10 +76,6 @@ def render_demonstrations(
             file were rendered in the other quality.
         RuntimeError: if nothing here can render.
         OSError: if the disk is full; what is finished stays.
-
-    See Also:
-        - :class:`~warmprior.data.RobomimicExperienceReplay`: reads the images.
-        - :func:`~warmprior.data.generate_demonstrations`: makes files to render.
 
     Examples:
         >>> from warmprior.data import render_demonstrations
@@ -107,7 +102,7 @@ def render_demonstrations(
     if out is None:
         names = "-".join(cameras) if len(cameras) < 3 else f"{len(cameras)}cameras"
         name = f"{path.stem}_{names}{size}{'fast' if fast else ''}_{identity}.hdf5"
-        out = cache_folder(cache_dir) / "rendered" / name
+        out = cache_folder() / "rendered" / name
         if out.exists():
             return out
     out = Path(out)
@@ -177,27 +172,31 @@ class _Illustrator:
 
     def positions(self, demo: str) -> np.ndarray:
         """Positions of all joints before every action, ``[N, nq]``."""
-        path, model = self.index.path, self.renderer.model
+        path, name = self.index.path, f"data/{demo}/states"
         with open_robomimic(path) as file:
-            states = member(file, f"data/{demo}/states", "dataset")
+            states = member(file, name, "dataset")
             if states is None:
                 raise DatasetError(f"{path}: data/{demo} has no states to render: record them")
-            steps = self.index.lengths[self.index.demos.index(demo)]
-            expected = (steps, 1 + model.nq + model.nv)
-            if states.shape != expected:
-                raise DatasetError(
-                    f"{path}: data/{demo}/states has shape {states.shape}, but the simulator of "
-                    f"{self.index.env_args['env_name']} has {expected}: its robots or objects are others here"
-                )
-            with reading(file, f"data/{demo}/states"):
-                found = states[:, 1 : 1 + model.nq]
-        usable = np.isfinite(found).all(-1)
+            with reading(file, name):
+                found = np.asarray(states[()])
+        return self._joints(found, self.index.lengths[self.index.demos.index(demo)], f"{path}: {name}")
+
+    def _joints(self, states: np.ndarray, steps: int, what: str) -> np.ndarray:
+        """Positions of all joints, ``[steps, nq]``, in states of this simulator."""
+        model = self.renderer.model
+        expected = (steps, 1 + model.nq + model.nv)
+        if states.shape != expected:
+            raise DatasetError(
+                f"{what} has shape {states.shape}, but the simulator of "
+                f"{self.index.env_args['env_name']} has {expected}: its robots or objects are others here"
+            )
+        usable = np.isfinite(states).all(-1)
         if not usable.all():  # MuJoCo would show something all the same
             raise DatasetError(
-                f"{path}: data/{demo}/states has NaN or infinity in row {int(np.argmin(usable))}: record it "
-                "again, or leave the demo out"
+                f"{what} has NaN or infinity in row {int(np.argmin(usable))}: record it again, or leave the "
+                "demo out"
             )
-        return found
+        return states[:, 1 : 1 + model.nq]
 
     def check(self) -> None:
         """Render one image of every camera."""
@@ -220,16 +219,9 @@ class _Illustrator:
 
     def compare(self, state: np.ndarray, images: Mapping[str, np.ndarray], name: str, advice: str) -> None:
         """Compare images of a state, by camera, with the simulator's."""
-        model = self.renderer.model
-        expected = 1 + model.nq + model.nv
-        if state.shape != (expected,):
-            raise DatasetError(
-                f"{name}: a state has shape {state.shape}, but the simulator of "
-                f"{self.index.env_args['env_name']} has {expected} numbers: its robots or objects are others "
-                "here"
-            )
+        (joints,) = self._joints(state[None], 1, f"{name}: the first state")
         for camera, image in images.items():
-            shown = self.renderer.render(camera, state[1 : 1 + model.nq]).astype(np.float32)
+            shown = self.renderer.render(camera, joints).astype(np.float32)
             stored = image.astype(np.float32)
             views = {
                 "show something else than the simulator": stored,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from itertools import pairwise
@@ -19,32 +18,16 @@ from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorS
 from tqdm import tqdm
 
 from warmprior.data.hdf5_members import DatasetError
-from warmprior.data.index import BLOCK, DatasetIndex
+from warmprior.data.index import BLOCK, DatasetIndex, DemonstrationReader
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 
-__all__ = ["DemonstrationReader", "DemonstrationReplay"]
+__all__ = ["DemonstrationReplay"]
 
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
-
-
-class DemonstrationReader(ABC):
-    """Gives the values of demonstrations, whose :class:`DatasetIndex` is known."""
-
-    @abstractmethod
-    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"`` into ``out``, and check them."""
-
-    @abstractmethod
-    def images(self, demo: str, key: str, out: Tensor) -> None:
-        """Read the first images of a demo into uint8 ``[rows, 3, size, size]``."""
-
-    @abstractmethod
-    def name(self, demo: str, key: str) -> str:
-        """What errors call an array of a demo, with the file that holds it."""
 
 
 def _allocate(
@@ -178,42 +161,8 @@ def _understanding(what: str) -> Iterator[None]:
 class DemonstrationReplay(TensorDictReplayBuffer):
     """Demonstrations, as one immutable TorchRL replay buffer; formats are subclasses of it.
 
-    The entries are those that :class:`RobomimicExperienceReplay` tells, whatever the format.
-
-    Args:
-        index: what to read.
-        reader: the context in which it can be read.
-
-    Keyword Args:
-        described: what errors call the index's ``env_args``.
-        absolute_actions: turn the recorded pose deltas into absolute poses
-            (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm.
-        storage: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``.
-        scratch_dir: folder of the memory maps; temporary files if ``None``.
-        device: device of the tensors; ``"cpu"`` for ``"memmap"``.
-        **kwargs: arguments of :class:`~torchrl.data.TensorDictReplayBuffer`.
-
-    Raises:
-        DatasetError: if what is stored is not as it should be; says which file, demo and key.
-        ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
-            of a controller without pose deltas.
-        OSError: if there is no space for memory maps.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from tempfile import TemporaryDirectory
-        >>> import h5py
-        >>> import numpy as np
-        >>> from warmprior.data import RobomimicExperienceReplay
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "toy.hdf5"
-        ...     with h5py.File(path, "w") as file:
-        ...         for name, shape in {"actions": (9, 2), "rewards": (9,), "obs/object": (9, 3)}.items():
-        ...             file[f"data/demo_0/{name}"] = np.ones(shape)
-        ...         file["data"].attrs["env_args"] = '{"env_name": "Toy", "env_kwargs": {}}'
-        ...     replay = RobomimicExperienceReplay(path, observation_keys=["object"], batch_size=4)
-        >>> replay.episode_lengths, replay.sample()["observation"].shape
-        (tensor([9]), torch.Size([4, 3]))
+    Entries, options and errors are those that :class:`RobomimicExperienceReplay` tells. ``reader`` is the
+    context in which what ``index`` selects can be read, and ``described`` what errors call its ``env_args``.
     """
 
     def __init__(
@@ -295,11 +244,6 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         return self._index.observation_keys
 
     @property
-    def image_keys(self) -> tuple[str, ...]:
-        """The images next to ``("observation", "state")``."""
-        return self._index.image_keys
-
-    @property
     def image_size(self) -> int:
         """Side of the images in pixels, 0 if there are none."""
         return self._index.image_size
@@ -322,8 +266,3 @@ class DemonstrationReplay(TensorDictReplayBuffer):
     def num_episodes(self) -> int:
         """The number of demos read."""
         return len(self._index.demos)
-
-    @property
-    def episode_lengths(self) -> Tensor:
-        """Steps of each episode, ``[num_episodes]`` int64 on the CPU."""
-        return torch.tensor(self._index.lengths)

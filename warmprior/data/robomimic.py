@@ -7,51 +7,34 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from torch import Tensor
-
 from warmprior.data.download import download_robomimic
-from warmprior.data.hdf5 import open_robomimic, read_index, read_rows
-from warmprior.data.hdf5_images import read_images
-from warmprior.data.replay import DemonstrationReader, DemonstrationReplay
+from warmprior.data.hdf5 import RobomimicReader, open_robomimic, read_index
+from warmprior.data.index import DemonstrationReader
+from warmprior.data.replay import DemonstrationReplay
 from warmprior.envs.tasks import TASKS
 
 __all__ = ["RobomimicExperienceReplay"]
 
 
-def _locate(dataset: str | Path, style: str, download: bool, root: str | Path | None) -> Path:
+def _locate(dataset: str | Path, style: str | None, download: bool, root: str | Path | None) -> Path:
     path = Path(dataset)
     if path.is_file() or (str(dataset) not in TASKS and not download):
         return path
     if download:
         return download_robomimic(str(dataset), style, root=root)
     raise FileNotFoundError(
-        f"{dataset}: no such file. To fetch the official {dataset} {style} file, pass download=True."
+        f"{dataset}: no such file. To fetch the official file of this task, pass download=True."
     )
-
-
-class _FileReader(DemonstrationReader):
-    def __init__(self, file: Any) -> None:
-        self.file = file
-
-    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        read_rows(self.file, demo, key, out, first)
-
-    def images(self, demo: str, key: str, out: Tensor) -> None:
-        read_images(self.file, demo, key, out)
-
-    def name(self, demo: str, key: str) -> str:
-        return f"{self.file.filename}: data/{demo}/{key}"
 
 
 @contextmanager
 def _reader(path: Path) -> Iterator[DemonstrationReader]:
     with open_robomimic(path) as file:
-        yield _FileReader(file)
+        yield RobomimicReader(file)
 
 
 class RobomimicExperienceReplay(DemonstrationReplay):
-    """Demonstrations of a robomimic HDF5 file, as one immutable TorchRL replay buffer.
+    """Demonstrations of an HDF5 file of robomimic or MimicGen, as one immutable TorchRL replay buffer.
 
     The whole selection becomes a flat, contiguous :class:`~tensordict.TensorDict` of ``N`` steps, in
     the order of the demos' numbers:
@@ -69,9 +52,8 @@ class RobomimicExperienceReplay(DemonstrationReplay):
 
     Args:
         dataset: path of an HDF5 file, or with ``download=True`` the name of a task.
-        style: which official file: ``"ph"`` or ``"mh"``. Ignored for a path.
-        download: fetch the official file if ``dataset`` is no file
-            (see :func:`warmprior.data.download_robomimic`).
+        style: which official file, see :func:`warmprior.data.download_robomimic`. Ignored for a path.
+        download: fetch the official file if ``dataset`` is no file.
         root: folder for downloads; by default the hub client's cache.
         filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
         demos: how many to take, the first ones by their numbers; all if ``None``.
@@ -81,9 +63,9 @@ class RobomimicExperienceReplay(DemonstrationReplay):
             ``storage="memmap"`` where they are many.
         absolute_actions: turn the recorded pose deltas into absolute poses
             (see :func:`warmprior.envs.absolute_actions`); ``d_a`` becomes 10 per arm.
-        **kwargs: those of :class:`~warmprior.data.replay.DemonstrationReplay`: ``storage``, ``scratch_dir``
-            and ``device``, and ``batch_size``, ``sampler``, ``transform``, ``prefetch``, ``pin_memory`` or
-            ``generator`` of TorchRL's.
+        **kwargs: ``storage``: ``"memory"``, or ``"memmap"`` for files under ``scratch_dir``, by default
+            temporary ones; ``device`` of the tensors in memory; and ``batch_size``, ``sampler``,
+            ``transform``, ``prefetch``, ``pin_memory`` or ``generator`` of TorchRL's.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -101,14 +83,14 @@ class RobomimicExperienceReplay(DemonstrationReplay):
         >>> RobomimicExperienceReplay("square")
         Traceback (most recent call last):
             ...
-        FileNotFoundError: square: no such file. To fetch the official square ph file, ...
+        FileNotFoundError: square: no such file. To fetch the official file of this task, ...
     """
 
     def __init__(
         self,
         dataset: str | Path,
         *,
-        style: str = "ph",
+        style: str | None = None,
         download: bool = False,
         root: str | Path | None = None,
         filter_key: str | None = None,

@@ -64,7 +64,7 @@ class AsyncExecutor:
             steps later.
         pool: where to compute; by default in one thread, which :meth:`close` ends.
         action_dim: ``d_a``; that of the actor's network by default.
-        chunk_key: where the policy writes its chunk; a :class:`~warmprior.WarmPriorActor`'s own by default.
+        chunk_key: where the policy writes its chunk; ``("vla_action", "chunk")`` by default.
 
     Raises:
         ValueError: for numbers that do not fit each other, or a missing argument that the actor does not

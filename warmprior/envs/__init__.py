@@ -23,7 +23,6 @@ from warmprior.envs.navigation_goal import GoalNavigationEnv
 from warmprior.envs.rendering import rendering_backend
 from warmprior.envs.robosuite import RobosuiteEnv, RobosuiteWrapper
 from warmprior.envs.tasks import TASKS, TaskSpec, get_task
-from warmprior.rotation import rotation_6d_to_rotvec
 
 __all__ = [
     "TASKS",
@@ -47,5 +46,4 @@ __all__ = [
     "navigation_metrics",
     "navigation_positions",
     "rendering_backend",
-    "rotation_6d_to_rotvec",
 ]

@@ -63,7 +63,6 @@ class StepLoop:
         """Look up what a reset may have replaced."""
         sim = self.env.sim
         self._model, self._data = sim.model._model, sim.data._data
-        self._sites: dict[str, int] = {}
         self._bodies: dict[str, int] = {}
         self._arms = [Arm(self.env, robot) for robot in self.env.robots]
 
@@ -122,12 +121,6 @@ class StepLoop:
             self._bodies[name] = self.env.sim.model.body_name2id(name)
         body = self._bodies[name]
         return self._data.xpos[body].copy(), self._data.xmat[body].reshape(3, 3).copy()
-
-    def site(self, name: str) -> np.ndarray:
-        """Return the position ``[3]`` (metres) of a site of the model."""
-        if name not in self._sites:
-            self._sites[name] = self.env.sim.model.site_name2id(name)
-        return self._data.site_xpos[self._sites[name]].copy()
 
 
 class ControlLoop(StepLoop):

@@ -99,7 +99,7 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv
     keeps no description of an environment.
     """
     description: Any = actor.environment
-    if not _describes_robosuite(description):
+    if environment_name(actor) is None:
         raise ValueError(
             f"the policy keeps no description of a robosuite environment, but {description}: build the "
             "environment yourself, with policy_transforms(actor)"
@@ -147,23 +147,8 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
 
 def environment_name(actor: WarmPriorActor) -> str | None:
     """Robosuite's name of the environment that a policy was made for, if it is known."""
-    description: Any = actor.environment
-    if not _describes_robosuite(description):
+    try:
+        description: Any = actor.environment
+        return str(description["robosuite"]["env_args"]["env_name"])
+    except (KeyError, TypeError):  # none, or a description of the user's own
         return None
-    return str(description["robosuite"]["env_args"].get("env_name"))
-
-
-def _describes_robosuite(description: Any) -> bool:
-    """Whether it is what :func:`environment_description` gives."""
-    return (
-        isinstance(description, Mapping)
-        and set(description) - {"actions", "images"} == {"robosuite", "observation_steps"}
-        and description.get("actions", "delta") in ("delta", "absolute")
-        and isinstance(description["robosuite"], Mapping)
-        and set(description["robosuite"]) == {"env_args", "style"}
-        and isinstance(description["robosuite"]["env_args"], Mapping)
-        and (
-            "images" not in description
-            or (isinstance(description["images"], Mapping) and set(description["images"]) == set(_IMAGES))
-        )
-    )

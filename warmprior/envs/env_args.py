@@ -19,8 +19,9 @@ from warmprior.envs.mimicgen import is_mimicgen
 from warmprior.rotation import (
     HAND_TO_SITE,
     matrix_to_rotation_6d,
+    matrix_to_rotvec,
     quaternion_to_matrix,
-    rotation_6d_to_rotvec,
+    rotation_6d_to_matrix,
     rotvec_to_matrix,
 )
 
@@ -244,5 +245,5 @@ def absolute_to_env_action(actions: Tensor) -> Tensor:
         tensor([ 0.1000,  0.0000,  1.0000,  0.0000,  0.0000,  0.0000, -1.0000])
     """
     pose = _per_arm("actions", actions, 10)
-    rotvec = rotation_6d_to_rotvec(pose[..., 3:9])
+    rotvec = matrix_to_rotvec(rotation_6d_to_matrix(pose[..., 3:9]))
     return torch.cat((pose[..., :3], rotvec, pose[..., 9:]), -1).flatten(-2).to(actions.dtype)

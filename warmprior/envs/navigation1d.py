@@ -36,9 +36,6 @@ UNDECIDED = 0.05
 def navigation_positions() -> Tensor:
     """Horizontal positions of the 64 steps, ``[64]``, from -1 to 1.
 
-    See Also:
-        :func:`~warmprior.envs.navigation_heights`: the demonstrations at these positions.
-
     Examples:
         >>> from warmprior.envs import navigation_positions
         >>> navigation_positions()[[0, -1]].tolist()
@@ -52,10 +49,6 @@ def navigation_heights() -> Tensor:
 
     A demonstration is a scaled profile with a bump over each obstacle; the two sides come closest (0.35
     apart) at the start, between the obstacles, and at the end.
-
-    See Also:
-        - :func:`~warmprior.envs.navigation_demonstrations`: the same as training data.
-        - :func:`~warmprior.envs.navigation_positions`: where they are held.
 
     Examples:
         >>> from warmprior.envs import navigation_heights
@@ -106,9 +99,6 @@ def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
 
     The points are at positions ``[*B, T]``, increasing, and heights ``[*B, T]``.
 
-    See Also:
-        :func:`~warmprior.envs.navigation_metrics`: counts the rollouts that do.
-
     Examples:
         >>> import torch
         >>> from warmprior.envs import navigation_collides
@@ -152,11 +142,6 @@ class NavigationEnv(EnvBase):
     Keyword Args:
         batch_size: ``*B``, independent agents.
         device: of all tensors.
-
-    See Also:
-        - :func:`~warmprior.envs.navigation_demonstrations`: what to clone.
-        - :func:`~warmprior.envs.navigation_metrics`: judges what a policy does in it.
-        - :class:`~warmprior.envs.GoalNavigationEnv`: adds a goal and a reward.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -267,9 +252,6 @@ class NavigationMetrics:
         recombination_rate: share of rollouts on the two routes that were not demonstrated.
         distance: mean distance to the nearest demonstration's height.
         jump: mean change of height at chunk boundaries.
-
-    See Also:
-        :func:`~warmprior.envs.navigation_metrics`: measures them.
 
     Examples:
         >>> import torch

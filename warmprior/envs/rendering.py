@@ -47,9 +47,6 @@ def rendering_backend() -> str | None:
     Returns:
         ``"egl"``, ``"osmesa"``, or ``None`` if neither works.
 
-    See Also:
-        :class:`~warmprior.envs.RobosuiteEnv`: renders its cameras with it.
-
     Examples:
         >>> from warmprior.envs import rendering_backend
         >>> rendering_backend() in ("egl", "osmesa", None)  # doctest: +SKIP

@@ -38,9 +38,6 @@ class TaskSpec:
         scripted: whether a scripted expert exists.
         official: the styles of the data that robomimic or MimicGen publish for the task.
 
-    See Also:
-        :func:`~warmprior.envs.get_task`: finds one by its short name.
-
     Examples:
         >>> from warmprior.envs import TaskSpec
         >>> door = TaskSpec("door", "Door", arms=1, horizon_ph=300, horizon_mh=500, object_dim=22)
@@ -130,10 +127,6 @@ def get_task(name: str) -> TaskSpec:
 
     Raises:
         ValueError: if there is no such task.
-
-    See Also:
-        - :class:`~warmprior.envs.RobosuiteEnv`: the environment of a task.
-        - :data:`~warmprior.envs.TASKS`: all of them.
 
     Examples:
         >>> from warmprior.envs import get_task

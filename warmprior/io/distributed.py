@@ -35,37 +35,18 @@ _waiting: dist.ProcessGroup | None = None
 
 
 def launched() -> bool:
-    """Whether ``torchrun`` started this process as one of several.
-
-    Examples:
-        >>> from warmprior.io.distributed import launched
-        >>> launched()
-        False
-    """
+    """Whether ``torchrun`` started this process as one of several."""
     names = ("RANK", "LOCAL_RANK", "WORLD_SIZE", "MASTER_ADDR")
     return all(name in os.environ for name in names) and int(os.environ["WORLD_SIZE"]) > 1
 
 
 def world_size() -> int:
-    """How many processes train together: 1 unless this one has :func:`joined` others.
-
-    Examples:
-        >>> from warmprior.io.distributed import world_size
-        >>> 256 // world_size()  # windows per process; here there is one
-        256
-    """
+    """How many processes train together: 1 unless this one has :func:`joined` others."""
     return dist.get_world_size() if dist.is_initialized() else 1
 
 
 def rank() -> int:
-    """The number of this process among them. The first, 0, is the leader: it alone writes and prints.
-
-    Examples:
-        >>> from warmprior.io.distributed import rank
-        >>> if not rank():
-        ...     print("trained")
-        trained
-    """
+    """The number of this process among them. The first, 0, is the leader: it alone writes and prints."""
     return dist.get_rank() if dist.is_initialized() else 0
 
 
@@ -102,10 +83,8 @@ def joined() -> Iterator[None]:
 def from_leader[T](make: Callable[[], T]) -> T:
     """What the first process makes of something that the others must not, or might not, make alike.
 
-    The first process calls it; its result has to be picklable.
-
-    Raises:
-        SystemExit: in the others, if it fails in the first, which says why.
+    The first process calls it; its result has to be picklable. If it fails there, which the first process
+    tells, the others get a ``SystemExit``.
 
     Examples:
         >>> from warmprior.io.distributed import from_leader
@@ -130,19 +109,8 @@ def from_leader[T](make: Callable[[], T]) -> T:
 def leader_first() -> Iterator[None]:
     """Let the first process do something before the others, which find it done.
 
-    Raises:
-        FloatingPointError: in all, if that is what it led to in the first: such failures end a training, and
-            not the run.
-        ValueError: likewise.
-        SystemExit: in the others, if it failed otherwise in the first, which says why.
-
-    Examples:
-        >>> from warmprior.io.distributed import leader_first
-        >>> found = set()
-        >>> with leader_first():  # what it leaves, such as a file, is there for the others
-        ...     found.add("generated")
-        >>> found
-        {'generated'}
+    If that ends in a ``FloatingPointError`` or ``ValueError``, which end a training and not the run, all get
+    it. After any other error, which the first process tells, the others get a ``SystemExit``.
     """
     failure: list[BaseException | None] = [SystemExit(2)]
     try:
@@ -163,18 +131,7 @@ def leader_first() -> Iterator[None]:
 
 
 def go_on_alone() -> None:
-    """Let the first process go on as if it had been started alone, and the others end.
-
-    Raises:
-        SystemExit: in the others, with success.
-
-    Examples:
-        >>> from warmprior.io.distributed import go_on_alone, joined, world_size
-        >>> with joined():
-        ...     go_on_alone()  # of several processes the others end here
-        ...     world_size()
-        1
-    """
+    """Let the first process go on as if it had been started alone, and the others end, with success."""
     ends = bool(rank())
     from_leader(int)  # all have arrived
     if dist.is_initialized():
@@ -184,10 +141,7 @@ def go_on_alone() -> None:
 
 
 def check_batch(size: int) -> None:
-    """Whether a batch, of so many windows of all processes, can be divided among them.
-
-    Raises:
-        ValueError: if it cannot.
+    """Refuse a batch, of so many windows of all processes, that cannot be divided among them.
 
     Examples:
         >>> from warmprior.io.distributed import check_batch
@@ -204,15 +158,7 @@ def check_batch(size: int) -> None:
 
 
 def check_device(device: str) -> None:
-    """Whether every process here has a device of a name, such as ``"cuda"`` for one each, and it computes.
-
-    Raises:
-        ValueError: naming ``--device`` and what there is instead.
-
-    Examples:
-        >>> from warmprior.io.distributed import check_device
-        >>> check_device("cpu")
-    """
+    """Refuse a device, such as ``"cuda"`` for one each, that not every process here has, or that fails."""
     try:
         if torch.device(device).type == "cuda" and launched():
             local, devices = int(os.environ["LOCAL_WORLD_SIZE"]), torch.cuda.device_count()

@@ -237,7 +237,6 @@ def exclusive(directory: Path) -> Iterator[None]:
         os.close(folder)
 
 
-def cache_folder(cache_dir: str | Path | None = None) -> Path:
-    """Where generated files are kept: by default ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
-    folder = cache_dir or os.environ.get("WARMPRIOR_CACHE") or Path.home() / ".cache" / "warmprior"
-    return Path(folder).expanduser()
+def cache_folder() -> Path:
+    """Where generated files are kept: ``$WARMPRIOR_CACHE`` or ``~/.cache/warmprior``."""
+    return Path(os.environ.get("WARMPRIOR_CACHE") or "~/.cache/warmprior").expanduser()

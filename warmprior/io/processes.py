@@ -34,24 +34,17 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
     """
 
     def begin(parent: int) -> None:
-        # Sent by value, for it is defined here: it runs before this library is imported, which takes seconds.
-        import os
+        # Sent by value, for it is defined here: Ctrl-C may come while this library is imported.
         import signal
         import sys
-        import threading
-        import time
 
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         # What a process keeps on purpose, such as demonstrations, is no leak to start it anew for.
         loky: Any = sys.modules["loky.process_executor"]
         loky._MAX_MEMORY_LEAK_SIZE = sys.maxsize
+        from warmprior.io.workers import end_with_parent
 
-        def watch() -> None:
-            while os.getppid() == parent:
-                time.sleep(0.2)
-            os._exit(1)  # nobody is left to hear, and a job may be in the middle of a step
-
-        threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
+        end_with_parent(parent)
 
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return require("loky", "sim").ProcessPoolExecutor(

@@ -31,25 +31,10 @@ CONNECT = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
 def check_ray(address: str | None = None) -> str | None:
     """Refuse a cluster that cannot be reached, before any work.
 
-    Args:
-        address: ``HOST:PORT`` of its head, or ``auto``; by default ``$RAY_ADDRESS``.
-
-    Returns:
-        The address, or ``None`` for a cluster of this machine alone, which has yet to be started.
-
-    Raises:
-        ImportError: if Ray is not installed.
-        ValueError: if this is no address of a head.
-        ConnectionError: if nothing answers there, or the cluster has another Ray or Python.
-
-    Examples:
-        >>> from warmprior.io.ray_cluster import check_ray
-        >>> check_ray("node-1:6379")  # doctest: +SKIP
-        'node-1:6379'
-        >>> check_ray("ray://node-1:10001")
-        Traceback (most recent call last):
-            ...
-        ValueError: --ray-address ray://node-1:10001 is not the address of a cluster's head, HOST:PORT ...
+    The address is ``HOST:PORT`` of its head, or ``auto``; by default ``$RAY_ADDRESS``. Returns it, or
+    ``None`` for a cluster of this machine alone, which has yet to be started. A ``ValueError`` if it is no
+    address of a head, and a ``ConnectionError`` if nothing answers there, or the cluster has another Ray or
+    Python.
     """
     require("ray", "ray")
     option = "--ray-address" if address else "RAY_ADDRESS"
@@ -89,9 +74,6 @@ def reason_of(text: bytes) -> str:
 
 def check_versions(mine: Mapping[str, str], theirs: Mapping[str, str], node: str) -> None:
     """Refuse a machine with other versions: it might compute something else.
-
-    Raises:
-        WorkerError: naming the machine and both versions, a ``RuntimeError``.
 
     Examples:
         >>> from warmprior.io.ray_cluster import check_versions
@@ -135,7 +117,8 @@ def ray_cluster(
     One that this process has already is taken, and left as it is.
 
     Args:
-        address: see :func:`check_ray`; a cluster of this machine is started by default, and ended.
+        address: ``HOST:PORT`` of its head, or ``auto``; by default ``$RAY_ADDRESS``, or a cluster of this
+            machine, which is started, and ended.
         num_cpus: of the cluster that is started; one per core by default.
         folders: that all machines have to share.
 

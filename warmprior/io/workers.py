@@ -72,19 +72,21 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def end_with_parent() -> None:
+def end_with_parent(parent: int | None = None) -> None:
     """Let this process end when the one that started it dies, however abruptly.
 
     A killed process cannot tell its workers to stop, and they would wait for hours: its ends of their
-    pipes stay open in whatever else it forked later. The main process is left alone.
+    pipes stay open in whatever else it forked later. A main process is left alone, unless ``parent`` says
+    which one started it.
     """
-    if multiprocessing.parent_process() is None:
-        return
-    parent = os.getppid()
+    if parent is None:
+        if multiprocessing.parent_process() is None:
+            return
+        parent = os.getppid()
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(0.5)
+            time.sleep(0.2)
         os._exit(1)  # nobody is left to hear, and the environment may be in the middle of a step
 
     threading.Thread(target=watch, name="end-with-parent", daemon=True).start()

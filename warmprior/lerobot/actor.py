@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior import keys
@@ -25,9 +24,10 @@ __all__ = ["LeRobotActor", "LeRobotFlow"]
 class LeRobotFlow(TensorDictModuleBase):
     """The sampler of a LeRobot policy in place of :class:`~warmprior.ODEActor`.
 
-    A deterministic map ``(noise, observation) -> chunk``: the padding around the prior's part of the source
-    is one fixed draw, unless a call passes its own. The policy's weights are not among the parameters of this
-    module.
+    A deterministic map ``(noise, observation) -> chunk``, source and chunk ``[*B, P, d_a]`` in the model's
+    units: the padding around the prior's part of the source is one fixed draw, unless a call passes its own.
+    The observation is ``[*B, To, d]`` (LeRobot's ``observation.state``), or a tensordict of such entries.
+    Images of bytes become floats in [0, 1]. The policy's weights are not among the parameters of this module.
 
     Args:
         policy: of LeRobot, see :class:`WarmPriorAdapter`.
@@ -40,19 +40,11 @@ class LeRobotFlow(TensorDictModuleBase):
             default.
         nfe: integration steps per chunk; the policy's own by default.
         seed: of the padding.
-        noise_key: the source, ``[*B, P, d_a]``.
-        observation_key: the observation, ``[*B, To, d]`` (LeRobot's ``observation.state``), or a
-            tensordict of such entries. Images of bytes become floats in [0, 1].
-        chunk_key: key written, ``[*B, P, d_a]``, in the model's units.
 
     Raises:
         ValueError: if gradients are required, which LeRobot's samplers do not compute, or ``padding`` has
             another shape than the model's source.
         KeyError: if an input key is missing.
-
-    See Also:
-        - :class:`~warmprior.lerobot.LeRobotActor`: this with a prior and memory: a whole policy.
-        - :class:`~warmprior.lerobot.WarmPriorAdapter`: stays within LeRobot instead.
 
     Examples:
         >>> from warmprior import PastPrior
@@ -74,9 +66,6 @@ class LeRobotFlow(TensorDictModuleBase):
         preprocess: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
         nfe: int | None = None,
         seed: int = 0,
-        noise_key: NestedKey = keys.NOISE,
-        observation_key: NestedKey = keys.OBSERVATION,
-        chunk_key: NestedKey = keys.CHUNK,
     ) -> None:
         super().__init__()
         check_steps(nfe)
@@ -89,8 +78,8 @@ class LeRobotFlow(TensorDictModuleBase):
         self.preprocess = preprocess
         self.nfe = nfe
         self.seed = seed
-        self.in_keys = [noise_key, observation_key]
-        self.out_keys = [chunk_key]
+        self.in_keys = [keys.NOISE, keys.OBSERVATION]
+        self.out_keys = [keys.CHUNK]
 
     @property
     def policy(self) -> Any:
@@ -115,12 +104,12 @@ class LeRobotFlow(TensorDictModuleBase):
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
         if missing:
             raise KeyError(f"LeRobotFlow needs the keys {self.in_keys}; missing: {missing}")
-        noise = tensordict.get(self.in_keys[0])
+        noise = tensordict.get(keys.NOISE)
         if torch.is_grad_enabled() and noise.requires_grad:
             raise ValueError("LeRobot's samplers compute no gradients: use no_grad or detach the source")
         batch = noise.shape[:-2]
         a0 = noise.reshape(-1, *noise.shape[-2:])
-        inputs = self._batch(network_observation(tensordict.get(self.in_keys[1]), batch))
+        inputs = self._batch(network_observation(tensordict.get(keys.OBSERVATION), batch))
         if padding is None:
             # One draw for all rows, so that a chunk does not depend on the other rows.
             generator = torch.Generator(a0.device).manual_seed(self.seed)
@@ -146,7 +135,7 @@ class LeRobotFlow(TensorDictModuleBase):
         ):
             self._port.predict(self.policy, inputs)
         chunk = chunks[0][:, self.source.positions, : self.source.action_dim]
-        return tensordict.set(self.out_keys[0], chunk.to(noise).reshape(noise.shape))
+        return tensordict.set(keys.CHUNK, chunk.to(noise).reshape(noise.shape))
 
     def _batch(self, observation: Tensor | TensorDictBase) -> dict[str, Any]:
         if isinstance(observation, Tensor):
@@ -206,6 +195,7 @@ class LeRobotActor(TensorDictModuleBase):
     normalizer = None
     environment = None
     start = None
+    chunk_key = keys.CHUNK
 
     def __init__(
         self,
@@ -232,9 +222,8 @@ class LeRobotActor(TensorDictModuleBase):
         )
         self.ode = LeRobotFlow(policy, source, **kwargs)
         self.generator = generator
-        noise_key, observation_key = self.ode.in_keys
-        self.in_keys = [observation_key, *((keys.HISTORY, name) for name in ENTRIES)]
-        self.out_keys = [keys.LOC, keys.WARM, noise_key, *self.ode.out_keys]
+        self.in_keys = [keys.OBSERVATION, *((keys.HISTORY, name) for name in ENTRIES)]
+        self.out_keys = [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK]
 
     @property
     def prior(self) -> Prior:
@@ -245,11 +234,6 @@ class LeRobotActor(TensorDictModuleBase):
     def network(self) -> ChunkSource:
         """The source, which has the width of actions."""
         return self.ode.source
-
-    @property
-    def chunk_key(self) -> NestedKey:
-        """Key of the chunk."""
-        return self.ode.out_keys[0]
 
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, generator: torch.Generator | None = None

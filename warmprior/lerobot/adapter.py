@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from warmprior.lerobot.memory import ActionMemory
-from warmprior.lerobot.ports import check_steps, port_for
+from warmprior.lerobot.ports import Velocity, check_steps, port_for
 from warmprior.lerobot.relative import RelativeActions
-from warmprior.lerobot.source import ChunkSource, SigmaUnit, action_std
+from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.prior import Prior
+from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
 
 __all__ = ["HISTORY", "HISTORY_IS_PAD", "WarmPriorAdapter", "history_indices"]
 
@@ -30,9 +31,6 @@ def history_indices(history_length: int, length: int, lead: int = 0) -> list[int
         history_length: of the prior, usually ``H``.
         length: ``T``, the length of the policy's chunk.
         lead: positions of the chunk before the current step.
-
-    See Also:
-        :class:`~warmprior.lerobot.WarmPriorAdapter`: reads these steps of a dataset.
 
     Examples:
         >>> from warmprior.lerobot import history_indices
@@ -63,15 +61,16 @@ class WarmPriorAdapter:
             the policy, whose later positions then start cold.
 
     Keyword Args:
-        sigma_unit: unit of ``sigma``: ``"model"`` (the normalised action space, as in the paper) or ``"std"``
-            (the standard deviation of the data), which does not depend on the normalisation.
-        stats: of the dataset (``dataset.meta.stats``), for ``sigma_unit="std"``.
-        action_std: the standard deviation itself, ``[d_a]`` in the model's units, instead of ``stats``.
+        std: standard deviation of the data in the model's units, ``[d_a]`` (see :func:`action_std`), if
+            ``sigma`` is in units of it, which do not depend on the normalisation; by default ``sigma`` is in
+            the normalised action space, as in the paper.
         relative: expresses remembered actions at the next state, for policies with relative actions.
         coupling: pairs the sources and targets of a batch (:data:`~warmprior.objectives.Coupling`), without
             observations; in their order by default.
         cold_probability: share of the training windows whose history is withheld.
         nfe: integration steps per chunk; the policy's own by default.
+        guidance: of chunks towards the rest of the last one, :class:`~warmprior.RealTimeChunking`, for pi0,
+            pi0.5 and SmolVLA; none by default.
         generator: source of randomness on the policy's device; PyTorch's global one by default.
 
     Raises:
@@ -92,13 +91,12 @@ class WarmPriorAdapter:
         policy: Any,
         prior: Prior,
         *,
-        sigma_unit: SigmaUnit = "model",
-        stats: Mapping[str, Mapping[str, Any]] | None = None,
-        action_std: Tensor | None = None,
+        std: Tensor | None = None,
         relative: RelativeActions | None = None,
         coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         cold_probability: float = 0.0,
         nfe: int | None = None,
+        guidance: RealTimeChunking | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         self.port = port_for(policy)
@@ -114,7 +112,7 @@ class WarmPriorAdapter:
             width=self.port.width(policy),
             action_dim=policy.config.action_feature.shape[0],
             lead=self.port.lead(policy),
-            std=_std(policy, sigma_unit, stats, action_std),
+            std=std,
         )
         steps = policy.config.n_action_steps
         if steps > prior.chunk_length:
@@ -131,12 +129,19 @@ class WarmPriorAdapter:
             raise ValueError(f"cold_probability must be in [0, 1], got {cold_probability}")
         self.coupling, self.cold_probability, self.nfe = coupling, cold_probability, nfe
         check_steps(nfe)
+        self.guidance = guidance
+        if guidance is not None:
+            self.port.guiding(policy, self._guided)  # refuses what cannot be guided
         self._relative = relative
         self._memory = ActionMemory(prior, self.source.action_dim)
         # Raw states at the last decision, and at the one under way.
         self._state: Tensor | None = None
         self._now: Tensor | None = None
         self._sampling = False
+        # Control steps until the chunk under way takes effect; of the last one the rest, how much is left,
+        # the delay, and the width of the source, all over the whole chunk.
+        self._delay = 0
+        self._rest: tuple[Tensor, Tensor, Tensor, Tensor]
 
     @property
     def action_indices(self) -> list[int]:
@@ -202,9 +207,12 @@ class WarmPriorAdapter:
         batch: dict[str, Any],
         executed_steps: int | Tensor | None = None,
         predict: Callable[..., Tensor] | None = None,
+        delay: int = 0,
         **kwargs: Any,
     ) -> Tensor:
         """A new chunk, ``[B, T', d_a]`` in the model's units.
+
+        With a delay its first actions are the rest of the last chunk, which is executed meanwhile.
 
         Args:
             batch: a preprocessed observation.
@@ -212,10 +220,12 @@ class WarmPriorAdapter:
                 reset since, or ``[B]``; by default the policy's ``n_action_steps``, or as many as
                 :meth:`select_action` returned.
             predict: the policy's ``predict_action_chunk`` by default.
+            delay: control steps until the chunk takes effect.
             kwargs: handed to it.
 
         Raises:
-            ValueError: see :meth:`select_action`; also if more actions were executed than are remembered.
+            ValueError: see :meth:`select_action`; also if more actions were executed than are remembered, or
+                fewer are left of the last chunk than the delay needs.
         """
         call = self.policy.predict_action_chunk if predict is None else predict
         if self._sampling:  # on the way from select_action
@@ -224,8 +234,13 @@ class WarmPriorAdapter:
             self._memory.executed(executed_steps)
         elif self._memory.waits:
             self._memory.executed(self.policy.config.n_action_steps)
-        with self._from_source():
-            return call(batch, **kwargs)
+        self._delay = delay
+        try:
+            with self._from_source():
+                chunk = call(batch, **kwargs)
+        finally:
+            self._delay = 0
+        return self._spliced(chunk)
 
     def record_executed(self, action: Tensor) -> None:
         """Replace the last action of :meth:`select_action` by the executed one, as after clipping.
@@ -264,45 +279,52 @@ class WarmPriorAdapter:
 
     @contextmanager
     def _from_source(self) -> Iterator[None]:
-        with self.aside(), self.port.sampling(self.policy, self._source, self._record, self.nfe):
+        guided = self.guidance is not None
+        guiding = self.port.guiding(self.policy, self._guided) if guided else nullcontext()
+        with self.aside(), guiding, self.port.sampling(self.policy, self._source, self._record, self.nfe):
             yield
 
+    def _guided(self, velocity: Velocity) -> Velocity:
+        """A velocity of the whole chunk, guided towards the rest of the last one."""
+        assert self.guidance is not None
+        rest, left, delay, scale = self._rest
+        return self.guidance.guided(velocity, rest, left, delay, scale)
+
+    def _spliced(self, chunk: Tensor) -> Tensor:
+        """A chunk, in whose place the last one is still executed until it takes effect."""
+        rest, _, delay, _ = self._rest
+        return with_leftover(chunk, rest[:, : chunk.shape[1], : chunk.shape[2]], delay)
+
     def _window(self, batch: Mapping[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        missing = [name for name in ("action", "action_is_pad") if name not in batch]
+        length, history, lead = self.source.length, self.prior.history_length, self.source.lead
+        expected = {"action": len(self.action_indices)}
+        if HISTORY in batch:
+            expected = {"action": length, HISTORY: history}
+        missing = [name for key in expected for name in (key, f"{key}_is_pad") if name not in batch]
         if missing:
             raise KeyError(
                 f"the batch lacks {' and '.join(missing)}: the history would leak the target without the "
                 "mask that LeRobotDataset gives with delta_timestamps"
             )
-        actions, is_pad = batch["action"], batch["action_is_pad"].bool()
-        length, history = self.source.length, self.prior.history_length
-        if HISTORY in batch:
-            if HISTORY_IS_PAD not in batch:
-                raise KeyError(f"the batch has {HISTORY}, but not {HISTORY_IS_PAD}")
-            past, past_is_pad = batch[HISTORY], batch[HISTORY_IS_PAD].bool()
-            expected = [length, history]
-        else:
-            past, past_is_pad = actions, is_pad
-            expected = [len(self.action_indices)]
-            if actions.shape[1] == expected[0]:
-                before = max(history, self.source.lead)
-                past, past_is_pad = (value[:, :before][:, -history:] for value in (actions, is_pad))
-        given = [actions.shape[1], *([past.shape[1]] if HISTORY in batch else [])]
+        given = {key: batch[key].shape[1] for key in expected}
         if given != expected:
             raise ValueError(
-                f"the batch has windows of {given} actions, expected {expected}: {history} before the "
-                f"current step and T={length} of the chunk. Take the steps of adapter.action_indices "
-                "from the dataset"
+                f"the batch has windows of {[*given.values()]} actions, expected {[*expected.values()]}: "
+                f"{history} before the current step and T={length} of the chunk. Take the steps of "
+                "adapter.action_indices from the dataset"
             )
-        for name, mask, values in (
-            ("action_is_pad", is_pad, actions),
-            (HISTORY_IS_PAD if HISTORY in batch else "action_is_pad", past_is_pad, past),
-        ):
-            if mask.shape != values.shape[:2]:
+        for key in expected:
+            mask, wanted = batch[f"{key}_is_pad"].shape, batch[key].shape[:2]
+            if mask != wanted:
                 raise ValueError(
-                    f"{name} has shape {tuple(mask.shape)}, expected {tuple(values.shape[:2])}: it marks "
-                    "padding among all actions of the window, those of the history included"
+                    f"{key}_is_pad has shape {tuple(mask)}, expected {tuple(wanted)}: it marks padding among "
+                    "all actions of the window, those of the history included"
                 )
+        actions, is_pad = batch["action"], batch["action_is_pad"].bool()
+        if HISTORY in batch:
+            past, past_is_pad = batch[HISTORY], batch[HISTORY_IS_PAD].bool()
+        else:
+            past, past_is_pad = (v[:, : max(history, lead)][:, -history:] for v in (actions, is_pad))
         return past, ~past_is_pad, actions[:, -length:], is_pad[:, -length:]
 
     def _source(self, shape: torch.Size, dtype: torch.dtype, device: torch.device) -> Tensor:
@@ -317,21 +339,20 @@ class WarmPriorAdapter:
                 return relative.reanchor(actions, before, now)
 
         history = self._memory.decide(shape[0], device, move)
-        a0 = self.source.draw(history, self.generator)
+        source, left = self.source.distribution(history), history["forecast_steps"]
+        values = source.sample(self.generator), source.scale
+        a0, scale = (self.source.scaled(value, source.warm) for value in values)
+        delay = torch.where(left > 0, self._delay, 0)
+        if self._delay and self.source.lead:
+            raise ValueError("delay is for policies whose chunk begins at the current step: leave it out")
+        if self._delay and left.any():
+            (self.guidance or RealTimeChunking()).check_delay(self._delay, int(left[left > 0].min()))
+        rest, width = torch.zeros(shape, dtype=dtype, device=device), torch.ones(shape, device=device)
+        mine = (..., self.source.positions, slice(self.source.action_dim))
+        rest[mine], width[mine] = history["forecast"].to(dtype), scale
+        self._rest = rest, left, delay, width
         return self.source.place(a0, self.generator).to(dtype)
 
     def _record(self, actions: Tensor) -> None:
         self._state = self._now
-        self._memory.record(actions[:, self.source.positions, : self.source.action_dim])
-
-
-def _std(
-    policy: Any, unit: SigmaUnit, stats: Mapping[str, Mapping[str, Any]] | None, given: Tensor | None
-) -> Tensor | None:
-    if unit not in ("model", "std"):
-        raise ValueError(f"sigma_unit must be 'model' or 'std', got {unit!r}")
-    if unit == "model":
-        if given is not None:
-            raise ValueError("action_std has no effect with sigma_unit='model': give sigma_unit='std'")
-        return None
-    return action_std(policy, stats) if given is None else torch.as_tensor(given)
+        self._memory.record(self._spliced(actions)[:, self.source.positions, : self.source.action_dim])

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from functools import wraps
 from importlib.metadata import version
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -17,19 +18,70 @@ from warmprior.lerobot.injection import Source, SourceInjection
 
 __all__ = ["PORTS", "FlowPort", "check_steps", "port_for"]
 
+Velocity = Callable[[Tensor, Tensor], Tensor]
+"""``(t [B], a_t [B, T, D]) -> [B, T, D]``."""
+
 Record = Callable[[Tensor], None]
 """Takes what a sampler returned, ``[B, T, >= d_a]``."""
 
 
-class FlowPort(ABC):
+def check_steps(nfe: int | None) -> None:
+    """A ``ValueError`` for a number of integration steps below 1."""
+    if nfe is not None and nfe < 1:
+        raise ValueError(f"nfe is the number of integration steps: it must be at least 1, got {nfe}")
+
+
+def _place(policy: Any, path: str) -> tuple[Any, str]:
+    """The object below a policy that has the last name of a dotted path, and that name."""
+    owner, _, name = path.rpartition(".")
+    return (attrgetter(owner)(policy) if owner else policy), name
+
+
+@contextmanager
+def _steps(policy: Any, path: str, nfe: int | None) -> Iterator[None]:
+    """Changes the number of integration steps inside the context."""
+    holder, name = _place(policy, path)
+    before = getattr(holder, name)
+    setattr(holder, name, before if nfe is None else nfe)
+    try:
+        yield
+    finally:
+        setattr(holder, name, before)
+
+
+@contextmanager
+def _replaced(policy: Any, path: str, around: Callable[..., Any]) -> Iterator[None]:
+    """Calls ``around`` with a method, and its arguments, instead of the method inside the context."""
+    owner, name = _place(policy, path)
+    method, before = getattr(owner, name), vars(owner).get(name)
+
+    @wraps(method)
+    def called(*args: Any, **kwargs: Any) -> Any:
+        return around(method, *args, **kwargs)
+
+    vars(owner)[name] = called
+    try:
+        yield
+    finally:
+        if before is None:
+            del vars(owner)[name]
+        else:
+            vars(owner)[name] = before
+
+
+@dataclass(frozen=True)
+class FlowPort:
     """Describes a family of policies: the chunk's shape, and where its noise is drawn.
 
     The policies are not changed. Training and sampling run inside :meth:`training` and :meth:`sampling`,
-    which check that the source is used exactly once.
+    which check that the source is used exactly once. Families that do not draw their noise by ``torch.randn``
+    in the loss and in the sampler are subclasses.
 
-    See Also:
-        - :func:`~warmprior.lerobot.port_for`: finds the port of a policy.
-        - :data:`~warmprior.lerobot.PORTS`: all of them.
+    Args:
+        chunk_length: where in a policy the length of the noisy chunk is, as a dotted path.
+        chunk_width: likewise its width.
+        sampler: likewise the method that samples a chunk.
+        steps: likewise the number of integration steps.
 
     Examples:
         >>> from warmprior.lerobot import PORTS
@@ -40,13 +92,18 @@ class FlowPort(ABC):
         (50, 32, 0)
     """
 
-    @abstractmethod
+    chunk_length: str
+    chunk_width: str
+    sampler: str
+    steps: str
+
     def length(self, policy: Any) -> int:
         """``T``, the length of the noisy chunk."""
+        return int(attrgetter(self.chunk_length)(policy))
 
-    @abstractmethod
     def width(self, policy: Any) -> int:
         """``D``, the width of the noisy chunk, with padding beyond the action's."""
+        return int(attrgetter(self.chunk_width)(policy))
 
     def lead(self, policy: Any) -> int:
         """Positions of the chunk that lie before the current step."""
@@ -56,182 +113,49 @@ class FlowPort(ABC):
         """How the preprocessor normalises actions, by LeRobot's name: ``"MEAN_STD"``, ``"MIN_MAX"``."""
         return getattr(policy.config.normalization_mapping.get("ACTION"), "value", None)
 
-    @abstractmethod
     def check(self, policy: Any) -> None:
         """Refuse options that would make the source inexact, with a ``ValueError`` that names one."""
 
-    @abstractmethod
     def training(self, policy: Any, source: Source) -> AbstractContextManager[Any]:
         """Context of one ``policy.forward``, whose loss uses this source."""
+        return SourceInjection(self.length(policy), self.width(policy), source)
 
-    @abstractmethod
-    def sampling(
-        self, policy: Any, source: Source, record: Record, nfe: int | None = None
-    ) -> AbstractContextManager[Any]:
+    @contextmanager
+    def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
         """Context of ``select_action`` or ``predict_action_chunk``: new chunks start from the source.
 
         ``record`` is called with each chunk, its positions and dimensions of padding.
         """
 
+        def sampled(sample: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            output = self.sample(policy, source, sample, *args, **kwargs)
+            record(output if isinstance(output, Tensor) else output["action_pred"])
+            return output
+
+        with _steps(policy, self.steps, nfe), _replaced(policy, self.sampler, sampled):
+            yield
+
+    def sample(
+        self, policy: Any, source: Source, sample: Callable[..., Any], *args: Any, **kwargs: Any
+    ) -> Any:
+        """Call the policy's sampler, with its noise from the source."""
+        with SourceInjection(self.length(policy), self.width(policy), source):
+            return sample(*args, **kwargs)
+
+    def guiding(self, policy: Any, guide: Callable[[Velocity], Velocity]) -> AbstractContextManager[Any]:
+        """Context in which ``guide`` changes the sampler's velocities, whose source is at time 0."""
+        raise ValueError(f"guidance is for pi0, pi05 and smolvla: leave it out with {type(policy).__name__}")
+
     def predict(self, policy: Any, batch: dict[str, Any]) -> None:
         """Sample a chunk for a batch of observations, without a queue."""
         policy.predict_action_chunk(batch)
-
-    def __reduce_ex__(self, protocol: Any) -> Any:
-        """Known ports are pickled and copied by name, because their lambdas cannot be."""
-        for release, ports in PORTS.items():
-            for name, port in ports.items():
-                if port is self:
-                    return _known, (release, name)
-        return super().__reduce_ex__(protocol)
-
-
-def _known(release: str, name: str) -> FlowPort:
-    return PORTS[release][name]
-
-
-def check_steps(nfe: int | None) -> None:
-    """A ``ValueError`` for a number of integration steps below 1."""
-    if nfe is not None and nfe < 1:
-        raise ValueError(f"nfe is the number of integration steps: it must be at least 1, got {nfe}")
-
-
-@contextmanager
-def _steps(holder: Any, name: str, nfe: int | None) -> Iterator[None]:
-    """Changes the number of integration steps inside the context."""
-    before = getattr(holder, name)
-    setattr(holder, name, before if nfe is None else nfe)
-    try:
-        yield
-    finally:
-        setattr(holder, name, before)
-
-
-@contextmanager
-def _replaced(owner: Any, name: str, around: Callable[[Callable[..., Any]], Any]) -> Iterator[None]:
-    """Wraps a method of one instance inside the context."""
-    method, before = getattr(owner, name), vars(owner).get(name)
-    vars(owner)[name] = wraps(method)(around(method))
-    try:
-        yield
-    finally:
-        if before is None:
-            del vars(owner)[name]
-        else:
-            vars(owner)[name] = before
-
-
-class DrawnPort(FlowPort):
-    """For policies that draw their noise with ``torch.randn`` inside a sampler.
-
-    Args:
-        length: attribute of the model's configuration.
-        width: attribute of its width.
-        sampler: ``policy -> (object, name of its method)``.
-        steps: ``policy -> (object, name of its attribute)``, the number of integration steps.
-        model_config: ``policy -> `` the configuration that the two are read from.
-        predicted: what of the sampler's output is the chunk.
-        lead: ``policy -> `` positions before the current step.
-        check: see :meth:`FlowPort.check`.
-        predict: see :meth:`FlowPort.predict`.
-    """
-
-    def __init__(
-        self,
-        length: str,
-        width: Callable[[Any], int],
-        sampler: Callable[[Any], tuple[Any, str]],
-        steps: Callable[[Any], tuple[Any, str]],
-        *,
-        model_config: Callable[[Any], Any] = lambda policy: policy.config,
-        predicted: Callable[[Any], Tensor] = lambda output: output,
-        lead: Callable[[Any], int] = lambda policy: 0,
-        check: Callable[[Any], None] = lambda policy: None,
-        predict: Callable[[Any, dict[str, Any]], Any] = (
-            lambda policy, batch: policy.predict_action_chunk(batch)
-        ),
-    ) -> None:
-        self._length, self._width, self._sampler = length, width, sampler
-        self._steps, self._predict = steps, predict
-        self._model_config, self._predicted = model_config, predicted
-        self._lead, self._check = lead, check
-
-    def length(self, policy: Any) -> int:
-        """``T``."""
-        return int(getattr(self._model_config(policy), self._length))
-
-    def width(self, policy: Any) -> int:
-        """``D``."""
-        return int(self._width(policy))
-
-    def lead(self, policy: Any) -> int:
-        """Observations before the last one, as the chunk begins with the first."""
-        return self._lead(policy)
-
-    def check(self, policy: Any) -> None:
-        """See :meth:`FlowPort.check`."""
-        self._check(policy)
-
-    def training(self, policy: Any, source: Source) -> AbstractContextManager[Any]:
-        """The draw in the loss."""
-        return SourceInjection(self.length(policy), self.width(policy), source)
-
-    def predict(self, policy: Any, batch: dict[str, Any]) -> None:
-        """See :meth:`FlowPort.predict`."""
-        self._predict(policy, batch)
-
-    @contextmanager
-    def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
-        """The draw in the sampler."""
-
-        def around(sample: Callable[..., Any]) -> Callable[..., Any]:
-            def sampled(*args: Any, **kwargs: Any) -> Any:
-                with SourceInjection(self.length(policy), self.width(policy), source):
-                    output = sample(*args, **kwargs)
-                record(self._predicted(output))
-                return output
-
-            return sampled
-
-        with _steps(*self._steps(policy), nfe), _replaced(*self._sampler(policy), around):
-            yield
-
-
-class GrootN15Port(DrawnPort):
-    """For GR00T N1.5, which deviates from its configuration."""
-
-    def normalization(self, policy: Any) -> str:
-        """Its preprocessor takes minima and maxima, whatever its ``normalization_mapping``."""
-        return "MIN_MAX"
-
-    @contextmanager
-    def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
-        """The draw in the sampler; ``select_action`` executes the first actions of a chunk."""
-
-        def around(predict: Callable[..., Tensor]) -> Callable[..., Tensor]:
-            def predicted(*args: Any, **kwargs: Any) -> Tensor:
-                # Its queue takes the whole chunk and keeps the last n_action_steps actions.
-                return predict(*args, **kwargs)[:, : policy.config.n_action_steps]
-
-            return predicted
-
-        with _replaced(policy, "predict_action_chunk", around), super().sampling(policy, source, record, nfe):
-            yield
 
 
 class OpenPiPort(FlowPort):
     """For pi0, pi0.5 and SmolVLA, whose models take the noise as an argument (compiled ones too)."""
 
-    def length(self, policy: Any) -> int:
-        """``T``."""
-        return int(policy.config.chunk_size)
-
-    def width(self, policy: Any) -> int:
-        """``D``."""
-        return int(policy.config.max_action_dim)
-
     def check(self, policy: Any) -> None:
-        """See :meth:`FlowPort.check`."""
+        """Of the options that only these have."""
         if getattr(policy.config, "adapt_to_pi_aloha", False):
             raise ValueError(
                 "adapt_to_pi_aloha=True gives actions in another space than the model's, so the source "
@@ -243,17 +167,14 @@ class OpenPiPort(FlowPort):
         """The model's argument."""
         signature, calls = inspect.signature(type(policy.model).forward), []
 
-        def around(forward: Callable[..., Any]) -> Callable[..., Any]:
-            def from_source(*args: Any, **kwargs: Any) -> Any:
-                bound = signature.bind(policy.model, *args, **kwargs)
-                actions = bound.arguments["actions"]
-                calls.append(actions.shape)
-                bound.arguments["noise"] = source(actions.shape, torch.float32, actions.device)
-                return forward(*bound.args[1:], **bound.kwargs)
+        def from_source(forward: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+            bound = signature.bind(policy.model, *args, **kwargs)
+            actions = bound.arguments["actions"]
+            calls.append(actions.shape)
+            bound.arguments["noise"] = source(actions.shape, torch.float32, actions.device)
+            return forward(*bound.args[1:], **bound.kwargs)
 
-            return from_source
-
-        with _replaced(policy.model, "forward", around):
+        with _replaced(policy, "model.forward", from_source):
             yield
         if len(calls) != 1:
             raise RuntimeError(
@@ -261,109 +182,135 @@ class OpenPiPort(FlowPort):
                 "source cannot be replaced. Use the version of lerobot that this port is for"
             )
 
+    def sample(
+        self, policy: Any, source: Source, sample: Callable[..., Any], *args: Any, **kwargs: Any
+    ) -> Any:
+        """The sampler's argument."""
+        if kwargs.get("noise") is not None:
+            raise ValueError(
+                "the prior gives noise=: leave it out, and put no second prior around a "
+                "policy that has one (warm_smolvla, warm_pi05)"
+            )
+        image = args[0][0]
+        shape = torch.Size((len(image), self.length(policy), self.width(policy)))
+        return sample(*args, **kwargs | {"noise": source(shape, torch.float32, image.device)})
+
+    def guiding(self, policy: Any, guide: Callable[[Velocity], Velocity]) -> AbstractContextManager[Any]:
+        """These families integrate from 1, the source, to 0: velocities have the other sign."""
+        rtc = getattr(policy.config, "rtc_config", None)
+        if rtc is not None and rtc.enabled:
+            raise ValueError("the policy's own rtc_config guides already: turn it off, or leave out guidance")
+
+        def guided(
+            step: Callable[..., Tensor], *args: Any, x_t: Tensor, timestep: Tensor, **kw: Any
+        ) -> Tensor:
+            def velocity(t: Tensor, a: Tensor) -> Tensor:
+                return -step(*args, x_t=a, timestep=1 - t, **kw)
+
+            return -guide(velocity)(1 - timestep, x_t)
+
+        return _replaced(policy, "model.denoise_step", guided)
+
+
+class GrootPort(FlowPort):
+    """For GR00T N1.7."""
+
+    def check(self, policy: Any) -> None:
+        """Of relative actions."""
+        if getattr(policy.config, "use_relative_actions", False):
+            raise ValueError(
+                "GR00T's own relative actions (use_relative_actions=True) cannot be expressed at the next "
+                "state from outside: train with absolute actions"
+            )
+
+
+class GrootN15Port(FlowPort):
+    """For GR00T N1.5, which deviates from its configuration."""
+
+    def check(self, policy: Any) -> None:
+        """Of copies of the batch."""
+        copies = policy._groot_model.action_head.config.expand_batch
+        if copies not in (None, 1):
+            raise ValueError(
+                f"the action head repeats each batch {copies} times before it draws noise "
+                f"(expand_batch={copies}), and the history is not repeated with it: set it to None, and take "
+                "a larger batch"
+            )
+
+    def normalization(self, policy: Any) -> str:
+        """Its preprocessor takes minima and maxima, whatever its ``normalization_mapping``."""
+        return "MIN_MAX"
+
     @contextmanager
     def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
-        """The sampler's argument."""
-        length, width = self.length(policy), self.width(policy)
+        """``select_action`` executes the first actions of a chunk."""
 
-        def around(sample: Callable[..., Any]) -> Callable[..., Any]:
-            def sampled(images: Any, *args: Any, **kwargs: Any) -> Tensor:
-                if kwargs.get("noise") is not None:
-                    raise ValueError(
-                        "the prior gives noise=: leave it out, and put no second prior around a "
-                        "policy that has one (warm_smolvla, warm_pi05)"
-                    )
-                shape = torch.Size((images[0].shape[0], length, width))
-                kwargs["noise"] = source(shape, torch.float32, images[0].device)
-                actions = sample(images, *args, **kwargs)
-                record(actions)
-                return actions
+        def predicted(predict: Callable[..., Tensor], *args: Any, **kwargs: Any) -> Tensor:
+            # Its queue takes the whole chunk and keeps the last n_action_steps actions.
+            return predict(*args, **kwargs)[:, : policy.config.n_action_steps]
 
-            return sampled
-
-        # SmolVLA calls it by another name.
-        steps = "num_steps" if hasattr(policy.config, "num_steps") else "num_inference_steps"
-        with _steps(policy.config, steps, nfe), _replaced(policy.model, "sample_actions", around):
+        with (
+            _replaced(policy, "predict_action_chunk", predicted),
+            super().sampling(policy, source, record, nfe),
+        ):
             yield
 
 
-def _check_groot(policy: Any) -> None:
-    if getattr(policy.config, "use_relative_actions", False):
-        raise ValueError(
-            "GR00T's own relative actions (use_relative_actions=True) cannot be expressed at the next "
-            "state from outside: train with absolute actions"
-        )
+class MultiTaskDiTPort(FlowPort):
+    """For multi_task_dit, whose chunk begins with the first of its observations."""
+
+    def lead(self, policy: Any) -> int:
+        """Observations before the last one."""
+        return policy.config.n_obs_steps - 1
+
+    def check(self, policy: Any) -> None:
+        """Of its objective."""
+        if policy.config.objective != "flow_matching":
+            raise ValueError(
+                f"multi_task_dit with objective={policy.config.objective!r} is no flow: set "
+                "objective='flow_matching'"
+            )
+
+    def predict(self, policy: Any, batch: dict[str, Any]) -> None:
+        """Its own ``predict_action_chunk`` takes the observations from its queue."""
+        policy.eval()
+        if policy.config.n_obs_steps == 1:  # the queue adds a time dimension even to a single one
+            seen = policy.config.input_features
+            batch = {name: v.unsqueeze(1) if name in seen else v for name, v in batch.items()}
+        with torch.no_grad():
+            policy._generate_actions(policy._prepare_batch(batch))
 
 
-def _check_groot_n15(policy: Any) -> None:
-    copies = policy._groot_model.action_head.config.expand_batch
-    if copies not in (None, 1):
-        raise ValueError(
-            f"the action head repeats each batch {copies} times before it draws noise "
-            f"(expand_batch={copies}), and the history is not repeated with it: set it to None, and take "
-            "a larger batch"
-        )
-
-
-def _check_multi_task_dit(policy: Any) -> None:
-    if policy.config.objective != "flow_matching":
-        raise ValueError(
-            f"multi_task_dit with objective={policy.config.objective!r} is no flow: set "
-            "objective='flow_matching'"
-        )
-
-
-def _predict_multi_task_dit(policy: Any, batch: dict[str, Any]) -> None:
-    # Its own predict_action_chunk takes the observations from its queue.
-    policy.eval()
-    if policy.config.n_obs_steps == 1:  # the queue adds a time dimension even to a single one
-        seen = policy.config.input_features
-        batch = {name: v.unsqueeze(1) if name in seen else v for name, v in batch.items()}
-    with torch.no_grad():
-        policy._generate_actions(policy._prepare_batch(batch))
-
-
-_openpi = OpenPiPort()
+_OPENPI = "config.chunk_size", "config.max_action_dim", "model.sample_actions"
+_HEAD = "_groot_model.action_head"
 
 PORTS: dict[str, dict[str, FlowPort]] = {
     "0.6": {
-        "pi0": _openpi,
-        "pi05": _openpi,
-        "smolvla": _openpi,
-        "groot": DrawnPort(
-            "action_horizon",
-            lambda policy: policy._groot_model.config.max_action_dim,
-            lambda policy: (policy._groot_model.action_head, "get_action_with_features"),
-            lambda policy: (policy._groot_model.action_head, "num_inference_timesteps"),
-            model_config=lambda policy: policy._groot_model.config,
-            predicted=lambda output: output["action_pred"],
-            check=_check_groot,
+        "pi0": OpenPiPort(*_OPENPI, "config.num_inference_steps"),
+        "pi05": OpenPiPort(*_OPENPI, "config.num_inference_steps"),
+        "smolvla": OpenPiPort(*_OPENPI, "config.num_steps"),
+        "groot": GrootPort(
+            "_groot_model.config.action_horizon",
+            "_groot_model.config.max_action_dim",
+            f"{_HEAD}.get_action_with_features",
+            f"{_HEAD}.num_inference_timesteps",
         ),
-        "multi_task_dit": DrawnPort(
-            "horizon",
-            lambda policy: policy.config.action_feature.shape[0],
-            lambda policy: (policy.objective, "conditional_sample"),
-            lambda policy: (policy.objective.config, "num_integration_steps"),
-            lead=lambda policy: policy.config.n_obs_steps - 1,
-            check=_check_multi_task_dit,
-            predict=_predict_multi_task_dit,
+        "multi_task_dit": MultiTaskDiTPort(
+            "config.horizon",
+            "objective.action_dim",
+            "objective.conditional_sample",
+            "objective.config.num_integration_steps",
         ),
-        "xvla": DrawnPort(
-            "chunk_size",
-            lambda policy: policy.model.dim_action,
-            lambda policy: (policy.model, "generate_actions"),
-            lambda policy: (policy.config, "num_denoising_steps"),
+        "xvla": FlowPort(
+            "config.chunk_size", "model.dim_action", "model.generate_actions", "config.num_denoising_steps"
         ),
     },
     "0.5.1": {
         "groot": GrootN15Port(
-            "action_horizon",
-            lambda policy: policy._groot_model.action_head.config.action_dim,
-            lambda policy: (policy._groot_model.action_head, "get_action"),
-            lambda policy: (policy._groot_model.action_head, "num_inference_timesteps"),
-            model_config=lambda policy: policy._groot_model.action_head.config,
-            predicted=lambda output: output["action_pred"],
-            check=_check_groot_n15,
+            f"{_HEAD}.config.action_horizon",
+            f"{_HEAD}.config.action_dim",
+            f"{_HEAD}.get_action",
+            f"{_HEAD}.num_inference_timesteps",
         )
     },
 }
@@ -379,10 +326,6 @@ def port_for(policy: Any) -> FlowPort:
     Raises:
         ValueError: if there is none, or it does not support the policy's options.
         ImportError: if there is none for this release.
-
-    See Also:
-        - :class:`~warmprior.lerobot.FlowPort`: what it returns.
-        - :data:`~warmprior.lerobot.PORTS`: all of them.
 
     Examples:
         >>> from warmprior.lerobot import port_for

@@ -23,10 +23,6 @@ class RelativeActions:
     Raises:
         ValueError: if the pipelines lack the steps, or have relative actions turned off.
 
-    See Also:
-        - :class:`~warmprior.lerobot.ActionMemory`: remembers the actions.
-        - :class:`~warmprior.lerobot.WarmPriorAdapter`: takes it as ``relative``.
-
     Examples:
         >>> from warmprior.lerobot import RelativeActions
         >>> relative = RelativeActions(preprocessor, postprocessor)  # doctest: +SKIP

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -14,9 +14,7 @@ from warmprior.history import check_history, cold_history, window_history, witho
 from warmprior.lerobot.ports import port_for
 from warmprior.modules.prior import Prior, Source
 
-__all__ = ["ChunkSource", "SigmaUnit", "action_std"]
-
-SigmaUnit = Literal["model", "std"]
+__all__ = ["ChunkSource", "action_std"]
 
 
 class ChunkSource:
@@ -36,10 +34,6 @@ class ChunkSource:
 
     Raises:
         ValueError: if the prior does not fit the policy.
-
-    See Also:
-        - :class:`~warmprior.lerobot.LeRobotFlow`: integrates from its samples.
-        - :class:`~warmprior.lerobot.WarmPriorAdapter`: gives it to a policy of LeRobot.
 
     Examples:
         >>> from warmprior.lerobot import ChunkSource
@@ -179,9 +173,6 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
         ValueError: if needed statistics are missing, a dimension never varies, the policy normalises actions
             elsewhere, or it has no port.
 
-    See Also:
-        :class:`~warmprior.lerobot.WarmPriorAdapter`: uses these units for ``sigma``.
-
     Examples:
         >>> from warmprior.lerobot import action_std
         >>> from types import SimpleNamespace
@@ -202,13 +193,13 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
     if mode not in needs:
         raise ValueError(
             f"{type(policy).__name__} normalises actions by its own means ({mode}): give their standard "
-            "deviation in the model's units as action_std, or use sigma_unit='model'"
+            "deviation in the model's units as std, or leave it out"
         )
     missing = [name for name in needs[mode] if name not in own]
     if missing:
         raise ValueError(
-            f"sigma_unit='std' needs the statistics {', '.join(missing)} of 'action' for {mode} "
-            "normalisation: give stats=dataset.meta.stats"
+            f"the standard deviation needs the statistics {', '.join(missing)} of 'action' for {mode} "
+            "normalisation: give dataset.meta.stats"
         )
     std, *bounds = (torch.as_tensor(own[name], dtype=torch.float32) for name in needs[mode])
     if mode == "MEAN_STD":
@@ -218,8 +209,8 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
     still = [i for i, value in enumerate(unit.tolist()) if not 0 < value < math.inf]
     if still:
         raise ValueError(
-            f"sigma_unit='std' needs actions that vary: dimensions {still} have std "
+            f"units of the standard deviation need actions that vary: dimensions {still} have std "
             f"{std[still].tolist()} between {needs[mode][1]} {low[still].tolist()} and {needs[mode][2]} "
-            f"{high[still].tolist()}. Give action_std in the model's units, or use sigma_unit='model'"
+            f"{high[still].tolist()}. Give std in the model's units, or leave it out"
         )
     return unit

@@ -16,16 +16,16 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
-from warmprior.data import download_mimicgen, download_robomimic, generate_demonstrations
+from warmprior.data import download_robomimic, generate_demonstrations
 from warmprior.data.index import DatasetIndex
-from warmprior.data.opening import Demonstrations, open_demonstrations
+from warmprior.data.opening import Demonstrations
 from warmprior.data.render import renderer_versions
 from warmprior.data.replay import DemonstrationReplay
 from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
 from warmprior.envs.simulator import task_env_args
-from warmprior.envs.tasks import TASKS, get_task
+from warmprior.envs.tasks import TASKS
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.normalize import Normalizer
@@ -290,7 +290,7 @@ def robosuite_task(
 
 def _open(place: Path | str, task: str | None, mask: str | None = None) -> Demonstrations:
     """The demonstrations at a place; the task's environment is theirs where they do not say."""
-    return open_demonstrations(place, task_env_args(task) if task in TASKS else None, mask)
+    return Demonstrations(place, task_env_args(task) if task in TASKS else None, mask)
 
 
 def _names(images: Mapping[str, Any] | None) -> list[str]:
@@ -418,9 +418,7 @@ def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tup
     if options.dataset is not None:
         return options.dataset, "file"
     if options.download:
-        theirs = is_mimicgen(get_task(str(name)).env_name)
-        download = download_mimicgen if theirs else download_robomimic
-        return download(str(name), style, force=options.force_download), "official"
+        return download_robomimic(str(name), style, force=options.force_download), "official"
     return generate_demonstrations(str(name), style, options.count(style)), "scripted"
 
 

@@ -35,7 +35,7 @@ class WarmupRatioConfig(LRSchedulerConfig):
 @PreTrainedConfig.register_subclass("warm_flow")
 @dataclass
 class WarmFlowConfig(PreTrainedConfig):
-    """The paper's policy from state: a ChiTransformer that carries the prior's source to a chunk.
+    """The paper's policy from state and images: a ChiTransformer that carries the prior's source to a chunk.
 
     The recipe is the paper's (Table 3), but for the preconditioning, which `precondition=false` turns off.
 
@@ -52,6 +52,10 @@ class WarmFlowConfig(PreTrainedConfig):
         num_layers: its depth.
         num_heads: its attention heads.
         dropout: of its layers.
+        encoder: of images, a network per camera: ``resnet18-imagenet`` starts from ImageNet's weights, which
+            torchvision downloads once; ``resnet18`` and ``small`` start from random ones.
+        image_size: side in pixels to which images are resized.
+        crop_size: side of their random window that is seen in training, the central one else.
     """
 
     n_obs_steps: int = 2
@@ -66,10 +70,14 @@ class WarmFlowConfig(PreTrainedConfig):
     num_layers: int = 8
     num_heads: int = 6
     dropout: float = 0.1
+    encoder: str = "resnet18-imagenet"
+    image_size: int = 84
+    crop_size: int = 76
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: {
             "STATE": NormalizationMode.MIN_MAX,
             "ENV": NormalizationMode.MIN_MAX,
+            "VISUAL": NormalizationMode.IDENTITY,  # the encoder has ImageNet's statistics
             "ACTION": NormalizationMode.MIN_MAX,
         }
     )
@@ -97,14 +105,14 @@ class WarmFlowConfig(PreTrainedConfig):
         """Refuse datasets that the policy cannot learn from.
 
         Raises:
-            ValueError: if there is no state, or there are images.
+            ValueError: if there is no state, or an image has no three channels.
         """
-        images = [n for n, e in self.input_features.items() if e.type is FeatureType.VISUAL]
-        if images:
-            raise ValueError(
-                f"warm_flow sees no images, and the dataset has {', '.join(images)}: take warm_smolvla or "
-                "warm_pi05, or name --policy.input_features without them"
-            )
+        for name, feature in self.image_features.items():
+            if feature.shape[0] != 3:
+                raise ValueError(
+                    f"warm_flow sees images [3, h, w], and {name} is {list(feature.shape)}: name "
+                    "--policy.input_features without it"
+                )
         if not self.observed:
             raise ValueError("warm_flow needs observation.state or observation.environment_state")
         if self.action_feature is None:

@@ -13,14 +13,17 @@ from lerobot.policies.utils import populate_queues
 from lerobot.processor import NormalizerProcessorStep, TransitionKey
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.nn.functional import interpolate
 
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from warmprior import (
     ChiTransformer,
     FlowMatchingLoss,
+    ImageEncoder,
     PreconditionedNetwork,
     Prior,
     VelocityNetwork,
+    VisionNetwork,
     WarmPriorActor,
     WithheldHistory,
     keys,
@@ -28,6 +31,7 @@ from warmprior import (
 from warmprior.data import lerobot_steps
 from warmprior.history import window_history
 from warmprior.lerobot import ActionMemory
+from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.training import ema_of, precondition
 
@@ -61,6 +65,14 @@ class WarmFlowPolicy(PreTrainedPolicy):
                 "preview or gaussian"
             )
         width = sum(config.input_features[name].shape[0] for name in config.observed)
+        self._cameras, encoder = list(config.image_features), None
+        if self._cameras:
+            size = {"image_size": config.image_size, "crop_size": config.crop_size}
+            backbone, _, pretrained = config.encoder.partition("-")
+            encoder = ImageEncoder(self._cameras, width, backbone=backbone, **size)
+            if pretrained and dataset_meta is not None:  # a saved policy has its weights in its file
+                load_imagenet(encoder)
+            width = encoder.observation_dim
         sizes = (config.action_feature.shape[0], width, prior.prediction_length, config.n_obs_steps)
         if config.network:
             try:
@@ -86,7 +98,10 @@ class WarmFlowPolicy(PreTrainedPolicy):
                 num_heads=config.num_heads,
                 dropout=config.dropout,
             )
-        if config.precondition and not isinstance(network, PreconditionedNetwork):
+        preconditioned = isinstance(network, PreconditionedNetwork)
+        if encoder is not None:
+            network = VisionNetwork(encoder, network)
+        if config.precondition and not preconditioned:
             network = self._preconditioned(network, prior, dataset_meta)
         # What the data span is [-1, 1]; nothing beyond it is executed, nor remembered. In other units than
         # those of the extremes it is not known.
@@ -133,7 +148,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
 
     def reset(self) -> None:
         """New episodes in all environments."""
-        self._queues = {name: deque(maxlen=self.config.n_obs_steps) for name in self.config.observed}
+        seen = (*self.config.observed, *self._cameras)
+        self._queues = {name: deque(maxlen=self.config.n_obs_steps) for name in seen}
         self._queues["action"] = deque(maxlen=self.config.n_action_steps)
         prior = self.actor.prior
         self.__dict__["_memory"] = ActionMemory(prior, self.config.action_feature.shape[0])
@@ -143,7 +159,7 @@ class WarmFlowPolicy(PreTrainedPolicy):
 
         Args:
             batch: ``"action"`` ``[B, H + P, d_a]`` and ``"action_is_pad"``, with the actions before in front,
-                and the observations ``[B, To, d]``.
+                the observations ``[B, To, d]``, and images in [0, 1] ``[B, To, 3, h, w]``.
 
         Raises:
             KeyError: if the mask is missing, without which the history would leak the target.
@@ -187,7 +203,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
         """A new chunk, ``[B, P, d_a]``, normalised.
 
         Args:
-            batch: the present observations ``[B, d]``; those before are remembered, since :meth:`reset`.
+            batch: the present observations ``[B, d]`` and images ``[B, 3, h, w]``; those before are
+                remembered, since :meth:`reset`.
             kwargs: nothing of it is needed.
         """
         self._remember(batch)
@@ -205,14 +222,15 @@ class WarmFlowPolicy(PreTrainedPolicy):
         return self._queues["action"].popleft()
 
     def _remember(self, batch: dict[str, Tensor]) -> None:
-        seen = {name: batch[name] for name in self.config.observed}
-        self._queues = populate_queues(self._queues, seen)
+        # LeRobot's helper takes what has a queue of its own; actions are queued apart.
+        self._queues = populate_queues(self._queues, batch, exclude_keys=["action"])
 
     def _chunk(self) -> Tensor:
         self.eval()
-        seen = {name: torch.stack(list(self._queues[name]), dim=1) for name in self.config.observed}
+        seen = {n: torch.stack(list(q), dim=1) for n, q in self._queues.items() if n != "action"}
         observation = self._observation(seen)
-        history = self._memory.decide(len(observation), observation.device)
+        first = seen[self.config.observed[0]]
+        history = self._memory.decide(len(first), first.device)
         data = TensorDict({keys.OBSERVATION: observation, keys.HISTORY: history}, history.shape)
         acting = self.actor
         if self.averaged.n_averaged:
@@ -221,6 +239,18 @@ class WarmFlowPolicy(PreTrainedPolicy):
         self._memory.record(chunk)
         return chunk
 
-    def _observation(self, batch: dict[str, Tensor]) -> Tensor:
-        """``[B, To, d_o]``."""
-        return torch.cat([batch[name] for name in self.config.observed], dim=-1)
+    def _observation(self, batch: dict[str, Tensor]) -> Tensor | TensorDict:
+        """``[B, To, d_o]``, with images as the entries of an encoder."""
+        vector = torch.cat([batch[name] for name in self.config.observed], dim=-1)
+        if not self._cameras:
+            return vector
+        images = {name: self._pixels(batch[name]) for name in self._cameras}
+        return TensorDict({keys.STATE: vector, **images}, [len(vector)])
+
+    def _pixels(self, images: Tensor) -> Tensor:
+        """Images in [0, 1], ``[B, To, 3, h, w]``, as uint8 squares."""
+        side = self.config.image_size
+        flat = images.flatten(0, 1)
+        if flat.shape[-2:] != (side, side):
+            flat = interpolate(flat, (side, side), mode="bilinear", antialias=True)
+        return (255 * flat).round().clamp(0, 255).to(torch.uint8).unflatten(0, images.shape[:2])

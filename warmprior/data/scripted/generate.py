@@ -40,7 +40,6 @@ def generate_demonstrations(
     *,
     path: str | Path | None = None,
     overwrite: bool = False,
-    cache_dir: str | Path | None = None,
     workers: int | None = None,
     progress: bool = True,
 ) -> Path:
@@ -58,10 +57,9 @@ def generate_demonstrations(
         style: ``"ph"`` for one skilled operator, ``"mh"`` for six of three levels.
         n: number of demonstrations.
         seed: 0 to 99; files of different seeds share no episode.
-        path: where to write. ``None`` for the cache, from which a file generated earlier with the same
-            arguments is returned at once.
+        path: where to write. ``None`` for the cache (``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if
+            that is not set), from which a file generated earlier with the same arguments is returned at once.
         overwrite: replace what is at ``path``.
-        cache_dir: ``None`` for ``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set.
         workers: number of processes; ``None`` for one per available core.
         progress: show a bar with the remaining time.
 
@@ -100,7 +98,7 @@ def generate_demonstrations(
             raise ValueError(f"{name} must be at least 1, got {value}")
     if path is None:
         name = f"{task}_{style}_n{n}_seed{seed}_v{GENERATOR_VERSION}.hdf5"
-        path = cache_folder(cache_dir) / "scripted" / name
+        path = cache_folder() / "scripted" / name
         if path.exists():
             return path
     path = Path(path)

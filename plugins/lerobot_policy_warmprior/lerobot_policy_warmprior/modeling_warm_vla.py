@@ -1,54 +1,19 @@
-"""What the warm policies share: options of the source, and where the policy's own methods go through it."""
+"""SmolVLA and PI05 with the source of a prior: the policy's own methods go through the adapter."""
 
 from __future__ import annotations
 
 import inspect
-from dataclasses import dataclass
 from typing import Any
 
 import torch
+from lerobot.policies.pi05.modeling_pi05 import PI05Policy
+from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from torch import Tensor
 
-from warmprior import Prior
-from warmprior.lerobot import WarmPriorAdapter, action_std, history_indices
-from warmprior.modules.registry import find, make
+from lerobot_policy_warmprior.configuration_warm_vla import WarmPI05Config, WarmSmolVLAConfig
+from warmprior.lerobot import WarmPriorAdapter, action_std
 
-__all__ = ["WarmConfigMixin", "WarmPolicyMixin"]
-
-
-@dataclass
-class WarmConfigMixin:
-    """Options of the source, beside those of the policy.
-
-    Attributes:
-        prior: its name, with options, such as ``past``, ``preview`` or ``past,sigma=0.3``.
-        prior_chunk: ``H``, the actions that it remembers; by default as many as the chunk allows.
-        sigma_unit: what sigma is in units of: ``model`` or ``std``, see
-            :class:`~warmprior.lerobot.WarmPriorAdapter`.
-        action_std: taken from the dataset for ``std``, and kept with the policy.
-        cold_probability: share of the training windows whose history is withheld.
-    """
-
-    prior: str = "past"
-    prior_chunk: int | None = None
-    sigma_unit: str = "model"
-    action_std: list[float] | None = None
-    cold_probability: float = 0.0
-
-    def make_prior(self) -> Prior:
-        """The source distribution.
-
-        Raises:
-            ValueError: if there is none of that name and these options.
-        """
-        kind = find(Prior, self.prior.partition(",")[0])
-        room = self.chunk_size // kind.prediction_chunks
-        return make(Prior, self.prior, room if self.prior_chunk is None else self.prior_chunk)
-
-    @property
-    def action_delta_indices(self) -> list[int]:
-        """Steps that LeRobot loads of every action: the history, and the chunk."""
-        return history_indices(self.make_prior().history_length, self.chunk_size)
+__all__ = ["WarmPI05Policy", "WarmSmolVLAPolicy"]
 
 
 class WarmPolicyMixin:
@@ -62,6 +27,8 @@ class WarmPolicyMixin:
             )
         self.__dict__["warm_adapter"] = None  # the policy's own constructor resets
         super().__init__(config, *args, **kwargs)
+        if config.sigma_unit not in ("model", "std"):
+            raise ValueError(f"sigma_unit must be 'model' or 'std', got {config.sigma_unit!r}")
         if config.sigma_unit == "std" and config.action_std is None:
             config.action_std = action_std(self, dataset_stats).tolist()
         std = torch.tensor(config.action_std) if config.sigma_unit == "std" else None
@@ -70,8 +37,7 @@ class WarmPolicyMixin:
         self.__dict__["warm_adapter"] = WarmPriorAdapter(
             self,
             prior,
-            sigma_unit=config.sigma_unit,
-            action_std=std,
+            std=std,
             cold_probability=config.cold_probability,
         )
 
@@ -95,3 +61,17 @@ class WarmPolicyMixin:
         super().reset()
         if self.warm_adapter is not None:
             self.warm_adapter.forget()
+
+
+class WarmSmolVLAPolicy(WarmPolicyMixin, SmolVLAPolicy):
+    """SmolVLA whose chunks start from a prior; its checkpoints load unchanged."""
+
+    config_class = WarmSmolVLAConfig
+    name = "warm_smolvla"
+
+
+class WarmPI05Policy(WarmPolicyMixin, PI05Policy):
+    """PI05 whose chunks start from a prior; its checkpoints load unchanged."""
+
+    config_class = WarmPI05Config
+    name = "warm_pi05"
