@@ -24,7 +24,6 @@ SHOWN_ALONE = {
     "warmprior.modules.imagenet_weights": "downloads them",
     "warmprior.envs.rendering_backend": "differs between machines",
     "warmprior.envs.mimicgen.register_mimicgen": "needs a package that is not on the package index",
-    "warmprior.rl.ray_collection.ray_rounds": "starts a cluster",
     "warmprior.lerobot.LeRobotActor": "needs a policy of LeRobot",
     "warmprior.lerobot.RelativeActions": "needs a policy of LeRobot",
     "warmprior.lerobot.WarmPriorAdapter": "needs a policy of LeRobot",

@@ -16,8 +16,9 @@ from warmprior.training.saved import load_policy, save_policy
 pytest.importorskip("robosuite")
 from warmprior.envs import rendering_backend
 from warmprior.envs.tasks import TaskSpec
-from warmprior.training import NetworkOptions, TrainingConfig, play_episode, robosuite_task, train_policy
+from warmprior.training import NetworkOptions, TrainingConfig, play_episode, train_policy
 from warmprior.training.behaviour_cloning import policy_path
+from warmprior.training.task import robosuite_task
 
 
 @pytest.fixture(scope="module", autouse=True)

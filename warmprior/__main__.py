@@ -17,8 +17,9 @@ from warmprior.io.script import ERRORS, run_script
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import make
-from warmprior.training import DataOptions, NetworkOptions, Task, TrainingConfig, find_tasks, train_policy
+from warmprior.training import DataOptions, NetworkOptions, Task, TrainingConfig, load_task, train_policy
 from warmprior.training.behaviour_cloning import policy_path
+from warmprior.training.task import task_places
 
 
 def _policy(args: argparse.Namespace) -> WarmPriorActor:
@@ -55,7 +56,7 @@ def evaluate(args: argparse.Namespace) -> None:
     from warmprior.diagnostics.statistics import success_posterior
     from warmprior.envs.description import environment_of
     from warmprior.training.evaluation import evaluate as play
-    from warmprior.training.film import check_video, record_video
+    from warmprior.training.film import check_video, record_filmstrip
 
     if args.episodes < 1:
         raise ValueError(f"--episodes must be at least 1, got {args.episodes}")
@@ -88,10 +89,17 @@ def evaluate(args: argparse.Namespace) -> None:
         f"between {100 * low:.1f}% and {100 * high:.1f}%), {steps:.0f} control steps on average"
     )
     if args.video is not None:
-        outcome = record_video(
-            actor, args.video, seed=args.first_seed, nfe=nfe, policy_seed=args.policy_seed, **options
+        film = record_filmstrip(
+            actor,
+            seed=args.first_seed,
+            nfe=nfe,
+            policy_seed=args.policy_seed,
+            frames=1,
+            size=256,
+            video=args.video,
+            **options,
         )
-        print(f"{args.video}: episode {args.first_seed}, {'' if outcome else 'not '}solved")
+        print(f"{args.video}: episode {args.first_seed}, {'' if film.success else 'not '}solved")
 
 
 def push(args: argparse.Namespace) -> None:
@@ -143,7 +151,8 @@ class Train:
 def _tasks(options: Train) -> list[Task]:
     data, keys = options.data, options.observation_keys
     if not keys:
-        return find_tasks(data, options.network.observation_steps)
+        steps = options.network.observation_steps
+        return [load_task(data, *place, steps) for place in task_places(data)]
     place = str(data.dataset)
     if not place.startswith(LEROBOT):
         raise ValueError("--observation-keys belongs to --dataset lerobot:FOLDER or lerobot:USER/NAME")

@@ -39,8 +39,8 @@ class NoDecoder(PriorDecoder):
     """Takes the source for the chunk: everything a decoder does but the flow."""
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        noise = tensordict.get(self.anchor_key) + tensordict.get(self.delta_key)
-        return tensordict.set(self.noise_key, noise).set(self.chunk_key, noise)
+        noise = tensordict.get(keys.ANCHOR) + tensordict.get(keys.DELTA)
+        return tensordict.set(keys.NOISE, noise).set(keys.CHUNK, noise)
 
 
 def frozen_policy(observation_dim: int = D_O) -> WarmPriorActor:

@@ -267,7 +267,7 @@ plt.show()
 # A film
 # ------
 # One episode of WP-Past, from a start that no demonstration has. (Tasks of robosuite have
-# :func:`~warmprior.training.record_video`, which renders the simulator; for an environment of your
+# :func:`~warmprior.training.record_filmstrip`, which renders the simulator; for an environment of your
 # own, draw its observations.)
 
 

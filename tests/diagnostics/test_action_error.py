@@ -7,7 +7,7 @@ import torch
 
 from tests.diagnostics.fields import H, policy, targets
 from warmprior import GaussianPrior, PreviewPrior
-from warmprior.diagnostics import action_error
+from warmprior.diagnostics import action_error, flow
 
 
 def towards(t, a, observation):
@@ -17,7 +17,8 @@ def towards(t, a, observation):
 
 @pytest.mark.parametrize("prior", [GaussianPrior(H), PreviewPrior(H)], ids=str)
 @pytest.mark.parametrize("split", [2, 4096])
-def test_by_hand(prior, split):
+def test_by_hand(prior, split, monkeypatch):
+    monkeypatch.setattr(flow, "SPLIT", split)
     batch = targets(prior, 5)
     total, count = 0.0, 0
     for row in batch:
@@ -27,7 +28,7 @@ def test_by_hand(prior, split):
                     total += float(row["observation"][-1, 0] - value) ** 2
                     count += 1
     before = batch.clone()
-    found = action_error(policy(towards, prior), batch, nfes=(1,), split=split)
+    found = action_error(policy(towards, prior), batch, nfes=(1,))
     assert found == {1: pytest.approx(total / count, rel=1e-5)}
     assert (batch == before).all()
 

@@ -43,9 +43,9 @@ def test_executed_positions_and_padding_count_separately():
     assert out["speed"][1] == pytest.approx(D_A * sum(p * p for p in range(1, 2 * H + 1)))
     assert out["speed_executed"][1] == pytest.approx(D_A * (1 + 4 + 9))
     data["action_is_pad"] = pad
-    out = curvature(policy(lambda t, a, o: weights.expand_as(a), prior), data, executed=1)
+    out = curvature(policy(lambda t, a, o: weights.expand_as(a), prior), data)
     assert out["speed"].tolist() == pytest.approx([D_A * 5.0] + [D_A * 91.0] * 4)
-    assert out["speed_executed"].tolist() == pytest.approx([D_A * 1.0] * 5)
+    assert out["speed_executed"].tolist() == pytest.approx([D_A * 5.0] + [D_A * 14.0] * 4)
 
 
 def test_a_field_that_has_not_learnt_to_move_is_flagged_with_targets():
@@ -76,8 +76,6 @@ def test_bad_options_and_policies_are_named():
     field = policy(lambda t, a, o: -a)
     with pytest.raises(ValueError, match="n_steps >= 2"):
         curvature(field, batch(), 1)
-    with pytest.raises(ValueError, match="executed"):
-        curvature(field, batch(), executed=H + 1)
     with pytest.raises(ValueError, match="no path of 100 steps"):
         curvature(policy(lambda t, a, o: -a, max_nfe=1), batch())
 

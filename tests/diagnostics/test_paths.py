@@ -1,11 +1,10 @@
 from __future__ import annotations
 
-import pytest
 import torch
 
 from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
 from warmprior import PastPrior, PreviewPrior, RealTimeChunking, WarmPriorActor
-from warmprior.diagnostics import deployed_history, flow_paths
+from warmprior.diagnostics.paths import deployed_history, flow_paths
 
 
 def test_paths_start_at_the_source_and_follow_euler():
@@ -21,8 +20,7 @@ def test_paths_start_at_the_source_and_follow_euler():
     torch.testing.assert_close(path, torch.stack(expected, 2))
 
 
-@pytest.mark.parametrize("executed", [1, H])
-def test_forecast_is_the_previous_prediction(executed):
+def test_forecast_is_the_previous_prediction():
     """A field that carries every source to the positions 0, 1, 2, ... predicts exactly these."""
     prior = PreviewPrior(H, sigma=0.1)
 
@@ -30,20 +28,16 @@ def test_forecast_is_the_previous_prediction(executed):
         goal = torch.arange(2.0 * H).view(1, -1, 1)
         return (goal - a) / (1 - t).clamp_min(1e-6)
 
-    out = deployed_history(policy(field, prior), batch(length=2 * H), executed=executed)
+    out = deployed_history(policy(field, prior), batch(length=2 * H))
     loc, _, warm = prior.distribution(out["history"])
-    expected = torch.arange(executed, executed + H).float()
+    expected = torch.arange(H, 2 * H).float()
     torch.testing.assert_close(loc[:, :H, 0], expected.expand(5, -1))
     assert warm[:, :H].all() and not warm[:, H:].any()
 
 
-def test_forecast_of_the_past_needs_a_full_history():
+def test_after_a_whole_chunk_the_history_is_full():
     actor = policy(lambda t, a, o: -a, PastPrior(H))
-    data = batch()
-    assert (deployed_history(actor, data)["history", "steps"] == H).all()
-    assert (deployed_history(actor, data, executed=1)["history", "steps"] == 1).all()
-    remember(data, torch.zeros(5, H, D_A))
-    assert (deployed_history(actor, data, executed=1)["history", "steps"] == H).all()
+    assert (deployed_history(actor, batch())["history", "steps"] == H).all()
 
 
 def test_the_forecast_of_a_guided_policy_is_what_it_would_do():
@@ -54,4 +48,4 @@ def test_the_forecast_of_a_guided_policy_is_what_it_would_do():
     data = remember(batch(rtc={"delay": torch.ones(5, 1, dtype=torch.int64)}), torch.rand(5, H, D_A))
     found = deployed_history(actor, data, generator=torch.Generator().manual_seed(0))
     acted = actor(data.clone(), generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(found["history", "actions"], acted[actor.chunk_key].detach())
+    torch.testing.assert_close(found["history", "actions"], acted["vla_action", "chunk"].detach())

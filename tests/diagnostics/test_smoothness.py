@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 
 from warmprior import GaussianPrior, HistoryObservation, PastPrior, VelocityMLP, WarmPriorActor, keys
-from warmprior.diagnostics import HistoryShift, compare_smoothness, executed_actions, smoothness
+from warmprior.diagnostics import executed_actions, smoothness
+from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.history import cold_history
 
 
@@ -37,7 +38,7 @@ def test_against_loops(rows, decisions, horizon, seed):
     steps[0][:2] = [horizon, 1]
     done = [[rng.random() < 0.3 for _ in range(decisions)] for _ in range(rows)]
     done[0][0] = False
-    boundary, inner, jerk, switches = [], [], [], []
+    boundary, inner, jerk = [], [], []
     for b in range(rows):
         episodes = [[]]
         for j in range(decisions):
@@ -47,13 +48,11 @@ def test_against_loops(rows, decisions, horizon, seed):
         for episode in episodes:
             for (j, x), (k, y) in pairwise(episode):
                 (boundary if j != k else inner).append(math.dist(x, y))
-                if j != k:
-                    switches.append((x[1] > 0) != (y[1] > 0))
             actions = [action for _, action in episode]
             for p, q, r, s in zip(actions, actions[1:], actions[2:], actions[3:], strict=False):
                 third = [d - 3 * c + 3 * b - a for a, b, c, d in zip(p, q, r, s, strict=True)]
                 jerk.append(math.hypot(*third))
-    result = smoothness(rollout_of(chunks, steps, done), mode=1)
+    result = smoothness(rollout_of(chunks, steps, done))
 
     def mean(values):
         return sum(values) / len(values) if values else math.nan
@@ -62,7 +61,6 @@ def test_against_loops(rows, decisions, horizon, seed):
     assert result.boundary_jump == pytest.approx(mean(boundary), rel=1e-4)
     assert result.inner_jump == pytest.approx(mean(inner), rel=1e-4, nan_ok=True)
     assert result.jerk == pytest.approx(mean(jerk), rel=1e-3, nan_ok=True)
-    assert result.switch_rate == pytest.approx(mean(switches))
 
 
 def test_bad_rollouts_are_named():
@@ -77,8 +75,6 @@ def test_bad_rollouts_are_named():
         smoothness(rollout_of(chunks * math.nan, [2, 2, 2]))
     with pytest.raises(ValueError, match="decisions"):
         executed_actions(rollout_of(chunks[:0], torch.zeros(0, dtype=torch.int64)))
-    with pytest.raises(ValueError, match="equally many actions"):
-        compare_smoothness({"a": rollout_of(chunks, [2] * 3), "b": rollout_of(chunks, [1] * 3)})
 
 
 @pytest.mark.parametrize("see_history", [False, True])

@@ -91,10 +91,8 @@ def test_one_exact_step_from_a_telling_source_spreads_less_than_the_data():
 def test_data_spread_against_loops(data):
     n = data.draw(st.integers(2, 12))
     episodes = data.draw(st.lists(st.integers(0, 4), min_size=n, max_size=n))
-    others = len(set(episodes)) - 1
-    if others == 0:
-        episodes[0], others = 9, 1
-    neighbours = data.draw(st.integers(1, others))
+    if len(set(episodes)) == 1:
+        episodes[0] = 9
     generator = torch.Generator().manual_seed(data.draw(st.integers(0, 10**6)))
     rows = windows(n).update({"observation": torch.randn(n, 2, 3, generator=generator)})
     target = torch.randn(n, H, D_A, generator=generator)
@@ -104,16 +102,10 @@ def test_data_spread_against_loops(data):
     squares = []
     for i in range(n):
         distance = [math.dist(rows["observation"][i].flatten(), o.flatten()) for o in rows["observation"]]
-        best = {}
-        for j in sorted(range(n), key=distance.__getitem__):
-            if episodes[j] != episodes[i]:
-                best.setdefault(episodes[j], j)
-        for j in list(best.values())[:neighbours]:
-            for p in range(min(int(length[i]), int(length[j]))):
-                squares += ((target[i, p] - target[j, p]) ** 2 / 2).tolist()
-    result = source_leak(
-        policy(passing(0.5)), rows, neighbours=neighbours, episodes=torch.tensor(episodes), nfes=(1,)
-    )
+        j = min((j for j in range(n) if episodes[j] != episodes[i]), key=distance.__getitem__)
+        for p in range(min(int(length[i]), int(length[j]))):
+            squares += ((target[i, p] - target[j, p]) ** 2 / 2).tolist()
+    result = source_leak(policy(passing(0.5)), rows, episodes=torch.tensor(episodes), nfes=(1,))
     expected = math.sqrt(sum(squares) / len(squares))
     assert result[1].data_spread == pytest.approx(expected, rel=1e-4)
 
@@ -130,15 +122,16 @@ def test_neighbours_come_from_other_episodes():
     )
     actor = policy(passing(0.5))
     # The nearest episode agrees with the window, the other two do not.
-    three = source_leak(actor, data, neighbours=3, episodes=episodes, nfes=(1,))[1]
-    assert three.data_spread == pytest.approx(math.sqrt(2 / 3 * 4 / 2))
     assert source_leak(actor, data, episodes=episodes, nfes=(1,))[1].data_spread == 0.0
-    carried = data.clone().set("episode", episodes)
-    assert source_leak(actor, carried, neighbours=3, nfes=(1,))[1] == three
+    apart = episodes % 2  # as if the two that agree were one
+    disagree = source_leak(actor, data, episodes=apart, nfes=(1,))[1]
+    assert disagree.data_spread == pytest.approx(math.sqrt(4 / 2))
+    carried = data.clone().set("episode", apart)
+    assert source_leak(actor, carried, nfes=(1,))[1] == disagree
     # Without episodes the other windows of one's own are neighbours, too.
     alone = data[:20].clone()
     assert math.isnan(source_leak(actor, alone, nfes=(1,))[1].leak)
-    with pytest.raises(ValueError, match="1 other episode"):
+    with pytest.raises(ValueError, match="all are of one"):
         source_leak(actor, alone, episodes=episodes[:20])
 
 
@@ -159,8 +152,6 @@ def test_bad_input_is_named():
     actor, data = policy(passing(0.5)), windows(5)
     with pytest.raises(KeyError, match="chunk"):
         source_leak(actor, data.exclude(("vla_action", "chunk")))
-    with pytest.raises(ValueError, match="4 other episode"):
-        source_leak(actor, data[:4], neighbours=4)
     with pytest.raises(ValueError, match="each of the 5 windows"):
         source_leak(actor, data, episodes=torch.zeros(4))
     with pytest.raises(ValueError, match="need draws"):

@@ -8,9 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from warmprior.diagnostics import (
-    SeedSummary,
     bootstrap_ratio,
-    exceeds_one_sigma,
     paired_probability_better,
     probability_better,
     success_posterior,
@@ -33,13 +31,6 @@ def test_top_k_mean_is_the_largest_mean_of_any_k(values, k):
     k_used = min(k, len(values))
     brute = max(sum(c) / k_used for c in combinations(values, k_used))
     assert top_k_mean(values, k) == pytest.approx(brute)
-
-
-def test_one_sigma_rule():
-    base = SeedSummary(0.80, 0.02, 3)
-    assert exceeds_one_sigma(SeedSummary(0.86, 0.03, 3), base)
-    assert not exceeds_one_sigma(SeedSummary(0.84, 0.03, 3), base)
-    assert not exceeds_one_sigma(SeedSummary(0.99, math.nan, 1), base)  # one seed has no spread
 
 
 @given(st.integers(0, 60), st.integers(0, 60), st.integers(0, 60), st.integers(0, 60))

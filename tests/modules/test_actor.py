@@ -67,12 +67,11 @@ def test_inference_of_algorithm_one(prior_class, nfe):
 @pytest.mark.parametrize("shape", [(), (4,), (2, 3)])
 def test_keys_and_shapes(shape):
     prior = PreviewPrior(H)
-    actor = actor_for(prior, path_key="path", nfe=2)
+    actor = actor_for(prior, nfe=2)
     assert actor.in_keys == ["observation", *(("history", name) for name in ENTRIES)]
-    assert actor.out_keys == [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK, "path"]
+    assert actor.out_keys == [keys.LOC, keys.WARM, keys.NOISE, keys.CHUNK]
     out = actor(batch(prior, *shape).select(*actor.in_keys))
     assert out["vla_action", "chunk"].shape == (*shape, 2 * H, D_A)
-    assert out["path"].shape == (*shape, 3, 2 * H, D_A)
     assert actor_for(prior, guidance=RealTimeChunking()).in_keys == [*actor.in_keys, keys.DELAY]
 
 

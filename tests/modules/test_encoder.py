@@ -20,7 +20,7 @@ from warmprior import (
     WarmPriorActor,
     window_replay_buffer,
 )
-from warmprior.modules import load_imagenet
+from warmprior.modules.encoder import load_imagenet
 from warmprior.training.saved import load_policy, save_policy
 
 CAMERAS = ("agentview_image", "robot0_eye_in_hand_image")

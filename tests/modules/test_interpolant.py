@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from warmprior import LinearInterpolant, PolynomialInterpolant, TrigonometricInterpolant
+from tests.paths import PolynomialInterpolant, TrigonometricInterpolant
+from warmprior import LinearInterpolant
 
 ALL = [
     LinearInterpolant(),
@@ -39,14 +40,3 @@ def test_linear_is_algorithm_one():
     for i in range(6):
         torch.testing.assert_close(a_t[i], (1 - t[i]) * a0[i] + t[i] * a1[i])
         torch.testing.assert_close(velocity[i], a1[i] - a0[i])
-
-
-def test_trigonometric_keeps_the_variance():
-    alpha, beta, *_ = TrigonometricInterpolant().coefficients(torch.linspace(0, 1, 11))
-    torch.testing.assert_close(alpha**2 + beta**2, torch.ones(11))
-
-
-@pytest.mark.parametrize("power", [0.0, -1.0])
-def test_bad_power(power):
-    with pytest.raises(ValueError, match="power"):
-        PolynomialInterpolant(power)

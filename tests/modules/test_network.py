@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from warmprior import ChiTransformer, VelocityMLP, VelocityNetwork
-from warmprior.modules import TimestepEmbedding
+from warmprior.modules.network import TimestepEmbedding
 from warmprior.modules.registry import from_config
 
 

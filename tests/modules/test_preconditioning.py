@@ -12,16 +12,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tensordict import TensorDict
 
+from tests.paths import PolynomialInterpolant, TrigonometricInterpolant
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
     LinearInterpolant,
     PastPrior,
-    PolynomialInterpolant,
     PreconditionedNetwork,
     PreviewPrior,
     SourceMoments,
-    TrigonometricInterpolant,
     VelocityMLP,
     VelocityNetwork,
     WarmPriorActor,

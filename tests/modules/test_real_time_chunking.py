@@ -10,7 +10,7 @@ from tensordict import TensorDict
 
 from warmprior import PastPrior, PreviewPrior, PriorDecoder, RealTimeChunking, VelocityMLP, WarmPriorActor
 from warmprior.history import advance, cold_history, without
-from warmprior.modules import with_leftover
+from warmprior.modules.real_time_chunking import with_leftover
 
 B, P, D = 3, 10, 4
 

@@ -6,15 +6,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from tests.paths import PolynomialInterpolant, TrigonometricInterpolant
 from tests.toy_env import random_history
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
     LinearInterpolant,
     PastPrior,
-    PolynomialInterpolant,
     PreviewPrior,
-    TrigonometricInterpolant,
     VelocityMLP,
     WarmPriorActor,
     window_replay_buffer,

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from tests.objectives.test_flow_matching import actor_for, sample
-from warmprior import FlowMatchingLoss, GaussianPrior, PastPrior, PolynomialInterpolant, PreviewPrior
+from tests.paths import PolynomialInterpolant
+from warmprior import FlowMatchingLoss, GaussianPrior, PastPrior, PreviewPrior
 from warmprior.modules import StartPoint
 
 H = 3

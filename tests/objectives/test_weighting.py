@@ -7,6 +7,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 
+from tests.paths import TrigonometricInterpolant
 from warmprior import (
     FlowMatchingLoss,
     GaussianPrior,
@@ -14,7 +15,6 @@ from warmprior import (
     PastPrior,
     PreconditionedNetwork,
     SourceMoments,
-    TrigonometricInterpolant,
     VelocityMLP,
     WarmPriorActor,
 )

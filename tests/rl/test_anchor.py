@@ -171,18 +171,6 @@ def test_rows_that_rest_keep_their_anchor(place, prior_class):
     assert not torch.isclose(after[0, H - 1], before[0, H - 1]).any()
 
 
-def generator(seed=0):
-    return torch.Generator().manual_seed(seed)
-
-
-def test_noise_is_of_the_generator_and_leaves_the_global_one():
-    expected = torch.randn(H, ACTION_DIM, generator=generator(3))
-    env = build("single", PastPrior(H), generator=generator(3))
-    state = torch.get_rng_state()
-    assert torch.equal(env.reset()["prior", "anchor"], expected)
-    assert torch.equal(torch.get_rng_state(), state)
-
-
 def test_wrong_places_and_options():
     with pytest.raises(ValueError, match="cold must be 'noise' or 'zero'"):
         PriorAnchor(actor_for(PastPrior(H)), cold="warm")

@@ -115,20 +115,6 @@ def test_nothing_can_change_the_decoder(network):
     assert torch.equal(first, decoder(fixed.clone())["vla_action", "chunk"])
 
 
-def test_gradient_of_the_residual_by_finite_differences():
-    prior = PastPrior(H)
-    decoder = PriorDecoder(make_actor(prior, nfe=2), delta=0.5, differentiable=True).double()
-    data = batch(prior, 1).double()
-
-    def decode(delta):
-        return decoder(data.clone().set(("prior", "delta"), delta))["vla_action", "chunk"]
-
-    delta = data["prior", "delta"].clone().requires_grad_()
-    assert torch.autograd.gradcheck(decode, delta)
-    with torch.no_grad():
-        assert not decode(delta).requires_grad
-
-
 def test_regression_has_no_source_space():
     with pytest.raises(ValueError, match=r"trained at t = 0 alone.* no flow from a source space"):
         PriorDecoder(make_actor(GaussianPrior(H), max_nfe=1), delta=0.5)

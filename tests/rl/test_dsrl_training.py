@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict.nn import TensorDictSequential
+from torchrl.modules import ProbabilisticActor, TanhNormal
 
 from tests.rl.dsrl_parts import D_A, D_O, TO, H, batch, build, make_decoder
 from warmprior import DSRLNALoss, PastPrior, keys, make_prior_space_actor, make_prior_space_critic
@@ -58,7 +59,10 @@ def test_networks_that_do_not_fit():
     with pytest.raises(ValueError, match=r"half side 1.5, and the decoder's 0.5"):
         DSRLNALoss(make_prior_space_actor(*sizes, delta=1.5), chunk, noise, decoder)
     with pytest.raises(ValueError, match=r"the actor writes .*shift.*, but the decoder reads .*delta"):
-        renamed = make_prior_space_actor(*sizes, delta=0.5, delta_key="shift")
+        parameters = {"loc": "delta_loc", "scale": "delta_scale"}
+        renamed = ProbabilisticActor(
+            actor.module[0], parameters, out_keys=["shift"], distribution_class=TanhNormal
+        )
         DSRLNALoss(renamed, chunk, noise, decoder)
     with pytest.raises(TypeError, match=r"without a decoder behind it, got TensorDictSequential"):
         DSRLNALoss(TensorDictSequential(actor, decoder), chunk, noise, decoder)

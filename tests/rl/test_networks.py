@@ -57,7 +57,7 @@ def test_densities_in_units_of_the_box(delta):
         (PastPrior(P), 0.5, {"distribution": "normal"}, stats.norm(scale=0.5)),
         (PastPrior(P), 0.5, {"distribution": "uniform"}, stats.uniform(-0.5, 1.0)),
         (PastPrior(P), 0.5, {"distribution": "truncated"}, stats.truncnorm(-1, 1, scale=0.5)),
-        (PastPrior(P), 0.5, {"distribution": "normal", "sigma": 2.0}, stats.norm(scale=2.0)),
+        (PastPrior(P, sigma=2.0), 0.5, {"distribution": "normal"}, stats.norm(scale=2.0)),
     ],
 )
 def test_distributions(prior, delta, options, distribution):
@@ -96,7 +96,7 @@ def test_sampler_options():
     decoder = make_decoder(PastPrior(P), 0.5)
     with pytest.raises(ValueError, match="must be 'normal', 'clipped', 'truncated' or 'uniform'"):
         ResidualSampler(decoder, distribution="laplace")
-    with pytest.raises(ValueError, match="sigma must be a finite number > 0"):
+    with pytest.raises(ValueError, match="a prior without noise leaves 'uniform'"):
         ResidualSampler(make_decoder(PastPrior(P, sigma=0.0), 0.5), distribution="clipped")
     # Without noise of the prior's own, the box is all there is.
     assert ResidualSampler(make_decoder(PastPrior(P, sigma=0.0), 0.5)).distribution == "uniform"

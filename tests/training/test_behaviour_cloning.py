@@ -14,8 +14,9 @@ import torch
 
 from tests.training.cloning_parts import CONFIG, actor_for, dataset, run_until, same, training, weights
 from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
-from warmprior.training import TrainingConfig, load_policy, make_optimizer
+from warmprior.training import TrainingConfig, load_policy
 from warmprior.training.checkpoint import load_state
+from warmprior.training.optim import make_optimizer
 from warmprior.training.training_config import PAPER
 
 LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}
@@ -153,7 +154,6 @@ def _iteration(folder):
         ({"save_every": 0}, "save_every must be a whole number"),
         ({"seed": -1}, "seed must be a whole number from 0"),
         ({"learning_rate": "fast"}, "learning_rate must be a finite number, got 'fast'"),
-        ({"betas": (0.9, 1.0)}, r"betas must lie in \[0, 1\), got \(0.9, 1.0\)"),
     ],
 )
 def test_recipes_that_cannot_be(options, said):

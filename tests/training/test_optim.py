@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from warmprior import ChiTransformer, VelocityMLP
-from warmprior.training import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 
 
 def test_group_values_are_the_paper_s():

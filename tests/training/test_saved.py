@@ -57,7 +57,7 @@ def chunk(actor, **options):
     data[keys.DELAY] = torch.full((4, 1), 1)
     generator = torch.Generator().manual_seed(1)
     with torch.no_grad():
-        return actor.eval()(data, generator=generator, **options)[actor.chunk_key]
+        return actor.eval()(data, generator=generator, **options)[keys.CHUNK]
 
 
 def rewrite(folder, change):
@@ -79,7 +79,7 @@ TRANSFORMER = {"embedding_dim": 12, "num_layers": 2, "num_heads": 2}
         lambda: policy(clip=(0.1, 0.2), normalizer=None, observation_key=("state", "low")),
         lambda: policy(max_nfe=1, nfe=1),  # regression
         lambda: policy(GaussianPrior(H), observation_key=keys.CONDITIONED, width=D_O + H * D_A + 1),
-        lambda: policy(start=Halfway(0.25), chunk_key="plan"),
+        lambda: policy(start=Halfway(0.25)),
         lambda: policy(guidance=RealTimeChunking(2, schedule="ones", jacobian=False, sigma=1.0)),
         lambda: policy(environment={"task": "square"}),
     ],
@@ -156,11 +156,11 @@ def test_missing_files(tmp_path):
         load_policy(tmp_path / "nowhere")
 
 
-@pytest.mark.parametrize("version", [4, None, "5"])
+@pytest.mark.parametrize("version", [5, None, "6"])
 def test_another_format(tmp_path, version):
     saved(tmp_path)
     rewrite(tmp_path, lambda tensors, config: config.update(format=version))
-    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 5"):
+    with pytest.raises(ValueError, match=r"has format .*, this version of warmprior reads 6"):
         load_policy(tmp_path)
 
 

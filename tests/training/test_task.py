@@ -19,11 +19,10 @@ from warmprior.training import (
     Task,
     TrainingConfig,
     load_task,
-    new_policy,
-    robosuite_task,
 )
 from warmprior.training import task as module
-from warmprior.training.task import read_like
+from warmprior.training.task import read_like, robosuite_task
+from warmprior.training.train import new_policy
 from warmprior.transforms import AbsoluteActions
 
 

@@ -6,7 +6,8 @@ import torch
 
 from warmprior import PastPrior
 from warmprior.modules import PreconditionedNetwork
-from warmprior.training import NetworkOptions, TrainingConfig, navigation_task, new_policy, train_policy
+from warmprior.training import NetworkOptions, TrainingConfig, navigation_task, train_policy
+from warmprior.training.train import new_policy
 
 NETWORK = NetworkOptions(hidden_dim=8, observation_steps=1)
 CONFIG = TrainingConfig(iterations=8, batch_size=16, checkpoints=2, save_every=2)

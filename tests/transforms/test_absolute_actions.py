@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase, ParallelEnv, SerialEnv, TransformedEnv
+from torchrl.envs import EnvBase, ExcludeTransform, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from warmprior import GaussianPrior
@@ -223,7 +223,8 @@ def test_refusals():
     with pytest.raises(ValueError, match=r"2 arm\(s\).*width 14.*have 7"):
         TransformedEnv(Gripper(), two_arms).full_action_spec  # noqa: B018
     with pytest.raises(KeyError, match="eef_pose=True"):
-        TransformedEnv(Gripper(), AbsoluteActions(SCALE, pose_key="hand")).full_action_spec  # noqa: B018
+        blind = TransformedEnv(Gripper(), ExcludeTransform("eef_pose"))
+        TransformedEnv(blind, AbsoluteActions(SCALE)).full_action_spec  # noqa: B018
     env = TransformedEnv(Gripper(), AbsoluteActions(SCALE))
     env.reset()
     with pytest.raises(KeyError, match="what reset or step_mdp returned"):

@@ -237,7 +237,6 @@ def test_an_event_at_any_executed_step_is_one_of_the_chunk(place):
     if place == "outside":  # the third decision is the second episode's first
         assert rows["next", "success"][1].flatten().tolist() == [True, False, True]
         assert rows["next", "bell"][1].flatten().tolist() == [False, True, False]
-    both = TransformedEnv(Events(), ChunkStep(3, event_keys=["bell", "absent"]))
-    rollout = both.rollout(3, ones(3))
+    rollout = TransformedEnv(Events(), ChunkStep(3, success="bell")).rollout(3, ones(3))
     assert rollout["next", "bell"].flatten().tolist() == [False, True, False]
     assert rollout["next", "success"].flatten().tolist() == [False, False, True]

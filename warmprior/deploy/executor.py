@@ -64,7 +64,7 @@ class AsyncExecutor:
             steps later.
         pool: where to compute; by default in one thread, which :meth:`close` ends.
         action_dim: ``d_a``; that of the actor's network by default.
-        chunk_key: where the policy writes its chunk; a :class:`~warmprior.WarmPriorActor`'s own by default.
+        chunk_key: where the policy writes its chunk; ``("vla_action", "chunk")`` by default.
 
     Raises:
         ValueError: for numbers that do not fit each other, or a missing argument that the actor does not
@@ -99,7 +99,6 @@ class AsyncExecutor:
     ) -> None:
         if isinstance(actor, WarmPriorActor):
             prior = actor.prior if prior is None else prior
-            chunk_key = actor.chunk_key if chunk_key is None else chunk_key
             if action_dim is None:
                 action_dim = getattr(actor.network, "action_dim", None)
         if prior is None or action_dim is None:

@@ -5,28 +5,22 @@ from warmprior.diagnostics.branching import branching_bound, branching_cost
 from warmprior.diagnostics.coverage import source_coverage
 from warmprior.diagnostics.curvature import curvature
 from warmprior.diagnostics.flow import encoded_windows
-from warmprior.diagnostics.history_shift import HistoryShift
 from warmprior.diagnostics.mean_error import MeanError, mean_error, mean_revision
 from warmprior.diagnostics.memory_gain import memory_gain
-from warmprior.diagnostics.paths import deployed_history, flow_paths
+from warmprior.diagnostics.paths import flow_paths
 from warmprior.diagnostics.shared_observations import SharedObservations
-from warmprior.diagnostics.smoothness import Smoothness, compare_smoothness, executed_actions, smoothness
+from warmprior.diagnostics.smoothness import Smoothness, executed_actions, smoothness
 from warmprior.diagnostics.source_leak import SourceLeak, source_leak
 from warmprior.diagnostics.statistics import (
-    SeedSummary,
     bootstrap_ratio,
-    exceeds_one_sigma,
     paired_probability_better,
     probability_better,
     success_posterior,
-    summarize_seeds,
     top_k_mean,
 )
 
 __all__ = [
-    "HistoryShift",
     "MeanError",
-    "SeedSummary",
     "SharedObservations",
     "Smoothness",
     "SourceLeak",
@@ -34,11 +28,8 @@ __all__ = [
     "bootstrap_ratio",
     "branching_bound",
     "branching_cost",
-    "compare_smoothness",
     "curvature",
-    "deployed_history",
     "encoded_windows",
-    "exceeds_one_sigma",
     "executed_actions",
     "flow_paths",
     "mean_error",
@@ -50,6 +41,5 @@ __all__ = [
     "source_coverage",
     "source_leak",
     "success_posterior",
-    "summarize_seeds",
     "top_k_mean",
 ]

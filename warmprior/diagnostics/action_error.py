@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict import TensorDictBase
 
 from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, judged, predict
@@ -18,8 +17,6 @@ def action_error(
     windows: TensorDictBase,
     *,
     nfes: Sequence[int] = (1, 9),
-    split: int = 4096,
-    generator: torch.Generator | None = None,
 ) -> dict[int, float]:
     r"""Mean squared error of the executed actions on windows of demonstrations.
 
@@ -34,13 +31,10 @@ def action_error(
 
     Keyword Args:
         nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
-        split: network batch size, for bounded memory; it changes nothing else.
-        generator: source of randomness on the policy's device; by default one of its own with a fixed
-            seed. One sample of the source per window, the same for every NFE.
 
     Returns:
-        By NFE, ascending, the mean over windows, the first ``H`` positions inside the episode and
-        dimensions, in squared normalised action units.
+        By NFE, ascending and from the same samples of the source, the mean over windows, the first ``H``
+        positions inside the episode and dimensions, in squared normalised action units.
 
     Raises:
         KeyError: if the windows lack a key.
@@ -58,13 +52,13 @@ def action_error(
         [1, 9]
     """
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
-    flat, target, rows, generator = judged(policy, windows, generator)
+    flat, target, rows, generator = judged(policy, windows)
     counted = flat.counted[:, : prior.chunk_length, 0]
     errors = {}
     with evaluation_mode(policy):
         a0 = drawn(policy, rows, generator)
         for nfe in allowed:
-            chunk = predict(policy, rows, a0, nfe=nfe, split=split)
+            chunk = predict(policy, rows, a0, nfe)
             error = (chunk - target)[:, : prior.chunk_length].square()
             errors[nfe] = float(error[counted].mean())
     return errors

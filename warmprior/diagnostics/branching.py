@@ -7,10 +7,10 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.flow import check_flow, evaluation_mode, field_of, flat_windows
+from warmprior.diagnostics.flow import SPLIT, check_flow, evaluation_mode, field_of, flat_windows
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_whole_numbers
-from warmprior.modules.interpolant import Interpolant, LinearInterpolant
+from warmprior.modules.interpolant import LinearInterpolant
 from warmprior.modules.prior import Prior, Source
 
 __all__ = ["branching_bound", "branching_cost"]
@@ -21,9 +21,6 @@ def branching_cost(
     batch: TensorDictBase,
     *,
     draws: int = 8,
-    executed: int | None = None,
-    interpolant: Interpolant | None = None,
-    split: int = 4096,
     generator: torch.Generator | None = None,
 ) -> TensorDict:
     r"""Velocity error of a policy on data: the branching cost, if its field is optimal.
@@ -44,14 +41,11 @@ def branching_cost(
 
     Keyword Args:
         draws: samples of source and time per window; the times are stratified.
-        executed: how many positions ``"..._executed"`` counts; ``H`` by default.
-        interpolant: the path of the training; linear by default.
-        split: network batch size, for bounded memory; it changes nothing else.
         generator: source of randomness on the policy's device; the policy's own by default.
 
     Returns:
-        TensorDict ``[*B]`` with ``"cost"`` (all coordinates), ``"cost_warm"``, ``"cost_executed"``, and
-        ``"still"``, ``"still_executed"``: the same for a field that is 0 everywhere.
+        TensorDict ``[*B]`` with ``"cost"`` (all coordinates), ``"cost_warm"``, ``"cost_executed"`` (the first
+        ``H`` positions), and ``"still"``, ``"still_executed"``: the same for a field that is 0 everywhere.
 
     Raises:
         KeyError: if the batch lacks a key.
@@ -70,11 +64,11 @@ def branching_cost(
         torch.Size([16])
     """
     check_flow(policy, 2)
-    check_whole_numbers(draws=draws, split=split)
+    check_whole_numbers(draws=draws)
     windows = flat_windows(policy, batch, target_needed=True)
-    n, steps = len(windows), executed_positions(policy.prior, executed)
+    n, steps = len(windows), policy.prior.chunk_length
     rows = windows.repeat(draws)
-    path = LinearInterpolant() if interpolant is None else interpolant
+    path = getattr(policy.network, "interpolant", LinearInterpolant())
     generator = policy.sampler.generator if generator is None else generator
     assert rows.target is not None
     with evaluation_mode(policy):
@@ -83,7 +77,7 @@ def branching_cost(
         stratum = torch.arange(draws, dtype=a0.dtype, device=a0.device).repeat_interleave(n)
         t = (stratum + within.repeat(draws)) / draws
         a_t, velocity = path(a0, rows.target, t)
-        slices = [slice(i, i + split) for i in range(0, n * draws, split)]
+        slices = [slice(i, i + SPLIT) for i in range(0, n * draws, SPLIT)]
         predicted = torch.cat([field_of(policy, rows.observation[s])(t[s], a_t[s]) for s in slices])
     error = (predicted - velocity).square() * rows.counted
     still = velocity.square() * rows.counted
@@ -169,13 +163,3 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
         },
         batch_size=batch.batch_size,
     )
-
-
-def executed_positions(prior: Prior, executed: int | None) -> int:
-    """How many positions of a prediction are executed, 1 to ``P``: ``H`` by default."""
-    executed = prior.chunk_length if executed is None else executed
-    if not 1 <= executed <= prior.prediction_length:
-        raise ValueError(
-            f"executed must be between 1 and {prior.prediction_length} for {prior}, got {executed}"
-        )
-    return executed

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.branching import branching_cost, executed_positions
-from warmprior.diagnostics.flow import RunningVariance, check_flow, evaluation_mode, field_of, flat_windows
+from warmprior.diagnostics.branching import branching_cost
+from warmprior.diagnostics.flow import (
+    SPLIT,
+    RunningVariance,
+    check_flow,
+    evaluation_mode,
+    field_of,
+    flat_windows,
+)
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.ode import integrate
 
 __all__ = ["curvature"]
@@ -29,9 +34,6 @@ def curvature(
     n_steps: int = 100,
     *,
     draws: int = 1,
-    executed: int | None = None,
-    interpolant: Interpolant | None = None,
-    split: int = 4096,
     generator: torch.Generator | None = None,
 ) -> TensorDict:
     r"""Pathwise curvature of the learned flow per observation,
@@ -42,7 +44,7 @@ def curvature(
     along the Euler sampler with ``n_steps`` steps, summed over coordinates. It shrinks with the length of the
     path, whatever its shape, and a source nearer to the data has shorter paths: compare ``"relative"``, which
     divides by :math:`\|\bar v\|^2`. The paper does not say whether a prediction of ``2H`` counts whole;
-    ``"..._executed"`` counts the executed positions only.
+    ``"..._executed"`` counts the first ``H`` positions only.
 
     A field that predicts no motion is not straight, though its curvature is tiny. So values are NaN, with a
     warning, for observations whose mean velocity is below 1e-4 per coordinate. All are NaN if the batch has
@@ -53,14 +55,11 @@ def curvature(
         policy: the policy; its ``nfe`` and solver play no role.
         batch: ``[*B]`` with observation and history: windows of the policy's own lengths or a
             rollout. In windows WP-Preview's mean is the target itself; see
-            :func:`~warmprior.diagnostics.deployed_history` for the history at deployment.
+            :meth:`SharedObservations.deployed` for the history at deployment.
         n_steps: Euler steps.
 
     Keyword Args:
         draws: source samples per observation, averaged.
-        executed: positions that ``"..._executed"`` counts; ``H`` by default.
-        interpolant: the path of the training, for the check with targets; linear by default.
-        split: network batch size, for bounded memory; it changes nothing else.
         generator: source of randomness on the policy's device; the policy's own by default.
 
     Returns:
@@ -91,18 +90,17 @@ def curvature(
         torch.Size([5])
     """
     check_flow(policy, max(n_steps, 2))
-    if draws < 1 or split < 1 or n_steps < 2:
-        raise ValueError(f"need n_steps >= 2, draws >= 1 and split >= 1, got {n_steps}, {draws} and {split}")
+    if draws < 1 or n_steps < 2:
+        raise ValueError(f"need n_steps >= 2 and draws >= 1, got {n_steps} and {draws}")
     windows = flat_windows(policy, batch)
-    steps = executed_positions(policy.prior, executed)
     rows = windows.repeat(draws)
     parts = []
     with evaluation_mode(policy):
         # All sources are drawn at once, so that splitting the batch does not change them.
         generator = policy.sampler.generator if generator is None else generator
         a0 = policy.prior.sample(rows.history, rows.observation, generator)
-        for i in range(0, len(rows), split):
-            s = slice(i, i + split)
+        for i in range(0, len(rows), SPLIT):
+            s = slice(i, i + SPLIT)
             parts.append(_measure(policy, a0[s], rows.observation[s], n_steps))
     deviations, mean, gap = (torch.cat(part) for part in zip(*parts, strict=True))
     bad = ~torch.isfinite(deviations).flatten(1).all(1)
@@ -112,7 +110,7 @@ def curvature(
             f"observation {int(bad.nonzero()[0]) % len(windows)}"
         )
     out = TensorDict({}, batch_size=windows.shape, device=a0.device)
-    for suffix, end in (("", policy.prior.prediction_length), ("_executed", steps)):
+    for suffix, end in (("", policy.prior.prediction_length), ("_executed", policy.prior.chunk_length)):
         counted = rows.counted[:, :end].expand_as(mean[:, :end])
 
         def total(x: Tensor, counted: Tensor = counted, end: int = end) -> Tensor:
@@ -125,7 +123,7 @@ def curvature(
         out["speed" + suffix] = speed
         out["relative" + suffix] = (kappa / speed).masked_fill(still, math.nan)
         out["one_step_error" + suffix] = (total(gap.square()) / count).sqrt()
-    _flag_no_motion(out, policy, batch, {"executed": steps, "interpolant": interpolant})
+    _flag_no_motion(out, policy, batch)
     return out
 
 
@@ -139,9 +137,7 @@ def _measure(
     return track.variance(), track.mean, one - end
 
 
-def _flag_no_motion(
-    out: TensorDict, policy: WarmPriorActor, batch: TensorDictBase, options: dict[str, Any]
-) -> None:
+def _flag_no_motion(out: TensorDict, policy: WarmPriorActor, batch: TensorDictBase) -> None:
     scopes = [suffix for suffix in ("", "_executed") if out["kappa" + suffix].isnan().any()]
     if scopes:
         warnings.warn(
@@ -154,7 +150,7 @@ def _flag_no_motion(
         return
     # A generator of its own, so that the check does not advance the caller's.
     generator = torch.Generator(out.device).manual_seed(0)
-    cost = branching_cost(policy, batch, generator=generator, **options)
+    cost = branching_cost(policy, batch, generator=generator)
     for suffix in ("", "_executed"):
         share = float(cost["cost" + suffix].sum() / cost["still" + suffix].sum())
         if share >= NO_MOTION:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -18,6 +17,9 @@ from warmprior.modules.network import encoded
 from warmprior.transforms.history_observation import HistoryObservation
 
 Field = Callable[[Tensor, Tensor], Tensor]
+
+SPLIT = 4096
+"""Largest batch of the network, for bounded memory; it changes nothing else."""
 
 
 @dataclass
@@ -55,7 +57,7 @@ class Windows:
 def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed: bool = False) -> Windows:
     """Check a batch and bring it into shape; a ``KeyError`` or ``ValueError`` says what is wrong with it."""
     observation_key = policy.in_keys[0]
-    needed = [*policy.in_keys, *([policy.chunk_key] if target_needed else [])]
+    needed = [*policy.in_keys, *([keys.CHUNK] if target_needed else [])]
     missing = [key for key in needed if batch.get(key, None) is None]
     if missing:
         bare = "" if policy.ode.guidance is None else ", or measure policy.replace(guidance=None)"
@@ -76,17 +78,17 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
         value = batch.get(key, None)
         return None if value is None else value.reshape(-1, *value.shape[ndim:]).to(device)
 
-    observation, target, pad = map(flat, (observation_key, policy.chunk_key, keys.IS_PAD))
+    observation, target, pad = map(flat, (observation_key, keys.CHUNK, keys.IS_PAD))
     assert observation is not None
     if target is not None and target.shape[-2] != prior.prediction_length:
         raise ValueError(
-            f"{policy.chunk_key} has {target.shape[-2]} positions, but {prior} predicts "
+            f"{keys.CHUNK} has {target.shape[-2]} positions, but {prior} predicts "
             f"{prior.prediction_length}: make the windows for this length"
         )
     history = batch.get(keys.HISTORY).reshape(-1).to(device)
     entries = {
         observation_key: observation,
-        policy.chunk_key: target,
+        keys.CHUNK: target,
         keys.ACTIONS: history["actions"],
         keys.FORECAST: history["forecast"],
     }
@@ -100,14 +102,14 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
 
 
 def judged(
-    policy: WarmPriorActor, windows: TensorDictBase, generator: torch.Generator | None
+    policy: WarmPriorActor, windows: TensorDictBase
 ) -> tuple[Windows, Tensor, TensorDictBase, torch.Generator]:
-    """Windows, targets, what the policy reads, and the generator, which has a fixed seed by default."""
+    """Windows, targets, what the policy reads, and a generator with a fixed seed."""
     flat = flat_windows(policy, windows, target_needed=True)
     assert flat.target is not None
     device = flat.loc.device
     rows = windows.select(*policy.in_keys).reshape(len(flat)).to(device)
-    return flat, flat.target, rows, generator or torch.Generator(device).manual_seed(0)
+    return flat, flat.target, rows, torch.Generator(device).manual_seed(0)
 
 
 def sees_history(policy: WarmPriorActor) -> bool:
@@ -124,7 +126,7 @@ def depends_on_history(policy: WarmPriorActor, windows: TensorDictBase) -> bool:
 def drawn(policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generator | None) -> Tensor:
     """Where a policy's samplers start at windows ``[N]``, ``[N, P, d_a]``."""
     inputs = rows.select(*policy.in_keys)
-    return policy.sampler(inputs, generator=generator)[policy.ode.in_keys[0]]
+    return policy.sampler(inputs, generator=generator)[keys.NOISE]
 
 
 def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: int = 256) -> TensorDictBase:
@@ -170,23 +172,8 @@ def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: i
 
 
 def seen_anew(policy: WarmPriorActor, windows: TensorDictBase) -> TensorDictBase:
-    """Update the last actions in the observation after the history has changed.
-
-    Images must not be encoded yet: the actions stand at the end of the observation's vector.
-    """
-    if not sees_history(policy):
-        return windows
-    key = policy.in_keys[0]
-    for needed in (key, keys.ACTIONS):
-        if windows.get(needed, None) is None:
-            raise KeyError(f"the batch lacks {needed!r}; sample windows with see_history=True")
-    seen, actions = windows.get(key), windows.get(keys.ACTIONS)
-    width = HistoryObservation.width(*actions.shape[-2:])
-    if isinstance(seen, TensorDictBase):
-        bare: Any = seen.copy().set(keys.STATE, seen.get(keys.STATE)[..., :-width])
-    else:
-        bare = seen[..., :-width]
-    return HistoryObservation(observation_key=key, out_key=key)(windows.set(key, bare))
+    """Update the last actions that a network sees beside the observation after the history has changed."""
+    return HistoryObservation()(windows) if sees_history(policy) else windows
 
 
 def observed(policy: WarmPriorActor, batch: TensorDictBase) -> Tensor:
@@ -240,10 +227,10 @@ def allowed_nfes(policy: WarmPriorActor, nfes: Sequence[int]) -> list[int]:
     return allowed
 
 
-def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, *, nfe: int, split: int) -> Tensor:
-    """The chunks ``[N, P, d_a]`` from windows ``[N]`` and sources, ``split`` at a time; all finite."""
-    parts = rows.clone(recurse=False).set(policy.ode.in_keys[0], a0).split(split)
-    chunk = torch.cat([policy.integrate(part, nfe).get(policy.chunk_key) for part in parts])
+def predict(policy: WarmPriorActor, rows: TensorDictBase, a0: Tensor, nfe: int) -> Tensor:
+    """The chunks ``[N, P, d_a]`` from windows ``[N]`` and sources; all finite."""
+    parts = rows.clone(recurse=False).set(keys.NOISE, a0).split(SPLIT)
+    chunk = torch.cat([policy.integrate(part, nfe).get(keys.CHUNK) for part in parts])
     if not torch.isfinite(chunk).all():
         raise FloatingPointError(f"at NFE {nfe} a prediction is NaN or infinite")
     return chunk

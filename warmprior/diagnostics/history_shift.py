@@ -29,19 +29,6 @@ class HistoryShift(TensorDictModuleBase):
 
     Raises:
         ValueError: if ``std < 0``.
-
-    See Also:
-        - :func:`~warmprior.training.judge_navigation`: plays policies with and without it.
-        - :class:`~warmprior.PastPrior`: a source whose mean it disturbs.
-
-    Examples:
-        >>> from warmprior.diagnostics import HistoryShift
-        >>> from torchrl.envs import GymEnv, TransformedEnv
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
-        >>> actor = WarmPriorActor(VelocityMLP(1, 3, 4), PastPrior(4))
-        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), policy_transforms(actor.prior))
-        >>> env.rollout(3, HistoryShift(actor, 0.1)).shape
-        torch.Size([3])
     """
 
     def __init__(

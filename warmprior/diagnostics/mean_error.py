@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
@@ -48,8 +47,6 @@ def mean_error(
     windows: TensorDictBase,
     *,
     nfe: int | None = None,
-    split: int = 4096,
-    generator: torch.Generator | None = None,
 ) -> MeanError:
     """Error of the mean at demonstrated states.
 
@@ -60,9 +57,6 @@ def mean_error(
 
     Keyword Args:
         nfe: network evaluations of the prediction; the policy's own by default.
-        split: network batch size, for bounded memory; it changes nothing else.
-        generator: source of randomness on the policy's device; by default one of its own with a fixed
-            seed.
 
     Returns:
         In normalised action units.
@@ -81,10 +75,10 @@ def mean_error(
         >>> mean_error(untrained, shared.windows(untrained.prior)).target  # the target itself
         0.0
     """
-    flat, target, rows, generator = judged(policy, windows, generator)
+    flat, target, rows, generator = judged(policy, windows)
     with evaluation_mode(policy):
         nfe = policy.ode.nfe if nfe is None else nfe
-        chunk = predict(policy, rows, drawn(policy, rows, generator), nfe=nfe, split=split)
+        chunk = predict(policy, rows, drawn(policy, rows, generator), nfe)
     mean, known = flat.loc, (flat.warm & flat.counted).expand_as(flat.loc)
     return MeanError(_rms((mean - target)[known]), _rms((mean - chunk)[known]))
 

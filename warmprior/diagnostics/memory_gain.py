@@ -21,7 +21,7 @@ from warmprior.diagnostics.flow import (
     sees_history,
 )
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_positive, check_whole_numbers
+from warmprior.modules.checks import check_positive
 
 __all__ = ["memory_gain"]
 
@@ -32,8 +32,6 @@ def memory_gain(
     *,
     nfes: Sequence[int] = (1, 9),
     shift: float = 0.05,
-    split: int = 4096,
-    generator: torch.Generator | None = None,
 ) -> dict[int, float]:
     r"""How much of a shift of the history reappears in the executed actions.
 
@@ -66,9 +64,6 @@ def memory_gain(
     Keyword Args:
         nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
         shift: :math:`\delta`, in normalised action units.
-        split: network batch size, for bounded memory; it changes nothing else.
-        generator: source of randomness on the policy's device; by default one of its own with a fixed
-            seed. One direction and sample of the source per window, the same for every NFE.
 
     Returns:
         By NFE, ascending; 0 if no window has a history, NaN if no position is inside an episode.
@@ -76,13 +71,12 @@ def memory_gain(
     Raises:
         KeyError: if the windows lack a key.
         ValueError: if the windows are empty, hold NaN or Inf, or belong to another prediction length, if the
-            observation's last actions differ from the history's, if ``shift`` or ``split`` is not positive,
+            observation's last actions differ from the history's, if ``shift`` is not positive,
             or the prior allows none of the NFEs.
         FloatingPointError: if a prediction is NaN or infinite.
 
     See Also:
-        - :func:`~warmprior.diagnostics.source_leak`: the same for the noise of the source.
-        - :class:`~warmprior.diagnostics.HistoryShift`: plays a policy with a disturbed memory.
+        :func:`~warmprior.diagnostics.source_leak`: the same for the noise of the source.
 
     Examples:
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
@@ -96,7 +90,6 @@ def memory_gain(
         (True, 0.0)
     """
     check_positive(shift=shift)
-    check_whole_numbers(split=split)
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
     windows = windows.reshape(windows.batch_size.numel())
     encoded = encoded_windows(policy, windows)
@@ -105,8 +98,7 @@ def memory_gain(
     # A network that sees the last actions encodes them together with the images.
     plain = (windows if sees_history(policy) else encoded).to(device)
     _check_seen(policy, plain)
-    if generator is None:
-        generator = torch.Generator(device).manual_seed(0)
+    generator = torch.Generator(device).manual_seed(0)
     normal = torch.randn(n, 1, flat.loc.shape[-1], generator=generator, dtype=flat.loc.dtype, device=device)
     direction = torch.nn.functional.normalize(normal, dim=-1)
     state = generator.get_state()
@@ -119,7 +111,7 @@ def memory_gain(
         )
         rows = encoded_windows(policy, rows).select(*policy.in_keys)
         a0 = drawn(policy, rows, generator)
-        return {nfe: predict(policy, rows, a0, nfe=nfe, split=split) for nfe in allowed}
+        return {nfe: predict(policy, rows, a0, nfe) for nfe in allowed}
 
     with evaluation_mode(policy):
         up, down = predicted(shift), predicted(-shift)

@@ -7,7 +7,6 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.branching import executed_positions
 from warmprior.diagnostics.flow import check_flow, drawn, evaluation_mode, field_of, flat_windows
 from warmprior.history import advance
 from warmprior.modules.actor import WarmPriorActor
@@ -68,53 +67,18 @@ def deployed_history(
     policy: WarmPriorActor,
     previous: TensorDictBase,
     *,
-    executed: int | None = None,
-    nfe: int | None = None,
     generator: torch.Generator | None = None,
 ) -> TensorDict:
     """The history at deployment, from the policy's own prediction one decision earlier.
 
-    ``batch.update(deployed_history(policy, previous))`` replaces that of windows. For a network that sees the
-    history, :class:`~warmprior.HistoryObservation` then updates the observation.
-
-    Args:
-        policy: the policy.
-        previous: windows ``[*B]`` of the decision before each window of interest, ``executed`` steps earlier
-            in the same episode, with the history of the training.
-
-    Keyword Args:
-        executed: actions executed between the two; ``H`` by default.
-        nfe: network evaluations of the prediction; the policy's own by default.
-        generator: source of randomness on the policy's device; the policy's own by default.
-
-    Returns:
-        TensorDict ``[*B]`` with ``"history"``.
-
-    Raises:
-        KeyError: if the batch lacks a key.
-        ValueError: for bad batches or options.
-
-    Examples:
-        >>> from warmprior.diagnostics import deployed_history
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.history import cold_history
-        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 16), PreviewPrior(8))
-        >>> previous = TensorDict({"observation": torch.zeros(5, 2, 3),
-        ...                        "history": cold_history([5], 8, 16, action_dim=2)}, [5])
-        >>> deployed_history(actor, previous)["history", "forecast_steps"].flatten().tolist()
-        [8, 8, 8, 8, 8]
+    ``previous`` are windows ``[*B]``, ``H`` steps before those of interest in the same episodes, with the
+    history of the training. Returns ``[*B]`` with ``"history"``.
     """
     windows = flat_windows(policy, previous)
-    prior = policy.prior
-    k = executed_positions(prior, executed)
-    if k > prior.chunk_length:
-        raise ValueError(f"at most H = {prior.chunk_length} actions are executed, got {k}")
     data = previous.select(*policy.in_keys).to(windows.loc.device)
     with evaluation_mode(policy):
-        data.set(policy.ode.in_keys[0], drawn(policy, data, generator))
-        chunk = policy.integrate(data, nfe).get(policy.chunk_key)
-        steps = torch.full((*data.batch_size, 1), k, device=chunk.device)
+        data.set(keys.NOISE, drawn(policy, data, generator))
+        chunk = policy.integrate(data).get(keys.CHUNK)
+        steps = torch.full((*data.batch_size, 1), policy.prior.chunk_length, device=chunk.device)
         history = advance(data[keys.HISTORY], chunk, steps)
     return TensorDict({keys.HISTORY: history}, batch_size=data.batch_size, device=chunk.device)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -13,9 +12,7 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.transforms.delay import executed_chunk
 
-__all__ = ["Smoothness", "compare_smoothness", "executed_actions", "smoothness"]
-
-Mode = int | Callable[[Tensor], Tensor]
+__all__ = ["Smoothness", "executed_actions", "smoothness"]
 
 
 @dataclass(frozen=True)
@@ -26,14 +23,10 @@ class Smoothness:
         boundary_jump: mean distance between the last action of a chunk and the first of the next.
         inner_jump: mean distance between consecutive actions inside chunks.
         jerk: mean norm of the third difference of the executed actions, per step cubed.
-        switch_rate: share of boundaries at which the mode changes sign, among those with a mode on
-            both sides.
         boundaries: number of boundaries.
-        executed: largest number of actions executed per decision.
 
     See Also:
-        - :func:`~warmprior.diagnostics.smoothness`: measures it.
-        - :func:`~warmprior.diagnostics.compare_smoothness`: compares two policies.
+        :func:`~warmprior.diagnostics.smoothness`: measures it.
 
     Examples:
         >>> from warmprior.diagnostics import smoothness
@@ -50,9 +43,7 @@ class Smoothness:
     boundary_jump: float
     inner_jump: float
     jerk: float
-    switch_rate: float
     boundaries: int
-    executed: int
 
     @property
     def jump_ratio(self) -> float:
@@ -124,15 +115,11 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
     )
 
 
-def smoothness(rollout: TensorDictBase, *, mode: Mode | None = None) -> Smoothness:
+def smoothness(rollout: TensorDictBase) -> Smoothness:
     """Jumps at and inside chunk boundaries, jerk, and the rate of mode switches.
 
     Args:
         rollout: see :func:`executed_actions`.
-
-    Keyword Args:
-        mode: whose sign is the mode of an action: the index of a coordinate, or a function of actions
-            ``[..., d_a]`` that returns ``[...]``. Where it is 0 an action has no mode.
 
     Returns:
         Means over all boundaries, steps and rows, in normalised action units.
@@ -148,9 +135,9 @@ def smoothness(rollout: TensorDictBase, *, mode: Mode | None = None) -> Smoothne
         >>> rollout = TensorDict({
         ...     "vla_action": {"chunk": torch.tensor([[[1.0], [1.5]], [[-1.0], [-1.5]]])},
         ...     "next": {"executed_steps": torch.tensor([[2], [2]])}}, [2])
-        >>> result = smoothness(rollout, mode=0)
-        >>> result.boundary_jump, result.inner_jump, result.switch_rate
-        (2.5, 0.5, 1.0)
+        >>> result = smoothness(rollout)
+        >>> result.boundary_jump, result.inner_jump
+        (2.5, 0.5)
     """
     actions, decision, episode = executed_actions(rollout)
     together = (episode[..., 1:] == episode[..., :-1]) & (episode[..., 1:] >= 0)
@@ -158,12 +145,6 @@ def smoothness(rollout: TensorDictBase, *, mode: Mode | None = None) -> Smoothne
     if not boundary.any():
         raise ValueError("the rollout has no chunk boundary: it needs two decisions of one episode")
     jump = torch.linalg.vector_norm(actions.diff(dim=-2), dim=-1)
-    switch_rate = math.nan
-    if mode is not None:
-        value = actions[..., mode] if isinstance(mode, int) else mode(actions)
-        side = value.nan_to_num().sign()
-        decided = boundary & (side[..., 1:] != 0) & (side[..., :-1] != 0)
-        switch_rate = _mean((side[..., 1:] != side[..., :-1]).float(), decided)
     jerk = math.nan
     if actions.shape[-2] > 3:
         third = torch.linalg.vector_norm(actions.diff(n=3, dim=-2), dim=-1)
@@ -172,36 +153,9 @@ def smoothness(rollout: TensorDictBase, *, mode: Mode | None = None) -> Smoothne
         boundary_jump=_mean(jump, boundary),
         inner_jump=_mean(jump, together & ~boundary),
         jerk=jerk,
-        switch_rate=switch_rate,
         boundaries=int(boundary.sum()),
-        executed=int(rollout["next", keys.EXECUTED].max()),
     )
 
 
 def _mean(values: Tensor, mask: Tensor) -> float:
     return float(values[mask].mean()) if mask.any() else math.nan
-
-
-def compare_smoothness(
-    rollouts: Mapping[str, TensorDictBase], *, mode: Mode | None = None
-) -> dict[str, Smoothness]:
-    """Smoothness of several policies that decide equally often, by name, see :func:`smoothness`.
-
-    Raises:
-        ValueError: if the policies execute different numbers of actions per decision: their boundaries
-            are not comparable then.
-
-    Examples:
-        >>> from warmprior.diagnostics import compare_smoothness
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> rollout = TensorDict({"vla_action": {"chunk": torch.zeros(3, 2, 1)},
-        ...                       "next": {"executed_steps": torch.full((3, 1), 2)}}, [3])
-        >>> compare_smoothness({"a": rollout, "b": rollout})["b"].boundaries
-        2
-    """
-    results = {name: smoothness(rollout, mode=mode) for name, rollout in rollouts.items()}
-    executed = {name: result.executed for name, result in results.items()}
-    if len(set(executed.values())) > 1:
-        raise ValueError(f"compare policies that execute equally many actions per decision, got {executed}")
-    return results

@@ -104,10 +104,7 @@ def source_leak(
     *,
     nfes: Sequence[int] = (1, 9),
     draws: int = 8,
-    neighbours: int = 1,
     episodes: Tensor | None = None,
-    split: int = 4096,
-    generator: torch.Generator | None = None,
 ) -> dict[int, SourceLeak]:
     r"""How far predictions spread over draws of the source, relative to the data.
 
@@ -118,13 +115,12 @@ def source_leak(
     warm source knows about the target, so its spread is not 0, but still at most the data's, by the law of
     total variance.
 
-    The data's variance is half the mean squared difference between a window's target and those at the nearest
-    observations (Euclidean, all ``To`` steps), one in each of the nearest other episodes; steps of one
-    episode would agree too well. It is conditioned on the observation alone for every prior, because
-    WP-Preview's training mean is cut from the target. It therefore errs upwards: neighbours' observations
-    differ, and the mean is not taken into account. Several modes at one observation spread far enough to hide
-    a leak, but noise between the actions of one chunk still shows, as steps inside chunks that are longer
-    than the data's.
+    The data's variance is half the mean squared difference between a window's target and that at the nearest
+    observation (Euclidean, all ``To`` steps) of another episode; steps of one episode would agree too well.
+    It is conditioned on the observation alone for every prior, because WP-Preview's training mean is cut from
+    the target. It therefore errs upwards: neighbours' observations differ, and the mean is not taken into
+    account. Several modes at one observation spread far enough to hide a leak, but noise between the actions
+    of one chunk still shows, as steps inside chunks that are longer than the data's.
 
     Positions past the first ``H`` or past an episode's end do not count.
 
@@ -137,20 +133,15 @@ def source_leak(
     Keyword Args:
         nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
         draws: samples of the source per window, at least 2, the same ones for every NFE.
-        neighbours: how many windows each target is compared with. More are further away.
         episodes: each window's episode, ``[*B]``, such as :attr:`SharedObservations.episodes`;
             by default ``"episode"`` in the windows; without it every window counts as an episode.
-        split: network batch size, for bounded memory; it changes nothing else.
-        generator: source of randomness on the policy's device; by default one of its own with a fixed
-            seed.
 
     Returns:
         The measures by NFE, in ascending order.
 
     Raises:
         KeyError: if the windows lack a key.
-        ValueError: for bad windows or options, fewer other episodes than neighbours, or if the prior
-            allows none of the NFEs.
+        ValueError: for bad windows or options, a single episode, or if the prior allows none of the NFEs.
         FloatingPointError: if a prediction is NaN or infinite.
 
     See Also:
@@ -168,33 +159,28 @@ def source_leak(
         >>> one_step.inner_step_ratio > 2, one_step.warning is None  # noise, to smooth demonstrations
         (True, False)
     """
-    if draws < 2 or neighbours < 1 or split < 1:
-        raise ValueError(
-            f"need draws >= 2, neighbours >= 1 and split >= 1, got {draws}, {neighbours} and {split}"
-        )
+    if draws < 2:
+        raise ValueError(f"need draws >= 2, got {draws}")
     prior, allowed = policy.prior, allowed_nfes(policy, nfes)
-    flat, target, rows, generator = judged(policy, windows, generator)
+    flat, target, rows, generator = judged(policy, windows)
     n, device, chunk_length = len(flat), flat.loc.device, prior.chunk_length
     if episodes is None:
         episodes = windows.get(keys.EPISODE, None)
     episodes = torch.arange(n) if episodes is None else episodes.flatten()
     if len(episodes) != n:
         raise ValueError(f"each of the {n} windows needs its episode, got {len(episodes)}")
-    others = len(episodes.unique()) - 1
-    if others < neighbours:
-        raise ValueError(
-            f"each window needs neighbours in {neighbours} other episode(s), but there are {others}"
-        )
+    if len(episodes.unique()) < 2:
+        raise ValueError("each window is compared with one of another episode, and all are of one")
     target, counted = target[:, :chunk_length], flat.counted[:, :chunk_length, 0]
     moments = {nfe: RunningVariance() for nfe in allowed}
     steps = {nfe: 0.0 for nfe in allowed}
     with evaluation_mode(policy):
         observation = observed(policy, windows).reshape(n, -1).to(device)
-        data_spread = _data_spread(observation, target, counted, episodes.to(device), neighbours)
+        data_spread = _data_spread(observation, target, counted, episodes.to(device))
         for _ in range(draws):
             a0 = drawn(policy, rows, generator)
             for nfe in allowed:
-                chunk = predict(policy, rows, a0, nfe=nfe, split=split)
+                chunk = predict(policy, rows, a0, nfe)
                 chunk = moments[nfe].add(chunk[:, :chunk_length])
                 steps[nfe] += _inner_step(chunk, counted) / draws
     spread = {
@@ -214,21 +200,16 @@ def source_leak(
     }
 
 
-def _data_spread(
-    observation: Tensor, target: Tensor, counted: Tensor, episodes: Tensor, neighbours: int
-) -> float:
+def _data_spread(observation: Tensor, target: Tensor, counted: Tensor, episodes: Tensor) -> float:
     size = max(DISTANCES // len(observation), 1)
     squares = []
     for i in range(0, len(observation), size):
         s = slice(i, i + size)
         # The faster form by matrix products loses small distances, which matter here.
         distance = torch.cdist(observation[s], observation, compute_mode="donot_use_mm_for_euclid_dist")
-        taken = episodes[s, None] == episodes
-        for _ in range(neighbours):
-            nearest = distance.masked_fill_(taken, math.inf).argmin(1)
-            taken = episodes[nearest, None] == episodes
-            difference = (target[s] - target[nearest]).square()
-            squares.append(difference[counted[s] & counted[nearest]])
+        nearest = distance.masked_fill_(episodes[s, None] == episodes, math.inf).argmin(1)
+        difference = (target[s] - target[nearest]).square()
+        squares.append(difference[counted[s] & counted[nearest]])
     return math.sqrt(float(torch.cat(squares).mean()) / 2)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,15 +14,15 @@ from torch import Tensor
 from warmprior.io.extras import require
 
 __all__ = [
-    "SeedSummary",
     "bootstrap_ratio",
-    "exceeds_one_sigma",
     "paired_probability_better",
     "probability_better",
     "success_posterior",
-    "summarize_seeds",
     "top_k_mean",
 ]
+
+RESAMPLES = 2_000
+"""Of a bootstrap."""
 
 
 def success_posterior(successes: int, episodes: int) -> Any:
@@ -96,9 +95,6 @@ def top_k_mean(rates: Sequence[float], k: int) -> float:
     The paper averages checkpoints like this. Choosing and reporting on the same episodes flatters every
     method alike.
 
-    See Also:
-        :func:`~warmprior.diagnostics.summarize_seeds`: over the seeds then.
-
     Examples:
         >>> from warmprior.diagnostics import top_k_mean
         >>> top_k_mean([0.1, 0.9, 0.5, 0.7], 3)
@@ -142,79 +138,14 @@ def paired_probability_better(wins: int, losses: int) -> float:
     return float(success_posterior(wins, wins + losses).sf(0.5))
 
 
-@dataclass(frozen=True)
-class SeedSummary:
-    """Mean and spread of one result over training seeds.
-
-    Attributes:
-        mean: mean over seeds.
-        std: sample standard deviation (divisor ``seeds - 1``); NaN for a single seed.
-        seeds: number of seeds.
-
-    See Also:
-        - :func:`~warmprior.diagnostics.summarize_seeds`: makes it.
-        - :func:`~warmprior.diagnostics.exceeds_one_sigma`: compares two.
-
-    Examples:
-        >>> from warmprior.diagnostics import exceeds_one_sigma, summarize_seeds
-        >>> one, three = summarize_seeds([0.6]), summarize_seeds([0.5, 0.6, 0.7])
-        >>> one.std, round(three.std, 3), exceeds_one_sigma(one, three)
-        (nan, 0.1, False)
-    """
-
-    mean: float
-    std: float
-    seeds: int
-
-
-def summarize_seeds(values: Sequence[float]) -> SeedSummary:
-    """Mean and sample standard deviation over seeds.
-
-    Raises:
-        ValueError: if there is no value.
-
-    See Also:
-        - :func:`~warmprior.diagnostics.top_k_mean`: over the checkpoints of a seed before.
-        - :func:`~warmprior.diagnostics.exceeds_one_sigma`: compares two summaries.
-
-    Examples:
-        >>> from warmprior.diagnostics import summarize_seeds
-        >>> summarize_seeds([0.5, 0.7])
-        SeedSummary(mean=0.6, std=0.1414..., seeds=2)
-    """
-    if not values:
-        raise ValueError("need at least one seed")
-    std = statistics.stdev(values) if len(values) > 1 else math.nan
-    return SeedSummary(statistics.fmean(values), std, len(values))
-
-
-def exceeds_one_sigma(method: SeedSummary, base: SeedSummary) -> bool:
-    """The paper's rule for a marked gain: non-overlapping one-sigma seed intervals (Table 1).
-
-    Always false with a single seed, which has no spread.
-
-    See Also:
-        - :func:`~warmprior.diagnostics.summarize_seeds`: makes what it compares.
-        - :func:`~warmprior.diagnostics.paired_probability_better`: where both played the same episodes.
-
-    Examples:
-        >>> from warmprior.diagnostics import SeedSummary, exceeds_one_sigma
-        >>> exceeds_one_sigma(SeedSummary(0.9, 0.02, 3), SeedSummary(0.8, 0.03, 3))
-        True
-    """
-    return method.mean - base.mean > method.std + base.std
-
-
 def bootstrap_ratio(
     numerator: Tensor,
     denominator: Tensor,
     groups: Tensor,
     *,
-    resamples: int = 2_000,
-    level: float = 0.95,
     generator: torch.Generator | None = None,
 ) -> tuple[float, float, float]:
-    """Ratio of two means over the same observations, with a percentile bootstrap interval.
+    """Ratio of two means over the same observations, with a percentile bootstrap interval of 95%.
 
     It draws whole groups with replacement: neighbouring steps of an episode are alike, and intervals from
     single steps would be far too narrow. Observations where either value is NaN do not count.
@@ -225,8 +156,6 @@ def bootstrap_ratio(
         groups: the group of each, int64 ``[n]``; its episode, usually.
 
     Keyword Args:
-        resamples: bootstrap samples.
-        level: of the interval.
         generator: source of randomness on the CPU; PyTorch's global one by default.
 
     Returns:
@@ -234,7 +163,7 @@ def bootstrap_ratio(
         interval for a single group.
 
     Raises:
-        ValueError: if the shapes differ, or an option is out of range.
+        ValueError: if the shapes differ.
         ImportError: if scipy is missing.
 
     See Also:
@@ -251,8 +180,6 @@ def bootstrap_ratio(
     if numerator.ndim != 1 or not numerator.shape == denominator.shape == groups.shape:
         shapes = [tuple(x.shape) for x in (numerator, denominator, groups)]
         raise ValueError(f"need three tensors [n], got {shapes}")
-    if resamples < 1 or not 0.0 < level < 1.0:
-        raise ValueError(f"need resamples >= 1 and 0 < level < 1, got {resamples} and {level}")
     both = torch.stack([numerator, denominator], -1).double().cpu()
     counted = ~both.isnan().any(-1)
     if not counted.any():
@@ -267,8 +194,8 @@ def bootstrap_ratio(
     found = require("scipy.stats", "sim").bootstrap(
         tuple(sums.T.numpy()),
         lambda above, below, axis: above.sum(axis) / below.sum(axis),
-        n_resamples=resamples,
-        confidence_level=level,
+        n_resamples=RESAMPLES,
+        confidence_level=0.95,
         paired=True,
         method="percentile",
         rng=np.random.default_rng(int(torch.randint(2**62, (), generator=generator))),

@@ -7,16 +7,14 @@ from warmprior.modules.interpolant import (
     BridgeInterpolant,
     Interpolant,
     LinearInterpolant,
-    PolynomialInterpolant,
-    TrigonometricInterpolant,
 )
 from warmprior.modules.mlp import VelocityMLP
-from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
+from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor, integrate
 from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
-from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
+from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.sampler import PriorSampler
 from warmprior.modules.start import StartPoint
 from warmprior.modules.trend import PoseTrend, RestingAction
@@ -32,7 +30,6 @@ __all__ = [
     "Normalizer",
     "ODEActor",
     "PastPrior",
-    "PolynomialInterpolant",
     "PoseTrend",
     "PreconditionedNetwork",
     "PreviewPrior",
@@ -43,8 +40,6 @@ __all__ = [
     "Source",
     "SourceMoments",
     "StartPoint",
-    "TimestepEmbedding",
-    "TrigonometricInterpolant",
     "VelocityMLP",
     "VelocityNetwork",
     "VisionNetwork",
@@ -52,5 +47,4 @@ __all__ = [
     "imagenet_weights",
     "integrate",
     "load_imagenet",
-    "with_leftover",
 ]

@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import nn
 
 from warmprior import keys
 from warmprior.modules.normalize import Normalizer
@@ -52,8 +52,6 @@ class WarmPriorActor(TensorDictModuleBase):
         observation_key: key of the observation, ``[*B, To, d_o]``, or of several nested under it;
             :data:`warmprior.keys.CONDITIONED` where the network sees the last actions
             (:class:`~warmprior.HistoryObservation`).
-        chunk_key: key of the chunk, ``[*B, P, d_a]``.
-        path_key: if given, the integration path is written there.
 
     Raises:
         ValueError: if the network was built for another prediction length than the prior's, ``nfe`` exceeds
@@ -90,8 +88,6 @@ class WarmPriorActor(TensorDictModuleBase):
         environment: Mapping[str, Any] | None = None,
         generator: torch.Generator | None = None,
         observation_key: NestedKey = keys.OBSERVATION,
-        chunk_key: NestedKey = keys.CHUNK,
-        path_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
         built_for = getattr(network, "prediction_length", prior.prediction_length)
@@ -112,8 +108,6 @@ class WarmPriorActor(TensorDictModuleBase):
             clip=clip,
             guidance=guidance,
             observation_key=observation_key,
-            chunk_key=chunk_key,
-            path_key=path_key,
         )
         self.normalizer = normalizer
         self.environment = environment
@@ -132,11 +126,6 @@ class WarmPriorActor(TensorDictModuleBase):
         return self.sampler.start
 
     @property
-    def chunk_key(self) -> NestedKey:
-        """Key of the chunk."""
-        return self.ode.out_keys[0]
-
-    @property
     def network(self) -> nn.Module:
         """The velocity network."""
         return self.ode.network
@@ -150,13 +139,10 @@ class WarmPriorActor(TensorDictModuleBase):
     def integrate(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
         """Integrate a given source sample to the chunk, with the policy's guidance.
 
-        The sample, ``[*B, P, d_a]``, stands under ``ode.in_keys[0]``.
+        The sample, ``[*B, P, d_a]``, stands under ``keys.NOISE``.
         """
-        return self.ode(tensordict, nfe=nfe, sigma=self._sigma(tensordict))
-
-    def _sigma(self, tensordict: TensorDictBase) -> Tensor | None:
-        """Standard deviation of the source, broadcastable to ``[*B, P, d_a]``, for the guidance."""
-        return None if self.ode.guidance is None else self.sampler.source(tensordict).scale
+        sigma = None if self.ode.guidance is None else self.sampler.source(tensordict).scale
+        return self.ode(tensordict, nfe=nfe, sigma=sigma)
 
     def replace(self, **changes: Any) -> WarmPriorActor:
         """A copy of the policy, with the same parts, and some constructor arguments changed.
@@ -187,8 +173,6 @@ class WarmPriorActor(TensorDictModuleBase):
             "environment": self.environment,
             "generator": self.sampler.generator,
             "observation_key": self.in_keys[0],
-            "chunk_key": self.chunk_key,
-            "path_key": ode.path_key,
         }
         options = mine | changes
         if "nfe" not in changes and ode.nfe > (options["max_nfe"] or ode.nfe):

@@ -2,38 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
 from warmprior.modules.network import TimestepEmbedding, VelocityNetwork
 
 __all__ = ["ChiTransformer"]
-
-
-class _ModulatedLayer(nn.TransformerDecoderLayer):
-    """PyTorch's pre-norm decoder layer, modulated by the memory's first token, the time.
-
-    It supports only what is used here: batch first, norm first, a causal mask, and no mask on the memory.
-    """
-
-    def __init__(self, dim: int, num_heads: int, **kwargs: Any) -> None:
-        super().__init__(dim, num_heads, **kwargs)
-        self.modulation = nn.Linear(dim, 6 * dim)
-
-    def forward(
-        self, tgt: Tensor, memory: Tensor, tgt_mask: Tensor | None = None, *args: Any, **kwargs: Any
-    ) -> Tensor:
-        scale, shift, gate, scale_2, shift_2, gate_2 = self.modulation(memory[:, :1]).chunk(6, -1)
-        x = self.norm1(tgt) * (1 + scale) + shift
-        x = self.self_attn(x, x, x, attn_mask=tgt_mask, is_causal=True, need_weights=False)[0]
-        tgt = tgt + (1 + gate) * self.dropout1(x)
-        x = self.multihead_attn(self.norm2(tgt), memory, memory, need_weights=False)[0]
-        tgt = tgt + self.dropout2(x)
-        x = self.norm3(tgt) * (1 + scale_2) + shift_2
-        x = self.linear2(self.dropout(self.activation(self.linear1(x))))
-        return tgt + (1 + gate_2) * self.dropout3(x)
 
 
 class ChiTransformer(VelocityNetwork):
@@ -61,9 +35,6 @@ class ChiTransformer(VelocityNetwork):
         num_heads: attention heads, a divisor of ``embedding_dim``.
         timestep_embedding_dim: width of the time embedding before its projection.
         dropout: dropout in attention and feed-forward layers.
-        time_modulation: let the time also scale, shift and gate self-attention and feed-forward layers
-            (adaptive layer norm, Peebles and Xie, 2023), from no effect at first. Off by default, as in the
-            paper.
 
     Raises:
         ValueError: if ``num_heads`` does not divide ``embedding_dim``.
@@ -94,7 +65,6 @@ class ChiTransformer(VelocityNetwork):
         num_heads: int = 6,
         timestep_embedding_dim: int = 128,
         dropout: float = 0.1,
-        time_modulation: bool = False,
     ) -> None:
         super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
         if embedding_dim % num_heads:
@@ -111,8 +81,7 @@ class ChiTransformer(VelocityNetwork):
             nn.Mish(),
             nn.Linear(4 * embedding_dim, embedding_dim),
         )
-        make_layer = _ModulatedLayer if time_modulation else nn.TransformerDecoderLayer
-        layer = make_layer(
+        layer = nn.TransformerDecoderLayer(
             embedding_dim,
             num_heads,
             dim_feedforward=4 * embedding_dim,
@@ -128,9 +97,6 @@ class ChiTransformer(VelocityNetwork):
         self.apply(self._init_weights)
         nn.init.normal_(self.action_position, std=0.02)
         nn.init.normal_(self.memory_position, std=0.02)
-        if time_modulation:
-            for layer in self.decoder.layers:
-                nn.init.zeros_(layer.modulation.weight)
 
     @staticmethod
     def _init_weights(module: nn.Module) -> None:

@@ -75,7 +75,6 @@ class ImageEncoder(nn.Module):
     See Also:
         - :class:`~warmprior.VisionNetwork`: a velocity network behind it.
         - :class:`~warmprior.EncodeObservation`: runs it next to the environment.
-        - :func:`~warmprior.modules.load_imagenet`: starts it from ImageNet's weights.
 
     Examples:
         >>> from warmprior import ImageEncoder

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -14,8 +12,6 @@ __all__ = [
     "BridgeInterpolant",
     "Interpolant",
     "LinearInterpolant",
-    "PolynomialInterpolant",
-    "TrigonometricInterpolant",
 ]
 
 
@@ -71,10 +67,6 @@ class Interpolant(Registered):
 class LinearInterpolant(Interpolant):
     r"""Straight line: :math:`\alpha = 1 - t`, :math:`\beta = t` (Lipman et al., 2023; the paper's).
 
-    See Also:
-        - :class:`~warmprior.TrigonometricInterpolant`: keeps the variance of uncorrelated ends.
-        - :class:`~warmprior.PolynomialInterpolant`: starts at rest.
-
     Examples:
         >>> from warmprior import LinearInterpolant
         >>> import torch
@@ -90,67 +82,6 @@ class LinearInterpolant(Interpolant):
         """Coefficients of the straight line."""
         one = torch.ones_like(t)
         return 1 - t, t, -one, one
-
-
-class TrigonometricInterpolant(Interpolant):
-    r"""Quarter circle: :math:`\alpha = \cos(\pi t/2)`, :math:`\beta = \sin(\pi t/2)`.
-
-    Keeps the variance constant for uncorrelated unit-variance ends (Albergo and Vanden-Eijnden, 2023).
-
-    See Also:
-        :class:`~warmprior.LinearInterpolant`: the default.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior import TrigonometricInterpolant
-        >>> alpha, beta, _, _ = TrigonometricInterpolant().coefficients(torch.tensor(1 / 3))
-        >>> round(alpha.item(), 3), round(beta.item(), 3)
-        (0.866, 0.5)
-    """
-
-    name = "trigonometric"
-
-    def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Coefficients of the quarter circle."""
-        w = math.pi / 2
-        sin, cos = torch.sin(w * t), torch.cos(w * t)
-        return cos, sin, -w * sin, w * cos
-
-
-class PolynomialInterpolant(Interpolant):
-    r"""Convex power: :math:`\alpha = 1 - t^n`, :math:`\beta = t^n` (Lipman et al., 2024, Sec. 4.8).
-
-    Args:
-        n: the power, > 0; ``n=1`` is the straight line. For ``n > 1`` the flow starts at rest, so one
-            Euler step from ``t=0`` does not move: use more steps.
-
-    Raises:
-        ValueError: if ``n <= 0``.
-
-    See Also:
-        :class:`~warmprior.LinearInterpolant`: the power 1.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior import PolynomialInterpolant
-        >>> a0, a1, t = torch.zeros(1, 1, 1), torch.ones(1, 1, 1), torch.tensor([0.5])
-        >>> a_t, velocity = PolynomialInterpolant(n=2)(a0, a1, t)
-        >>> a_t.item(), velocity.item()
-        (0.25, 1.0)
-    """
-
-    name = "polynomial"
-
-    def __init__(self, n: float = 2.0) -> None:
-        if n <= 0:
-            raise ValueError(f"the power n must be > 0, got {n}")
-        self.n = float(n)
-
-    def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Coefficients of the power path."""
-        beta = t**self.n
-        d_beta = self.n * t ** (self.n - 1)
-        return 1 - beta, beta, -d_beta, d_beta
 
 
 class BridgeInterpolant(Interpolant):

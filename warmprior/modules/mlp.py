@@ -48,8 +48,7 @@ class VelocityMLP(VelocityNetwork):
         timestep_embedding_dim: width of the time embedding.
 
     See Also:
-        - :class:`~warmprior.ChiTransformer`: the paper's network.
-        - :class:`~warmprior.PreconditionedNetwork`: adds what is known before training.
+        :class:`~warmprior.ChiTransformer`: the paper's network.
 
     Examples:
         >>> from warmprior import VelocityMLP

@@ -184,15 +184,6 @@ class TimestepEmbedding(nn.Module):
 
     Raises:
         ValueError: if ``dim`` is odd or < 4.
-
-    See Also:
-        :class:`~warmprior.ChiTransformer`: embeds its times with it.
-
-    Examples:
-        >>> from warmprior.modules import TimestepEmbedding
-        >>> import torch
-        >>> TimestepEmbedding(8)(torch.tensor([0.0, 1.0])).shape
-        torch.Size([2, 8])
     """
 
     frequencies: Tensor

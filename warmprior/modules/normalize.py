@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -128,7 +128,7 @@ class Normalizer(nn.Module):
                 data.set(key, data.get(key) * self.scale(key) + self.loc(key))
         return data
 
-    def env_transforms(self, action_key: NestedKey = keys.ACTION) -> list[Transform]:
+    def env_transforms(self) -> list[Transform]:
         """TorchRL transforms that do the same next to the base environment.
 
         Observations are normalised on the way out and actions denormalised on the way in. Append them
@@ -137,37 +137,24 @@ class Normalizer(nn.Module):
         transforms: list[Transform] = []
         for key in self.keys:
             loc, scale = self.loc(key).clone(), self.scale(key).clone()
-            if key == action_key:
+            if key == keys.ACTION:
                 transforms.append(ActionScaling(in_keys_inv=[key], in_keys=[], loc=loc, scale=scale))
             else:
                 transforms.append(ObservationNorm(in_keys=[key], loc=loc, scale=scale, standard_normal=True))
         return transforms
 
     def config(self) -> dict[str, Any]:
-        """JSON-serialisable widths, nested as the keys are; the values themselves are buffers."""
-        widths: dict[str, Any] = {}
-        for key in self.keys:
-            *branches, leaf = (key,) if isinstance(key, str) else key
-            place = widths
-            for branch in branches:
-                place = place.setdefault(branch, {})
-            place[leaf] = list(self.loc(key).shape)
-        return {"widths": widths}
+        """JSON-serialisable keys, each with its shape; the values themselves are buffers."""
+        return {"shapes": [[key, list(self.loc(key).shape)] for key in self.keys]}
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> Normalizer:
-        """An unfitted normaliser with the keys and widths of :meth:`config`, to load buffers into."""
-        zero = {key: torch.zeros(shape) for key, shape in _leaves(config["widths"])}
+        """An unfitted normaliser with the keys and shapes of :meth:`config`, to load buffers into."""
+        zero: dict[NestedKey, Tensor] = {}
+        for key, shape in config["shapes"]:
+            zero[tuple(key) if isinstance(key, list) else key] = torch.zeros(shape)
         return cls(zero, zero)
 
 
 def _name(key: NestedKey, part: str) -> str:
     return f"{key if isinstance(key, str) else '/'.join(key)}_{part}"
-
-
-def _leaves(widths: dict[str, Any], *branch: str) -> Iterator[tuple[NestedKey, list[int]]]:
-    for name, value in widths.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, *branch, name)
-        else:
-            yield (*branch, name) if branch else name, value

@@ -156,10 +156,7 @@ class ODEActor(TensorDictModuleBase):
         guidance: makes chunks continue the one being executed; none by default. It reads the rest of that
             chunk, ``("history", "forecast")`` and ``("history", "forecast_steps")``, and the delay, int64
             ``[*B, 1]``.
-        noise_key: key of the source, ``[*B, P, d_a]``.
         observation_key: key of the observation, ``[*B, To, d_o]``.
-        chunk_key: key written, ``[*B, P, d_a]``.
-        path_key: if given, the integration path ``[*B, steps + 1, P, d_a]`` is written there.
 
     Raises:
         ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend or that exceeds ``max_nfe``, or
@@ -167,8 +164,7 @@ class ODEActor(TensorDictModuleBase):
         KeyError: if an input key is missing.
 
     See Also:
-        - :class:`~warmprior.WarmPriorActor`: this with a source before it: a whole policy.
-        - :func:`~warmprior.integrate`: the integration alone.
+        :class:`~warmprior.WarmPriorActor`: this with a source before it: a whole policy.
 
     Examples:
         >>> import torch
@@ -193,10 +189,7 @@ class ODEActor(TensorDictModuleBase):
         grid: str = "uniform",
         clip: float | Sequence[float] | None = None,
         guidance: RealTimeChunking | None = None,
-        noise_key: NestedKey = keys.NOISE,
         observation_key: NestedKey = keys.OBSERVATION,
-        chunk_key: NestedKey = keys.CHUNK,
-        path_key: NestedKey | None = None,
     ) -> None:
         super().__init__()
         if nfe is None:
@@ -227,11 +220,10 @@ class ODEActor(TensorDictModuleBase):
         self.grid = grid
         self.clip = clip
         self.guidance = guidance
-        self.path_key = path_key
-        self.in_keys = [noise_key, observation_key]
+        self.in_keys = [keys.NOISE, observation_key]
         if guidance is not None:
             self.in_keys += GUIDED_BY
-        self.out_keys = [chunk_key] if path_key is None else [chunk_key, path_key]
+        self.out_keys = [keys.CHUNK]
 
     def check_nfe(self, nfe: int) -> None:
         """A ``ValueError`` unless solver and network support ``nfe`` network evaluations."""
@@ -245,7 +237,7 @@ class ODEActor(TensorDictModuleBase):
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, sigma: Tensor | None = None
     ) -> TensorDictBase:
-        """Write the chunk (and the path, where asked for).
+        """Write the chunk.
 
         ``sigma`` is the source's standard deviation for the guidance, broadcastable to ``[*B, P, d_a]``; 1 by
         default.
@@ -258,9 +250,7 @@ class ODEActor(TensorDictModuleBase):
             about = GUIDED_BY_WHOM if set(GUIDED_BY) & set(missing) else ""
             raise KeyError(f"ODEActor needs the keys {self.in_keys}; missing: {missing}{about}")
         a0, observation, *rest = inputs
-        batch = a0.shape[:-2]
-        observation = network_observation(observation, batch)
-        velocity = velocity_field(self.network, observation)
+        velocity = velocity_field(self.network, network_observation(observation, a0.shape[:-2]))
         if self.guidance is not None:
             leftover, left, delay = rest
             scale = torch.ones_like(a0) if sigma is None else sigma.expand_as(a0)
@@ -271,23 +261,17 @@ class ODEActor(TensorDictModuleBase):
                 delay.reshape(-1, 1),
                 scale.reshape(-1, *a0.shape[-2:]),
             )
-        path_or_chunk = integrate(
+        chunk = integrate(
             velocity,
             a0.reshape(-1, *a0.shape[-2:]),
             nfe=nfe,
             solver=self.solver,
             grid=self.grid,
             start_time=self.start_time,
-            return_path=self.path_key is not None,
-        )
-        chunk = path_or_chunk
-        if self.path_key is not None:
-            tensordict.set(self.path_key, path_or_chunk.reshape(*batch, *path_or_chunk.shape[1:]))
-            chunk = path_or_chunk[:, -1]
-        chunk = chunk.reshape(a0.shape)
+        ).reshape(a0.shape)
         if isinstance(self.clip, list):
             bound = torch.tensor(self.clip, dtype=chunk.dtype, device=chunk.device)
             chunk = chunk.clamp(-bound, bound)
         elif self.clip is not None:
             chunk = chunk.clamp(-self.clip, self.clip)
-        return tensordict.set(self.out_keys[0], chunk)
+        return tensordict.set(keys.CHUNK, chunk)

@@ -98,6 +98,9 @@ class SourceMoments(nn.Module):
             # Copies, so that a tensor given twice does not become one buffer under two names.
             self.register_buffer(name, value.to(source_mean.dtype, copy=True))
 
+    def config(self) -> None:
+        """Nothing: the values are buffers, and take the place of the :meth:`identity`."""
+
     @classmethod
     def identity(cls, prediction_length: int, action_dim: int) -> SourceMoments:
         """Moments of independent standard normal ends, to be replaced by loading a state dict."""
@@ -269,15 +272,6 @@ class PreconditionedNetwork(VelocityNetwork):
                 f"the trend is of chunks (P, d_a) = {tuple(self.trend.target.shape)}, but the network "
                 f"was built for {shape}"
             )
-
-    def config(self) -> dict[str, Any]:
-        """JSON-serialisable class name and constructor arguments; the moments are buffers."""
-        config = {
-            "name": type(self).__name__,
-            "network": self.network.config(),
-            "interpolant": self.interpolant.config(),
-        }
-        return config if self.trend is None else config | {"trend": self.trend.config()}
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """As the network inside does."""

@@ -34,17 +34,6 @@ def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
         chunk: the prediction, ``[*B, P, d_a]``.
         leftover: what the chunk before holds for the same control steps, ``[*B, P, d_a]``.
         delay: control steps until ``chunk`` takes effect, int64 ``[*B, 1]``.
-
-    See Also:
-        - :func:`~warmprior.history.advance`: moves the rest of the old chunk to the positions of the new one.
-        - :class:`~warmprior.RealTimeChunking`: makes the prediction continue the old chunk.
-
-    Examples:
-        >>> from warmprior.modules import with_leftover
-        >>> import torch
-        >>> chunk, leftover = torch.zeros(1, 4, 1), torch.ones(1, 4, 1)
-        >>> with_leftover(chunk, leftover, torch.tensor([[2]])).flatten().tolist()
-        [1.0, 1.0, 0.0, 0.0]
     """
     late = torch.arange(chunk.shape[-2], device=chunk.device) < delay
     return torch.where(late.unsqueeze(-1), leftover.to(chunk.dtype), chunk)

@@ -77,15 +77,17 @@ class Registered:
         """Name and constructor arguments as JSON holds them; :func:`from_config` reverses it.
 
         An argument that the constructor chose, as for ``sigma=None``, is taken from the object's attribute of
-        that name, if it is a number or text. All others are as given.
+        that name, if it is a number or text. Arguments that have a ``config()`` are saved as that, and all
+        others as given.
 
         Raises:
             TypeError: if JSON cannot hold an argument.
         """
         if "name" in self._arguments:
             raise TypeError(f"{type(self).__name__} takes an argument called name: rename it")
+        values = {n: v.config() if hasattr(v, "config") else v for n, v in self._resolved().items()}
         try:
-            return json.loads(json.dumps({"name": self.name, **self._resolved()}, allow_nan=False))
+            return json.loads(json.dumps({"name": self.name, **values}, allow_nan=False))
         except (TypeError, ValueError) as error:
             raise TypeError(
                 f"{type(self).__name__} has an argument that cannot be saved ({error}): take numbers, text, "
@@ -112,12 +114,6 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
 
     Raises:
         ValueError: if there is none, or it is a base class.
-
-    Examples:
-        >>> from warmprior.modules.registry import find
-        >>> from warmprior import Prior
-        >>> find(Prior, "past").__name__
-        'PastPrior'
     """
     module, colon, attribute = name.partition(":")
     if not colon:
@@ -165,11 +161,6 @@ def options_of(text: str) -> dict[str, Any]:
 
     Raises:
         ValueError: if they are not written like this, or one is given twice.
-
-    Examples:
-        >>> from warmprior.modules.registry import options_of
-        >>> options_of("preview,correlation=0.5,words=one, two")
-        {'correlation': 0.5, 'words': 'one, two'}
     """
     options: dict[str, Any] = {}
     _, comma, rest = text.partition(",")
@@ -188,17 +179,7 @@ def options_of(text: str) -> dict[str, Any]:
 
 
 def from_config[T: Registered](base: type[T], config: Mapping[str, Any]) -> T:
-    """Build what :meth:`Registered.config` describes, without importing anything.
-
-    Raises:
-        ValueError: if no imported class has that name.
-
-    Examples:
-        >>> from warmprior.modules.registry import from_config
-        >>> from warmprior import Prior
-        >>> from_config(Prior, {"name": "past", "chunk_length": 8})
-        PastPrior(chunk_length=8, sigma=0.5, correlation=0.0)
-    """
+    """Build what :meth:`Registered.config` describes, without importing anything; an unknown name raises."""
     arguments = dict(config)
     name = arguments.pop("name", None)
     return _known(base, name, "import the module that defines it")(**arguments)

@@ -28,7 +28,6 @@ class PriorSampler(TensorDictModuleBase):
         start: the point from which samplers start, if that is not the source itself.
         observation_key: key of the observation, ``[*B, To, d_o]``; only start points and priors that override
             :meth:`~Prior.distribution` read it.
-        noise_key: key written, ``[*B, P, d_a]``.
         generator: source of randomness; PyTorch's global generator by default. Per call:
             ``sampler(data, generator=...)``. Worker processes take none, since all of them would draw the
             same noise.
@@ -58,7 +57,6 @@ class PriorSampler(TensorDictModuleBase):
         *,
         start: StartPoint | None = None,
         observation_key: NestedKey | None = None,
-        noise_key: NestedKey = keys.NOISE,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
@@ -67,7 +65,7 @@ class PriorSampler(TensorDictModuleBase):
         self.observation_key = observation_key if reads else None
         observed = [] if self.observation_key is None else [self.observation_key]
         self.in_keys = [*((keys.HISTORY, name) for name in ENTRIES), *observed]
-        self.out_keys = [keys.LOC, keys.WARM, noise_key]
+        self.out_keys = [keys.LOC, keys.WARM, keys.NOISE]
 
     def __getstate__(self) -> Any:
         if self.generator is not None and get_spawning_popen() is not None:

@@ -65,14 +65,6 @@ class VisionNetwork(VelocityNetwork):
         )
         self.encoder, self.network = encoder, network
 
-    def config(self) -> dict[str, Any]:
-        """JSON-serialisable class name and constructor arguments."""
-        return {
-            "name": type(self).__name__,
-            "encoder": self.encoder.config(),
-            "network": self.network.config(),
-        }
-
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """The encoded observation, ``[B, To, d_o]``; an encoded one is returned as it is."""
         return self.encoder(observation) if isinstance(observation, TensorDictBase) else observation

@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
+from warmprior import keys
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
@@ -122,9 +123,6 @@ class BridgeCoupling(OTCoupling):
     Raises:
         ValueError: as :class:`OTCoupling`, or if ``sigma`` is not a finite number > 0.
 
-    See Also:
-        :class:`~warmprior.objectives.OTCoupling`: the limit without noise.
-
     Examples:
         >>> import torch
         >>> from warmprior.objectives import BridgeCoupling
@@ -215,6 +213,5 @@ class ReflowCoupling:
             if tensor.device != a0.device:
                 self.teacher.to(a0.device)
                 break
-        noise_key, observation_key = ode.in_keys[:2]
-        data = TensorDict({noise_key: a0, observation_key: observation}, a0.shape[:-2])
-        return a0, ode(data, nfe=self.nfe)[ode.out_keys[0]]
+        data = TensorDict({keys.NOISE: a0, ode.in_keys[1]: observation}, a0.shape[:-2])
+        return a0, ode(data, nfe=self.nfe)[keys.CHUNK]

@@ -94,7 +94,7 @@ class FlowMatchingLoss(LossModule):
         coupling: pairs the sources and targets of a batch, see :data:`~warmprior.objectives.Coupling`; in
             their order by default (Algorithm 1).
         times: how training times are distributed: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
-            ``"logit-normal"``, ``"start"`` (regression) (:mod:`warmprior.objectives.times`), or a function
+            ``"logit-normal"``, ``"start"`` (regression) (``warmprior.objectives.times``), or a function
             of their signature.
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) takes errors as they are. ``"standardised"`` divides them by
@@ -177,8 +177,6 @@ class FlowMatchingLoss(LossModule):
         reduction: str = "mean",
         generator: torch.Generator | None = None,
     ) -> None:
-        self._in_keys: list[NestedKey] | None = None
-        self._out_keys: list[NestedKey] | None = None
         super().__init__()
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
@@ -231,34 +229,15 @@ class FlowMatchingLoss(LossModule):
                 raise ValueError(f"a velocity predicts the sample {straight}")
         self.reduction = reduction
         self.generator = actor_network.sampler.generator if generator is None else generator
-        self.set_keys(observation=actor_network.in_keys[0], chunk=actor_network.chunk_key)
+        self.out_keys = ["loss_flow_matching"]
+        if self_distillation:
+            self.out_keys.append("loss_self_distillation")
+        self.set_keys(observation=actor_network.in_keys[0])
 
-    def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
-        self._in_keys = None
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys that :meth:`forward` reads."""
-        if self._in_keys is None:
-            k = self.tensor_keys
-            self._in_keys = [k.observation, k.chunk, k.pad_mask, k.history]
-        return self._in_keys
-
-    @in_keys.setter
-    def in_keys(self, value: list[NestedKey]) -> None:
-        self._in_keys = value
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Keys of the result."""
-        if self._out_keys is not None:
-            return self._out_keys
-        distilled = ["loss_self_distillation"] if self.self_distillation else []
-        return ["loss_flow_matching", *distilled]
-
-    @out_keys.setter
-    def out_keys(self, value: list[NestedKey]) -> None:
-        self._out_keys = value
+    def _set_in_keys(self) -> None:
+        """TorchRL calls it from :meth:`set_keys`."""
+        k = self.tensor_keys
+        self.in_keys = [k.observation, k.chunk, k.pad_mask, k.history]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """Compute the loss.

@@ -31,20 +31,7 @@ STEEPNESS = 4.0
 def uniform_times(
     shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    """All times alike, as in Algorithm 1.
-
-    See Also:
-        - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
-        - :class:`~warmprior.FlowMatchingLoss`: draws its times so.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.objectives.times import uniform_times
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> t = uniform_times(torch.Size([1000]), generator, torch.float32, torch.device("cpu"))
-        >>> abs(float(t.mean()) - 0.5) < 0.05
-        True
-    """
+    """All times alike, as in Algorithm 1."""
     return torch.rand(shape, generator=generator, dtype=dtype, device=device)
 
 
@@ -59,18 +46,6 @@ def u_shaped_times(
 
     .. math::
         F(t) = \frac12 + \frac{\sinh(a(t - \frac12))}{2 \sinh\frac a2}.
-
-    See Also:
-        - :func:`~warmprior.objectives.times.logit_normal_times`: prefers the middle.
-        - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
-
-    Examples:
-        >>> from warmprior.objectives.times import u_shaped_times
-        >>> import torch
-        >>> t = u_shaped_times(torch.Size([9999]), torch.Generator().manual_seed(0), torch.float64,
-        ...                    torch.device("cpu"))
-        >>> [round(((t > i / 4) & (t < (i + 1) / 4)).double().mean().item(), 1) for i in range(4)]
-        [0.3, 0.2, 0.2, 0.3]
     """
     u = torch.rand(shape, generator=generator, dtype=dtype, device=device)
     t = 0.5 + torch.asinh((2 * u - 1) * math.sinh(STEEPNESS / 2)) / STEEPNESS
@@ -80,20 +55,7 @@ def u_shaped_times(
 def logit_normal_times(
     shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
 ) -> Tensor:
-    r"""More often in the middle: :math:`\log\frac t{1-t} \sim N(0, 1)` (Esser et al., 2024).
-
-    See Also:
-        - :func:`~warmprior.objectives.times.u_shaped_times`: prefers both ends.
-        - :class:`~warmprior.FlowMatchingLoss`: can draw its times so.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.objectives.times import logit_normal_times
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> t = logit_normal_times(torch.Size([1000]), generator, torch.float32, torch.device("cpu"))
-        >>> bool(((t - 0.5).abs() < 0.25).float().mean() > 0.6)  # half of uniform ones
-        True
-    """
+    r"""More often in the middle: :math:`\log\frac t{1-t} \sim N(0, 1)` (Esser et al., 2024)."""
     return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
 
 
@@ -103,15 +65,6 @@ def start_times(
     r"""``t = 0`` alone: the network regresses :math:`a_1 - a_0`, and one step of Euler's method returns it.
 
     The field is not trained at any other time: build the policy with ``max_nfe=1``.
-
-    See Also:
-        :class:`~warmprior.FlowMatchingLoss`: can be trained so.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.objectives.times import start_times
-        >>> start_times(torch.Size([2]), None, torch.float32, torch.device("cpu"))
-        tensor([0., 0.])
     """
     return torch.zeros(shape, dtype=dtype, device=device)
 

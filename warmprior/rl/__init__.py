@@ -1,13 +1,12 @@
 """Reinforcement learning in the source space of a frozen policy."""
 
-from warmprior.rl.anchor import PriorAnchor, has_anchor, source_anchor
+from warmprior.rl.anchor import PriorAnchor, has_anchor
 from warmprior.rl.box_normal import BoxTanhNormal
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.decoder import PriorDecoder
 from warmprior.rl.dsrl import DSRLNALoss
 from warmprior.rl.environment import PriorSpace
 from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
-from warmprior.rl.replay_segments import ReplaySegments
 from warmprior.rl.residual import ResidualSampler
 from warmprior.rl.training import PriorSpaceTraining
 
@@ -19,10 +18,8 @@ __all__ = [
     "PriorSpace",
     "PriorSpaceConfig",
     "PriorSpaceTraining",
-    "ReplaySegments",
     "ResidualSampler",
     "has_anchor",
     "make_prior_space_actor",
     "make_prior_space_critic",
-    "source_anchor",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
@@ -102,11 +102,6 @@ class PriorSpaceAgent:
             target_entropy=config.target_entropy,
         )
 
-    def _schedule(self) -> Iterator[Callable[[TensorDictBase], TensorDict]]:
-        if isinstance(self.loss, DSRLNALoss):
-            return self.loss.schedule(self.config.updates)
-        return iter([self.loss] * self.config.updates)
-
     def learn(self, buffer: ReplayBuffer) -> dict[str, float]:
         """The updates for one vector step of the environment, each on its own batch from the agent's device.
 
@@ -114,7 +109,10 @@ class PriorSpaceAgent:
         names a loss that is NaN or infinite before it changes anything.
         """
         values: dict[str, Tensor] = {}
-        for compute in self._schedule():
+        schedule: Iterable[Callable[[TensorDictBase], TensorDict]] = [self.loss] * self.config.updates
+        if isinstance(self.loss, DSRLNALoss):
+            schedule = self.loss.schedule(self.config.updates)
+        for compute in schedule:
             result = compute(buffer.sample())
             losses = {k: v for k, v in result.items() if k.startswith("loss_")}
             check_finite(losses)  # TorchRL's SAC does not check this

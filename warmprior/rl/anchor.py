@@ -7,15 +7,13 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.history import check_history, window_history
 from warmprior.modules.prior import Prior, checked_mean
-from warmprior.transforms.inner_step import keep_resting
+from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
 __all__ = ["PriorAnchor", "has_anchor", "residual_sigma", "source_anchor"]
 
@@ -25,9 +23,6 @@ def has_anchor(actor: Any) -> bool:
 
     It has if the policy has a start point, or its prior's mean is warm once the history is full. Otherwise
     agents search around zero, as in DSRL.
-
-    See Also:
-        :func:`~warmprior.rl.source_anchor`: returns that centre.
 
     Examples:
         >>> from warmprior.rl import has_anchor
@@ -49,28 +44,8 @@ def has_anchor(actor: Any) -> bool:
 def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
     """The centre of the source at decisions: the mean where it is warm, or that of the start point.
 
-    Args:
-        actor: the policy, or another object with ``prior`` and ``start``.
-        history: ``[*B]``, see :mod:`warmprior.history`.
-        observation: what the policy's network sees, ``[*B, To, d_o]``.
-
-    Returns:
-        The anchor, ``[*B, P, d_a]``, and where it is known, bool ``[*B, P, 1]``.
-
-    See Also:
-        :class:`~warmprior.PriorAnchor`: writes it in an environment, with noise elsewhere.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.history import window_history
-        >>> from warmprior.rl import source_anchor
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> target, steps = torch.zeros(4, 2), torch.tensor([4])
-        >>> history = window_history(torch.ones(4, 2), steps, target, chunk_length=4)
-        >>> anchor, known = source_anchor(
-        ...     WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), history, None)
-        >>> anchor.unique().tolist(), bool(known.all())
-        ([1.0], True)
+    Of histories ``[*B]`` and what the policy's network sees, ``[*B, To, d_o]``: the anchor, ``[*B, P, d_a]``,
+    and where it is known, bool ``[*B, P, 1]``.
     """
     if actor.start is not None:
         centre = actor.start.centre(history, observation)
@@ -89,8 +64,8 @@ def residual_sigma(actor: Any) -> float:
     return actor.prior.sigma * float(getattr(actor.prior, "typical_scale", 1.0))
 
 
-class PriorAnchor(Transform):
-    r"""Writes the anchor around which an agent acts in source space: the mean, and noise where it is cold.
+class PriorAnchor(EnvTransform):
+    r"""Writes the anchor, ``[*B, P, d_a]``, around which agents act: the mean, and noise where it is cold.
 
     .. math::
         c_\tau = \mu_\tau \;\; (\tau \in W), \qquad
@@ -119,9 +94,6 @@ class PriorAnchor(Transform):
         cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise if the policy
             has an anchor (:func:`~warmprior.rl.has_anchor`), and zero otherwise, which gives vanilla DSRL:
             :math:`a_0 = \Delta`.
-        generator: source of the noise, on the CPU, so that a seed gives the same noise on every device;
-            PyTorch's global one by default. Copies of the environment continue from its state.
-        anchor_key: where the anchor is written, ``[*B, P, d_a]``.
 
     Raises:
         ValueError: for an unknown ``cold``, or if the environment's history has other lengths than the
@@ -144,15 +116,8 @@ class PriorAnchor(Transform):
     prior: Any
     start: Any
 
-    def __init__(
-        self,
-        actor: Any,
-        *,
-        cold: Literal["noise", "zero"] | None = None,
-        generator: torch.Generator | None = None,
-        anchor_key: NestedKey = keys.ANCHOR,
-    ) -> None:
-        super().__init__(in_keys=list(actor.in_keys), out_keys=[anchor_key])
+    def __init__(self, actor: Any, *, cold: Literal["noise", "zero"] | None = None) -> None:
+        super().__init__(in_keys=list(actor.in_keys), out_keys=[keys.ANCHOR])
         if cold not in (None, "noise", "zero"):
             raise ValueError(f"cold must be 'noise' or 'zero', got {cold!r}")
         # Copies, so that moving the environment does not move the policy's own.
@@ -163,16 +128,14 @@ class PriorAnchor(Transform):
         self.moves = has_anchor(actor)
         self.cold = cold or ("noise" if self.moves else "zero")
         self.observation_key = actor.in_keys[0]
-        self.generator = generator
-        self.anchor_key = unravel_key(anchor_key)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         history = next_tensordict.get(keys.HISTORY, None)
         check_history(history, self.prior.history_length, self.prior.prediction_length, self.prior)
         forecast = history["forecast"]
         if self.cold == "noise":
-            cold = torch.randn(forecast.shape, generator=self.generator, dtype=forecast.dtype)
-            cold = cold.to(forecast.device)
+            # On the CPU, so that a seed gives the same noise on every device.
+            cold = torch.randn(forecast.shape, dtype=forecast.dtype).to(forecast.device)
         else:
             cold = torch.zeros_like(forecast)
         anchor = cold
@@ -180,22 +143,14 @@ class PriorAnchor(Transform):
             with torch.no_grad():
                 mean, known = source_anchor(self, history, next_tensordict.get(self.observation_key, None))
             anchor = torch.where(known, mean, cold)
-        return next_tensordict.set(self.anchor_key, anchor)
+        return next_tensordict.set(keys.ANCHOR, anchor)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return keep_resting(tensordict, self._call(next_tensordict), [self.anchor_key])
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        # For all sub-environments: TorchRL keeps the rows of those that were reset.
-        return self._call(tensordict_reset)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing: the key is already in the data."""
-        return tensordict
+        return keep_resting(tensordict, self._call(next_tensordict), [keys.ANCHOR])
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the anchor."""
         if keys.FORECAST not in observation_spec.keys(True, True):
             raise KeyError(f"PriorAnchor found no {keys.FORECAST}: append it after ActionHistory")
-        observation_spec[self.anchor_key] = observation_spec[keys.FORECAST].clone()
+        observation_spec[keys.ANCHOR] = observation_spec[keys.FORECAST].clone()
         return observation_spec

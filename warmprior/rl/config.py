@@ -59,9 +59,6 @@ class PriorSpaceConfig:
         >>> config = PriorSpaceConfig(algorithm="dsrl-sac", delta=1.5, hidden_dim=128)
         >>> config.environment_steps, config.gamma
         (1000000, 0.99)
-        >>> PriorSpaceConfig(gamma=1.5)
-        Traceback (most recent call last):
-        ValueError: gamma must lie in (0, 1], got 1.5
     """
 
     algorithm: Literal["dsrl-na", "dsrl-sac"] = "dsrl-na"

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -45,10 +44,6 @@ class PriorDecoder(TensorDictModuleBase):
         delta: half the side of the agent's box, in units of the normalised action space. The paper uses
             0.5 around a warm mean and 1.5 around zero.
         nfe: network evaluations per chunk; the actor's own by default.
-        differentiable: let gradients flow from the chunk to the residual. The network stays frozen.
-        anchor_key: centre of the box, ``[*B, P, d_a]``.
-        delta_key: the residual, ``[*B, P, d_a]``.
-        noise_key: where the source is written, ``[*B, P, d_a]``.
 
     Raises:
         ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0``
@@ -69,17 +64,7 @@ class PriorDecoder(TensorDictModuleBase):
         (0.5, [])
     """
 
-    def __init__(
-        self,
-        actor: WarmPriorActor,
-        *,
-        delta: float,
-        nfe: int | None = None,
-        differentiable: bool = False,
-        anchor_key: NestedKey = keys.ANCHOR,
-        delta_key: NestedKey = keys.DELTA,
-        noise_key: NestedKey = keys.NOISE,
-    ) -> None:
+    def __init__(self, actor: WarmPriorActor, *, delta: float, nfe: int | None = None) -> None:
         super().__init__()
         check_positive(delta=delta)
         if actor.ode.max_nfe == 1:
@@ -91,20 +76,15 @@ class PriorDecoder(TensorDictModuleBase):
                 "the agent's residual alone must decide the chunk: take actor.replace(guidance=None)"
             )
         self.delta = float(delta)
-        self.differentiable = differentiable
         self.ode = copy.deepcopy(actor.ode)
         self.nfe = self.ode.nfe if nfe is None else nfe
         self.ode.check_nfe(self.nfe)
         self.normalizer = copy.deepcopy(actor.normalizer)
         self.prior, self.start = copy.deepcopy(actor.prior), copy.deepcopy(actor.start)
         _freeze(self)
-        self.anchor_key = unravel_key(anchor_key)
-        self.delta_key = unravel_key(delta_key)
-        self.noise_key = unravel_key(noise_key)
-        self._ode_noise_key, self.observation_key = self.ode.in_keys
-        self.chunk_key = unravel_key(self.ode.out_keys[0])
-        self.in_keys = [self.observation_key, self.anchor_key, self.delta_key]
-        self.out_keys = [self.noise_key, self.chunk_key]
+        self.observation_key = self.ode.in_keys[1]
+        self.in_keys = [self.observation_key, keys.ANCHOR, keys.DELTA]
+        self.out_keys = [keys.NOISE, keys.CHUNK]
 
     @property
     def network(self) -> nn.Module:
@@ -121,6 +101,7 @@ class PriorDecoder(TensorDictModuleBase):
         """``d_a``, or ``None`` if the network does not say."""
         return getattr(self.ode.network, "action_dim", None)
 
+    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the source and the chunk."""
         missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
@@ -129,24 +110,21 @@ class PriorDecoder(TensorDictModuleBase):
                 f"PriorDecoder needs the keys {self.in_keys}; missing: {missing}. PriorAnchor writes the "
                 "anchor in an environment and the agent the residual"
             )
-        anchor, delta = tensordict.get(self.anchor_key), tensordict.get(self.delta_key)
+        anchor, delta = tensordict.get(keys.ANCHOR), tensordict.get(keys.DELTA)
         expected = (self.prediction_length, self.action_dim or anchor.shape[-1])
         if tuple(anchor.shape[-2:]) != expected:
             raise ValueError(
-                f"{self.anchor_key} has shape {tuple(anchor.shape)}, but the policy predicts chunks "
+                f"{keys.ANCHOR} has shape {tuple(anchor.shape)}, but the policy predicts chunks "
                 f"[*B, P, d_a] with (P, d_a) = {expected}"
             )
         if delta.shape != anchor.shape:
             raise ValueError(
-                f"{self.delta_key} has shape {tuple(delta.shape)}, but {self.anchor_key} has "
-                f"{tuple(anchor.shape)}"
+                f"{keys.DELTA} has shape {tuple(delta.shape)}, but {keys.ANCHOR} has {tuple(anchor.shape)}"
             )
-        with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
-            noise = anchor + delta
-            inputs = tensordict.select(*self.in_keys).set(self._ode_noise_key, noise)
-            chunk = self.ode(inputs, nfe=self.nfe).get(self.chunk_key)
-        tensordict.set(self.noise_key, noise)
-        return tensordict.set(self.chunk_key, chunk)
+        noise = anchor + delta
+        inputs = tensordict.select(*self.in_keys).set(keys.NOISE, noise)
+        chunk = self.ode(inputs, nfe=self.nfe).get(keys.CHUNK)
+        return tensordict.set(keys.NOISE, noise).set(keys.CHUNK, chunk)
 
     def check_env(self, env: EnvBase) -> None:
         """Compare the policy with an environment whose action is the chunk: its length and width.
@@ -156,12 +134,12 @@ class PriorDecoder(TensorDictModuleBase):
             ValueError: naming what differs.
         """
         actions = env.full_action_spec
-        if self.chunk_key not in actions.keys(True, True):
+        if keys.CHUNK not in actions.keys(True, True):
             raise KeyError(
-                f"the environment takes {list(actions.keys(True, True))}, not {self.chunk_key}: append "
+                f"the environment takes {list(actions.keys(True, True))}, not {keys.CHUNK}: append "
                 "ChunkStep first"
             )
-        shape = actions[self.chunk_key].shape
+        shape = actions[keys.CHUNK].shape
         expected = (self.prediction_length, self.action_dim or shape[-1])
         if tuple(shape[-2:]) != expected:
             raise ValueError(

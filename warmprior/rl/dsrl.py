@@ -28,6 +28,9 @@ __all__ = ["DSRLNALoss"]
 
 type Critics = TensorDictModule | list[TensorDictModule]
 
+CRITICS = 2
+"""Of each kind, of whose values the smaller, or the mean, counts."""
+
 
 class DSRLNALoss(LossModule):
     r"""Noise-aliased DSRL (`Wagenmaker et al. 2025 <https://arxiv.org/abs/2506.15799>`_), around any anchor.
@@ -67,15 +70,14 @@ class DSRLNALoss(LossModule):
 
     Args:
         actor_network: the policy over residuals, see :func:`~warmprior.make_prior_space_actor`.
-        qvalue_network: :math:`Q^A`, which reads ``decoder.chunk_key`` (all ``P`` actions, or its targets
+        qvalue_network: :math:`Q^A`, which reads ``keys.CHUNK`` (all ``P`` actions, or its targets
             would not be Markov for WP-Preview; see :func:`~warmprior.make_prior_space_critic`); one module,
-            of which ``num_qvalue_nets`` copies are initialised, or a list.
-        noise_qvalue_network: :math:`Q^W`, which reads ``decoder.delta_key``; the same.
+            of which two copies are initialised, or a list.
+        noise_qvalue_network: :math:`Q^W`, which reads ``keys.DELTA``; the same.
         decoder: the frozen policy. Its buffers are in the loss's ``state_dict()`` and move with
             ``loss.to(device)``; ``parameters()`` and target updates never see it.
 
     Keyword Args:
-        num_qvalue_nets: critics of each kind.
         backup: how critics are combined, in targets and in the actor's loss: ``"min"`` or ``"mean"``.
         backup_entropy: whether targets include the entropy.
         bootstrap_timeouts: whether the value after a time-out counts. The official implementation treats
@@ -86,12 +88,8 @@ class DSRLNALoss(LossModule):
         noise_critic_steps: distillation steps per round of :meth:`schedule`.
         distillation: :math:`q`, see :class:`~warmprior.ResidualSampler`. By default ``"normal"`` around
             zero, the official one, and ``"clipped"`` around a mean.
-        distillation_sigma: scale of the first two; the prior's own by default.
         alpha_init: initial temperature.
-        fixed_alpha: do not train it.
         target_entropy: :math:`\mathcal{H}`, of the residual in units of the box.
-        deactivate_vmap: evaluate the critics one after the other.
-        generator: source of randomness of the distillation; the actor uses PyTorch's global one.
 
     .. note::
         Keys (renameable by :meth:`set_keys`): ``chunk``, the decoded chunk of the transition (set it to
@@ -160,25 +158,20 @@ class DSRLNALoss(LossModule):
         noise_qvalue_network: Critics,
         decoder: PriorDecoder,
         *,
-        num_qvalue_nets: int = 2,
         backup: Literal["min", "mean"] = "min",
         backup_entropy: bool = True,
         bootstrap_timeouts: bool = False,
         discount: Literal["step", "decision"] = "step",
         noise_critic_steps: int = 10,
         distillation: ResidualDistribution | None = None,
-        distillation_sigma: float | None = None,
         alpha_init: float = 1.0,
-        fixed_alpha: bool = False,
         target_entropy: float = 0.0,
-        deactivate_vmap: bool = False,
-        generator: torch.Generator | None = None,
     ) -> None:
         if backup not in ("min", "mean"):
             raise ValueError(f"backup must be 'min' or 'mean', got {backup!r}")
         if discount not in ("step", "decision"):
             raise ValueError(f"discount must be 'step' or 'decision', got {discount!r}")
-        check_whole_numbers(num_qvalue_nets=num_qvalue_nets, noise_critic_steps=noise_critic_steps)
+        check_whole_numbers(noise_critic_steps=noise_critic_steps)
         check_positive(alpha_init=alpha_init)
         if not math.isfinite(target_entropy):
             raise ValueError(f"target_entropy must be a finite number, got {target_entropy}")
@@ -190,21 +183,13 @@ class DSRLNALoss(LossModule):
         self.bootstrap_timeouts = bootstrap_timeouts
         self.discount = discount
         self.noise_critic_steps = noise_critic_steps
-        self.deactivate_vmap = deactivate_vmap
         self.reduction = "mean"
-        self.distillation = ResidualSampler(
-            decoder, distribution=distillation, sigma=distillation_sigma, generator=generator
-        )
+        self.distillation = ResidualSampler(decoder, distribution=distillation)
         self.convert_to_functional(actor_network, "actor_network")
-        self.convert_to_functional(
-            qvalue_network, "qvalue_network", num_qvalue_nets, create_target_params=True
-        )
-        self.convert_to_functional(noise_qvalue_network, "noise_qvalue_network", num_qvalue_nets)
+        self.convert_to_functional(qvalue_network, "qvalue_network", CRITICS, create_target_params=True)
+        self.convert_to_functional(noise_qvalue_network, "noise_qvalue_network", CRITICS)
         log_alpha = torch.tensor(math.log(alpha_init), device=self._default_device)
-        if fixed_alpha:
-            self.register_buffer("log_alpha", log_alpha)
-        else:
-            self.log_alpha = nn.Parameter(log_alpha)
+        self.log_alpha = nn.Parameter(log_alpha)
         self.register_buffer("target_entropy", torch.full_like(log_alpha, target_entropy))
         self._make_vmap()
         self._set_in_keys()
@@ -212,7 +197,7 @@ class DSRLNALoss(LossModule):
         self.out_keys += ["alpha", "entropy", "td_error"]
 
     def _make_vmap(self) -> None:
-        options = {"randomness": self.vmap_randomness, "pseudo_vmap": self.deactivate_vmap}
+        options = {"randomness": self.vmap_randomness}
         self._vmap_qvalue = _vmap_func(self.qvalue_network, (None, 0), **options)
         self._vmap_noise_qvalue = _vmap_func(self.noise_qvalue_network, (None, 0), **options)
 
@@ -233,7 +218,7 @@ class DSRLNALoss(LossModule):
 
     def _states(self, *modules: TensorDictModuleBase) -> list[NestedKey]:
         """The keys that the modules read, without actions."""
-        actions = {self.decoder.delta_key, self.decoder.chunk_key}
+        actions = {keys.DELTA, keys.CHUNK}
         needed = dict.fromkeys(unravel_key(key) for module in modules for key in module.in_keys)
         return [key for key in needed if key not in actions]
 
@@ -289,7 +274,7 @@ class DSRLNALoss(LossModule):
         delta, log_prob = self._act(state)
         # Gradients reach the residual, not the critic.
         frozen = self.noise_qvalue_network_params.detach()
-        value = self._vmap_noise_qvalue(state.set(self.decoder.delta_key, delta), frozen)
+        value = self._vmap_noise_qvalue(state.set(keys.DELTA, delta), frozen)
         loss_actor = alpha * log_prob - self._combine(value)
         loss_alpha = -self.log_alpha * (log_prob.detach() + self.target_entropy)
         losses = {"loss_actor": loss_actor, "loss_alpha": loss_alpha, "loss_qvalue": loss_qvalue}
@@ -301,13 +286,13 @@ class DSRLNALoss(LossModule):
             after = tensordict.get("next")
             state = after.select(*self._states(self.actor_network, self.decoder, self.qvalue_network))
             delta, log_prob = self._act(state)
-            state = self.decoder(state.set(self.decoder.delta_key, delta))
+            state = self.decoder(state.set(keys.DELTA, delta))
             value = self._combine(self._vmap_qvalue(state, self.target_qvalue_network_params))
             if self.backup_entropy:
                 value = value - alpha * log_prob
             target = self._td_target(after, value)
         state = tensordict.select(*self._states(self.qvalue_network))
-        state.set(self.decoder.chunk_key, tensordict.get(self.tensor_keys.chunk))
+        state.set(keys.CHUNK, tensordict.get(self.tensor_keys.chunk))
         error = self._values(self._vmap_qvalue(state, self.qvalue_network_params)) - target
         return 0.5 * error.square().sum(0), error.detach().abs().amax(0)
 
@@ -390,10 +375,10 @@ def _check_networks(
             f"{type(actor).__name__}"
         )
     written = [unravel_key(key) for key in actor.dist_sample_keys]
-    if written != [decoder.delta_key]:
-        raise ValueError(f"the actor writes {written}, but the decoder reads {decoder.delta_key}")
+    if written != [keys.DELTA]:
+        raise ValueError(f"the actor writes {written}, but the decoder reads {keys.DELTA}")
     spec = getattr(actor, "spec", None)
-    box = None if spec is None or decoder.delta_key not in spec.keys(True, True) else spec[decoder.delta_key]
+    box = None if spec is None or keys.DELTA not in spec.keys(True, True) else spec[keys.DELTA]
     high = getattr(box, "high", None)
     if high is not None and not torch.allclose(high, torch.full_like(high, decoder.delta)):
         raise ValueError(
@@ -401,8 +386,8 @@ def _check_networks(
             "build the actor with delta=decoder.delta"
         )
     for name, critic, key in (
-        ("qvalue_network", chunk_critic, decoder.chunk_key),
-        ("noise_qvalue_network", noise_critic, decoder.delta_key),
+        ("qvalue_network", chunk_critic, keys.CHUNK),
+        ("noise_qvalue_network", noise_critic, keys.DELTA),
     ):
         critics = critic if isinstance(critic, list) else [critic]
         for module in critics:

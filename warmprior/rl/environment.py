@@ -6,17 +6,16 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
 from torchrl.data import Bounded, Composite
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.rl.decoder import PriorDecoder
+from warmprior.transforms.inner_step import EnvTransform
 
 __all__ = ["PriorSpace"]
 
 
-class PriorSpace(Transform):
+class PriorSpace(EnvTransform):
     r"""Makes the residual the environment's action: :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`.
 
     The other way to use :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
@@ -39,10 +38,6 @@ class PriorSpace(Transform):
     Args:
         decoder: the frozen policy.
 
-    Keyword Args:
-        noise_key: where the source is written, ``[*B, P, d_a]``.
-        chunk_key: where the chunk is written, ``[*B, P, d_a]``.
-
     Raises:
         KeyError: if :class:`~warmprior.ChunkStep` or :class:`~warmprior.PriorAnchor` does not come before.
         ValueError: if the environment's chunks are not the policy's, see
@@ -64,16 +59,9 @@ class PriorSpace(Transform):
         torch.Size([3, 2, 4, 1])
     """
 
-    def __init__(
-        self,
-        decoder: PriorDecoder,
-        *,
-        noise_key: NestedKey = keys.DECODED_NOISE,
-        chunk_key: NestedKey = keys.DECODED_CHUNK,
-    ) -> None:
-        super().__init__(
-            out_keys=[noise_key, chunk_key], in_keys_inv=[decoder.chunk_key], out_keys_inv=[decoder.delta_key]
-        )
+    def __init__(self, decoder: PriorDecoder) -> None:
+        written = [keys.DECODED_NOISE, keys.DECODED_CHUNK]
+        super().__init__(out_keys=written, in_keys_inv=[keys.CHUNK], out_keys_inv=[keys.DELTA])
         self.decoder = decoder
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -91,31 +79,20 @@ class PriorSpace(Transform):
         return tensordict_reset
 
     def _anchor_of(self, observations: Any) -> Any:
-        key = self.decoder.anchor_key
-        if key not in observations.keys(True, True):
-            raise KeyError(f"PriorSpace found no {key} among the observations: append it after PriorAnchor")
-        return observations[key]
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing."""
-        return tensordict
+        if keys.ANCHOR not in observations.keys(True, True):
+            raise KeyError(
+                f"PriorSpace found no {keys.ANCHOR} among the observations: append it after PriorAnchor"
+            )
+        return observations[keys.ANCHOR]
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the chunk by the bounded residual."""
         self.decoder.check_env(self.parent)
         actions = input_spec["full_action_spec"]
-        key: NestedKey = self.decoder.chunk_key
-        leaf, delta = actions[key], self.decoder.delta
-        actions[self.decoder.delta_key] = Bounded(
-            -delta, delta, leaf.shape, dtype=leaf.dtype, device=leaf.device
-        )
-        del actions[key]
-        while isinstance(key, tuple) and len(key) > 1:
-            # An empty branch would count as an action.
-            key = key[:-1]
-            if len(actions[key].keys()):
-                break
-            del actions[key]
+        leaf, delta = actions[keys.CHUNK], self.decoder.delta
+        actions[keys.DELTA] = Bounded(-delta, delta, leaf.shape, dtype=leaf.dtype, device=leaf.device)
+        # With its branch, which would count as an action when it is empty.
+        del actions[keys.CHUNK[0]]
         return input_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -92,7 +92,6 @@ def make_prior_space_actor(
     hidden_dim: int = 256,
     num_layers: int = 3,
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR),
-    delta_key: NestedKey = keys.DELTA,
     distribution_class: type[TanhNormal] = TanhNormal,
 ) -> ProbabilisticActor:
     r"""A squashed Gaussian over residuals, :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`, for SAC.
@@ -113,7 +112,6 @@ def make_prior_space_actor(
         in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``. Leave the anchor out if
             it is always zero. Add ``keys.ACTIONS`` if the decoder or the next mean depends on more than the
             anchor: for a network that sees the last actions, and for WP-Past with ``execute < H``.
-        delta_key: where the residual is written; its log-probability is summed over the chunk.
         distribution_class: :class:`~warmprior.BoxTanhNormal` for entropies in units of the box in TorchRL's
             own losses; :class:`~warmprior.DSRLNALoss` takes either.
 
@@ -139,8 +137,8 @@ def make_prior_space_actor(
     return ProbabilisticActor(
         TensorDictModule(_ActorHead(trunk, chunk), in_keys=list(in_keys), out_keys=parameters),
         in_keys=dict(zip(("loc", "scale"), parameters, strict=True)),
-        out_keys=[delta_key],
-        spec=Composite({delta_key: Bounded(-delta, delta, chunk)}),
+        out_keys=[keys.DELTA],
+        spec=Composite({keys.DELTA: Bounded(-delta, delta, chunk)}),
         distribution_class=distribution_class,
         # Two event dimensions: one log-probability per chunk and not per action.
         distribution_kwargs={"low": -delta, "high": delta, "event_dims": 2},
@@ -159,7 +157,6 @@ def make_prior_space_critic(
     num_layers: int = 3,
     in_keys: Sequence[NestedKey] = (keys.OBSERVATION, keys.ANCHOR, keys.DELTA),
     out_features: int = 1,
-    delta_key: NestedKey = keys.DELTA,
 ) -> ValueOperator:
     """A critic of residuals or of chunks, with the trunk of :func:`make_prior_space_actor`.
 
@@ -181,7 +178,6 @@ def make_prior_space_critic(
         num_layers: number of layers.
         in_keys: the observation, ``[*B, To, d_o]``, and any tensors ``[*B, P, d_a]``.
         out_features: values per input, more than one for quantile critics.
-        delta_key: where the residual is read.
 
     Raises:
         ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
@@ -203,7 +199,7 @@ def make_prior_space_critic(
         out_features,
         hidden_dim,
         num_layers,
-        {unravel_key(delta_key): 1.0 / delta},
+        {keys.DELTA: 1.0 / delta},
     )
     # TorchRL would call it "state_value", because the action is not named "action".
     return ValueOperator(trunk, in_keys=list(in_keys), out_keys=["state_action_value"])

@@ -29,27 +29,6 @@ class WarmUpSwitch(TensorDictModuleBase):
     """Acts by ``warmup``, and by ``policy`` once ``learning`` is set.
 
     That is a buffer, bool ``[]``, which collectors receive with the weights.
-
-    See Also:
-        - :func:`~warmprior.rl.ray_collection.ray_rounds`: collects with it.
-        - :class:`~warmprior.ResidualSampler`: what acts at first.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from warmprior import keys
-        >>> from warmprior.rl.ray_collection import WarmUpSwitch
-        >>> from tensordict.nn import TensorDictModule
-        >>> def always(value):
-        ...     def act(seen):
-        ...         return (torch.full_like(seen, value),) * 2
-        ...     return TensorDictModule(act, ["observation"], [keys.DELTA, keys.CHUNK])
-        >>> switch = WarmUpSwitch(warmup=always(0.0), policy=always(1.0))
-        >>> data = TensorDict({"observation": torch.zeros(1, 2)}, [1])
-        >>> before = switch(data)[keys.CHUNK]
-        >>> _ = switch.learning.fill_(True)
-        >>> before, switch(data)[keys.CHUNK]
-        (tensor([[0., 0.]]), tensor([[1., 1.]]))
     """
 
     def __init__(self, warmup: TensorDictModuleBase, policy: TensorDictModuleBase) -> None:
@@ -98,34 +77,16 @@ def ray_rounds(
     seed: int,
     address: str | None = None,
 ) -> Iterator[Iterator[TensorDictBase]]:
-    """Rounds of decisions: one by each environment of several Ray actors, each on its own CPU.
+    """Rounds of decisions, ``[collectors, num_envs, 1]``: one by each environment of several Ray actors.
 
-    Before every round all actors receive the current weights of ``policy``, and wait for the slowest. Actor
-    ``i`` draws from ``seed + 10_000 * i``, so the same arguments give the same decisions on any number of
-    machines. Local collection by :class:`~warmprior.rl.PriorSpaceTraining` gives others.
-
-    Args:
-        policy: what acts, as a copy on the CPU.
-        make_env: ``make_env(seed) -> EnvBase``, ``[num_envs]``.
-
-    Keyword Args:
-        collectors: how many actors.
-        num_envs: environments of each.
-        seed: of all draws.
-        address: of the cluster, see :func:`~warmprior.io.ray_cluster.ray_cluster`.
-
-    Yields:
-        An iterator over rounds, ``[collectors, num_envs, 1]``.
+    Each has a CPU, and ``make_env(seed)`` makes its ``num_envs`` environments. Before every round all receive
+    the current weights of ``policy``, and wait for the slowest. Actor ``i`` draws from
+    ``seed + 10_000 * i``, so the same arguments give the same decisions on any number of machines. Local
+    collection gives others.
 
     Raises:
         ValueError: if the cluster has fewer CPUs than there are to be actors.
         WorkerError: if an actor dies, or an environment in it fails, a ``RuntimeError``.
-
-    Examples:
-        >>> from warmprior.rl.ray_collection import ray_rounds
-        >>> with ray_rounds(switch, make_env, collectors=2, num_envs=4, seed=0) as rounds:  # doctest: +SKIP
-        ...     next(rounds).shape
-        torch.Size([2, 4, 1])
     """
     with ray_cluster(address, collectors) as ray:
         from torchrl.collectors.distributed import RayCollector

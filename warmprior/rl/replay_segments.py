@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
 
 from warmprior.io.files import read_tensors, save_file, write_atomic
 
@@ -20,23 +19,6 @@ class ReplaySegments:
 
     A segment is valid once :attr:`committed` counts it. If a process dies between writing a segment and its
     training state, the next one replaces that segment. Of a folder that exists ``segments`` are kept.
-
-    See Also:
-        :class:`~warmprior.rl.PriorSpaceTraining`: saves its replay buffer so.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from warmprior.rl import ReplaySegments
-        >>> from tempfile import TemporaryDirectory
-        >>> with TemporaryDirectory() as folder:
-        ...     segments = ReplaySegments(Path(folder))
-        ...     for k in range(2):
-        ...         segments.append(TensorDict({"next": {"reward": torch.full((3, 1), float(k))}}, [3]))
-        ...         segments.write()
-        ...     ReplaySegments(Path(folder), segments.committed).load()["next", "reward"].flatten()
-        tensor([0., 0., 0., 1., 1., 1.])
     """
 
     def __init__(self, directory: Path, segments: int = 0) -> None:
@@ -81,11 +63,9 @@ class ReplaySegments:
                     "or choose another output folder"
                 ) from error
             size = len(next(iter(tensors.values())))
-            nested = {_key(name): value for name, value in tensors.items()}
-            parts.append(TensorDict(nested, batch_size=[size]))
+            part = TensorDict({}, batch_size=[size])
+            for name, value in tensors.items():
+                key = json.loads(name)
+                part.set(tuple(key) if isinstance(key, list) else key, value)
+            parts.append(part)
         return torch.cat(parts) if parts else None
-
-
-def _key(name: str) -> NestedKey:
-    key = json.loads(name)
-    return tuple(key) if isinstance(key, list) else key

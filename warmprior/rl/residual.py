@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal, get_args
 
 import torch
@@ -10,6 +9,7 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch.nn.init import trunc_normal_
 
+from warmprior import keys
 from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.rl.decoder import PriorDecoder
 
@@ -42,11 +42,10 @@ class ResidualSampler(TensorDictModuleBase):
     Keyword Args:
         distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
             noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
-        sigma: as above by default.
         generator: source of randomness on the data's device; PyTorch's global one by default.
 
     Raises:
-        ValueError: for an unknown distribution or a ``sigma`` that is not a finite number > 0.
+        ValueError: for an unknown distribution, or another than ``"uniform"`` for a prior without noise.
         KeyError: (when called) if the anchor is missing.
 
     See Also:
@@ -68,12 +67,10 @@ class ResidualSampler(TensorDictModuleBase):
         decoder: PriorDecoder,
         *,
         distribution: ResidualDistribution | None = None,
-        sigma: float | None = None,
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        if sigma is None:
-            sigma = residual_sigma(decoder)
+        sigma = residual_sigma(decoder)
         if distribution is None and has_anchor(decoder):
             distribution = "clipped" if sigma > 0 else "uniform"
         elif distribution is None:
@@ -83,16 +80,14 @@ class ResidualSampler(TensorDictModuleBase):
                 "the distribution must be 'normal', 'clipped', 'truncated' or 'uniform', got "
                 f"{distribution!r}"
             )
-        if distribution != "uniform" and not (sigma > 0 and math.isfinite(sigma)):
-            raise ValueError(
-                f"sigma must be a finite number > 0, got {sigma}; a prior without noise leaves 'uniform'"
-            )
+        if distribution != "uniform" and sigma == 0:
+            raise ValueError(f"a prior without noise leaves 'uniform', got the distribution {distribution!r}")
         self.distribution = distribution
         self.sigma = sigma
         self.delta = decoder.delta
         self.generator = generator
-        self.in_keys = [decoder.anchor_key]
-        self.out_keys = [decoder.delta_key]
+        self.in_keys = [keys.ANCHOR]
+        self.out_keys = [keys.DELTA]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the residual."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -26,8 +25,8 @@ from warmprior.rl.anchor import has_anchor
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
 from warmprior.rl.replay_segments import ReplaySegments
-from warmprior.training.checkpoint import check_identity, load_state, save_state
-from warmprior.training.evaluation import Episode, evaluate, watched
+from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state
+from warmprior.training.evaluation import evaluate, watched
 
 __all__ = ["PriorSpaceTraining"]
 
@@ -66,7 +65,6 @@ class PriorSpaceTraining:
 
     See Also:
         - :class:`~warmprior.rl.PriorSpaceConfig`: its recipe.
-        - :class:`~warmprior.PriorAnchor`: what the environment needs.
         - :func:`~warmprior.training.evaluate`: plays episodes with ``agent.policy``.
 
     Examples:
@@ -118,7 +116,12 @@ class PriorSpaceTraining:
         self.segments = ReplaySegments(self.directory / "buffer")
         self.steps = 0
         self.curve: list[dict[str, Any]] = []
-        self.identity = {"config": asdict(config), "prior": actor.prior.config(), "policy": _digest(actor)}
+        self.identity = {
+            "config": asdict(config),
+            "prior": actor.prior.config(),
+            "policy": digest_of_state(None, {n: v.detach().cpu() for n, v in actor.state_dict().items()}),
+            "transitions": self._keys,
+        }
         if self.state_path.exists():
             self._restore()
 
@@ -148,7 +151,13 @@ class PriorSpaceTraining:
         with (
             self._environment(0) as evaluation_env,
             self._rounds(evaluation_env.batch_size.numel()) as rounds,
-            self._bar() as bar,
+            tqdm(
+                total=config.environment_steps,
+                initial=self.steps,
+                desc=self.description,
+                unit="step",
+                disable=self.description is None,
+            ) as bar,
         ):
             self.decoder.check_env(evaluation_env)
             if keys.ANCHOR not in evaluation_env.observation_spec.keys(True, True):
@@ -162,7 +171,8 @@ class PriorSpaceTraining:
                 bar.update(executed)
                 if self.steps > config.warmup_steps:
                     found = self.agent.learn(self.buffer)
-                    bar.set_postfix(found | self._last_success(), refresh=False)
+                    last = {row["evaluation"]: row["success_rate"] for row in self.curve}
+                    bar.set_postfix(found | last, refresh=False)
                 due = self.steps // config.evaluate_every > before // config.evaluate_every
                 if due or self.steps >= config.environment_steps:
                     self.agent.state()  # Raises if the agent's state is not finite.
@@ -212,19 +222,6 @@ class PriorSpaceTraining:
     def _learns(self) -> bool:
         return self.steps >= self.config.warmup_steps
 
-    def _bar(self) -> Any:
-        return tqdm(
-            total=self.config.environment_steps,
-            initial=self.steps,
-            desc=self.description,
-            unit="step",
-            disable=self.description is None,
-        )
-
-    def _last_success(self) -> dict[str, float]:
-        """Of the last evaluations, for the progress bar."""
-        return {row["evaluation"]: row["success_rate"] for row in self.curve}
-
     def _seed(self) -> int:
         # Apart from the seeds of evaluation and demonstrations; a resumed training plays new episodes.
         if self.steps:
@@ -243,10 +240,14 @@ class PriorSpaceTraining:
 
     def _keep(self, data: TensorDictBase) -> int:
         """Add decisions to the replay buffer; returns the number of their control steps."""
-        transitions = self._transitions(data)
+        transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
+        following = transitions["next"]
+        following["reward"] = following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
+        if not self.config.bootstrap_timeouts:
+            following["terminated"] = following["done"].clone()
         # Checked before saving: they would end every later training.
         self._check_finite(transitions)
-        self._check_executed(transitions["next"])
+        self._check_executed(following)
         self.buffer.extend(transitions)
         self.segments.append(transitions)
         return int(data["next", keys.EXECUTED].sum())
@@ -275,14 +276,6 @@ class PriorSpaceTraining:
         after = [*states, "reward", "done", "terminated", keys.EXECUTED]
         return [*states, keys.DELTA, keys.CHUNK, *(unravel_key(("next", key)) for key in after)]
 
-    def _transitions(self, data: TensorDictBase) -> TensorDictBase:
-        transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
-        following = transitions["next"]
-        following["reward"] = following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
-        if not self.config.bootstrap_timeouts:
-            following["terminated"] = following["done"].clone()
-        return transitions
-
     def _evaluate(self, env: EnvBase, policies: dict[str, TensorDictModuleBase]) -> None:
         for name, policy in policies.items():
             kind = ExplorationType.DETERMINISTIC if name == "greedy" else ExplorationType.RANDOM
@@ -295,18 +288,16 @@ class PriorSpaceTraining:
                     nfe=self.config.nfe if name == "base" else None,
                     policy_seed=self.config.seed,
                 )
-            self.curve.append(self._row(name, episodes))
+            successes = sum(episode.success for episode in episodes)
+            row = {
+                "environment_steps": self.steps,
+                "evaluation": name,
+                "episodes": len(episodes),
+                "successes": successes,
+                "success_rate": successes / len(episodes),
+            }
+            self.curve.append(row)
         self.agent.policy.train()
-
-    def _row(self, name: str, episodes: list[Episode]) -> dict[str, Any]:
-        successes = sum(episode.success for episode in episodes)
-        return {
-            "environment_steps": self.steps,
-            "evaluation": name,
-            "episodes": len(episodes),
-            "successes": successes,
-            "success_rate": successes / len(episodes),
-        }
 
     def _save(self) -> None:
         tensors = {**self.agent.state(), "rng": torch.get_rng_state()}
@@ -327,36 +318,9 @@ class PriorSpaceTraining:
         self.segments = ReplaySegments(self.directory / "buffer", facts["segments"])
         transitions = self.segments.load()
         if transitions is not None:
-            self._check_wiring(transitions)
             self.buffer.extend(transitions)
         self.agent.load(tensors)
         self.steps, self.curve = facts["steps"], facts["curve"]
         torch.set_rng_state(tensors["rng"])
         if "rng_cuda" in tensors:
             torch.cuda.set_rng_state(tensors["rng_cuda"], self.device)
-
-    def _check_wiring(self, transitions: TensorDictBase) -> None:
-        found = set(transitions.keys(True, True))
-        missing = [key for key in self._keys if key not in found]
-        if missing:
-            raise ValueError(
-                f"the replay buffer in {self.segments.directory} comes from another wiring: it lacks "
-                f"{missing} and holds {sorted(map(str, found))}. Choose another output folder."
-            )
-        length = self.decoder.prediction_length
-        for key in (keys.ANCHOR, keys.DELTA, keys.CHUNK):
-            shape = transitions[key].shape
-            if shape[1:] != (length, self.decoder.action_dim or shape[-1]):
-                raise ValueError(
-                    f"the replay buffer in {self.segments.directory} belongs to another policy: its "
-                    f"{key} is {tuple(shape)}, this policy predicts chunks of (P, d_a) = "
-                    f"{(length, self.decoder.action_dim)}. Choose another output folder."
-                )
-
-
-def _digest(actor: WarmPriorActor) -> str:
-    digest = hashlib.sha256()
-    for name, value in sorted(actor.state_dict().items()):
-        digest.update(name.encode())
-        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()[:16]

@@ -4,14 +4,14 @@ from warmprior.io.workers import WorkerError
 from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.card import model_card, policy_results
 from warmprior.training.evaluation import Episode, evaluate, parallel_env, play_episode
-from warmprior.training.film import Filmstrip, record_filmstrip, record_video
+from warmprior.training.film import Filmstrip, record_filmstrip
 from warmprior.training.navigation import judge_navigation, play_navigation
-from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.optim import ema_of, warmup_cosine
 from warmprior.training.options import DataOptions, NetworkOptions
 from warmprior.training.precondition import precondition
-from warmprior.training.saved import check_saveable, load_policy, push_policy, save_policy
-from warmprior.training.task import Task, find_tasks, load_task, navigation_task, robosuite_task
-from warmprior.training.train import new_policy, train_policy
+from warmprior.training.saved import load_policy, push_policy, save_policy
+from warmprior.training.task import Task, load_task, navigation_task
+from warmprior.training.train import train_policy
 from warmprior.training.training_config import TrainingConfig
 
 __all__ = [
@@ -23,17 +23,13 @@ __all__ = [
     "Task",
     "TrainingConfig",
     "WorkerError",
-    "check_saveable",
     "ema_of",
     "evaluate",
-    "find_tasks",
     "judge_navigation",
     "load_policy",
     "load_task",
-    "make_optimizer",
     "model_card",
     "navigation_task",
-    "new_policy",
     "parallel_env",
     "play_episode",
     "play_navigation",
@@ -41,8 +37,6 @@ __all__ = [
     "precondition",
     "push_policy",
     "record_filmstrip",
-    "record_video",
-    "robosuite_task",
     "save_policy",
     "train_policy",
     "warmup_cosine",

@@ -22,7 +22,6 @@ from warmprior.io.files import exclusive
 from warmprior.io.workers import count_devices
 from warmprior.keys import ACTION, CONDITIONED, EPISODE, OBSERVATION
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.prior import Prior
 from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
@@ -39,7 +38,7 @@ from warmprior.training.checkpoint import (
     select,
     snapshot_optimizer,
 )
-from warmprior.training.identity import coupling_identity, data_digest, fixed_identity, network_identity
+from warmprior.training.identity import data_digest, fixed_identity, part_identity
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
 from warmprior.training.placement import Prefetch
 from warmprior.training.saved import check_saveable, load_policy, save_policy
@@ -78,7 +77,6 @@ class BehaviourCloning:
         observation_steps: ``To``.
         coupling: pairs sources and targets, see :class:`~warmprior.FlowMatchingLoss`.
         logger: a TorchRL logger for the loss, the learning rate and the speed.
-        resume: continue from the folder's state if there is one; otherwise start over.
         compile: compile the velocity network with :func:`torch.compile`; on a GPU, as CUDA graphs.
         prefetch: gather batches ahead in a thread, drawn by a generator of their own; always where data on
             the CPU train a network that is not.
@@ -86,12 +84,11 @@ class BehaviourCloning:
     Raises:
         ValueError: if a batch cannot be divided among the processes, the folder's
             state is damaged or belongs to another recipe, prior, network or dataset, the policy could not be
-            loaded again (:func:`~warmprior.training.check_saveable`).
+            loaded again.
         TypeError: if the policy cannot be saved.
 
     See Also:
         - :class:`~warmprior.training.TrainingConfig`: its recipe.
-        - :class:`~warmprior.FlowMatchingLoss`: the loss alone, for a loop of your own.
         - :func:`~warmprior.training.evaluate`: plays episodes with what it trained.
 
     Examples:
@@ -121,7 +118,6 @@ class BehaviourCloning:
         observation_steps: int = 2,
         coupling: Coupling | None = None,
         logger: Logger | None = None,
-        resume: bool = True,
         compile: bool = False,
         prefetch: bool = False,
     ) -> None:
@@ -141,8 +137,9 @@ class BehaviourCloning:
         device = next((p.device for p in actor.network.parameters()), home)
         self.generator = torch.Generator(device).manual_seed(config.seed)
         windows = self.generator
-        if prefetch := prefetch or home.type != device.type:
-            # What is drawn ahead cannot be drawn by the generator of what follows.
+        if (
+            prefetch := prefetch or home.type != device.type
+        ):  # what is drawn ahead cannot be drawn by the generator of what follows
             windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
         see_history = actor.in_keys[0] == CONDITIONED  # made of the data's observation
         observation_key = OBSERVATION if see_history else actor.in_keys[0]
@@ -155,7 +152,6 @@ class BehaviourCloning:
             withhold=config.cold_probability,
             generator=windows,
             observation_key=observation_key,
-            chunk_key=actor.chunk_key,
         )
         self._prefetch = Prefetch(self.replay_buffer.sample, windows, device=device) if prefetch else None
         #: The network, and the prior where it has weights as well.
@@ -182,25 +178,22 @@ class BehaviourCloning:
             cache_enabled=False,
         )
         self.optimizer = make_optimizer(
-            actor.network,
-            learning_rate=config.learning_rate,
-            weight_decay=config.weight_decay,
-            betas=config.betas,
-            eps=config.eps,
+            actor.network, learning_rate=config.learning_rate, weight_decay=config.weight_decay
         )
-        learning = _learning(actor.prior)
-        if learning:
+        # A prior that learnt before is fixed by then.
+        prior = actor.prior.parameters() if isinstance(actor.prior, nn.Module) else ()
+        if learning := [parameter for parameter in prior if parameter.requires_grad]:
             self.optimizer.add_param_group({"params": learning, "weight_decay": 0.0})
         self.schedule = warmup_cosine(self.optimizer, config.iterations, config.warmup_ratio)
         self.iteration = 0
         self.losses: list[tuple[int, float]] = []
         self._running: list[torch.Tensor] = []  # losses since the last logged mean
         self.identity = {
-            "config": asdict(config) | {"betas": list(config.betas), "weighting": self.loss_module.weighting},
-            "prior": actor.prior.config() | fixed_identity(actor.prior),
-            "start": None if actor.start is None else actor.start.config() | fixed_identity(actor.start),
-            "coupling": coupling_identity(coupling),
-            "network": network_identity(actor.network),
+            "config": asdict(config) | {"weighting": self.loss_module.weighting},
+            "prior": part_identity(actor.prior),
+            "start": part_identity(actor.start),
+            "coupling": part_identity(coupling),
+            "network": part_identity(actor.network),
             "data": data_digest(data.select(observation_key, ACTION, EPISODE)),
             "policy": {
                 "observation_steps": observation_steps,
@@ -212,7 +205,6 @@ class BehaviourCloning:
         }
         torch.manual_seed(config.seed)
         self._differ()
-        self._resume = resume
         self._restored: float | None = None  # when the state that was restored had been written
         self._restore()
         self._graphs = compile and device.type == "cuda"
@@ -314,7 +306,10 @@ class BehaviourCloning:
 
     def _keep(self) -> None:
         """Keep the policy of this iteration."""
-        save_policy(self._averaged_actor(), self.policy_path(self.iteration))
+        averaged, prior = cast(Any, self.ema.module), self.actor.prior
+        prior = averaged["prior"] if isinstance(prior, nn.Module) else prior
+        actor = self.actor.replace(network=averaged["network"], prior=prior)
+        save_policy(actor, self.policy_path(self.iteration))
 
     def _is_kept(self) -> bool:
         """Whether the policy of this iteration is on disk and whole."""
@@ -357,13 +352,6 @@ class BehaviourCloning:
                 place = getattr(self.logger, "log_dir", type(self.logger).__name__)
                 raise OSError(error.errno, f"cannot write the log: {error.strerror}", str(place)) from error
 
-    def _averaged_actor(self) -> WarmPriorActor:
-        averaged = cast(Any, self.ema.module)
-        prior = self.actor.prior
-        return self.actor.replace(
-            network=averaged["network"], prior=averaged["prior"] if isinstance(prior, nn.Module) else prior
-        )
-
     def _save(self) -> None:
         tensors = {
             **named("trained", module_tensors(self.trained)),
@@ -388,7 +376,7 @@ class BehaviourCloning:
 
     def _restore(self) -> None:
         """Continue from the folder's state, if there is one that is not continued already."""
-        if not self._resume or not self.state_path.exists():
+        if not self.state_path.exists():
             return
         written = self.state_path.stat().st_mtime
         if written == self._restored:
@@ -436,13 +424,6 @@ class _Loss(nn.Module):
     def forward(self, batch: TensorDictBase) -> Tensor:
         losses = self.loss_module(batch)
         return torch.stack([losses[key] for key in self.loss_module.out_keys]).sum()
-
-
-def _learning(prior: Prior) -> list[nn.Parameter]:
-    """Parameters of a prior that are trained with the flow; one that learnt before is fixed by then."""
-    if not isinstance(prior, nn.Module):
-        return []
-    return [parameter for parameter in prior.parameters() if parameter.requires_grad]
 
 
 def policy_path(directory: Path, iteration: int) -> Path:

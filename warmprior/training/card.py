@@ -80,7 +80,7 @@ def model_card(
         licence: the hub's name of its licence, such as ``"mit"``.
 
     Raises:
-        TypeError: if the policy cannot be saved, see :func:`~warmprior.training.check_saveable`.
+        TypeError: if the policy cannot be saved, see :func:`~warmprior.training.save_policy`.
         ImportError: if huggingface_hub is not installed.
 
     Examples:

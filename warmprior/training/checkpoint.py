@@ -24,7 +24,7 @@ def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, An
     stored = as_json(facts)
     cpu = {name: value.detach().to("cpu").contiguous() for name, value in tensors.items()}
     # One entry: the format keeps no order of several, and equal states have equal files.
-    metadata = {"facts": json.dumps(stored | {"sha256": _digest(stored, cpu)})}
+    metadata = {"facts": json.dumps(stored | {"sha256": digest_of_state(stored, cpu)})}
     write_atomic(path, lambda temporary: save_file(cpu, temporary, metadata=metadata))
 
 
@@ -36,14 +36,14 @@ def load_state(
     try:
         tensors, metadata = read_tensors(path.read_bytes())
         facts = dict(json.loads(metadata["facts"]))
-        if facts.pop("sha256") != _digest(facts, tensors):
+        if facts.pop("sha256") != digest_of_state(facts, tensors):
             raise ValueError("its content has changed since it was written")
     except Exception as error:  # the format's own errors, those of JSON, or a failing disk
         raise ValueError(f"{path} is not a readable {what}: {error}. {advice}.") from error
     return tensors, facts
 
 
-def _digest(facts: Any, tensors: Mapping[str, Tensor]) -> str:
+def digest_of_state(facts: Any, tensors: Mapping[str, Tensor]) -> str:
     digest = hashlib.sha256(json.dumps(facts).encode())
     for name in sorted(tensors):
         value = tensors[name]

@@ -22,7 +22,6 @@ from tqdm import tqdm
 
 from warmprior import keys
 from warmprior.io.workers import end_with_parent, start_method, worker_died
-from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.threads import torch_threads
 
 __all__ = ["Episode", "evaluate", "parallel_env", "play_episode"]
@@ -126,8 +125,7 @@ def parallel_env(
         ValueError: if ``num_envs < 1``.
 
     See Also:
-        - :func:`~warmprior.training.evaluate`: plays episodes in it.
-        - :class:`~warmprior.envs.RobosuiteEnv`: what its processes usually hold.
+        :func:`~warmprior.training.evaluate`: plays episodes in it.
 
     Examples:
         >>> from functools import partial
@@ -263,8 +261,7 @@ def play_episode(
         KeyError: if it lacks ``success``, one of ``measures``, or the policy's transforms.
 
     See Also:
-        - :func:`~warmprior.training.evaluate`: many of them, one by one or side by side.
-        - :func:`~warmprior.training.record_video`: films one.
+        :func:`~warmprior.training.record_filmstrip`: films one.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -293,7 +290,7 @@ def play_episode(
         data = env.reset()
         while True:
             data = env.step(act(data))
-            tally.add(data["next"], _decision(data, policy, env))
+            tally.add(data["next"], _decision(data))
             if data["next", "done"].all():
                 return tally.episode(seed)
             data = env.step_mdp(data)
@@ -347,9 +344,7 @@ def evaluate(
         WorkerError: if a worker process dies, a ``RuntimeError``.
 
     See Also:
-        - :func:`~warmprior.training.play_episode`: a single one.
-        - :func:`~warmprior.training.parallel_env`: several simulators at a time.
-        - :func:`~warmprior.diagnostics.success_posterior`: what the successes tell about the rate.
+        :func:`~warmprior.diagnostics.success_posterior`: what the successes tell about the rate.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -420,7 +415,7 @@ def _play_batched(
             data = env.step(act(data))
             after = data["next"].select("done", success, keys.EXECUTED, *measures).cpu()
             done = after["done"].flatten() & active
-            decided = _decision(data, policy, env)
+            decided = _decision(data)
             for i in active.nonzero().flatten().tolist():
                 tallies[i].add(after[i], decided[i])
             for i in done.nonzero().flatten().tolist():
@@ -507,10 +502,8 @@ def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
                 )
 
 
-def _decision(data: TensorDictBase, policy: TensorDictModuleBase, env: EnvBase) -> TensorDictBase:
+def _decision(data: TensorDictBase) -> TensorDictBase:
     """What :attr:`Episode.decisions` keeps of a step, on the CPU."""
-    # What the environment takes, if the policy does not tell where it writes its chunks.
-    chunk_key = policy.chunk_key if isinstance(policy, WarmPriorActor) else env.action_key
     late = [keys.DELAY, keys.FORECAST] if data.get(keys.DELAY, None) is not None else []
-    kept = data.select(keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED), strict=False).cpu()
-    return kept.set(keys.CHUNK, data[chunk_key].cpu())
+    kept = (keys.CHUNK, keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED))
+    return data.select(*kept, strict=False).cpu()

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
-from torchrl.envs.transforms import Transform
 
 from warmprior.envs.description import environment_of
 from warmprior.envs.rendering import EnvRenderers, require_rendering
@@ -20,11 +19,12 @@ from warmprior.io.files import check_writable, write_atomic
 from warmprior.keys import SUCCESS
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.evaluation import play_episode
+from warmprior.transforms.inner_step import EnvTransform
 
-__all__ = ["Filmstrip", "check_video", "record_filmstrip", "record_video"]
+__all__ = ["Filmstrip", "check_video", "record_filmstrip"]
 
 
-class _Recorder(Transform):
+class _Recorder(EnvTransform):
     """Keeps what a function sees after the reset and after every control step."""
 
     def __init__(self, look: Callable[[], Any]) -> None:
@@ -35,9 +35,6 @@ class _Recorder(Transform):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         self.seen.append(self.look())
         return next_tensordict
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
 
 
 def _write(path: Path, pictures: Iterable[np.ndarray], size: int, rate: int) -> None:
@@ -85,8 +82,7 @@ class Filmstrip:
         success: whether the task was solved.
 
     See Also:
-        - :func:`~warmprior.training.record_filmstrip`: makes it.
-        - :func:`~warmprior.training.record_video`: films one.
+        :func:`~warmprior.training.record_filmstrip`: makes it.
 
     Examples:
         >>> import numpy as np
@@ -191,36 +187,3 @@ def check_video(path: Path) -> None:
     require("av", "lerobot")
     require_rendering()
     check_writable(path.parent)
-
-
-def record_video(actor: WarmPriorActor, path: Path, *, size: int = 256, **options: Any) -> bool:
-    """Play the episode of one seed and write it as an MP4, a frame per control step.
-
-    Args:
-        actor: a policy that keeps its environment's description.
-        path: of the MP4.
-
-    Keyword Args:
-        size: side of the picture in pixels, even.
-        options: those of :func:`record_filmstrip`: ``seed``, ``nfe``, ``policy_seed`` and so on.
-
-    Returns:
-        Whether the task was solved.
-
-    Raises:
-        ImportError: if PyAV is missing.
-        RuntimeError: if nothing on this machine can render; the message names the packages to install.
-        ValueError: if the policy keeps no description of its environment, or the size is odd.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from warmprior.training import load_policy, record_video
-        >>> actor = load_policy("policy_010000")  # doctest: +SKIP
-        >>> record_video(actor, Path("film.mp4"), seed=10_000_000, nfe=1)  # doctest: +SKIP
-        True
-        >>> record_video(None, Path("film.mp4"), seed=0, size=255)
-        Traceback (most recent call last):
-            ...
-        ValueError: the side of a video must be an even number of pixels, got 255
-    """
-    return record_filmstrip(actor, frames=1, size=size, video=path, **options).success

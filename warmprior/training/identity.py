@@ -11,27 +11,22 @@ from tensordict import TensorDictBase
 from torch import nn
 
 from warmprior.modules.compiled import uncompiled
-from warmprior.objectives.couplings import Coupling
 
-__all__ = ["coupling_identity", "data_digest", "fixed_identity", "network_identity"]
+__all__ = ["data_digest", "fixed_identity", "part_identity"]
 
 HASHED_AT_ONCE = 2**26
 """Bytes of the data."""
 
 
-def network_identity(network: nn.Module) -> Any:
-    """Configuration of a network, with a digest of what is not trained in it."""
-    network = uncompiled(network)
-    config: Any = network.config
-    return {**config(), **fixed_identity(network)}
-
-
-def coupling_identity(coupling: Coupling | None) -> Any:
-    """Configuration of a coupling, or the name of a function."""
-    if coupling is None:
+def part_identity(part: Any) -> Any:
+    """A part's configuration, or a function's name, with a digest of what is not trained in it."""
+    if part is None:
         return None
-    config = getattr(coupling, "config", None)
-    return config() if config else getattr(coupling, "__qualname__", type(coupling).__qualname__)
+    part = uncompiled(part)
+    config = getattr(part, "config", None)
+    if config is None:
+        return getattr(part, "__qualname__", type(part).__qualname__)
+    return {**config(), **fixed_identity(part)}
 
 
 def fixed_identity(part: object) -> dict[str, str]:

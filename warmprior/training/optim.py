@@ -23,37 +23,14 @@ def make_optimizer(
     *,
     learning_rate: float = 1e-4,
     weight_decay: float = 1e-5,
-    betas: tuple[float, float] = (0.9, 0.999),
-    eps: float = 1e-8,
 ) -> AdamW:
-    """AdamW with the paper's values; no decay on biases, norms and position embeddings.
-
-    Args:
-        network: the velocity network.
-
-    Keyword Args:
-        learning_rate: peak learning rate.
-        weight_decay: decay of matrix weights.
-        betas: decay rates of the moments.
-        eps: added to the root of the second moment.
-
-    See Also:
-        - :func:`~warmprior.training.warmup_cosine`: the schedule of its learning rate.
-        - :class:`~warmprior.training.BehaviourCloning`: uses both.
-
-    Examples:
-        >>> from warmprior import VelocityMLP
-        >>> from warmprior.training import make_optimizer
-        >>> optimizer = make_optimizer(VelocityMLP(2, 3, 8))
-        >>> [group["weight_decay"] for group in optimizer.param_groups]
-        [1e-05, 0.0]
-    """
+    """AdamW with the paper's values; no decay on biases, norms and position embeddings."""
     network = uncompiled(network)
     if isinstance(network, VelocityNetwork):
         groups = network.parameter_groups(weight_decay)
     else:
         groups = [{"params": list(network.parameters()), "weight_decay": weight_decay}]
-    return AdamW(groups, lr=learning_rate, betas=betas, eps=eps, fused=True)
+    return AdamW(groups, lr=learning_rate, fused=True)
 
 
 def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0.2) -> LambdaLR:
@@ -66,9 +43,6 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
 
     Raises:
         ValueError: if ``iterations < 1`` or ``warmup_ratio`` is not in [0, 1).
-
-    See Also:
-        :func:`~warmprior.training.make_optimizer`: the paper's optimizer.
 
     Examples:
         >>> import torch

@@ -18,10 +18,9 @@ from warmprior.modules import (
     VelocityMLP,
     VelocityNetwork,
     VisionNetwork,
-    imagenet_weights,
-    load_imagenet,
 )
 from warmprior.modules.checks import check_whole_numbers
+from warmprior.modules.encoder import imagenet_weights, load_imagenet
 
 __all__ = ["GENERATED", "PRETRAINED", "DataOptions", "NetworkOptions", "check_counts"]
 
@@ -73,17 +72,13 @@ class DataOptions:
         fast_rendering: render without reflections, shadows and smooth edges, three to five times faster.
 
     See Also:
-        :func:`~warmprior.training.find_tasks`: reads what they name.
+        :func:`~warmprior.training.load_task`: reads what they name.
 
     Examples:
         >>> from warmprior.training import DataOptions
         >>> options = DataOptions(data=("ph", "mh"), demonstrations=(20, 60))
         >>> options.count("ph"), options.count("mh"), options.generated
         (20, 60, True)
-        >>> DataOptions(task=("tool_hang",)).check()
-        Traceback (most recent call last):
-            ...
-        ValueError: there is no scripted expert for tool_hang: add --download for the official data, or ...
     """
 
     task: tuple[str, ...] = ()
@@ -178,8 +173,7 @@ class NetworkOptions:
         share_encoder: one encoder for all cameras.
 
     See Also:
-        - :class:`~warmprior.PreconditionedNetwork`: what ``precondition`` does.
-        - :class:`~warmprior.ChiTransformer`: the paper's network.
+        :class:`~warmprior.ChiTransformer`: the paper's network.
 
     Examples:
         >>> import torch

@@ -18,15 +18,7 @@ DEVICE_SHARE = 0.5
 
 
 def placed(data: TensorDictBase, device: torch.device | str) -> TensorDictBase:
-    """The demonstrations, contiguous steps, on the network's device if they fit, or where they are.
-
-    Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> from warmprior.training.placement import placed
-        >>> placed(TensorDict({"action": torch.zeros(3, 2)}, [3]), "cpu").device
-        device(type='cpu')
-    """
+    """The demonstrations, contiguous steps, on the network's device if they fit, or where they are."""
     device = torch.device(device)
     if device.type != "cuda":
         return data.to(device)
@@ -45,16 +37,6 @@ class Prefetch:
     The prefetching of TorchRL's replay buffers cannot be used here: batches on their way have been drawn
     already, so that a stored random state would lose them. This one knows the state that belongs to the batch
     it gave last. Nothing else may draw from the generator, and batches go to a GPU through pinned memory.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.training.placement import Prefetch
-        >>> generator = torch.Generator().manual_seed(0)
-        >>> batches = Prefetch(lambda: torch.rand(2, generator=generator), generator)
-        >>> first, state, second = batches(), batches.state(), batches()
-        >>> batches.restore(state)
-        >>> torch.equal(batches(), second)
-        True
     """
 
     def __init__(

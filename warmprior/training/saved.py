@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior.io.extras import require
@@ -37,7 +36,7 @@ __all__ = [
     "save_policy",
 ]
 
-FORMAT = 5
+FORMAT = 6
 """Version of the layout that :func:`save_policy` writes."""
 
 CONFIG, WEIGHTS, CARD = "config.json", "model.safetensors", "README.md"
@@ -121,11 +120,15 @@ def policy_config(actor: WarmPriorActor) -> dict[str, Any]:
             "max_nfe": actor.ode.max_nfe,
             "guidance": None if guidance is None else guidance.config(),
             "observation_key": actor.in_keys[0],
-            "chunk_key": actor.chunk_key,
         },
         "normalizer": None if actor.normalizer is None else actor.normalizer.config(),
         "environment": actor.environment,
-        "precision": _precision(actor),
+        # Of each part its own: half precision is too coarse for statistics.
+        "precision": {
+            name: str(dtype).removeprefix("torch.")
+            for name, part in _parts(actor).items()
+            if (dtype := _dtype(part))
+        },
     }
     try:
         return as_json(config)
@@ -147,12 +150,6 @@ def _parts(actor: WarmPriorActor) -> dict[str, nn.Module]:
     return {name: part for name, part in parts.items() if isinstance(part, nn.Module)}
 
 
-def _precision(actor: WarmPriorActor) -> dict[str, str]:
-    """Names of the parts' precisions. Each its own: half precision is too coarse for statistics."""
-    found = {name: _dtype(part) for name, part in _parts(actor).items()}
-    return {name: str(dtype).removeprefix("torch.") for name, dtype in found.items() if dtype}
-
-
 def policy_file(place: str | Path, *, revision: str | None = None) -> dict[str, Any]:
     """The configuration of a saved policy, as its file has it; arguments as of :func:`load_policy`."""
     return _read(_folder(place, revision=revision))[1]
@@ -166,11 +163,6 @@ def check_saveable(actor: WarmPriorActor) -> tuple[dict[str, Any], dict[str, Ten
     Raises:
         TypeError: if there is no :func:`policy_config`.
         ValueError: if a policy built from it has other tensors than this one.
-
-    Examples:
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
-        >>> from warmprior.training import check_saveable
-        >>> config, weights = check_saveable(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)))
     """
     config = policy_config(actor)
     tensors = without_compilation(actor.state_dict())
@@ -199,10 +191,7 @@ def save_policy(actor: WarmPriorActor, directory: str | Path) -> None:
     Raises:
         OSError: if the folder cannot be written to.
         TypeError: if the network is not a :class:`VelocityNetwork` (its configuration is needed).
-        ValueError: if the policy could not be loaded again, see :func:`check_saveable`.
-
-    See Also:
-        :func:`~warmprior.training.load_policy`: reads it.
+        ValueError: if the policy could not be loaded again, as is checked before.
 
     Examples:
         >>> from tempfile import TemporaryDirectory
@@ -285,7 +274,6 @@ def push_policy(
 def load_policy(
     directory: str | Path,
     *,
-    prior: Prior | None = None,
     device: torch.device | str = "cpu",
     generator: torch.Generator | None = None,
     revision: str | None = None,
@@ -301,7 +289,6 @@ def load_policy(
             repository at the Hugging Face hub, where there is no such folder.
 
     Keyword Args:
-        prior: the prior that the policy must have been trained with, if any.
         device: where to put the weights.
         generator: source of randomness of the sampler.
         revision: branch, tag or commit of the repository; its main branch by default.
@@ -309,8 +296,7 @@ def load_policy(
 
     Raises:
         FileNotFoundError: if there is none.
-        ValueError: if it is damaged, of another format version, or has another prior; or if a revision of a
-            folder is asked for.
+        ValueError: if it is damaged or of another format version; or if a revision of a folder is asked for.
         OSError: the hub client's own, if the hub does not have it, or does not give it to this user.
         ImportError: if the hub has to be asked, and huggingface_hub is not installed.
 
@@ -332,8 +318,6 @@ def load_policy(
     except Exception as error:  # whatever options of another version lead to
         reason = str(error) if type(error) is ValueError else repr(error)
         raise ValueError(f"the policy at {folder} cannot be built here: {reason}") from error
-    if prior is not None and as_json(prior.config()) != config["prior"]:
-        raise ValueError(f"the policy at {folder} was trained with {actor.prior}, not with {prior}")
     actor.sampler.generator = generator
     return actor.to(device).eval()
 
@@ -355,8 +339,8 @@ def _filled(config: dict[str, Any], tensors: Mapping[str, Tensor]) -> WarmPriorA
 def _from_config(config: dict[str, Any]) -> WarmPriorActor:
     """An actor with fresh weights."""
     options: dict[str, Any] = dict(config["actor"])
-    for name in ("observation_key", "chunk_key"):
-        options[name] = _key_from_json(options[name])
+    key = options["observation_key"]
+    options["observation_key"] = tuple(key) if isinstance(key, list) else key  # nested, as JSON holds it
     if options["guidance"] is not None:
         options["guidance"] = RealTimeChunking(**options["guidance"])
     normalizer, start = config["normalizer"], config["start"]
@@ -375,11 +359,6 @@ def _from_config(config: dict[str, Any]) -> WarmPriorActor:
         if _dtype(parts[name]) != dtype:
             parts[name].to(dtype)
     return actor
-
-
-def _key_from_json(value: Any) -> NestedKey:
-    """A key as JSON holds it: text, or a list of texts for a nested one."""
-    return tuple(value) if isinstance(value, list) else value
 
 
 def _dtype(part: nn.Module) -> torch.dtype | None:

@@ -34,7 +34,7 @@ from warmprior.training.identity import data_digest
 from warmprior.training.options import DataOptions, is_simulated
 from warmprior.transforms.absolute_actions import AbsoluteActions
 
-__all__ = ["Task", "find_tasks", "load_task", "navigation_task", "read_like", "robosuite_task", "task_places"]
+__all__ = ["Task", "load_task", "navigation_task", "read_like", "robosuite_task", "task_places"]
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Task:
             combined in another way.
 
     See Also:
-        - :func:`~warmprior.training.robosuite_task`: of demonstrations in robosuite.
+        - :func:`~warmprior.training.load_task`: of demonstrations in robosuite.
         - :func:`~warmprior.training.navigation_task`: the toy.
 
     Examples:
@@ -223,46 +223,9 @@ def robosuite_task(
 ) -> Task:
     """The task of demonstrations in robosuite, played in the simulator that recorded them.
 
-    Args:
-        path: of a robomimic HDF5 file; or ``lerobot:`` and the folder or repository of a LeRobotDataset,
-            whose environment is that of ``options.task`` where it does not describe its own.
-        style: of the demonstrations, such as ``"ph"``; decides the time limit of tasks of ours.
-
-    Keyword Args:
-        source: where the file comes from: ``"scripted"``, ``"official"`` or ``"file"``.
-        observation_steps: ``To`` of the policies.
-        options: the policies' actions and observations, and how many demonstrations to take; those of the
-            file by default.
-
-    Raises:
-        DatasetError: if the file cannot be read or has fewer demonstrations, or images are to be rendered
-            and it has no states.
-        ValueError: if it has no pose deltas to make absolute poses of, there is no such camera, its
-            environment is unknown, or a file is of another task than the one that is named.
-        ImportError: if its simulator is MimicGen's, and its package is missing.
-
-    See Also:
-        - :func:`~warmprior.training.find_tasks`: all that the options name.
-        - :class:`~warmprior.envs.RobosuiteEnv`: its environment.
-
-    Examples:
-        >>> from pathlib import Path
-        >>> from tempfile import TemporaryDirectory
-        >>> import h5py
-        >>> import torch
-        >>> from warmprior.envs import TASKS
-        >>> from warmprior.training import robosuite_task
-        >>> lift = TASKS["lift"]
-        >>> with TemporaryDirectory() as folder:
-        ...     path = Path(folder) / "lift.hdf5"
-        ...     with h5py.File(path, "w") as file:
-        ...         widths = {f"obs/{key}": width for key, width in lift.low_dim_widths.items()}
-        ...         for name, width in {"actions": lift.action_dim, "rewards": 1, **widths}.items():
-        ...             file[f"data/demo_0/{name}"] = torch.arange(9.0)[:, None].expand(9, width).numpy()
-        ...         file["data"].attrs["env_args"] = '{"env_name": "Lift", "env_kwargs": {}}'
-        ...     task = robosuite_task(path)
-        >>> task.title, task.vector.shape, task.vector.amin().item(), task.vector.amax().item()
-        ('lift ph (file data)', torch.Size([9, 19]), -1.0, 1.0)
+    The place is a robomimic HDF5 file, or ``lerobot:`` and the folder or repository of a LeRobotDataset,
+    whose environment is that of ``options.task`` where it does not describe its own. The style decides the
+    time limit of tasks of ours, and the source (``"scripted"``, ``"official"``, ``"file"``) made the file.
     """
     options = DataOptions() if options is None else options
     # A generated file has as many as were asked for.
@@ -429,17 +392,10 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
     Raises:
         ValueError: if there is no such task, or a file is of another one.
 
-    See Also:
-        :func:`~warmprior.training.find_tasks`: all that options name.
-
     Examples:
         >>> from warmprior.training import DataOptions, load_task
         >>> load_task(DataOptions(), "navigation").title
         'navigation toy'
-        >>> load_task(DataOptions(), "nowhere:pendulum")
-        Traceback (most recent call last):
-            ...
-        ValueError: --task nowhere:pendulum: No module named 'nowhere'
     """
     if name == "navigation":
         return navigation_task()
@@ -467,15 +423,7 @@ def demonstrations_of(options: DataOptions, name: str | None, style: str) -> tup
 
 
 def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
-    """The tasks that options name, checked: for each what :func:`load_task` takes, a name and a style.
-
-    Examples:
-        >>> from warmprior.training import DataOptions
-        >>> from warmprior.training.task import task_places
-        >>> task_places(DataOptions(task=("can", "tool_hang"), data=("ph", "mh"), download=True))
-        Data: there are no official mh demonstrations of tool_hang.
-        [('can', 'ph'), ('can', 'mh'), ('tool_hang', 'ph')]
-    """
+    """The tasks that options name, checked: for each what :func:`load_task` takes, a name and a style."""
     options.check()
     names: Sequence[str | None] = options.task or (None if options.dataset else "square",)
     if options.generated and any(name in TASKS for name in names):
@@ -497,20 +445,3 @@ def task_places(options: DataOptions) -> list[tuple[str | None, str]]:
                 styles = there
         found |= dict.fromkeys((name, style) for style in styles)
     return list(found)
-
-
-def find_tasks(options: DataOptions, observation_steps: int = 2) -> list[Task]:
-    """Read, download or generate the demonstrations of all tasks that options name; see :func:`load_task`.
-
-    Raises:
-        ValueError: see :func:`task_places` and :func:`load_task`.
-
-    See Also:
-        :func:`~warmprior.training.load_task`: one of them.
-
-    Examples:
-        >>> from warmprior.training import DataOptions, find_tasks
-        >>> [task.title for task in find_tasks(DataOptions(task=("navigation",)))]
-        ['navigation toy']
-    """
-    return [load_task(options, *place, observation_steps) for place in task_places(options)]

@@ -42,31 +42,7 @@ def new_policy(
     see_history: bool = False,
     max_nfe: int | None = None,
 ) -> WarmPriorActor:
-    """A policy with fresh weights, which depend on the seed of its training alone.
-
-    Args:
-        task: what it is for.
-        prior: the source distribution.
-        network: the velocity network.
-        training: the recipe that it will be trained by.
-
-    Keyword Args:
-        start: where samplers start; at the source by default.
-        coupling: how the training pairs sources and targets; as they come by default.
-        see_history: whether the network sees the last actions.
-        max_nfe: most network evaluations per chunk, for a field that is trained at ``t = 0`` alone.
-
-    See Also:
-        :func:`~warmprior.training.train_policy`: trains one.
-
-    Examples:
-        >>> from warmprior import PastPrior
-        >>> from warmprior.training import NetworkOptions, TrainingConfig, navigation_task, new_policy
-        >>> options = NetworkOptions(hidden_dim=8, observation_steps=1)
-        >>> actor = new_policy(navigation_task(), PastPrior(4), options, TrainingConfig(seed=3))
-        >>> type(actor.network).__name__
-        'PreconditionedNetwork'
-    """
+    """A policy with fresh weights, which depend on the training's seed alone; see :func:`train_policy`."""
     action_dim, observation_dim = task.data[keys.ACTION].shape[-1], task.vector.shape[-1]
     if see_history:
         observation_dim += HistoryObservation.width(prior.chunk_length, action_dim)
@@ -129,10 +105,10 @@ def train_policy(
     Keyword Args:
         network: the velocity network.
         training: the recipe; :data:`~warmprior.training.training_config.PAPER` is the paper's.
-        start: see :func:`new_policy`.
-        coupling: likewise.
-        see_history: likewise.
-        max_nfe: likewise.
+        start: where samplers start; at the source by default.
+        coupling: how sources and targets are paired; as they come by default.
+        see_history: whether the network sees the last actions.
+        max_nfe: most network evaluations per chunk, for a field that is trained at ``t = 0`` alone.
         device: of the network and, where they fit, the demonstrations.
         compile: compile the network with :func:`torch.compile`.
         logger: a TorchRL logger, closed at the end.
@@ -150,7 +126,6 @@ def train_policy(
         ValueError: if the demonstrations have another form, or the folder holds another training.
 
     See Also:
-        - :class:`~warmprior.training.BehaviourCloning`: the training loop.
         - :func:`~warmprior.training.evaluate`: plays episodes.
         - :func:`~warmprior.training.save_policy`: keeps the policy.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -26,8 +25,6 @@ class TrainingConfig:
         batch_size: windows per step, of all processes together.
         learning_rate: peak of the schedule.
         weight_decay: AdamW's decay of matrix weights.
-        betas: AdamW's decay rates.
-        eps: AdamW's epsilon.
         warmup_ratio: share of the iterations over which the learning rate rises.
         ema_rate: decay of the averaged weights that are evaluated.
         checkpoints: how many policies to keep at most, evenly spaced, the last at the end.
@@ -61,8 +58,6 @@ class TrainingConfig:
     batch_size: int = 128
     learning_rate: float = 1e-3
     weight_decay: float = 1e-5
-    betas: tuple[float, float] = (0.9, 0.999)
-    eps: float = 1e-8
     warmup_ratio: float = 0.1
     ema_rate: float = 0.995
     checkpoints: int = 1
@@ -83,19 +78,17 @@ class TrainingConfig:
             check_whole_numbers(save_every=self.save_every)
         if not isinstance(self.seed, int) or not 0 <= self.seed < 2**62:  # others are counted from it
             raise ValueError(f"seed must be a whole number from 0 to 2**62 - 1, got {self.seed!r}")
-        ranges: dict[str, tuple[Callable[[float], bool], tuple[str, ...]]] = {
-            "be > 0": (lambda value: value > 0, ("learning_rate", "eps")),
-            "be >= 0": (lambda value: value >= 0, ("weight_decay",)),
-            "lie in [0, 1)": (lambda value: 0 <= value < 1, ("betas", "warmup_ratio", "ema_rate")),
-            "lie in [0, 1]": (lambda value: 0 <= value <= 1, ("cold_probability",)),
-        }
-        for words, (fits, names) in ranges.items():
-            for name in names:
-                value = getattr(self, name)
-                for number in value if name == "betas" else (value,):
-                    check_finite_numbers(**{name: number})
-                    if not fits(number):
-                        raise ValueError(f"{name} must {words}, got {value}")
+        for name, words, fits in (
+            ("learning_rate", "be > 0", lambda value: value > 0),
+            ("weight_decay", "be >= 0", lambda value: value >= 0),
+            ("warmup_ratio", "lie in [0, 1)", lambda value: 0 <= value < 1),
+            ("ema_rate", "lie in [0, 1)", lambda value: 0 <= value < 1),
+            ("cold_probability", "lie in [0, 1]", lambda value: 0 <= value <= 1),
+        ):
+            value = getattr(self, name)
+            check_finite_numbers(**{name: value})
+            if not fits(value):
+                raise ValueError(f"{name} must {words}, got {value}")
         if self.precision not in get_args(Precision):
             known = ", ".join(get_args(Precision))
             raise ValueError(f"precision must be one of {known}, got {self.precision!r}")

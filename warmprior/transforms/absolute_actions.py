@@ -6,14 +6,12 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.rotation import matrix_to_rotvec, rotation_6d_to_matrix
-from warmprior.transforms.inner_step import KEPT
+from warmprior.transforms.inner_step import KEPT, EnvTransform
 
 __all__ = ["AbsoluteActions"]
 
@@ -23,17 +21,18 @@ _TINY = 1e-150
 _REACH = 2.0  # metres, in the specification of actions: it only says what is worth sampling
 
 
-class AbsoluteActions(Transform):
+class AbsoluteActions(EnvTransform):
     r"""Turns the pose that an action asks for into the delta from where the gripper is now.
 
     Per arm an action holds a position in metres in the world, the first two rows of a rotation matrix and the
-    gripper, as :func:`~warmprior.envs.absolute_actions` computes them from demonstrations. The environment
-    below gets
+    gripper, as :func:`~warmprior.envs.absolute_actions` computes them from demonstrations: ``"action"``
+    ``[*B, 10 * arms]``. The environment below gets ``[*B, 7 * arms]``,
 
     .. math:: \mathrm{clip}\bigl((p^* - p) / s_p\bigr), \quad
               \mathrm{clip}\bigl(\log(R^* R^\top) / s_R\bigr)
 
-    and the gripper, where :math:`(p, R)` is the gripper's pose before the step. The result is clipped to the
+    and the gripper, where :math:`(p, R)` is the gripper's pose before the step, which the environment writes
+    under ``"eef_pose"``, ``[*B, arms, 3, 4]`` (:mod:`warmprior.keys`). The result is clipped to the
     :math:`[-1, 1]` that the controller takes, so a pose beyond the reach of one control step is approached at
     full speed.
     Any two rows that are not parallel will do; they are orthonormalised.
@@ -46,11 +45,6 @@ class AbsoluteActions(Transform):
             :func:`~warmprior.envs.delta_conventions`, also for the next.
         base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; one arm in the world frame
             by default.
-
-    Keyword Args:
-        action_key: the action, ``[*B, 10 * arms]`` outside and ``[*B, 7 * arms]`` inside.
-        pose_key: the grippers' poses in the world, ``[*B, arms, 3, 4]``: rotation and, in the last column,
-            position in metres.
 
     Raises:
         ValueError: if the shapes do not fit each other, or (in an environment) its actions.
@@ -71,11 +65,8 @@ class AbsoluteActions(Transform):
         self,
         output_max: Tensor | Sequence[float],
         base_rotation: Tensor | None = None,
-        *,
-        action_key: NestedKey = keys.ACTION,
-        pose_key: NestedKey = keys.EEF_POSE,
     ) -> None:
-        super().__init__(in_keys_inv=[action_key], out_keys_inv=[action_key])
+        super().__init__(in_keys_inv=[keys.ACTION], out_keys_inv=[keys.ACTION])
         # In double precision, like the simulator's: a delta is a small difference of large numbers.
         scale = torch.as_tensor(output_max, dtype=torch.float64)
         rotation = torch.eye(3)[None] if base_rotation is None else base_rotation
@@ -86,8 +77,6 @@ class AbsoluteActions(Transform):
             )
         self.register_buffer("scale", scale)
         self.register_buffer("base_rotation", rotation.double())
-        self.action_key = unravel_key(action_key)
-        self.pose_key = unravel_key(pose_key)
 
     @property
     def arms(self) -> int:
@@ -118,31 +107,27 @@ class AbsoluteActions(Transform):
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         # A partial step of a batched environment has set its observations aside.
         kept = tensordict.get(KEPT, None)
-        pose = tensordict.get(self.pose_key, None)
+        pose = tensordict.get(keys.EEF_POSE, None)
         if pose is None and kept is not None:
-            pose = kept.get(self.pose_key, None)
+            pose = kept.get(keys.EEF_POSE, None)
         if pose is None:
             raise KeyError(
-                f"AbsoluteActions needs the gripper's pose at {self.pose_key!r}: step with what reset or "
+                f"AbsoluteActions needs the gripper's pose at {keys.EEF_POSE!r}: step with what reset or "
                 "step_mdp returned"
             )
-        action = tensordict.get(self.action_key)
-        return tensordict.set(self.action_key, self.delta(action, pose))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing: demonstrations are read as absolute poses."""
-        return tensordict
+        action = tensordict.get(keys.ACTION)
+        return tensordict.set(keys.ACTION, self.delta(action, pose))
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the deltas by absolute poses."""
         parent = self.parent
-        if parent is not None and self.pose_key not in parent.observation_spec.keys(True, True):
+        if parent is not None and keys.EEF_POSE not in parent.observation_spec.keys(True, True):
             raise KeyError(
-                f"AbsoluteActions found no {self.pose_key!r} among the observations: make the environment "
+                f"AbsoluteActions found no {keys.EEF_POSE!r} among the observations: make the environment "
                 "with eef_pose=True"
             )
         actions = input_spec["full_action_spec"]
-        leaf = actions[self.action_key]
+        leaf = actions[keys.ACTION]
         if leaf.shape[-1] != self.arms * _DELTA:
             raise ValueError(
                 f"AbsoluteActions of {self.arms} arm(s) needs actions of width {self.arms * _DELTA}, but the "
@@ -150,7 +135,7 @@ class AbsoluteActions(Transform):
             )
         limit = torch.tensor(([_REACH] * 3 + [1.0] * 7) * self.arms, device=leaf.device)
         limit = limit.to(leaf.dtype).expand(*leaf.shape[:-1], self.arms * _ABSOLUTE)
-        actions[self.action_key] = Bounded(-limit, limit, device=leaf.device)
+        actions[keys.ACTION] = Bounded(-limit, limit, device=leaf.device)
         return input_spec
 
 

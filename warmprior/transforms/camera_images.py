@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
 from torchrl.data import Bounded, Composite
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
+from warmprior.transforms.inner_step import EnvTransform
 
 __all__ = ["CameraImages"]
 
 
-class CameraImages(Transform):
+class CameraImages(EnvTransform):
     """Adds an image per camera to an observation vector.
 
     The images are rendered from the environment's state (``RobosuiteEnv(..., sim_state=True)``). That takes
@@ -76,20 +75,12 @@ class CameraImages(Transform):
                 "sim_state=True"
             )
         simulator, numbers = self._simulator, state.cpu().numpy()
-        images = {
-            f"{camera}_image": _channels_first(simulator.render_frame(camera, self.size, numbers))
-            for camera in self.cameras
-        }
         vector = next_tensordict.get(keys.OBSERVATION)
-        entries = {keys.STATE: vector, **{k: v.to(vector.device) for k, v in images.items()}}
+        entries = {keys.STATE: vector}
+        for camera in self.cameras:
+            image = simulator.render_frame(camera, self.size, numbers).transpose(2, 0, 1)
+            entries[f"{camera}_image"] = torch.from_numpy(np.ascontiguousarray(image)).to(vector.device)
         return next_tensordict.set(keys.OBSERVATION, TensorDict(entries))
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing: demonstrations hold their images."""
-        return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Replace the vector by the vector and images."""
@@ -102,7 +93,3 @@ class CameraImages(Transform):
         images = {f"{camera}_image": image.clone() for camera in self.cameras}
         observation_spec[keys.OBSERVATION] = Composite({keys.STATE: vector, **images})
         return observation_spec
-
-
-def _channels_first(image: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))

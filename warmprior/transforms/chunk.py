@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import torch
@@ -10,22 +10,22 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
-from torchrl.envs.transforms import Transform, VecGymEnvTransform
+from torchrl.envs.transforms import VecGymEnvTransform
 
 from warmprior import keys
-from warmprior.transforms.inner_step import InnerStep, rows_where, set_aside
+from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside
 from warmprior.transforms.late import LateTransforms, advance
 
 __all__ = ["ChunkStep"]
 
 
-class ChunkStep(Transform):
+class ChunkStep(EnvTransform):
     r"""Turns an environment of single actions into one of action chunks (a semi-MDP).
 
     One outer step executes the first ``execute`` actions of a chunk ``[*B, P, d_a]``, and stops each
     sub-environment at the end of its own episode. The reward is the discounted sum :math:`\sum_{i<k} \gamma^i
     r_i` over the ``k`` executed steps. ``k`` itself is written to ``("next", "executed_steps")``. A success
-    at any step is a success of the chunk (see ``event_keys``), and everything else is taken from the last
+    at any step is a success of the chunk (see ``success``), and everything else is taken from the last
     executed step. Unlike
     :class:`~torchrl.envs.transforms.MultiAction` it keeps the last reward of an episode that ends inside a
     chunk, and its shapes are fixed, so it works inside and outside batched environments.
@@ -50,11 +50,8 @@ class ChunkStep(Transform):
             default.
         prediction_length: ``P``, the length of the chunks that the policy gives; ``H`` by default.
         gamma: discount per control step.
-        action_key: the single action that the wrapped environment takes.
-        chunk_key: the chunk, ``[*B, P, d_a]``.
-        executed_key: where ``k`` is written, int64 ``[*B, 1]``.
-        event_keys: bool flags that hold after a chunk if they held after any of its executed steps; flags
-            that the environment does not write are ignored.
+        success: a bool flag that holds after a chunk if it held after any of its executed steps; ignored if
+            the environment does not write it.
         measures: further keys whose values after a chunk are the ``"max"``, ``"sum"`` or ``"last"`` of those
             after its executed steps.
 
@@ -85,13 +82,10 @@ class ChunkStep(Transform):
         execute: int | None = None,
         prediction_length: int | None = None,
         gamma: float = 1.0,
-        action_key: NestedKey = keys.ACTION,
-        chunk_key: NestedKey = keys.CHUNK,
-        executed_key: NestedKey = keys.EXECUTED,
-        event_keys: Sequence[NestedKey] = (keys.SUCCESS,),
+        success: NestedKey = keys.SUCCESS,
         measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
     ) -> None:
-        super().__init__(in_keys_inv=[action_key], out_keys_inv=[chunk_key])
+        super().__init__(in_keys_inv=[keys.ACTION], out_keys_inv=[keys.CHUNK])
         execute = chunk_length if execute is None else execute
         prediction_length = chunk_length if prediction_length is None else prediction_length
         if not 1 <= execute <= chunk_length <= prediction_length:
@@ -104,28 +98,25 @@ class ChunkStep(Transform):
         self.execute = execute
         self.prediction_length = prediction_length
         self.gamma = gamma
-        self.action_key = unravel_key(action_key)
-        self.chunk_key = unravel_key(chunk_key)
-        self.executed_key = unravel_key(executed_key)
-        self.event_keys = [unravel_key(key) for key in event_keys]
+        self.success = unravel_key(success)
         self.measures = {key: how for key, how in (measures or {}).items() if how != "last"}
         self._input: TensorDictBase | None = None
         self._inner: tuple[Any, InnerStep, LateTransforms | None, NestedKey] | None = None
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         # The wrapped environment's own step executes the first action; _step runs the others.
-        chunk = tensordict.get(self.chunk_key)
+        chunk = tensordict.get(keys.CHUNK)
         if chunk is None or chunk.shape[-2] != self.prediction_length:
             found = "nothing" if chunk is None else f"shape {tuple(chunk.shape)}"
             raise ValueError(
                 f"ChunkStep expects a chunk [*B, {self.prediction_length}, d_a] at "
-                f"{self.chunk_key}, found {found}"
+                f"{keys.CHUNK}, found {found}"
             )
         # Inverse transforms of the environment below may change it before _step gets it.
         self._input = tensordict.copy()
         if "_step" in tensordict:
             set_aside(tensordict, self._inner_step()[0].observed)
-        return tensordict.set(self.action_key, chunk[..., 0, :])
+        return tensordict.set(keys.ACTION, chunk[..., 0, :])
 
     def _inner_step(self) -> tuple[InnerStep, LateTransforms | None, NestedKey]:
         """How to step what this transform wraps, also with late transforms, and the key of its reward."""
@@ -144,14 +135,14 @@ class ChunkStep(Transform):
                     f"measures of ChunkStep cannot be the reward {rewards[0]!r}, which after a chunk is its "
                     "return: have the environment write it under another key as well"
                 )
-            read = (*dones, rewards[0], *self.event_keys, *self.measures)
+            read = (*dones, rewards[0], self.success, *self.measures)
             if self.execute > 1 and any(isinstance(t, VecGymEnvTransform) for t in inner.transforms):
                 raise RuntimeError(
                     "ChunkStep cannot step a vector environment of Gymnasium (num_envs): it restarts an "
                     "episode that ends inside a chunk, and the rest of the chunk would be played in the next "
                     "one. Use SerialEnv or ParallelEnv of single environments"
                 )
-            late = LateTransforms.of(inner, self.action_key, read)
+            late = LateTransforms.of(inner, read)
             self._inner = (parent, inner, late, rewards[0])
         return self._inner[1:]
 
@@ -161,7 +152,7 @@ class ChunkStep(Transform):
         before, self._input = self._input, None
         if before is None:
             raise RuntimeError("ChunkStep._step was called without ChunkStep.inv: use env.step")
-        chunk = before.get(self.chunk_key)[..., : self.execute, :]
+        chunk = before.get(keys.CHUNK)[..., : self.execute, :]
         # A plain dictionary: a tensordict's checks would be made at every control step.
         current = dict(before.items())
         preset = current.pop("next", None)
@@ -188,7 +179,7 @@ class ChunkStep(Transform):
                 break
             advance(current, next_tensordict, reward_key)
             inputs = TensorDict(current, batch_size=batch, device=next_tensordict.device)
-            result = step(inputs.set(self.action_key, chunk[..., i, :]), alive)
+            result = step(inputs.set(keys.ACTION, chunk[..., i, :]), alive)
             reward = result.get(reward_key)
             if alive is None:
                 next_tensordict = result
@@ -203,10 +194,9 @@ class ChunkStep(Transform):
         if preset is not None:
             # A policy may preset other keys under "next", which the inner steps do not return.
             next_tensordict.update(preset.exclude(*next_tensordict.keys(True, True)))
-        for key in self.event_keys:
-            if next_tensordict.get(key, None) is not None:
-                flags = torch.stack([result.get(key) for result in results])
-                next_tensordict.set(key, flags.any(0))
+        if next_tensordict.get(self.success, None) is not None:
+            flags = torch.stack([result.get(self.success) for result in results])
+            next_tensordict.set(self.success, flags.any(0))
         for key, how in self.measures.items():
             values = [result.get(key) for result in results]
             if how == "max":
@@ -218,7 +208,7 @@ class ChunkStep(Transform):
             ]
             next_tensordict.set(key, torch.stack(counted).sum(0))
         next_tensordict.set(reward_key, self._return(earned))
-        return next_tensordict.set(self.executed_key, steps.unsqueeze(-1))
+        return next_tensordict.set(keys.EXECUTED, steps.unsqueeze(-1))
 
     def _return(self, rewards: list[Tensor]) -> Tensor:
         """The discounted sum, accumulated in floating point."""
@@ -232,32 +222,28 @@ class ChunkStep(Transform):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         shape = (*tensordict_reset.batch_size, 1)
         executed = torch.zeros(shape, dtype=torch.int64, device=tensordict_reset.device)
-        return tensordict_reset.set(self.executed_key, executed)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing."""
-        return tensordict
+        return tensordict_reset.set(keys.EXECUTED, executed)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the action by a chunk of ``P`` actions."""
         actions, ndim = input_spec["full_action_spec"], input_spec.ndim
-        if self.action_key not in actions.keys(True, True):
+        if keys.ACTION not in actions.keys(True, True):
             raise KeyError(
-                f"ChunkStep found no action {self.action_key!r}, only {list(actions.keys(True, True))}: name "
-                "it with action_key"
+                f"ChunkStep found no {keys.ACTION!r}, only {list(actions.keys(True, True))}: rename it with "
+                "TorchRL's RenameTransform"
             )
-        leaf = actions[self.action_key]
+        leaf = actions[keys.ACTION]
         if leaf.ndim != ndim + 1:
             raise ValueError(
                 "ChunkStep takes environments whose action is one vector [*B, d_a], but "
-                f"{self.action_key!r} has shape {tuple(leaf.shape)} for the batch size "
+                f"{keys.ACTION!r} has shape {tuple(leaf.shape)} for the batch size "
                 f"{tuple(input_spec.shape)}: make it a vector before, for instance with FlattenAction or "
                 "UnsqueezeTransform"
             )
         leaf = leaf.unsqueeze(ndim)
         leaf = leaf.expand(*leaf.shape[:ndim], self.prediction_length, *leaf.shape[ndim + 1 :])
-        actions[self.chunk_key] = leaf.clone()
-        del actions[self.action_key]
+        actions[keys.CHUNK] = leaf.clone()
+        del actions[keys.ACTION]
         return input_spec
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
@@ -283,7 +269,7 @@ class ChunkStep(Transform):
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the number of executed steps."""
-        observation_spec[self.executed_key] = Unbounded(
+        observation_spec[keys.EXECUTED] = Unbounded(
             (*observation_spec.shape, 1), dtype=torch.int64, device=observation_spec.device
         )
         return observation_spec

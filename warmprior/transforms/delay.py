@@ -6,14 +6,12 @@ from numbers import Integral
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import TensorSpec, Unbounded
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.modules.real_time_chunking import with_leftover
-from warmprior.transforms.inner_step import keep_resting
+from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
 __all__ = ["InferenceDelay", "check_delay", "executed_chunk"]
 
@@ -39,12 +37,12 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
         )
 
 
-def executed_chunk(tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK) -> Tensor:
+def executed_chunk(tensordict: TensorDictBase) -> Tensor:
     """The chunks of decisions as they are executed: a late chunk begins with the rest of the one before.
 
     Args:
-        tensordict: ``[*B]`` decisions, such as those of a rollout.
-        chunk_key: the prediction, ``[*B, P, d_a]``; executed as it is if no delay is recorded.
+        tensordict: ``[*B]`` decisions, such as those of a rollout. Without a recorded delay the chunks are
+            executed as they are.
 
     See Also:
         - :class:`~warmprior.InferenceDelay`: lets chunks take effect late.
@@ -62,11 +60,11 @@ def executed_chunk(tensordict: TensorDictBase, chunk_key: NestedKey = keys.CHUNK
     """
     delay = tensordict.get(keys.DELAY, None)
     if delay is None:
-        return tensordict.get(chunk_key)
-    return with_leftover(tensordict.get(chunk_key), tensordict.get(keys.FORECAST), delay)
+        return tensordict.get(keys.CHUNK)
+    return with_leftover(tensordict.get(keys.CHUNK), tensordict.get(keys.FORECAST), delay)
 
 
-class InferenceDelay(Transform):
+class InferenceDelay(EnvTransform):
     r"""Makes every chunk take effect ``delay`` control steps after the observation that it answers.
 
     Simulators wait for policies, and robots do not. Here the robot goes on meanwhile: the first ``delay`` of
@@ -88,8 +86,6 @@ class InferenceDelay(Transform):
 
     Keyword Args:
         execute: actions executed per decision, as :class:`ChunkStep` has it.
-        chunk_key: the chunk, ``[*B, P, d_a]``.
-        executed_key: the number of executed actions, int64 ``[*B, 1]``.
 
     Raises:
         ValueError: if not ``0 <= delay <= execute`` (the next decision would be due before the last one took
@@ -112,20 +108,11 @@ class InferenceDelay(Transform):
         (True, True)
     """
 
-    def __init__(
-        self,
-        delay: int,
-        *,
-        execute: int,
-        chunk_key: NestedKey = keys.CHUNK,
-        executed_key: NestedKey = keys.EXECUTED,
-    ) -> None:
+    def __init__(self, delay: int, *, execute: int) -> None:
         super().__init__(in_keys=[keys.FORECAST], out_keys=[keys.DELAY])
         check_delay(delay, execute)
         self.delay = delay
         self.execute = execute
-        self.chunk_key = unravel_key(chunk_key)
-        self.executed_key = unravel_key(executed_key)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         missing = [k for k in (keys.FORECAST, keys.DELAY) if tensordict.get(k, None) is None]
@@ -134,12 +121,12 @@ class InferenceDelay(Transform):
                 f"InferenceDelay found no {missing} in a step's input: hand over what the reset or the step "
                 "before gave, with the chunk"
             )
-        if tensordict.get(self.chunk_key, None) is None:
+        if tensordict.get(keys.CHUNK, None) is None:
             return tensordict  # ChunkStep raises
-        return tensordict.set(self.chunk_key, executed_chunk(tensordict, self.chunk_key))
+        return tensordict.set(keys.CHUNK, executed_chunk(tensordict))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        executed = next_tensordict.get(self.executed_key)
+        executed = next_tensordict.get(keys.EXECUTED)
         if (executed > self.execute).any():
             raise RuntimeError(
                 f"a decision executed {int(executed.max())} actions, and InferenceDelay has "
@@ -152,10 +139,6 @@ class InferenceDelay(Transform):
         shape = (*tensordict_reset.batch_size, 1)
         none = torch.zeros(shape, dtype=torch.int64, device=tensordict_reset.device)
         return tensordict_reset.set(keys.DELAY, none)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Does nothing: in data no chunk is late."""
-        return tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the delay."""

@@ -6,19 +6,19 @@ import copy
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import unravel_key
 from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded, network_observation
+from warmprior.transforms.inner_step import EnvTransform
 
 __all__ = ["EncodeObservation"]
 
 
-class EncodeObservation(Transform):
-    """Writes the features that a frozen policy's encoder extracts from images.
+class EncodeObservation(EnvTransform):
+    """Writes the features ``[*B, To, d_o]`` that a frozen policy's encoder extracts from images.
 
     Agents in the policy's source space and their critics read the features, so the encoder runs once per
     decision and replay buffers hold vectors. The policy behind the agent reads them too:
@@ -27,9 +27,6 @@ class EncodeObservation(Transform):
 
     Args:
         actor: the policy; its network is copied and stays as it is.
-
-    Keyword Args:
-        out_key: key written, ``[*B, To, d_o]``.
 
     Raises:
         ValueError: if the network has no encoder (:attr:`VelocityNetwork.encodes`).
@@ -49,9 +46,9 @@ class EncodeObservation(Transform):
         torch.Size([5, 2, 67])
     """
 
-    def __init__(self, actor: WarmPriorActor, *, out_key: NestedKey = keys.FEATURES) -> None:
+    def __init__(self, actor: WarmPriorActor) -> None:
         observation_key = unravel_key(actor.in_keys[0])
-        super().__init__(in_keys=[observation_key], out_keys=[unravel_key(out_key)])
+        super().__init__(in_keys=[observation_key], out_keys=[keys.FEATURES])
         if not getattr(actor.network, "encodes", False):
             raise ValueError(
                 f"{type(actor.network).__name__} takes observations as they are: there is nothing to encode"
@@ -77,9 +74,6 @@ class EncodeObservation(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self.forward(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the features."""

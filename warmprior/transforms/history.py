@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey, unravel_key
+from tensordict.utils import NestedKey
 from torchrl.data import TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
@@ -12,14 +12,14 @@ from torchrl.envs.transforms import Transform
 from warmprior import keys
 from warmprior.history import ENTRIES, advance, cold_history, without
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
-from warmprior.transforms.inner_step import keep_resting
+from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
 __all__ = ["ActionHistory", "WithheldHistory"]
 
 HISTORY_KEYS: list[NestedKey] = [(keys.HISTORY, name) for name in ENTRIES]
 
 
-class ActionHistory(Transform):
+class ActionHistory(EnvTransform):
     """Writes the history for the next decision after each step, and a cold one at resets.
 
     It has no state, so it does the same in ``env.rollout``, collectors and batched environments, inside and
@@ -28,10 +28,6 @@ class ActionHistory(Transform):
 
     Args:
         history_length: how many executed actions are remembered, usually ``H``.
-
-    Keyword Args:
-        chunk_key: the predicted chunk, ``[*B, P, d_a]``.
-        executed_key: the number of executed actions, int64 ``[*B, 1]``.
 
     Raises:
         ValueError: if ``history_length < 1``.
@@ -51,18 +47,10 @@ class ActionHistory(Transform):
         True
     """
 
-    def __init__(
-        self,
-        history_length: int,
-        *,
-        chunk_key: NestedKey = keys.CHUNK,
-        executed_key: NestedKey = keys.EXECUTED,
-    ) -> None:
-        super().__init__(in_keys=[chunk_key], out_keys=HISTORY_KEYS)
+    def __init__(self, history_length: int) -> None:
+        super().__init__(in_keys=[keys.CHUNK], out_keys=HISTORY_KEYS)
         check_whole_numbers(history_length=history_length)
         self.history_length = history_length
-        self.chunk_key = unravel_key(chunk_key)
-        self.executed_key = unravel_key(executed_key)
         self._chunk: TensorSpec | None = None
 
     def set_container(self, container: Transform | EnvBase) -> None:
@@ -77,12 +65,12 @@ class ActionHistory(Transform):
                 f"ActionHistory found no {keys.HISTORY!r} in a step's input: hand over what the reset or the "
                 "step before gave, with the chunk"
             )
-        executed = next_tensordict.get(self.executed_key)
+        executed = next_tensordict.get(keys.EXECUTED)
         if executed is None:
             raise KeyError(
-                f"ActionHistory found no {self.executed_key!r} after the step: append it after ChunkStep"
+                f"ActionHistory found no {keys.EXECUTED!r} after the step: append it after ChunkStep"
             )
-        moved = advance(history, tensordict.get(self.chunk_key), executed)
+        moved = advance(history, tensordict.get(keys.CHUNK), executed)
         next_tensordict.set(keys.HISTORY, moved)
         # The others' chunks were not executed.
         return keep_resting(tensordict, next_tensordict, HISTORY_KEYS)
@@ -91,10 +79,6 @@ class ActionHistory(Transform):
         # Everywhere: TorchRL merges these rows into the sub-environments that were reset only.
         chunk = self._chunk or self._check_chunk()
         return tensordict_reset.set(keys.HISTORY, self._cold(chunk, tensordict_reset))
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Does nothing: in data the history is already there."""
-        return tensordict
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the history."""
@@ -109,13 +93,13 @@ class ActionHistory(Transform):
 
     def _check_chunk(self) -> TensorSpec:
         actions = self.parent.full_action_spec
-        if self.chunk_key not in actions.keys(True, True):
+        if keys.CHUNK not in actions.keys(True, True):
             raise KeyError(
-                f"ActionHistory found no {self.chunk_key} among the actions "
+                f"ActionHistory found no {keys.CHUNK} among the actions "
                 f"{list(actions.keys(True, True))}: append it after ChunkStep"
             )
         # Kept because resets are frequent and TorchRL rebuilds specs on every access.
-        self._chunk = actions[self.chunk_key]
+        self._chunk = actions[keys.CHUNK]
         return self._chunk
 
 

@@ -9,15 +9,17 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import Composite, Unbounded
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
+from warmprior.transforms.inner_step import EnvTransform
 
 __all__ = ["HistoryObservation"]
 
 
-class HistoryObservation(Transform):
+class HistoryObservation(EnvTransform):
     """Appends the last ``H`` actions to the observation, in environments and replay buffers alike.
+
+    It writes ``keys.CONDITIONED``, ``[*B, To, d_o + H * d_a + 1]``.
 
     The actions are flattened (zero until there are ``H`` of them), followed by 1 if there are ``H`` and 0
     otherwise, and repeated over the observation steps. Build the network with ``observation_dim = d_o +
@@ -27,7 +29,6 @@ class HistoryObservation(Transform):
     Keyword Args:
         observation_key: the observation, ``[*B, To, d_o]``, or one with images nested under the key, whose
             vector ``"state"`` is extended.
-        out_key: key written, ``[*B, To, d_o + H * d_a + 1]``.
 
     Raises:
         KeyError: if an input key is missing.
@@ -43,11 +44,9 @@ class HistoryObservation(Transform):
         (torch.Size([2, 1, 6]), [0.0, 1.0], 6)
     """
 
-    def __init__(
-        self, *, observation_key: NestedKey = keys.OBSERVATION, out_key: NestedKey = keys.CONDITIONED
-    ) -> None:
+    def __init__(self, *, observation_key: NestedKey = keys.OBSERVATION) -> None:
         read = [unravel_key(observation_key), keys.ACTIONS, keys.STEPS]
-        super().__init__(in_keys=read, out_keys=[unravel_key(out_key)])
+        super().__init__(in_keys=read, out_keys=[keys.CONDITIONED])
 
     @staticmethod
     def width(history_length: int, action_dim: int) -> int:
@@ -80,9 +79,6 @@ class HistoryObservation(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self.forward(next_tensordict)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self.forward(tensordict_reset)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the extended observation."""

@@ -11,10 +11,22 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
-__all__ = ["InnerStep", "keep_resting", "rows_where", "set_aside"]
+__all__ = ["EnvTransform", "InnerStep", "keep_resting", "rows_where", "set_aside"]
 
 KEPT = "_kept"
 """Where :func:`set_aside` puts observations, at the root of a step's input."""
+
+
+class EnvTransform(Transform):
+    """A transform that writes the same after a reset as after a step, and nothing outside environments."""
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Does nothing: what the transform writes is already in data, or not needed there."""
+        return tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        # For all sub-environments: TorchRL keeps the rows of those that were reset.
+        return self._call(tensordict_reset)
 
 
 class InnerStep:

@@ -42,10 +42,9 @@ class LateTransforms:
     doubles the speed.
     """
 
-    def __init__(self, step: InnerStep, action_key: str, brief: bool) -> None:
+    def __init__(self, step: InnerStep, brief: bool) -> None:
         self._step = step
         self._transforms = step.transforms
-        self._action_key = action_key
         self._reach = 1 + sum(_REACH[type(t)](t) - 1 for t in self._transforms)
         # Actions are inverted from the last transform to the first: those after the last one that looks at
         # the state can take all of them at once.
@@ -57,23 +56,21 @@ class LateTransforms:
             self._control_steps = _control_steps(step.base)
 
     @classmethod
-    def of(cls, step: InnerStep, action_key: NestedKey, read: Iterable[NestedKey]) -> LateTransforms | None:
+    def of(cls, step: InnerStep, read: Iterable[NestedKey]) -> LateTransforms | None:
         """Such steps, or ``None`` where ``read`` needs every transform to run at every step."""
         transforms, base = step.transforms, step.base
-        if not isinstance(action_key, str):
-            return None
         # An environment reads its action and states alone: other observations may reach it untransformed.
         # A transformed one has transforms of its own, which may read what these write.
         if isinstance(base, TransformedEnv) or any(type(t) not in _REACH for t in transforms):
             return None
         written = _roots(key for t in transforms for key in t.out_keys)
-        looked_at = [t.pose_key for t in transforms if isinstance(t, AbsoluteActions)]
-        needed = _roots([action_key, *read, *looked_at, *base.state_spec.keys(True, True)])
+        looked_at = [keys.EEF_POSE for t in transforms if isinstance(t, AbsoluteActions)]
+        needed = _roots([keys.ACTION, *read, *looked_at, *base.state_spec.keys(True, True)])
         inverse = [(list(t.in_keys_inv), list(t.out_keys_inv)) for t in transforms]
-        if written & needed or any(keys not in ([], [action_key]) for pair in inverse for keys in pair):
+        if written & needed or any(ends not in ([], [keys.ACTION]) for pair in inverse for ends in pair):
             return None
         brief = {*base.reward_keys, *base.done_keys, keys.SUCCESS}
-        return cls(step, action_key, brief.issuperset(read))
+        return cls(step, brief.issuperset(read))
 
     def __call__(
         self, current: dict[str, Any], first: TensorDictBase, actions: Tensor, reward_key: NestedKey
@@ -101,7 +98,7 @@ class LateTransforms:
             if current["done"].any():
                 break
             # Without the constructor's checks: the entries come out of tensordicts of this batch size.
-            entries = current | {self._action_key: action}
+            entries = current | {keys.ACTION: action}
             inputs = TensorDict._new_unsafe(entries, batch_size=first.batch_size, device=first.device)
             for transform in reversed(self._one_by_one):
                 inputs = transform._inv_call(inputs)
@@ -142,5 +139,5 @@ def advance(current: dict[str, Any], next_tensordict: TensorDictBase, reward_key
             current[key] = value
 
 
-def _roots(keys: Iterable[NestedKey]) -> set[str]:
-    return {key if isinstance(key, str) else key[0] for key in keys}
+def _roots(names: Iterable[NestedKey]) -> set[str]:
+    return {name if isinstance(name, str) else name[0] for name in names}

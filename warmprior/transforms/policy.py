@@ -34,8 +34,6 @@ def policy_transforms(
     gamma: float = 1.0,
     see_history: bool | None = None,
     observation_key: NestedKey | None = None,
-    action_key: NestedKey = keys.ACTION,
-    chunk_key: NestedKey | None = None,
     success: NestedKey = keys.SUCCESS,
     measures: Mapping[str, Literal["max", "sum", "last"]] | None = None,
 ) -> Compose:
@@ -64,9 +62,7 @@ def policy_transforms(
             policy with :class:`~warmprior.RealTimeChunking`, and otherwise none is written.
         gamma: discount per control step inside a chunk.
         see_history: whether the network sees the last actions; as in the policy by default.
-        observation_key: the policy's by default, also for the following.
-        action_key: the single action that the environment takes.
-        chunk_key: the chunk.
+        observation_key: the policy's by default.
         success: the environment's key for whether the task is solved; it counts at any step of a chunk.
         measures: see :class:`ChunkStep`.
 
@@ -92,7 +88,6 @@ def policy_transforms(
         prior, observed = policy.prior, policy.in_keys[0]
         sees_history = observed == keys.CONDITIONED  # made of the observation under its usual key
         normalizer = normalizer or policy.normalizer
-        chunk_key = chunk_key or policy.chunk_key
         observation_key = observation_key or (None if sees_history else observed)
         see_history = sees_history if see_history is None else see_history
         if observation_steps is None:
@@ -102,11 +97,11 @@ def policy_transforms(
     if not isinstance(prior, Prior):
         raise TypeError(f"policy_transforms takes a WarmPriorActor or a Prior, got {type(prior).__name__}")
     observation_steps = 2 if observation_steps is None else observation_steps
-    observation_key, chunk_key = observation_key or keys.OBSERVATION, chunk_key or keys.CHUNK
-    if normalizer is not None and action_key not in normalizer.keys:
+    observation_key = observation_key or keys.OBSERVATION
+    if normalizer is not None and keys.ACTION not in normalizer.keys:
         raise ValueError(
-            f"the normaliser has {normalizer.keys}, but not the environment's action {action_key!r}: "
-            "fit it to data with that key, or name the action with action_key"
+            f"the normaliser has {normalizer.keys}, but not the environment's action {keys.ACTION!r}: fit it "
+            "to data with that key"
         )
     late: list[Transform] = []
     seen = [HistoryObservation(observation_key=observation_key)] if see_history else []
@@ -114,9 +109,9 @@ def policy_transforms(
         if execute is None:
             execute = min(prior.chunk_length, prior.prediction_length - delay)
         check_delay(delay, execute, prior.prediction_length)
-        late = [InferenceDelay(delay, execute=execute, chunk_key=chunk_key)]
+        late = [InferenceDelay(delay, execute=execute)]
     per_step = [transform.clone() for transform in (actions, images) if transform is not None]
-    per_step += [] if normalizer is None else normalizer.env_transforms(action_key)
+    per_step += [] if normalizer is None else normalizer.env_transforms()
     return Compose(
         *per_step,
         ObservationStack(observation_steps, observation_key=observation_key),
@@ -125,12 +120,10 @@ def policy_transforms(
             execute=execute,
             prediction_length=prior.prediction_length,
             gamma=gamma,
-            action_key=action_key,
-            chunk_key=chunk_key,
-            event_keys=(success,),
+            success=success,
             measures=measures,
         ),
-        ActionHistory(prior.history_length, chunk_key=chunk_key),
+        ActionHistory(prior.history_length),
         *seen,
         *late,
     )

@@ -9,15 +9,14 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
 from torchrl.data import Composite
-from torchrl.envs.transforms import Transform
 
 from warmprior import keys
-from warmprior.transforms.inner_step import KEPT, set_aside
+from warmprior.transforms.inner_step import KEPT, EnvTransform, set_aside
 
 __all__ = ["ObservationStack"]
 
 
-class ObservationStack(Transform):
+class ObservationStack(EnvTransform):
     """Replaces the observation ``[*B, d_o]`` by the last ``To`` of them, ``[*B, To, d_o]``.
 
     Images ``[*B, C, H, W]`` become ``[*B, To, C, H, W]``, and so does every entry of a nested observation, as
@@ -104,10 +103,6 @@ class ObservationStack(Transform):
                 f"ObservationStack found no {self.observation_key!r}, only "
                 f"{list(observations.keys(True, True))}: name the observation with observation_key"
             )
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Outside environments the transform does nothing: windows are stacked already."""
-        return tensordict
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Insert the stack's dimension after those of the batch."""

@@ -7,7 +7,6 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torchrl.data import RandomSampler, TensorDictReplayBuffer, TensorStorage
-from torchrl.data.replay_buffers.samplers import Sampler, SliceSampler
 from torchrl.data.replay_buffers.writers import ImmutableDatasetWriter
 from torchrl.envs.transforms import Compose, Transform
 
@@ -24,11 +23,11 @@ __all__ = ["ActionWindow", "window_replay_buffer", "window_transforms", "without
 class ActionWindow(Transform):
     """Replaces sampled steps by training windows with the history before them.
 
-    For the step ``i`` it gathers the last ``To`` observations (the episode's first one repeated at the
-    start), the target chunk ``[i, i+P)`` (the episode's last action repeated past its end, and marked
-    in ``"action_is_pad"``) and the history (:mod:`warmprior.history`): the actions before, and the target's
-    first ``P - H`` as a forecast. Windows never cross episode borders, and border windows are sampled like
-    all others. One buffer serves all priors of its lengths.
+    For the step ``i``, int64 ``[*B]`` under ``"frame"``, it gathers the last ``To`` observations (the
+    episode's first one repeated at the start), the target chunk ``[i, i+P)`` (the episode's last action
+    repeated past its end, and marked in ``"action_is_pad"``) and the history (:mod:`warmprior.history`): the
+    actions before, and the target's first ``P - H`` as a forecast. Windows never cross episode borders, and
+    border windows are sampled like all others. One buffer serves all priors of its lengths.
 
     Args:
         data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
@@ -40,13 +39,7 @@ class ActionWindow(Transform):
         prediction_length: ``P``; ``H`` by default.
         history_length: how many executed actions are remembered; ``H`` by default, and at least.
         observation_steps: ``To``.
-        frame_key: the sampled step's index into ``data``, int64 ``[B]``. (A replay buffer adds its
-            own ``"index"`` only after its transforms ran.)
         observation_key: key of the observation, in ``data`` and in windows.
-        action_key: key of the action in ``data``.
-        episode_key: key of the episode number in ``data``.
-        chunk_key: where the target is written, ``[*B, P, d_a]``.
-        pad_key: where the mask of padding is written, bool ``[*B, P]``.
 
     Raises:
         KeyError: if ``data`` lacks a key.
@@ -88,15 +81,10 @@ class ActionWindow(Transform):
         prediction_length: int | None = None,
         history_length: int | None = None,
         observation_steps: int = 2,
-        frame_key: NestedKey = keys.FRAME,
         observation_key: NestedKey = keys.OBSERVATION,
-        action_key: NestedKey = keys.ACTION,
-        episode_key: NestedKey = keys.EPISODE,
-        chunk_key: NestedKey = keys.CHUNK,
-        pad_key: NestedKey = keys.IS_PAD,
     ) -> None:
-        out_keys = [observation_key, chunk_key, pad_key, keys.HISTORY]
-        super().__init__(in_keys=[frame_key], out_keys=out_keys)
+        out_keys = [observation_key, keys.CHUNK, keys.IS_PAD, keys.HISTORY]
+        super().__init__(in_keys=[keys.FRAME], out_keys=out_keys)
         check_whole_numbers(observation_steps=observation_steps)
         prediction_length = chunk_length if prediction_length is None else prediction_length
         history_length = chunk_length if history_length is None else history_length
@@ -107,8 +95,7 @@ class ActionWindow(Transform):
                 f"history_length={history_length}"
             )
         self.chunk_length, self.history_length = chunk_length, history_length
-        self.frame_key = frame_key
-        observations, action, episode = _checked(data, observation_key, action_key, episode_key)
+        observations, action, episode = _checked(data, observation_key)
         self._observations = {f"observation_{i}": key for i, key in enumerate(observations)}
         start, end = _episode_borders(episode)
         for name, value in {
@@ -123,10 +110,10 @@ class ActionWindow(Transform):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the windows of the sampled steps."""
-        frame = tensordict.get(self.frame_key)
+        frame = tensordict.get(keys.FRAME)
         if frame is None:
             raise KeyError(
-                f"ActionWindow needs the index of each sampled step under {self.frame_key!r}: store "
+                f"ActionWindow needs the index of each sampled step under {keys.FRAME!r}: store "
                 "torch.arange(N) there, or use window_replay_buffer"
             )
         batch, before = tensordict.batch_size, self.history_length
@@ -135,7 +122,7 @@ class ActionWindow(Transform):
             start, end = _rows(self.start, frame), _rows(self.end, frame)
         except IndexError as error:
             raise IndexError(
-                f"{self.frame_key!r} has steps from {int(frame.min())} to {int(frame.max())}, but the data "
+                f"{keys.FRAME!r} has steps from {int(frame.min())} to {int(frame.max())}, but the data "
                 f"hold 0 to {len(self.start) - 1}"
             ) from error
         index = frame + self.action_offsets
@@ -161,11 +148,11 @@ def _rows(values: Tensor, index: Tensor) -> Tensor:
 
 
 def _checked(
-    data: TensorDictBase, observation_key: NestedKey, action_key: NestedKey, episode_key: NestedKey
+    data: TensorDictBase, observation_key: NestedKey
 ) -> tuple[dict[NestedKey, Tensor], Tensor, Tensor]:
     """The entries of the observation, the action and the episode numbers."""
     entries = []
-    for key in (observation_key, action_key, episode_key):
+    for key in (observation_key, keys.ACTION, keys.EPISODE):
         value = data.get(key, None)
         if value is None:
             raise KeyError(f"the data lack {key!r}; they hold {sorted(map(str, data.keys(True)))}")
@@ -175,14 +162,14 @@ def _checked(
         raise ValueError(f"the data must be flat steps [N] with N > 0, got {tuple(data.shape)}")
     if action.ndim != 2 or not action.is_floating_point():
         raise ValueError(
-            f"actions must be vectors of real numbers, {action_key!r} [N, d_a], got {tuple(action.shape)} of "
-            f"{action.dtype}: flatten it, or convert it with .float()"
+            f"actions must be vectors of real numbers, {keys.ACTION!r} [N, d_a], got {tuple(action.shape)} "
+            f"of {action.dtype}: flatten it, or convert it with .float()"
         )
     observations = {observation_key: observation}
     if is_tensor_collection(observation):
         nested = observation.items(True, True)
         observations = {unravel_key((observation_key, key)): value for key, value in nested}
-    for key, value in (*observations.items(), (action_key, action)):
+    for key, value in (*observations.items(), (keys.ACTION, action)):
         check_finite(key, value)
     return observations, action, episode.flatten()
 
@@ -219,7 +206,7 @@ def window_transforms(
     see_history: bool = False,
     withhold: float = 0.0,
     generator: torch.Generator | None = None,
-    **renamed: NestedKey,
+    observation_key: NestedKey = keys.OBSERVATION,
 ) -> Compose:
     """Transforms that turn step numbers into the windows that a policy reads.
 
@@ -236,7 +223,7 @@ def window_transforms(
         see_history: whether the network sees the last actions.
         withhold: share of the windows whose history is withheld.
         generator: source of randomness of the withheld windows, on the data's device.
-        renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
+        observation_key: see :class:`ActionWindow`.
 
     Examples:
         >>> import torch
@@ -258,14 +245,13 @@ def window_transforms(
             prediction_length=prior.prediction_length,
             history_length=prior.history_length,
             observation_steps=observation_steps,
-            **renamed,
+            observation_key=observation_key,
         )
     ]
     if withhold:
         transforms.append(WithheldHistory(withhold, generator=generator))
     if see_history:
-        seen = {k: v for k, v in renamed.items() if k == "observation_key"}
-        transforms.append(HistoryObservation(**seen))
+        transforms.append(HistoryObservation(observation_key=observation_key))
     return Compose(*transforms)
 
 
@@ -277,9 +263,8 @@ def window_replay_buffer(
     observation_steps: int = 2,
     see_history: bool = False,
     withhold: float = 0.0,
-    sampler: Sampler | None = None,
     generator: torch.Generator | None = None,
-    **renamed: NestedKey,
+    observation_key: NestedKey = keys.OBSERVATION,
 ) -> TensorDictReplayBuffer:
     """A replay buffer that samples training windows from demonstrations.
 
@@ -296,16 +281,14 @@ def window_replay_buffer(
         observation_steps: ``To``.
         see_history: see :func:`window_transforms`.
         withhold: see :func:`window_transforms`.
-        sampler: ``RandomSampler()`` by default; ``SamplerWithoutReplacement()`` for epochs.
         generator: source of randomness of sampler and what is withheld; PyTorch's global one by default.
-        renamed: keys of :class:`ActionWindow`, such as ``observation_key``.
+        observation_key: see :class:`ActionWindow`.
 
     Raises:
-        ValueError: if ``batch_size < 1``, for a ``SliceSampler``, or see :class:`ActionWindow`.
+        ValueError: if ``batch_size < 1``, or see :class:`ActionWindow`.
 
     See Also:
-        - :func:`~warmprior.window_transforms`: its transforms, for a buffer of your own.
-        - :class:`~warmprior.FlowMatchingLoss`: takes its batches.
+        :class:`~warmprior.FlowMatchingLoss`: takes its batches.
 
     Examples:
         >>> import torch
@@ -318,11 +301,6 @@ def window_replay_buffer(
         (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
     """
     check_whole_numbers(batch_size=batch_size)
-    if isinstance(sampler, SliceSampler):
-        raise ValueError(
-            "SliceSampler needs whole steps in the storage, and this one holds step numbers: every window is "
-            "a slice already, so take RandomSampler or SamplerWithoutReplacement"
-        )
     windows = window_transforms(
         data,
         prior,
@@ -330,14 +308,14 @@ def window_replay_buffer(
         see_history=see_history,
         withhold=withhold,
         generator=generator,
-        **renamed,
+        observation_key=observation_key,
     )
     window = windows[0]
     frames = torch.arange(len(data), device=window.start.device)
     return TensorDictReplayBuffer(
         # The sampler draws on the storage's device, where the generator has to be too.
-        storage=TensorStorage(TensorDict({window.frame_key: frames}, [len(data)]), device=frames.device),
-        sampler=RandomSampler() if sampler is None else sampler,
+        storage=TensorStorage(TensorDict({keys.FRAME: frames}, [len(data)]), device=frames.device),
+        sampler=RandomSampler(),
         writer=ImmutableDatasetWriter(),
         batch_size=batch_size,
         transform=windows,
