@@ -14,7 +14,6 @@ from typing import Self
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from warmprior import keys
@@ -64,7 +63,6 @@ class AsyncExecutor:
             steps later.
         pool: where to compute; by default in one thread, which :meth:`close` ends.
         action_dim: ``d_a``; that of the actor's network by default.
-        chunk_key: where the policy writes its chunk; ``("vla_action", "chunk")`` by default.
 
     Raises:
         ValueError: for numbers that do not fit each other, or a missing argument that the actor does not
@@ -95,7 +93,6 @@ class AsyncExecutor:
         latency: int | None = None,
         pool: Executor | None = None,
         action_dim: int | None = None,
-        chunk_key: NestedKey | None = None,
     ) -> None:
         if isinstance(actor, WarmPriorActor):
             prior = actor.prior if prior is None else prior
@@ -120,7 +117,6 @@ class AsyncExecutor:
             )
         self.prior, self.execute, self.timeout, self.latency = prior, execute, timeout, latency
         self.actor = actor.eval()
-        self._chunk_key = keys.CHUNK if chunk_key is None else chunk_key
         self._shape = (length, action_dim)
         self._device = next(
             (value.device for value in chain(actor.parameters(), actor.buffers())), torch.device("cpu")
@@ -244,10 +240,10 @@ class AsyncExecutor:
         data = data.clone()
         if self._sees_history:
             data = HistoryObservation()(data)
-        chunk = self.actor(data.to(self._device)).get(self._chunk_key)
+        chunk = self.actor(data.to(self._device)).get(keys.CHUNK)
         if chunk is None or tuple(chunk.shape) != self._shape:
             found = "nothing" if chunk is None else f"shape {tuple(chunk.shape)}"
-            raise ValueError(f"expected a chunk [P, d_a] = {self._shape} at {self._chunk_key}, found {found}")
+            raise ValueError(f"expected a chunk [P, d_a] = {self._shape} at {keys.CHUNK}, found {found}")
         if not chunk.isfinite().all():
             raise FloatingPointError("the policy's chunk holds NaN or infinity")
         return chunk.to(self._chunk)

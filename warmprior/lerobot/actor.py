@@ -171,7 +171,6 @@ class LeRobotActor(TensorDictModuleBase):
     normalizer = None
     environment = None
     start = None
-    chunk_key = keys.CHUNK
 
     def __init__(
         self,
