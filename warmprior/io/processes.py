@@ -28,17 +28,24 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
     """
 
     def begin(parent: int) -> None:
-        # Sent by value, for it is defined here: Ctrl-C may come while this library is imported.
+        # Sent by value, for it is defined here: Ctrl-C, or the end of this process, may come while the new one
+        # imports this library, which takes seconds.
+        import os
         import signal
         import sys
+        import threading
+        import time
 
+        def watch() -> None:
+            while os.getppid() == parent:
+                time.sleep(0.2)
+            os._exit(1)
+
+        threading.Thread(target=watch, daemon=True).start()
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         # What a process keeps on purpose, such as demonstrations, is no leak to start it anew for.
         loky: Any = sys.modules["loky.process_executor"]
         loky._MAX_MEMORY_LEAK_SIZE = sys.maxsize
-        from warmprior.io.workers import end_with_parent
-
-        end_with_parent(parent)
 
     threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     return require("loky", "sim").ProcessPoolExecutor(

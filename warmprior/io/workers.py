@@ -68,17 +68,15 @@ def available_cores() -> int:
     return os.cpu_count() or 1
 
 
-def end_with_parent(parent: int | None = None) -> None:
-    """Let this process end when the one that started it dies, however abruptly.
+def end_with_parent() -> None:
+    """Let this process end when the one that started it dies, however abruptly; a main process goes on.
 
     A killed process cannot tell its workers to stop, and they would wait for hours: its ends of their
-    pipes stay open in whatever else it forked later. A main process is left alone, unless ``parent`` says
-    which one started it.
+    pipes stay open in whatever else it forked later.
     """
-    if parent is None:
-        if multiprocessing.parent_process() is None:
-            return
-        parent = os.getppid()
+    if multiprocessing.parent_process() is None:
+        return
+    parent = os.getppid()
 
     def watch() -> None:
         while os.getppid() == parent:
