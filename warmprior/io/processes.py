@@ -28,8 +28,8 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
     """
 
     def begin(parent: int) -> None:
-        # Sent by value, for it is defined here: Ctrl-C, or the end of this process, may come while the new one
-        # imports this library, which takes seconds.
+        # Sent by value, for it is defined here: Ctrl-C, or the end of this process, may come while the other
+        # one imports this library, which takes seconds.
         import os
         import signal
         import sys
