@@ -310,7 +310,7 @@ folder.cleanup()
 # .. code-block:: console
 #
 #    python benchmarks/prior_space_rl.py
-#    python benchmarks/prior_space_rl.py --preset paper --task square --run runs/square-ph-paper
+#    python benchmarks/prior_space_rl.py --preset paper --run runs/square-ph-paper
 #
 # The agents of those recipes have not been measured with the present policies.
 # :doc:`/prior_space_rl` has the parts for a training loop of your own, TorchRL's own losses, and what

@@ -89,3 +89,18 @@ def solved(path, actions):
 def test_demonstrations_replay_in_both_spaces(lift_demonstrations):
     found = [solved(lift_demonstrations, actions) for actions in ("absolute", "delta")]
     assert found == [[True] * 3] * 2
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"actions": "joint"}, {"observation_steps": None}, {"images": {"size": 84}}, {"robosuite": {"seed": 7}}],
+)
+def test_a_description_with_more_or_less_builds_nothing(change):
+    described = environment_description(task_env_args("lift"), "ph", 2)
+    for name, value in change.items():
+        described[name] = {**described.get(name, {}), **value} if isinstance(value, dict) else value
+        if value is None:
+            del described[name]
+    policy = WarmPriorActor(VelocityMLP(7, 19, 4, hidden_dim=16), PastPrior(4), environment=described)
+    with pytest.raises(ValueError, match="keeps no description of a robosuite environment"):
+        environment_of(policy)

@@ -108,6 +108,14 @@ def run_expert(env, steps, seed=0):
         yield td
 
 
+def test_the_simulator_is_closed_once(monkeypatch):
+    env, closed = RobosuiteEnv("lift"), []
+    monkeypatch.setattr(env._env, "close", lambda: closed.append(1))
+    env.close()
+    env.close(raise_if_closed=False)
+    assert closed == [1] and env.is_closed
+
+
 def test_success_terminates():
     steps = []
     for td in run_expert(RobosuiteEnv("lift"), 200):

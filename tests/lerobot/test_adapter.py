@@ -96,6 +96,12 @@ def test_chunks_are_guided_towards_the_rest_of_the_last_one(built, monkeypatch, 
         torch.testing.assert_close(chunks[-1], expected)
     with pytest.raises(ValueError, match="a delay of 4 control steps needs as many actions"):
         adapter.predict_action_chunk(dict(batch), executed_steps=LENGTH - 1, delay=4)
+    with pytest.raises(ValueError, match="a delay of 1 control steps needs as many actions"):
+        adapter.predict_action_chunk(dict(batch), executed_steps=torch.tensor([LENGTH, 2]), delay=1)
+    with pytest.raises(ValueError, match=r"must be a whole number of at least 0, got 0\.5"):
+        adapter.predict_action_chunk(dict(batch), delay=0.5)
+    with pytest.raises(ValueError, match="leaves nothing that guidance could continue"):
+        adapter.select_action(dict(batch))
     with pytest.raises(ValueError, match="guidance is for pi0, pi05 and smolvla"):
         WarmPriorAdapter(built("multi_task_dit"), PastPrior(4), guidance=rtc)
 

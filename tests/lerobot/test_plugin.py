@@ -42,6 +42,8 @@ pytest.importorskip("lerobot")
 pytest.importorskip("lerobot_policy_warmprior")
 pytest.importorskip("transformers")
 
+from lerobot.configs.types import NormalizationMode
+
 STATE, OBJECT = 9, 10  # of lift
 
 
@@ -122,6 +124,7 @@ def test_losses_and_chunks_start_from_the_prior(found, name):
     assert not torch.equal(seen.x[0][..., :ACTION], sources[2])
 
 
+STANDARDISED = {"normalization_mapping": {"VISUAL": NormalizationMode.MEAN_STD}}
 TRAIN = """--policy.type=warm_flow --policy.embedding_dim=24 --policy.num_layers=1 --policy.device=cpu
 --policy.push_to_hub=false --steps=2 --batch_size=4 --num_workers=0 --save_freq=2"""
 
@@ -289,6 +292,11 @@ def test_the_flow_policy_sees_images(found, tmp_path):
         torch.manual_seed(7)
         actions.append(one.select_action({**start, "observation.images.top": flat}))
     assert actions[0].shape == (2, 2) and torch.equal(*actions)
+    with pytest.raises(KeyError, match=r"images\.top"):
+        policy.select_action(start)
+    for options, why in (({"encoder": "tiny"}, "one of resnet18-imagenet"), (STANDARDISED, "not MEAN_STD")):
+        with pytest.raises(ValueError, match=why):
+            flow_policy(found, images=(3, 16, 16), **options)
     with pytest.raises(ValueError, match=r"sees images \[3, h, w\], and observation.images.top is \[1, 16"):
         flow_policy(found, images=(1, 16, 16))
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictSequential
 from torchrl.collectors import Collector
+from torchrl.data import Categorical
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -26,6 +27,7 @@ from warmprior import (
     make_prior_space_actor,
     policy_transforms,
 )
+from warmprior.training import play_episode
 
 H, TO, D_O, DELTA = 3, 2, 2 + ACTION_DIM, 0.5
 LENGTHS = (7, 4)
@@ -103,6 +105,31 @@ def test_specs_and_random_actions(batched):
         assert torch.equal(noise, data["prior", "anchor"] + delta)
     finally:
         env.close(raise_if_closed=False)
+
+
+class SolvedEnv(CountingEnv):
+    """One that says whether it is solved: never."""
+
+    def __init__(self, length):
+        super().__init__(length)
+        self.observation_spec["success"] = Categorical(2, dtype=torch.bool, shape=(1,))
+
+    def _reset(self, tensordict=None, **kwargs):
+        return super()._reset(tensordict, **kwargs).set("success", torch.zeros(1, dtype=torch.bool))
+
+    def _step(self, tensordict):
+        return super()._step(tensordict).set("success", torch.zeros(1, dtype=torch.bool))
+
+
+def test_an_episode_of_an_agent_has_the_decoded_chunks():
+    prior = PastPrior(H)
+    transforms = policy_transforms(prior, observation_steps=TO)
+    transforms.append(PriorAnchor(make_actor(prior)))
+    transforms.append(PriorSpace(make_decoder(prior)))
+    env = TransformedEnv(SolvedEnv(LENGTHS[0]), transforms)
+    agent = make_prior_space_actor(ACTION_DIM, D_O, prior.prediction_length, TO, delta=DELTA, hidden_dim=8)
+    decisions = play_episode(agent, env, seed=0).decisions
+    assert decisions["vla_action", "chunk"].shape[-2:] == (H, ACTION_DIM)
 
 
 def test_without_anchor_or_chunks():

@@ -126,13 +126,16 @@ def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
             f"{path}: the group 'data' has no attribute env_args, which names the environment; "
             "copy it from the file this one was made from"
         )
+    return check_env_args(what, _parsed(what, text))
+
+
+def _parsed(what: str, text: Any) -> Any:
     if not isinstance(text, str | bytes):
         raise DatasetError(f"{what} is not text; copy it from the file this one was made from")
     try:
-        parsed = json.loads(text)
+        return json.loads(text)
     except (ValueError, RecursionError) as error:  # not UTF-8 included
         raise DatasetError(f"{what} is not JSON ({error})") from error
-    return check_env_args(what, parsed)
 
 
 def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
@@ -142,7 +145,8 @@ def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarra
         states = member(file, f"data/{demo}/states", "dataset")
         with reading(file, f"data/{demo}/states"):
             state = np.asarray(states[0], np.float64) if states is not None and states.size else None
-    return None if rendering is None else json.loads(rendering), state
+    what = f"{path}: data.attrs['rendering']"
+    return None if rendering is None else _parsed(what, rendering), state
 
 
 def _demo(file: h5py.File, name: str) -> h5py.Group:

@@ -164,10 +164,10 @@ class LeRobotExperienceReplay(DemonstrationReplay):
     Args:
         dataset: the dataset's folder, or its repository in the hub (``"user/name"``).
         revision: branch, tag or commit of a repository.
-        env_args: of the environment in which it was recorded (see :func:`warmprior.envs.task_env_args`),
-            for datasets that :func:`convert_robomimic` did not write; those are refused if it names
-            another. Frequency, widths and names are checked against it, and robomimic's observations found
-            by it. Without, whole features are observations.
+        env_args: of the environment in which it was recorded
+            (:func:`warmprior.envs.simulator.task_env_args`), for datasets that :func:`convert_robomimic`
+            did not write; those are refused if it names another. Frequency, widths and names are checked
+            against it, and robomimic's observations found by it. Without, whole features are observations.
         filter_key: a mask of the converted file, see :class:`RobomimicExperienceReplay`.
         demos: likewise.
         observation_keys: observations to concatenate; by default those of the task, or of an unknown

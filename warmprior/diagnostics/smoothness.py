@@ -116,7 +116,7 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def smoothness(rollout: TensorDictBase) -> Smoothness:
-    """Jumps at and inside chunk boundaries, jerk, and the rate of mode switches.
+    """Jumps at and inside chunk boundaries, and jerk.
 
     Args:
         rollout: see :func:`executed_actions`.

@@ -99,7 +99,7 @@ def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv
     keeps no description of an environment.
     """
     description: Any = actor.environment
-    if environment_name(actor) is None:
+    if not _is_complete(description):
         raise ValueError(
             f"the policy keeps no description of a robosuite environment, but {description}: build the "
             "environment yourself, with policy_transforms(actor)"
@@ -152,3 +152,17 @@ def environment_name(actor: WarmPriorActor) -> str | None:
         return str(description["robosuite"]["env_args"]["env_name"])
     except (KeyError, TypeError):  # none, or a description of the user's own
         return None
+
+
+def _is_complete(description: Any) -> bool:
+    """Whether it is what :func:`environment_description` gives, and no other option reaches a simulator."""
+    try:
+        images = description.get("images", dict.fromkeys(_IMAGES))
+        return (
+            description.keys() - {"actions", "images"} == {"robosuite", "observation_steps"}
+            and description["robosuite"].keys() == {"env_args", "style"}
+            and description.get("actions", "delta") in ("delta", "absolute")
+            and images.keys() == set(_IMAGES)
+        )
+    except AttributeError:  # none, or one of the user's own
+        return False

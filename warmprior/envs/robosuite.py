@@ -169,6 +169,7 @@ class RobosuiteEnv(EnvBase):
         self._seed, self._offset, self._stride = seed, seed_offset, seed_stride
         self._episode, self._elapsed = 0, 0
         self._make_specs(self._env)
+        self.is_closed = False
 
     @property
     def episode_seed(self) -> int:

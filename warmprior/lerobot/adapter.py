@@ -187,8 +187,15 @@ class WarmPriorAdapter:
             kwargs: handed to it.
 
         Raises:
-            ValueError: if there are other environments than before; :meth:`reset` first.
+            ValueError: if there are other environments than before, :meth:`reset` first; or if guidance has
+                nothing to continue, because all actions of a chunk are executed.
         """
+        steps, length = self.policy.config.n_action_steps, self.prior.prediction_length
+        if self.guidance is not None and steps >= length:
+            raise ValueError(
+                f"n_action_steps={steps} executes all of a chunk of {length}, and leaves nothing that "
+                "guidance could continue: set it lower, or leave out guidance"
+            )
         with self._from_source():
             action = (self.policy.select_action if select is None else select)(batch, **kwargs)
         self._memory.step()
@@ -226,6 +233,8 @@ class WarmPriorAdapter:
             self._memory.executed(executed_steps)
         elif self._memory.waits:
             self._memory.executed(self.policy.config.n_action_steps)
+        if not isinstance(delay, int) or isinstance(delay, bool) or delay < 0:
+            raise ValueError(f"delay must be a whole number of at least 0, got {delay!r}")
         self._delay = delay
         try:
             with self._from_source():
@@ -337,8 +346,9 @@ class WarmPriorAdapter:
         delay = torch.where(left > 0, self._delay, 0)
         if self._delay and self.source.lead:
             raise ValueError("delay is for policies whose chunk begins at the current step: leave it out")
-        if self._delay and left.any():
-            (self.guidance or RealTimeChunking()).check_delay(self._delay, int(left[left > 0].min()))
+        going_on = left[~self._memory.began]
+        if self._delay and len(going_on):
+            (self.guidance or RealTimeChunking()).check_delay(self._delay, int(going_on.min()))
         rest, width = torch.zeros(shape, dtype=dtype, device=device), torch.ones(shape, device=device)
         mine = (..., self.source.positions, slice(self.source.action_dim))
         rest[mine], width[mine] = history["forecast"].to(dtype), scale

@@ -45,6 +45,8 @@ class ActionMemory:
         self.action_dim = action_dim
         # None between episodes; the others are of the same decision.
         self._chunk: Tensor | None = None
+        # Rows whose episode began since the decision before, bool [B].
+        self.began = torch.empty(0, dtype=torch.bool)
         # The history of the decision under way counts once there is a chunk, since a sampler may fail.
         self._history = self._decision = TensorDict()
         self._executed = self._new = torch.empty(0)
@@ -69,11 +71,13 @@ class ActionMemory:
             ValueError: if there are other environments than before.
         """
         if self._chunk is None:
+            self.began = torch.ones(batch_size, dtype=torch.bool, device=device)
             lengths = self.prior.history_length, self.prior.prediction_length
             history = cold_history([batch_size], *lengths, self.action_dim, device=device)
         elif len(self._chunk) != batch_size:
             raise ValueError(f"{batch_size} environments follow {len(self._chunk)}: call reset() in between")
         else:
+            self.began = self._new
             history = advance(self._history, self._chunk, self._executed)
             # The rest of the chunk belongs to an episode that is over.
             cold = without(history, self._new)

@@ -153,7 +153,7 @@ class BridgeCoupling(OTCoupling):
             for _ in range(self.ROUNDS if k else 5 * self.ROUNDS):
                 column = -now * ((row - cost) / now).logsumexp(0, keepdim=True)
                 row = -now * ((column - cost) / now).logsumexp(1, keepdim=True)
-        return torch.multinomial(((row + column - cost) / noise).exp(), 1).squeeze(1)
+        return torch.multinomial(((column - cost) / noise).softmax(1), 1).squeeze(1)
 
 
 def _squared_distances(x: Tensor, y: Tensor) -> Tensor:

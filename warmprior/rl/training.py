@@ -48,8 +48,8 @@ class PriorSpaceTraining:
     Keyword Args:
         evaluation_seed: simulator seed of the first evaluation episode.
         description: of the progress bar; no bar if ``None``.
-        collectors: how many actors of a Ray cluster collect, each with its own environments, see
-            :func:`~warmprior.rl.ray_collection.ray_rounds`; by default this process collects. Another number
+        collectors: how many actors of a Ray cluster collect, each with its own environments;
+            by default this process collects. Another number
             means other episodes.
         ray_address: of the cluster.
 

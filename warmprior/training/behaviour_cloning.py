@@ -137,9 +137,8 @@ class BehaviourCloning:
         device = next((p.device for p in actor.network.parameters()), home)
         self.generator = torch.Generator(device).manual_seed(config.seed)
         windows = self.generator
-        if (
-            prefetch := prefetch or home.type != device.type
-        ):  # what is drawn ahead cannot be drawn by the generator of what follows
+        prefetch = prefetch or home.type != device.type
+        if prefetch:  # what is drawn ahead cannot be drawn by the generator of what follows
             windows = torch.Generator(home).manual_seed(WINDOWS_SEED + config.seed)
         see_history = actor.in_keys[0] == CONDITIONED  # made of the data's observation
         observation_key = OBSERVATION if see_history else actor.in_keys[0]

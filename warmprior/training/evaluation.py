@@ -39,8 +39,8 @@ class Episode:
         success: whether the task was solved at any step.
         steps: control steps executed.
         measures: what was asked for besides, see :func:`play_episode`.
-        decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, whatever the policy's own
-            key for it, the mean of its source and where that is warm, if it has one, under ``"next"``
+        decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, of an agent the decoded one,
+            the mean of its source and where that is warm, if it has one, under ``"next"``
             ``"executed_steps"`` and ``"done"``, and the delay with what was left of the chunk before, if
             chunks took effect late. Episodes concatenated along
             ``D`` are a rollout for :func:`~warmprior.diagnostics.smoothness`.
@@ -505,5 +505,8 @@ def _check_units(policy: TensorDictModuleBase, env: EnvBase) -> None:
 def _decision(data: TensorDictBase) -> TensorDictBase:
     """What :attr:`Episode.decisions` keeps of a step, on the CPU."""
     late = [keys.DELAY, keys.FORECAST] if data.get(keys.DELAY, None) is not None else []
-    kept = (keys.CHUNK, keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED))
-    return data.select(*kept, strict=False).cpu()
+    kept = data.select(keys.CHUNK, keys.LOC, keys.WARM, *late, ("next", keys.EXECUTED), strict=False)
+    decoded = data.get(("next", *keys.DECODED_CHUNK), None)
+    if decoded is not None:  # an agent acts, and the environment decodes
+        kept[keys.CHUNK] = decoded
+    return kept.cpu()

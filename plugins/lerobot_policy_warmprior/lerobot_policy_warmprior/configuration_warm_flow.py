@@ -105,8 +105,17 @@ class WarmFlowConfig(PreTrainedConfig):
         """Refuse datasets that the policy cannot learn from.
 
         Raises:
-            ValueError: if there is no state, or an image has no three channels.
+            ValueError: if there is no state, an image has no three channels or is normalised, or there is no
+                such encoder.
         """
+        encoders = ("resnet18-imagenet", "resnet18", "small")
+        if self.encoder not in encoders:
+            raise ValueError(f"--policy.encoder must be one of {', '.join(encoders)}, got {self.encoder!r}")
+        mode = self.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY)
+        if self.image_features and mode != NormalizationMode.IDENTITY:
+            raise ValueError(
+                f"warm_flow scales pixels by itself: its VISUAL normalisation is IDENTITY, not {mode.value}"
+            )
         for name, feature in self.image_features.items():
             if feature.shape[0] != 3:
                 raise ValueError(

@@ -70,7 +70,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
             size = {"image_size": config.image_size, "crop_size": config.crop_size}
             backbone, _, pretrained = config.encoder.partition("-")
             encoder = ImageEncoder(self._cameras, width, backbone=backbone, **size)
-            if pretrained and dataset_meta is not None:  # a saved policy has its weights in its file
+            # A saved policy has its weights in its file.
+            if pretrained and dataset_meta is not None and not config.pretrained_path:
                 load_imagenet(encoder)
             width = encoder.observation_dim
         sizes = (config.action_feature.shape[0], width, prior.prediction_length, config.n_obs_steps)
@@ -222,8 +223,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
         return self._queues["action"].popleft()
 
     def _remember(self, batch: dict[str, Tensor]) -> None:
-        # LeRobot's helper takes what has a queue of its own; actions are queued apart.
-        self._queues = populate_queues(self._queues, batch, exclude_keys=["action"])
+        seen = {name: batch[name] for name in (*self.config.observed, *self._cameras)}
+        self._queues = populate_queues(self._queues, seen)
 
     def _chunk(self) -> Tensor:
         self.eval()
@@ -249,6 +250,10 @@ class WarmFlowPolicy(PreTrainedPolicy):
 
     def _pixels(self, images: Tensor) -> Tensor:
         """Images in [0, 1], ``[B, To, 3, h, w]``, as uint8 squares."""
+        if not images.is_floating_point():
+            raise ValueError(
+                f"warm_flow sees images as numbers in [0, 1], as LeRobot loads them, got {images.dtype}"
+            )
         side = self.config.image_size
         flat = images.flatten(0, 1)
         if flat.shape[-2:] != (side, side):
