@@ -29,6 +29,7 @@ from options import (
     MeasuredOptions,
     Options,
     Run,
+    of_run,
     stored_options,
     with_parts,
 )
@@ -346,9 +347,9 @@ def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict
 
 def finished_policies(run: Path, options: Options) -> list[Policy]:
     """The policies of a finished run by the methods that are asked for; its data are read again."""
-    stored = stored_options(Options, run, None)
-    methods = " ".join(stored.sources.prior)
-    policies = policies_of(with_parts(stored, run={"out": run}, sources={"prior": options.sources.prior}))
+    stored = of_run(options, run)
+    policies = policies_of(with_parts(stored, evaluation={"grid": options.evaluation.grid}))
+    methods = " ".join(stored_options(Options, run, None).sources.prior)
     for policy in policies:
         if not policy.is_trained:
             raise FileNotFoundError(

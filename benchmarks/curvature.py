@@ -47,6 +47,9 @@ def main(argv: list[str] | None) -> None:
     with started(options, "curvature") as out:
         run = options.policies
         policies = policies_of(options) if run is None else finished_policies(run, options)
+        if run is not None and len({policy.training.seed for policy in policies}) < options.evaluation.seeds:
+            raise ValueError(f"--run {run} has fewer seeds than --seeds {options.evaluation.seeds}")
+        policies = [policy for policy in policies if policy.training.seed in options.seeds]
         # Before the training: what cannot be measured is better known now.
         observations, source = observations_of(options, policies[0])
         width = observations.data["action"].shape[-1]

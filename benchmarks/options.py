@@ -283,9 +283,6 @@ def study[O: Options](kind: type[O], preset: Options, **parts: Any) -> O:
     return kind(**mine | parts)
 
 
-POLICY_PARTS = ("data", "network", "training", "sources")  # of options: what determines the policies
-
-
 def parse[O: Options](
     presets: Mapping[str, O],
     argv: Sequence[str] | None,
@@ -302,27 +299,30 @@ def parse[O: Options](
     asked = read(next(iter(presets.values())), argv, description)
     if asked.run.preset not in presets:
         raise ValueError(f"--preset must be one of {', '.join(presets)}, got {asked.run.preset!r}")
-    base = adapt(presets[asked.run.preset], asked)
+    base = presets[asked.run.preset]
+    known = (*argv, *base.sources.prior, *base.data.task)  # no name of a file's
+    base = adapt(base, asked)
     if not asked.data.generated:  # the demonstrations of presets are numbers to generate
         base = with_parts(base, data={"demonstrations": ()})
-    known = (*argv, *base.sources.prior, *base.data.task)
     finished: Path | None = getattr(asked, "policies", None)
     if finished is not None:
-        of_run = stored_options(Options, finished, None)
-        base = with_parts(base, **{part: getattr(of_run, part) for part in POLICY_PARTS})
+        theirs = stored_options(Options, finished, None)
+        base = with_parts(
+            base,
+            **{part: getattr(theirs, part) for part in ("data", "network", "training", "sources")},
+            evaluation={"seeds": theirs.evaluation.seeds},
+            run={"compile": theirs.run.compile},
+        )
     options = read(base, argv, description)
     out = from_leader(lambda: output_folder(options, study))
     if options.run.resume:
         stored = stored_options(type(base), out, study)
         options = read(stored, argv, description)
         check_same(stored, options, f"{out} was started with other values of", "choose another --out")
-        check_typed(stored, out, known)
-    elif finished is not None:
-        theirs: Any = {part: getattr(base, part) for part in POLICY_PARTS}
-        # Some of its methods will do.
-        theirs["sources"] = replace(base.sources, prior=options.sources.prior)
-        check_same(replace(options, **theirs), options, f"--run {finished} has its own", "leave out --run")
-        check_typed(base, finished, known)
+    if options.run.resume or finished is not None:
+        check_typed(options, finished or out, known)
+    if finished is not None:
+        of_run(options, finished)
     check_device(options.run.device)
     name = options.run.logger
     if name in ("tensorboard", "wandb") and find_spec(name) is None:
@@ -404,6 +404,24 @@ def check_same(one: Options, two: Options, said: str, otherwise: str) -> None:
         raise ValueError(f"{said} {', '.join(changed)}: leave these out, or {otherwise}")
 
 
+def of_run(options: Options, run: Path) -> Options:
+    """The options of a finished run, with those of its tasks, styles, chunks and methods that are asked for.
+
+    Whatever else determines its policies has to be as in the run.
+    """
+    stored = stored_options(Options, run, None)
+    some: dict[str, dict[str, Any]] = {"data": {}, "sources": {"prior": options.sources.prior}}
+    for part, name in (("data", "task"), ("data", "data"), ("sources", "chunk")):
+        asked = getattr(getattr(options, part), name)
+        if {*asked} <= {*getattr(getattr(stored, part), name)}:
+            some[part][name] = asked
+    stored = with_parts(stored, **some)
+    theirs: Any = {part: getattr(stored, part) for part in ("data", "network", "training", "sources")}
+    same = with_parts(options, **theirs, run={"compile": stored.run.compile})
+    check_same(same, options, f"--run {run} has its own", "leave out --run")
+    return with_parts(stored, run={"out": run})
+
+
 def stored_options[O: Options](kind: type[O], out: Path, study: str | None) -> O:
     """The options of the run in a folder: of one study, or what any study shares."""
     path = out / "options.json"
@@ -468,6 +486,6 @@ def started(options: Options, study: str) -> Iterator[Path]:
         try:
             yield out
         except Exception:
-            if not (out / "tasks.json").exists():  # nothing was begun, and nothing is in the way
+            if not options.run.resume and len(list(out.iterdir())) == 1:  # nothing was begun
                 (out / "options.json").unlink()
             raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 from itertools import groupby
 
 import pytest
@@ -173,6 +174,14 @@ def test_policies_of_a_finished_run(dataset, tmp_path, capsys):
         with pytest.raises(ValueError, match=f"has its own {why}: leave these out"):
             frozen(words)
     assert len(frozen("")) == 3  # all of its methods
+    # A name in a file is not imported, whichever file says it.
+    resumed = json.loads((run / "options.json").read_text())
+    resumed["options"]["data"]["task"] = ["evil:task"]
+    (tmp_path / "evil").mkdir()
+    (tmp_path / "evil" / "options.json").write_text(json.dumps(resumed))
+    (tmp_path / "evil" / "tasks.json").write_text('[{"task": "evil:task"}]')
+    with pytest.raises(ValueError, match="uses evil:task: name it again"):
+        read(f"--run {tmp_path / 'evil'} --out {out}")
     few = {"rl__environment_steps": 60, "rl__warmup_steps": 30, "rl__evaluate_every": 60, "episodes": 1}
     argv = command_line(run=run, out=out, horizon=20, seeds=2, prior=own, num_envs=1, **few)
     assert benchmark.main(argv) == 0
