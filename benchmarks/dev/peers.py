@@ -20,7 +20,7 @@ import argparse
 import json
 import statistics
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -52,8 +52,7 @@ from warmprior.io.machine import facts_of_machine
 from warmprior.io.script import run_script
 
 NFES = (1, 3, 9)
-VECTOR, OBJECTS = 9, D_O - 9
-"""Widths of the robot's own state and of the objects'."""
+VECTOR, OBJECTS = 9, D_O - 9  # widths of the robot's own state and of the objects'
 
 Batch = TensorDictBase
 Row = dict[str, Any]
@@ -61,23 +60,14 @@ Row = dict[str, Any]
 
 @dataclass
 class Peer:
-    """A policy to be measured.
-
-    Attributes:
-        name: of the row.
-        module: what is trained.
-        loss: of a batch of windows.
-        decide: makes a chunk for one observation, with a number of network evaluations.
-        own_steps: the number of evaluations that the package would take.
-        network_pass: the network alone on a batch, where operations of the loss cannot be counted.
-    """
+    """A policy to be measured."""
 
     name: str
-    module: nn.Module
-    loss: Callable[[Batch], torch.Tensor]
-    decide: Callable[[int], object]
-    own_steps: int
-    network_pass: Callable[[Batch], torch.Tensor] | None = None
+    module: nn.Module  # what is trained
+    loss: Callable[[Batch], torch.Tensor]  # of a batch of windows
+    decide: Callable[[int], object]  # makes a chunk for one observation, at a number of network evaluations
+    own_steps: int  # the number of evaluations that the package would take
+    network_pass: Callable[[Batch], torch.Tensor] | None = None  # where a loss's operations are not counted
 
     @property
     def parameters(self) -> int:
@@ -96,9 +86,19 @@ def nearest(make: Callable[[int], nn.Module], widths: Sequence[int], parameters:
     return min(widths, key=excess)
 
 
-def ours(name: str, make: Callable[[int], VelocityNetwork], width: int, device: str) -> Peer:
+def transformer(width: int, **options: float) -> VelocityNetwork:
+    return ChiTransformer(D_A, D_O, H, TO, embedding_dim=width, **options)
+
+
+def mlp(width: int) -> VelocityNetwork:
+    return VelocityMLP(D_A, D_O, H, TO, hidden_dim=width)
+
+
+def ours(
+    name: str, make: Callable[[int], VelocityNetwork], widths: Sequence[int], parameters: float, device: str
+) -> Peer:
     """FlowMatchingLoss on one of this library's networks."""
-    network = make(width).to(device)
+    network = make(nearest(make, widths, parameters)).to(device)
     actor = WarmPriorActor(network, PRIOR)
     loss = FlowMatchingLoss(actor)
     history = window_history(torch.zeros(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
@@ -113,27 +113,6 @@ def ours(name: str, make: Callable[[int], VelocityNetwork], width: int, device: 
             torch.rand(len(batch), device=device), batch["vla_action", "chunk"], batch["observation"]
         ),
     )
-
-
-def warmprior_transformer(parameters: float, device: str, dropout: float | None = None) -> Peer:
-    """The paper's network, with its own dropout by default."""
-    options = {} if dropout is None else {"dropout": dropout}
-
-    def make(width: int) -> VelocityNetwork:
-        return ChiTransformer(D_A, D_O, H, TO, embedding_dim=width, **options)
-
-    width = nearest(make, range(48, 1024, 24), parameters)
-    name = "ChiTransformer" if dropout is None else f"ChiTransformer, dropout {dropout:g}"
-    return ours(name, make, width, device)
-
-
-def warmprior_mlp(parameters: float, device: str) -> Peer:
-    """The network of the small presets."""
-
-    def make(width: int) -> VelocityNetwork:
-        return VelocityMLP(D_A, D_O, H, TO, hidden_dim=width)
-
-    return ours("VelocityMLP", make, nearest(make, range(64, 4096, 32), parameters), device)
 
 
 def torchrl(parameters: float, device: str) -> Peer:
@@ -266,25 +245,18 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
     return Peer("lerobot: multi_task_dit", policy, lambda b: policy(lerobots(b))[0], decide, 100)
 
 
+# How to build each, and the packages that it needs.
 PEERS: dict[str, tuple[Callable[[float, str], Peer], tuple[str, ...]]] = {
-    "warmprior_transformer": (warmprior_transformer, ()),
-    "warmprior_transformer_no_dropout": (partial(warmprior_transformer, dropout=0.0), ()),
-    "warmprior_mlp": (warmprior_mlp, ()),
+    "warmprior_transformer": (partial(ours, "ChiTransformer", transformer, range(48, 1024, 24)), ()),
+    "warmprior_transformer_no_dropout": (
+        partial(ours, "ChiTransformer, dropout 0", partial(transformer, dropout=0.0), range(48, 1024, 24)),
+        (),
+    ),
+    "warmprior_mlp": (partial(ours, "VelocityMLP", mlp, range(64, 4096, 32)), ()),
     "torchrl": (torchrl, ()),
     "lerobot_diffusion": (lerobot_diffusion, ("lerobot", "diffusers")),
     "lerobot_multi_task_dit": (lerobot_multi_task_dit, ("lerobot", "diffusers", "transformers")),
 }
-"""By name: how to build it, and the packages that it needs."""
-
-
-def found(names: Sequence[str]) -> Iterator[str]:
-    """Those of the peers whose packages are installed; the others are named."""
-    for name in names:
-        missing = [package for package in PEERS[name][1] if not find_spec(package)]
-        if missing:
-            print(f"{name}: skipped, needs {' and '.join(missing)} (warmprior[vla])")
-        else:
-            yield name
 
 
 def synchronised(function: Callable[[], object], device: str) -> Callable[[], object]:
@@ -365,14 +337,6 @@ def report(rows: Sequence[Row]) -> str:
     return pd.DataFrame(lines).T.to_string()
 
 
-def over_lerobot(rows: Sequence[Row]) -> dict[str, float]:
-    """Training samples per second of this library's over those of LeRobot's faster policy."""
-    speed = {row["policy"]: row["samples_per_second"] for row in rows}
-    theirs = [value for name, value in speed.items() if name.startswith("lerobot")]
-    mine = {name: value for name, value in speed.items() if name.startswith("warmprior")}
-    return {name: value / max(theirs) for name, value in mine.items()} if theirs else {}
-
-
 def draw(path: Path, rows: Sequence[Row]) -> None:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     speed, latency = figure.subplots(1, 2)
@@ -406,7 +370,13 @@ def run(argv: Sequence[str] | None) -> None:
         parser.error("--repeats and --batch-size must be at least 1, --parameters 1e4 to 1e9")
     check_device(options.device)
     torch.manual_seed(0)
-    peers = [PEERS[name][0](options.parameters, options.device) for name in found(options.peers)]
+    peers = []
+    for name in options.peers:
+        make, packages = PEERS[name]
+        if missing := [package for package in packages if not find_spec(package)]:
+            print(f"{name}: skipped, needs {' and '.join(missing)} (warmprior[vla])")
+        else:
+            peers.append(make(options.parameters, options.device))
     if not peers:
         raise ValueError("none of these peers is installed: pip install 'warmprior[vla]'")
     options.out.mkdir(parents=True, exist_ok=True)
@@ -420,8 +390,6 @@ def run(argv: Sequence[str] | None) -> None:
     (options.out / "table.txt").write_text(report(rows) + "\n")
     draw(options.out / "peers.png", rows)
     print(report(rows))
-    for name, ratio in over_lerobot(rows).items():
-        print(f"training over lerobot's faster policy, {name}: {ratio:.2f}")
     print(f"written to {options.out}")
 
 

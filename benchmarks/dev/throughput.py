@@ -1,7 +1,7 @@
-"""Speed and memory of the library as ratios to what it is built on, each measured in one run.
+"""Speed of the library as ratios to what it is built on, each measured in one run.
 
 python benchmarks/dev/throughput.py                                  # everything, a few minutes
-python benchmarks/dev/throughput.py --only windows_per_second actor_over_network
+python benchmarks/dev/throughput.py --only windows_over_torch job_overhead
 """
 
 from __future__ import annotations
@@ -14,45 +14,27 @@ import logging
 import os
 import platform
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import prior_space_figures as prior_space
 import torch
 import training_figures as training
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 from tqdm import tqdm
-from training_figures import BATCH, D_A, D_O, PRIOR, TO, H, paper_network, small_network, step_of, steps
+from training_figures import BATCH, D_A, D_O, PRIOR, TO, H, steps
 
-from warmprior import (
-    ChiTransformer,
-    ImageEncoder,
-    Normalizer,
-    VisionNetwork,
-    WarmPriorActor,
-    policy_transforms,
-    window_replay_buffer,
-)
+from warmprior import Normalizer, policy_transforms, window_replay_buffer
 from warmprior.data import LeRobotExperienceReplay
-from warmprior.data.scripted.episode import Episode
-from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs import RobosuiteEnv
-from warmprior.envs.simulator import task_env_args
-from warmprior.history import window_history
 from warmprior.io.files import read_json, write_atomic
 from warmprior.io.machine import facts_of_machine
 from warmprior.io.processes import fresh_processes
 from warmprior.io.ray_cluster import ray_cluster
-from warmprior.training import precondition
 
 
 class Clock:
@@ -82,12 +64,6 @@ class Clock:
         """Median of the rounds' time of ``thing`` over that of ``base``."""
         one, two = self.times(thing, base, **options)
         return statistics.median(a / b for a, b in zip(one, two, strict=True))
-
-
-def windows_per_second(clock: Clock) -> float:
-    buffer = window_replay_buffer(steps(400, 200), PRIOR, batch_size=BATCH, observation_steps=TO)
-    (seconds,) = clock.times(buffer.sample, calls=50)
-    return BATCH / statistics.median(seconds)
 
 
 def bare_windows(data: TensorDict, batch: int, select: bool) -> Callable[[], list[torch.Tensor]]:
@@ -177,44 +153,6 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
     return ratio * 20 * BATCH / 64
 
 
-def preconditioning_over_network(clock: Clock) -> float:
-    network = precondition(small_network(), steps(400, 200), PRIOR, observation_steps=TO)
-    return clock.ratio(step_of(network), step_of(small_network()), calls=20)
-
-
-def actor_over_network(clock: Clock, compiled: bool = False) -> dict[str, float]:
-    call = torch.compile(paper_network().eval()) if compiled else paper_network().eval()
-    actor = WarmPriorActor(call, PRIOR).eval()
-    t, a, o = torch.rand(1), torch.randn(1, H, D_A), torch.randn(1, TO, D_O)
-    history = window_history(a, torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
-    data = TensorDict({"observation": o, "history": history}, [1])
-    found = {}
-    with torch.no_grad():
-        for nfe in (1, 3, 9):
-            found[str(nfe)] = clock.ratio(
-                partial(actor, data, nfe=nfe),
-                lambda nfe=nfe: [call(t, a, o) for _ in range(nfe)],
-                calls=max(2, 18 // nfe),
-            )
-    return found
-
-
-def env_over_robosuite(clock: Clock) -> float:
-    envs = RobosuiteEnv("square"), RobosuiteEnv("square", control_loop="robosuite")
-    lean, own = (env.loop for env in envs)
-    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (20, D_A))
-
-    def before() -> None:  # the same episode on both sides: contacts decide what a step costs
-        lean.reset(0)
-        own.reset(0)
-
-    return clock.ratio(
-        lambda: [own.env.step(action) for action in actions],
-        lambda: [lean.step(action) for action in actions],
-        before=before,
-    )
-
-
 def chunk_step_overhead(clock: Clock) -> float:
     # Statistics that leave actions as they are, so that both sides simulate the same.
     high = {"observation": torch.ones(D_O), "action": torch.ones(D_A)}
@@ -237,91 +175,6 @@ def chunk_step_overhead(clock: Clock) -> float:
 
     actions = chunks.flatten(0, 1).numpy()
     return clock.ratio(decisions, lambda: [alone.loop.step(a) for a in actions], before=before) - 1
-
-
-def image_windows_over_h5py(clock: Clock) -> float:
-    """Batches of windows with images, over decoding their frames from a rendered file."""
-    import h5py
-
-    length, episodes, size, batch = 100, 10, 84, 64
-    camera, frames = "agentview_image", length * episodes
-    smooth = np.add.outer(np.arange(size), np.arange(size))[..., None] + np.arange(3)
-    noise = np.random.default_rng(0).integers(0, 8, (frames, size, size, 3))
-    images = (smooth + noise).astype(np.uint8)  # compresses about as much as a rendered image
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "images.hdf5"
-        with h5py.File(path, "w") as file:
-            chunk = (1, size, size, 3)
-            file.create_dataset(camera, data=images, chunks=chunk, compression="gzip")
-        data = steps(episodes, length)
-        vector = data["observation"]
-        channels_first = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
-        data["observation"] = TensorDict({"state": vector, camera: channels_first}, [frames])
-        data = data.memmap(Path(folder) / "memmap")
-        buffer = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO)
-        with h5py.File(path) as file:
-            stored = file[camera]
-
-            def decode() -> None:
-                for i in torch.randint(frames, (batch,)).tolist():
-                    first = i - i % length
-                    for step in range(TO):
-                        stored[max(first, i - step)]
-
-            return clock.ratio(decode, buffer.sample)
-
-
-def encoder_share(clock: Clock) -> dict[str, float]:
-    """Share of a decision's time that the ResNets of two cameras take."""
-    torch.manual_seed(0)
-    cameras = ["agentview_image", "robot0_eye_in_hand_image"]
-    encoder = ImageEncoder(cameras, 9)
-    network = ChiTransformer(D_A, encoder.observation_dim, PRIOR.prediction_length, TO)
-    actor = WarmPriorActor(VisionNetwork(encoder, network), PRIOR).eval()
-    images = {name: torch.zeros(1, TO, 3, 84, 84, dtype=torch.uint8) for name in cameras}
-    observation = TensorDict({"state": torch.randn(1, TO, 9), **images}, [1])
-    history = window_history(torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
-    data = TensorDict({"observation": observation, "history": history}, [1])
-    with torch.no_grad():
-        return {
-            str(nfe): clock.ratio(partial(encoder, observation), partial(actor, data, nfe=nfe))
-            for nfe in (1, 3, 9)
-        }
-
-
-LOAD = """
-import sys
-from warmprior.data import RobomimicExperienceReplay
-def memory(name):
-    with open("/proc/self/status") as file:
-        return 1024 * int(next(line for line in file if line.startswith(name)).split()[1])
-RobomimicExperienceReplay(sys.argv[1])  # libraries and caches
-with open("/proc/self/clear_refs", "w") as file:
-    file.write("5")  # forget the peak so far
-before = memory("VmRSS")
-data = RobomimicExperienceReplay(sys.argv[2]).data
-print((memory("VmHWM") - before) / sum(v.numel() * v.element_size() for v in data.values(True, True)))
-"""
-
-
-def load_memory_over_data(clock: Clock) -> float:
-    widths = {"object": 14, "robot0_eef_pos": 3, "robot0_eef_quat": 4, "robot0_gripper_qpos": 2}
-    rng = np.random.default_rng(0)
-
-    def episode(seed: int, length: int) -> Episode:
-        observations = {k: rng.normal(size=(length + 1, w)) for k, w in widths.items()}
-        actions, rewards = rng.uniform(-1, 1, (length, D_A)), np.eye(length)[-1]
-        states = np.zeros((length, 1))
-        return Episode(seed, 0, "better", True, actions, states, rewards, observations)
-
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / f"{size}.hdf5" for size in ("small", "large")]
-        for path, count in zip(paths, (2, 2000), strict=True):
-            episodes = (episode(i, 500) for i in range(count))
-            write_robomimic(path, episodes, env_args=task_env_args("square"), model_file="")
-        command = [sys.executable, "-c", LOAD, *map(str, paths)]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return float(done.stdout)
 
 
 def empty_cell(number: int, folder: Path) -> int:
@@ -351,23 +204,12 @@ def job_overhead(clock: Clock) -> dict[str, float]:
 
 
 FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
-    "windows_per_second": (windows_per_second, ">= 150000"),
     "windows_over_torch": (windows_over_torch, ">= 0.6"),
     "lerobot_windows_over_getitem": (lerobot_windows_over_getitem, ">= 500"),
-    "train_step_over_network": (training.train_step_over_network, "<= 1.10"),
     "ddp_efficiency": (training.ddp_efficiency, ""),
     "cuda_train_step_over_network": (training.cuda_train_step_over_network, "<= 1.05"),
     "cuda_latency": (training.cuda_latency, ""),
-    "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
-    "actor_over_network": (actor_over_network, "<= 1.10"),
-    "actor_over_network_compiled": (partial(actor_over_network, compiled=True), ""),
-    "env_over_robosuite": (env_over_robosuite, ">= 2"),
     "chunk_step_overhead": (chunk_step_overhead, "<= 0.10"),
-    "load_memory_over_data": (load_memory_over_data, "<= 1.3"),
-    "image_windows_over_h5py": (image_windows_over_h5py, ">= 5"),
-    "encoder_share": (encoder_share, ""),
-    "prior_space_decoding": (prior_space.decoding, ""),
-    "prior_space_collection_over_env": (prior_space.collection_over_env, ""),
     "job_overhead": (job_overhead, ""),
 }
 

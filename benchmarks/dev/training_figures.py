@@ -58,26 +58,6 @@ def cloning(
     return training
 
 
-def step_of(network: nn.Module, batch: int = BATCH, device: str = "cpu") -> Callable[[], None]:
-    """A training step of a network alone, on random numbers."""
-    optimizer = torch.optim.AdamW(network.parameters(), fused=True)
-    t, a = torch.rand(batch, device=device), torch.randn(batch, H, D_A, device=device)
-    o = torch.randn(batch, TO, D_O, device=device)
-
-    def step() -> None:
-        loss = network(t, a, o).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-
-    return step
-
-
-def train_step_over_network(clock: Any) -> float:
-    with tempfile.TemporaryDirectory() as folder:
-        return clock.ratio(cloning(paper_network(), folder).step, step_of(paper_network()))
-
-
 SCALED = {"paper": (paper_network, 1), "small": (small_network, 10)}
 """Networks, and training steps per round."""
 
@@ -137,6 +117,15 @@ def cuda_train_step_over_network(clock: Any) -> float | None:
         return None
     batch, bare = TrainingConfig().batch_size, paper_network().to("cuda")
     bare.compile(mode="reduce-overhead")
+    optimizer = torch.optim.AdamW(bare.parameters(), fused=True)
+    t, a = torch.rand(batch, device="cuda"), torch.randn(batch, H, D_A, device="cuda")
+    o = torch.randn(batch, TO, D_O, device="cuda")
+
+    def bare_step() -> None:
+        loss = bare(t, a, o).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
 
     def twenty(step: Callable[[], object]) -> Callable[[], None]:
         def run() -> None:
@@ -149,7 +138,7 @@ def cuda_train_step_over_network(clock: Any) -> float | None:
 
     with tempfile.TemporaryDirectory() as folder:
         ours = cloning(paper_network(), folder, batch, "cuda", compile=True)
-        return clock.ratio(twenty(ours.step), twenty(step_of(bare, batch, "cuda")))
+        return clock.ratio(twenty(ours.step), twenty(bare_step))
 
 
 def cuda_latency(clock: Any) -> dict[str, float] | None:
