@@ -14,8 +14,9 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from common import Policy, observations_of, policies_of, write_rows
-from options import PRESETS, MeasuredOptions, check_single, parse, script, started, study
+from common import Policy, policies_of, write_rows
+from measures import held_out
+from options import PRESETS, MeasuredOptions, check_given, check_single, parse, script, started, study
 from plots import plot_lines
 from report import labelled, per_seed, table, write_report
 from robomimic import compare
@@ -36,8 +37,7 @@ class BudgetOptions(MeasuredOptions):
         super().check()
         check_single(self, "sigma")
         check_counts(self, "budgets")
-        if not self.budgets:
-            raise ValueError("--budgets needs at least one number of iterations")
+        check_given(self, "budgets")
 
     def trainings(self) -> list[TrainingConfig]:
         """One per budget, the shortest first, each with its last policy alone."""
@@ -67,7 +67,7 @@ def main(argv: list[str] | None) -> None:
     with started(options, "budget") as out:
         policies = policies_of(options)
         # Before the hours of training: what cannot be measured on is better known now.
-        observations, source = observations_of(options, policies[0])
+        observations, source = held_out(options, policies[0])
         _, failures = compare(options, policies)
         error = errors(policies, observations, options.evaluation.nfe)
         played = read_lines(out / "results.jsonl")

@@ -57,7 +57,6 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "paired": (".2f", "probability of winning an episode that only one of the two solves"),
     "paper": (".1%", "the paper's success rate, on the official demonstrations"),
     "paper_ratio": (".3f", "the paper's ratio of curvatures, on the official demonstrations"),
-    "paper_gain": ("+.1%", "the paper's gain over the Gaussian source"),
     "mean_steps": (".1f", "control steps per episode"),
     "action_error": (".4f", "mean squared error of executed actions on demonstrations held out"),
     # Jumps and distances, in normalised action units.

@@ -22,25 +22,17 @@ import pandas as pd
 import torch
 from filelock import FileLock
 from learned_sources import Learner, learn
-from measures import held_out, measured
+from measures import measured
 from methods import Method
-from options import (
-    Evaluation,
-    MeasuredOptions,
-    Options,
-    Run,
-    stored_options,
-    with_parts,
-)
+from options import Evaluation, Options, Run, stored_options, with_parts
 from report import read_rows
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.record.loggers import get_logger
 
 from warmprior import WarmPriorActor
-from warmprior.diagnostics import SharedObservations, mean_revision, smoothness
-from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.diagnostics import mean_revision, smoothness
 from warmprior.io.distributed import from_leader, leader_first, rank
-from warmprior.io.files import digest_of, read_json, read_lines, write_atomic
+from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.training import (
     DataOptions,
@@ -59,7 +51,6 @@ from warmprior.training.task import task_places
 from warmprior.transforms import policy_transforms
 
 LEARNING_SHARE = 0.25  # gradient steps of sources that learn before the flow, per step of the flow
-EPISODES_PER_JOB = 5  # so few that all cores are busy to the end; so many that policies are loaded seldom
 
 
 @dataclass(frozen=True)
@@ -271,14 +262,7 @@ def train(policy: Policy) -> None:
 
 def clock(status: Path) -> float | None:
     """The processor time in a status file, if there is one."""
-    if not status.exists():
-        return None
-    try:
-        return float(read_json(status)["seconds"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{status} is damaged: remove it, and the time before is not counted ({error})"
-        ) from error
+    return float(read_json(status)["seconds"]) if status.exists() else None
 
 
 def status_writer(path: Path, iterations: int) -> Callable[[int], None]:
@@ -326,12 +310,6 @@ def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
         observation_steps=policy.network.observation_steps,
         coupled=policy.method.parts.coupling is not None,
     )
-
-
-def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
-    """Observations that no policy was trained on, where there are some, and what they are in words."""
-    steps = policy.network.observation_steps
-    return held_out(options, policy.data, policy.task(), policy.method.chunk_length, steps)
 
 
 def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict[int, WarmPriorActor]]:
@@ -382,22 +360,17 @@ class Cell:
 
 def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int]) -> list[Episode]:
     """Play episodes. Their noise is that of the policy's seed and the episode's, wherever they are played."""
-    actor, env = prepared(policy, cell.checkpoint, replace(cell, nfe=1), evaluation.play_on)
-    seed = policy.training.seed
-    task = policy.task()
-    return [
-        play_episode(
-            actor, env, episode, nfe=cell.nfe, policy_seed=seed, success=task.success, measures=task.measures
-        )
-        for episode in seeds
-    ]
+    actor, env = prepared(policy, replace(cell, nfe=1), evaluation.play_on)
+    task, noise = policy.task(), {"nfe": cell.nfe, "policy_seed": policy.training.seed}
+    outcome = {"success": task.success, "measures": task.measures}
+    return [play_episode(actor, env, episode, **noise, **outcome) for episode in seeds]
 
 
 @lru_cache(maxsize=1)
-def prepared(policy: Policy, checkpoint: int, cell: Cell, play_on: bool) -> tuple[WarmPriorActor, EnvBase]:
+def prepared(policy: Policy, cell: Cell, play_on: bool) -> tuple[WarmPriorActor, EnvBase]:
     """A policy and its environment: an episode after one of the same policy needs no preparation."""
     key = (policy.data, *policy.place, policy.network.observation_steps)
-    actor = policy.load(checkpoint).replace(guidance=cell.guidance)
+    actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance)
     return actor, environment(policy, simulator(key, play_on), cell)
 
 
@@ -453,17 +426,6 @@ def row(
         "training_seconds": policy.seconds,
         "outcomes": "".join("01"[solved] for solved in solved),
     }
-
-
-def batches(evaluation: Evaluation) -> list[range]:
-    """The seeds of the evaluation episodes, a few per job."""
-    seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)
-    return [seeds[i : i + EPISODES_PER_JOB] for i in range(0, len(seeds), EPISODES_PER_JOB)]
-
-
-def stored_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file, if there is one."""
-    return read_lines(path) if path.exists() else []
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:

@@ -10,8 +10,8 @@ import sys
 from dataclasses import dataclass
 
 import torch
-from common import facts_of, finished_policies, observations_of, policies_of, trained_actors, write_rows
-from measures import RATIOS, straightness
+from common import facts_of, finished_policies, policies_of, trained_actors, write_rows
+from measures import RATIOS, held_out, straightness
 from options import PRESETS, FinishedRun, MeasuredOptions, parse, script, started, study
 from paper import PAPER_CURVATURE
 from plots import plot_flow_paths
@@ -29,7 +29,6 @@ class CurvatureOptions(MeasuredOptions):
     """What to measure."""
 
     policies: FinishedRun = None  # a finished run, whose policies to take instead of training
-    coordinate: int = 0  # of the action, in flow_paths.png
 
     @property
     def name(self) -> str:
@@ -48,14 +47,11 @@ def main(argv: list[str] | None) -> None:
         run = options.policies
         policies = policies_of(options) if run is None else finished_policies(run, options)
         # Before the training: what cannot be measured is better known now.
-        observations, source = observations_of(options, policies[0])
-        width = observations.data["action"].shape[-1]
-        if not 0 <= options.coordinate < width:
-            raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
+        observations, source = held_out(options, policies[0])
         if run is None:
             train_all(options, policies)
         task, actors = facts_of(policies[0].task()), trained_actors(policies, options.run.device)
-        measured = straightness(actors, observations, n_steps=options.steps, draws=options.draws)
+        measured = straightness(actors, observations, n_steps=options.steps)
         rows = write_rows(out / "curvature.jsonl", measured)
 
         few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
@@ -68,9 +64,8 @@ def main(argv: list[str] | None) -> None:
                 windows = few.windows(actor.prior, see_history=sees_history(actor))
                 windows = encoded_windows(actor, windows)
                 path = flow_paths(actor, windows, options.steps, generator=generator)
-                paths[labels[str(method)]] = path[..., 0, options.coordinate].cpu()
-        where = f"{task['task']} {task['data']}: action coordinate {options.coordinate}"
-        title = f"{where} along the flow,\n{source}"
+                paths[labels[str(method)]] = path[..., 0, 0].cpu()
+        title = f"{task['task']} {task['data']}: action coordinate 0 along the flow,\n{source}"
         plot_flow_paths(paths, out / "flow_paths.png", title=title)
         seeds = rows.seed.dropna().nunique()
         notes = [

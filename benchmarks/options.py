@@ -36,6 +36,13 @@ from warmprior.training.training_config import PAPER
 Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
 
 
+def check_given(options: Any, *names: str) -> None:
+    """Refuse an option that takes several values and has none."""
+    for name in names:
+        if not getattr(options, name):
+            raise ValueError(f"--{name} needs at least one value")
+
+
 @dataclass(frozen=True)
 class Sources:
     """The methods to compare."""
@@ -49,9 +56,7 @@ class Sources:
 
     def __post_init__(self) -> None:
         check_counts(self, "chunk")
-        for name in ("prior", "chunk"):
-            if not getattr(self, name):
-                raise ValueError(f"--{name} needs at least one value")
+        check_given(self, "prior", "chunk")
 
     def methods(self) -> list[Method]:
         """All of them, chunk length by chunk length, each once."""
@@ -77,8 +82,7 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         check_counts(self, "seeds", "episodes", "nfe", "top_k")
-        if not self.nfe:
-            raise ValueError("--nfe needs at least one number of network evaluations")
+        check_given(self, "nfe")
         check_grid(self.grid)
 
     @property
@@ -197,12 +201,11 @@ class MeasuredOptions(Options):
     validation: Path | None = None  # demonstrations, as --dataset names them (default: newly generated ones)
     observations: int = 500  # how many to measure on; the paper's curvature has 2000
     steps: int = 100  # Euler steps of a curvature
-    draws: int = 1  # source samples per observation
 
     def check(self) -> None:
         super().check()
         check_single(self, "task", "data", "chunk")
-        check_counts(self, "observations", "draws", "steps")
+        check_counts(self, "observations", "steps")
         if self.steps < 2:
             raise ValueError(f"--steps must be at least 2, got {self.steps}")
         if self.validation is not None:
@@ -279,8 +282,7 @@ def with_parts[O](options: O, **parts: Any) -> O:
 
 def study[O: Options](kind: type[O], preset: Options, **parts: Any) -> O:
     """A preset of a study: that of the comparison, with further parts or others."""
-    mine: Any = {f.name: getattr(preset, f.name) for f in fields(Options)}
-    return kind(**mine | parts)
+    return kind(**vars(preset) | parts)
 
 
 POLICY_PARTS = ("data", "network", "training", "sources")  # of options: what determines the policies

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import pandas as pd
 import tyro
-from common import facts_of, finished_policies, policies_of, slug, stored_rows, trained_actors, write_rows
+from common import facts_of, finished_policies, policies_of, slug, trained_actors, write_rows
 from methods import ColdPrior, Method
 from navigation1d import NAVIGATION_PRESETS
 from options import (
@@ -29,6 +29,7 @@ from options import (
     FinishedRun,
     Options,
     Sources,
+    check_given,
     check_single,
     parse,
     script,
@@ -47,7 +48,7 @@ from warmprior.diagnostics.flow import sees_history
 from warmprior.envs import NavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.io.files import read_json
+from warmprior.io.files import read_json, read_lines
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 from warmprior.training import DataOptions, parallel_env
 from warmprior.training.options import check_counts
@@ -118,7 +119,6 @@ class AgentsOptions(Options):
     delta: tuple[float, ...] = ()  # half the agents' boxes (default: 0.5 around a mean, 1.5 around zero)
     horizon: int | None = None  # time limit in control steps (default: the task's)
     num_envs: int = 4  # parallel environments of an agent
-    threads: int | None = None  # of a training; in small networks more than one wait for each other
     # Ray actors that collect, with num-envs environments each, with --engine ray (default: none, the training
     # itself collects).
     collectors: int | None = None
@@ -134,15 +134,13 @@ class AgentsOptions(Options):
         return TOY if self.is_toy else super().name
 
     def check(self) -> None:
-        check_counts(self, "horizon", "num_envs", "threads", "collectors")
+        check_counts(self, "horizon", "num_envs", "collectors")
         if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
             raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "data", "chunk", "sigma", "nfe")
-        for name in ("algorithm", "centre"):
-            if not getattr(self, name):
-                raise ValueError(f"--{name} needs at least one value")
+        check_given(self, "algorithm", "centre")
         if self.collectors is not None and self.run.engine != "ray":
             raise ValueError("--collectors belongs to --engine ray")
         if not self.is_toy and self.policies is None:
@@ -196,7 +194,6 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
             alpha_init=0.05,
             evaluate_every=6_000,
         ),
-        threads=1,
     ),
     # The navigation toy with a goal, three seeds: agents around the mean and around zero, in two boxes.
     "unit": AgentsOptions(
@@ -224,7 +221,6 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
             evaluate_every=6_000,
         ),
         num_envs=32,
-        threads=1,
     ),
     # Fig. 7's four agents with DSRL's hyper-parameters per task, three seeds: needs a GPU. As in DSRL,
     # success does not end the episode. The paper's policies have 3,000 epochs; these have Table 3's.
@@ -329,7 +325,7 @@ def learn(
         collectors=options.collectors,
         ray_address=options.run.ray_address,
     )
-    with torch_threads(options.threads):
+    with torch_threads(1):  # workers that end set it otherwise
         training.run()
     return training
 
@@ -341,7 +337,7 @@ def main(argv: list[str] | None) -> None:
     with started(options, "rl") as out:
         task, frozen = frozen_policies(options)
         path = out / "results.jsonl"
-        rows, failures = stored_rows(path), []
+        rows, failures = read_lines(path) if path.exists() else [], []
         arms = [arm for method in frozen for arm in options.arms(method)]
         for seed, arm in product(options.seeds, sorted(arms, key=lambda arm: arm.algorithm)):
             actor = frozen[arm.method][seed]

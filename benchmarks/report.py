@@ -108,9 +108,7 @@ def summary(rows: DataFrame, top_k: int) -> DataFrame:
     intervals = [stats.success_posterior(*map(int, pair)).interval(0.95) for pair in counts]
     found["low"], found["high"] = zip(*intervals, strict=True)
     firsts = seeds.groupby(keys, sort=False, as_index=False).head(1).to_dict("records")
-    base = {"prior": "gaussian", "sigma": 1.0, "options": ""}
     found["paper"] = [paper_success(row) for row in firsts]
-    found["paper_gain"] = found["paper"] - [paper_success(row | base) for row in firsts]
     return _beside(found, seeds, keys)
 
 

@@ -15,8 +15,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
-from common import observations_of, policies_of, trained_actors, write_rows
-from measures import straightness
+from common import policies_of, trained_actors, write_rows
+from measures import held_out, straightness
 from options import PRESETS, MeasuredOptions, Options, check_single, parse, script, started, study
 from paper import paper_success
 from plots import plot_lines
@@ -55,10 +55,10 @@ def main(argv: list[str] | None) -> None:
     with started(options, "sigma") as out:
         policies = policies_of(options)
         # Before the hours of training: what cannot be measured on is better known now.
-        observations, source = observations_of(options, policies[0])
+        observations, source = held_out(options, policies[0])
         rows, failures = compare(options, policies)
         actors = trained_actors(policies, options.run.device)
-        flow = straightness(actors, observations, n_steps=options.steps, draws=options.draws)
+        flow = straightness(actors, observations, n_steps=options.steps)
         curvatures = write_rows(out / "curvature.jsonl", flow)
         title = f"{policies[0].task().title}, NFE {options.evaluation.nfe[0]}"
         draw(rows, curvatures, out / "sigma.png", options.evaluation.top_k, title)

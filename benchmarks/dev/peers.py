@@ -166,6 +166,28 @@ def features(objects: bool) -> dict[str, Any]:
     return {"input_features": inputs, "output_features": outputs, "n_obs_steps": TO, "horizon": H}
 
 
+def lerobot(
+    name: str,
+    policy: Any,
+    seen: Callable[[torch.Tensor], dict[str, torch.Tensor]],
+    set_steps: Callable[[int], None],
+    device: str,
+) -> Peer:
+    """A policy of LeRobot's; `seen` names the parts of observations as it does."""
+    now = seen(torch.randn(1, D_O, device=device))
+
+    def loss(batch: Batch) -> torch.Tensor:
+        target = {"action": batch["vla_action", "chunk"], "action_is_pad": batch["action_is_pad"]}
+        return policy(seen(batch["observation"]) | target)[0]
+
+    def decide(nfe: int) -> None:
+        set_steps(nfe)
+        policy.reset()
+        policy.select_action(dict(now))
+
+    return Peer(name, policy, loss, decide, 100)
+
+
 def lerobot_diffusion(parameters: float, device: str) -> Peer:
     """LeRobot's Diffusion Policy: a U-Net over the chunk, conditioned on state vectors."""
     from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
@@ -178,26 +200,12 @@ def lerobot_diffusion(parameters: float, device: str) -> Peer:
 
     policy = make(nearest(make, range(16, 513, 16), parameters)).to(device)
 
-    def lerobots(batch: Batch) -> dict[str, torch.Tensor]:
-        state, objects = batch["observation"].split((VECTOR, OBJECTS), dim=-1)
-        return {
-            "observation.state": state,
-            "observation.environment_state": objects,
-            "action": batch["vla_action", "chunk"],
-            "action_is_pad": batch["action_is_pad"],
-        }
+    def seen(observation: torch.Tensor) -> dict[str, torch.Tensor]:
+        parts = observation.split((VECTOR, OBJECTS), dim=-1)
+        return dict(zip(("observation.state", "observation.environment_state"), parts, strict=True))
 
-    now = {
-        "observation.state": torch.randn(1, VECTOR, device=device),
-        "observation.environment_state": torch.randn(1, OBJECTS, device=device),
-    }
-
-    def decide(nfe: int) -> None:
-        policy.diffusion.num_inference_steps = nfe
-        policy.reset()
-        policy.select_action(dict(now))
-
-    return Peer("lerobot: diffusion (U-Net)", policy, lambda b: policy(lerobots(b))[0], decide, 100)
+    steps = partial(setattr, policy.diffusion, "num_inference_steps")
+    return lerobot("lerobot: diffusion (U-Net)", policy, seen, steps, device)
 
 
 def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
@@ -224,25 +232,15 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
     encoder = classmethod(lambda kind, *args, **kwargs: kind(small))
     with mock.patch.object(modeling.CLIPTextModel, "from_pretrained", encoder):
         policy = make(nearest(make, range(64, 769, 64), parameters)).to(device)
-    token = {
-        "observation.language.tokens": torch.zeros(1, 1, dtype=torch.long, device=device),
-        "observation.language.attention_mask": torch.ones(1, 1, dtype=torch.bool, device=device),
-    }
 
-    def lerobots(batch: Batch) -> dict[str, torch.Tensor]:
-        language = {k: v.expand(len(batch), 1) for k, v in token.items()}
-        state, action = batch["observation"], batch["vla_action", "chunk"]
-        pad = batch["action_is_pad"]
-        return language | {"observation.state": state, "action": action, "action_is_pad": pad}
+    def seen(observation: torch.Tensor) -> dict[str, torch.Tensor]:
+        token = torch.ones(len(observation), 1, dtype=torch.bool, device=device)
+        language = {"tokens": 0 * token.long(), "attention_mask": token}
+        named = {f"observation.language.{name}": value for name, value in language.items()}
+        return {"observation.state": observation, **named}
 
-    now = {"observation.state": torch.randn(1, D_O, device=device), **token}
-
-    def decide(nfe: int) -> None:
-        policy.config.num_integration_steps = nfe
-        policy.reset()
-        policy.select_action(dict(now))
-
-    return Peer("lerobot: multi_task_dit", policy, lambda b: policy(lerobots(b))[0], decide, 100)
+    steps = partial(setattr, policy.config, "num_integration_steps")
+    return lerobot("lerobot: multi_task_dit", policy, seen, steps, device)
 
 
 # How to build each, and the packages that it needs.
