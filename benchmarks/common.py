@@ -22,7 +22,6 @@ import pandas as pd
 import torch
 from filelock import FileLock
 from learned_sources import Learner, learn
-from measures import measured
 from methods import Method
 from options import Evaluation, Options, Run, stored_options, with_parts
 from report import read_rows
@@ -129,7 +128,7 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
     The tasks are those that the options name and `more`, or with `only` the latter alone.
     """
-    run = replace(options.run, out=options.run.folder.absolute())
+    run = replace(options.run, out=options.run.out.absolute())
     with leader_first():  # other processes find what it has generated, rendered or downloaded
         places = [*([] if only else task_places(options.data)), *more]
         steps = options.network.observation_steps
@@ -235,7 +234,7 @@ def train(policy: Policy) -> None:
             if isinstance(part, Learner):
                 with leader_first():
                     learned(part, policy, training)
-        logger, logs = None, str(policy.run.folder / "logs")
+        logger, logs = None, str(policy.run.out / "logs")
         if policy.run.logger != "none" and not rank():
             logger = get_logger(policy.run.logger, logger_name=logs, experiment_name=policy.name)
         # Every step draws a_0 from `prior`; the loss is `warmprior.FlowMatchingLoss.forward`.
@@ -298,18 +297,6 @@ def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
         seed=training.seed,
     )
     save_state(path, module_tensors(learner), policy.method.config())
-
-
-def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
-    """Measure the last checkpoint of a policy on its training data, by NFE."""
-    return measured(
-        policy.load(),
-        policy.task().data,
-        policy.method.nfes(nfes),
-        chunk_length=policy.method.chunk_length,
-        observation_steps=policy.network.observation_steps,
-        coupled=policy.method.parts.coupling is not None,
-    )
 
 
 def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict[int, WarmPriorActor]]:

@@ -32,7 +32,6 @@ class CurvatureOptions(MeasuredOptions):
 
     @property
     def name(self) -> str:
-        """Of the output folder."""
         return super().name if self.policies is None else self.policies.resolve().name
 
 
@@ -51,7 +50,7 @@ def main(argv: list[str] | None) -> None:
         if run is None:
             train_all(options, policies)
         task, actors = facts_of(policies[0].task()), trained_actors(policies, options.run.device)
-        measured = straightness(actors, observations, n_steps=options.steps)
+        measured = straightness(actors, observations)
         rows = write_rows(out / "curvature.jsonl", measured)
 
         few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
@@ -63,7 +62,7 @@ def main(argv: list[str] | None) -> None:
                 generator = torch.Generator(options.run.device).manual_seed(0)
                 windows = few.windows(actor.prior, see_history=sees_history(actor))
                 windows = encoded_windows(actor, windows)
-                path = flow_paths(actor, windows, options.steps, generator=generator)
+                path = flow_paths(actor, windows, 100, generator=generator)
                 paths[labels[str(method)]] = path[..., 0, 0].cpu()
         title = f"{task['task']} {task['data']}: action coordinate 0 along the flow,\n{source}"
         plot_flow_paths(paths, out / "flow_paths.png", title=title)

@@ -7,9 +7,10 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
+from common import Policy
 from methods import Method
 from options import MeasuredOptions
 from tensordict import TensorDict, TensorDictBase
@@ -32,9 +33,6 @@ from warmprior.diagnostics import (
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history, sees_history
 from warmprior.training.task import demonstrations_of, read_like
 
-if TYPE_CHECKING:
-    from common import Policy
-
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
 HELD_OUT_SEED = 50  # of generated demonstrations that no training uses; training data have seed 0
 
@@ -47,17 +45,11 @@ RATIOS = {
 }
 
 
-def measured(
-    policy: WarmPriorActor,
-    data: TensorDictBase,
-    nfes: Sequence[int],
-    *,
-    chunk_length: int,
-    observation_steps: int,
-    coupled: bool,
-) -> dict[int, dict[str, float | None]]:
-    """What is measured of a policy on its training data, by NFE: the same observations and draws for all."""
-    shared = SharedObservations(data.to("cpu"), chunk_length, observation_steps=observation_steps)
+def measure(trained: Policy, asked: Sequence[int]) -> dict[int, dict[str, float | None]]:
+    """Measure a policy on its training data, by NFE: on the same observations and draws for all."""
+    policy, data, method = trained.load(), trained.task().data.to("cpu"), trained.method
+    nfes, observation_steps = method.nfes(asked), trained.network.observation_steps
+    shared = SharedObservations(data, method.chunk_length, observation_steps=observation_steps)
     drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
     shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
     windows = shared.windows(policy.prior, see_history=sees_history(policy))
@@ -70,7 +62,19 @@ def measured(
     allowed = allowed_nfes(policy, nfes)
     means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
     gains = memory_gain(policy, windows if sees_history(policy) else seen, nfes=nfes)
-    flow = flow_measures(policy, met, coupled=coupled, generator=generator)
+    # How straight the flow is between source and targets, over the executed H.
+    kappa, relative = math.nan, math.nan
+    if policy.ode.max_nfe is None:
+        with warnings.catch_warnings():  # the NaN says that something does not move
+            warnings.simplefilter("ignore")
+            values = curvature(policy, met, 100, generator=generator)
+        kappa, relative = (float(values[key].nanmean()) for key in ("kappa_executed", "relative_executed"))
+    flow = {
+        "kappa": kappa,
+        "relative_curvature": relative,
+        "bound": float(bounds(policy.prior, met, method.parts.coupling is not None)[1]),
+        "coverage": source_coverage(policy, met),
+    }
     return {
         nfe: {
             "mean_error": means[nfe].target,
@@ -81,24 +85,6 @@ def measured(
             **flow,
         }
         for nfe in allowed
-    }
-
-
-def flow_measures(
-    policy: WarmPriorActor, batch: TensorDictBase, *, coupled: bool, generator: torch.Generator
-) -> dict[str, float]:
-    """How far the source is from its targets, and how straight the flow between them, over the executed H."""
-    kappa, relative = math.nan, math.nan
-    if policy.ode.max_nfe is None:
-        with warnings.catch_warnings():  # the NaN says that something does not move
-            warnings.simplefilter("ignore")
-            values = curvature(policy, batch, 100, generator=generator)
-        kappa, relative = (float(values[key].nanmean()) for key in ("kappa_executed", "relative_executed"))
-    return {
-        "kappa": kappa,
-        "relative_curvature": relative,
-        "bound": float(bounds(policy.prior, batch, coupled)[1]),
-        "coverage": source_coverage(policy, batch),
     }
 
 

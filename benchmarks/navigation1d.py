@@ -38,7 +38,6 @@ class NavigationOptions(Options):
 
     @property
     def name(self) -> str:
-        """Of the output folder."""
         return f"h{'-'.join(map(str, self.sources.chunk))}"
 
     def check(self) -> None:
@@ -108,7 +107,7 @@ def draw(
             paths[row.method] = flow_paths(actor, batch, 100, generator=generator)[..., 0, 0]
     network, iterations = options.network.hidden_dim, options.training.iterations
     what = f"H = {chunk}, {network}-d network, {iterations} iterations, seed {seed}"
-    out = options.run.folder
+    out = options.run.out
     title = f"One-dimensional navigation: {what}"
     plot_navigation(panels, out / "navigation1d.png", chunk_length=chunk, title=title)
     title = f"Paths of the flow above the first obstacle, after a demonstrated history: {what}"

@@ -117,14 +117,9 @@ class Run:
             raise ValueError(f"--device {self.device}: with --engine ray, Ray chooses the GPU: use cuda")
 
     @property
-    def folder(self) -> Path:
-        assert self.out is not None
-        return self.out
-
-    @property
     def policies(self) -> Path:
         """Where policies lie: beside the run, so that others share them."""
-        return self.folder.absolute().parent / "policies"
+        return self.out.absolute().parent / "policies"
 
 
 @dataclass(frozen=True)
@@ -200,14 +195,11 @@ class MeasuredOptions(Options):
 
     validation: Path | None = None  # demonstrations, as --dataset names them (default: newly generated ones)
     observations: int = 500  # how many to measure on; the paper's curvature has 2000
-    steps: int = 100  # Euler steps of a curvature
 
     def check(self) -> None:
         super().check()
         check_single(self, "task", "data", "chunk")
-        check_counts(self, "observations", "steps")
-        if self.steps < 2:
-            raise ValueError(f"--steps must be at least 2, got {self.steps}")
+        check_counts(self, "observations")
         if self.validation is not None:
             check_place(self.validation, "--validation")
 
@@ -456,7 +448,7 @@ def script(name: str, together: bool = False) -> Callable[[Callable[..., object]
 @contextmanager
 def started(options: Options, study: str) -> Iterator[Path]:
     """The output folder, with the options in it, and without another process."""
-    out = options.run.folder
+    out = options.run.out
     if rank():  # the first process is in it, for all
         yield out
         return

@@ -130,7 +130,6 @@ class AgentsOptions(Options):
 
     @property
     def name(self) -> str:
-        """Of the output folder."""
         return TOY if self.is_toy else super().name
 
     def check(self) -> None:

@@ -42,7 +42,6 @@ class DelayOptions(Options):
 
     @property
     def name(self) -> str:
-        """Of the output folder."""
         if self.toy == "alone":
             return "navigation"
         return super().name + ("-navigation" if self.toy == "beside" else "")

@@ -19,8 +19,9 @@ from itertools import product
 from typing import Any
 
 import pandas as pd
-from common import Cell, Policy, facts_of, measure, play, policies_of, row, train, write_rows
+from common import Cell, Policy, facts_of, play, policies_of, row, train, write_rows
 from jobs import Jobs
+from measures import measure
 from methods import Method
 from options import PRESETS, Evaluation, Options, parse, script, started
 from pictures import draw
@@ -82,7 +83,7 @@ def compare(
         rows.sort(key=order)
         write_rows(path, rows)
 
-    path = options.run.folder / "results.jsonl"
+    path = options.run.out / "results.jsonl"
     rows = read_lines(path) if path.exists() else []
     if others := {row["policy"] for row in rows} - places.keys():
         raise ValueError(
@@ -130,7 +131,7 @@ def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
     tasks = {policy.place: policy.task() for policy in policies}.values()
     text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
     if not rank():
-        write_atomic(options.run.folder / "tasks.json", lambda path: path.write_text(text))
+        write_atomic(options.run.out / "tasks.json", lambda path: path.write_text(text))
 
     failures = {}
     for policy in policies if world_size() > 1 else ():

@@ -58,7 +58,7 @@ def main(argv: list[str] | None) -> None:
         observations, source = held_out(options, policies[0])
         rows, failures = compare(options, policies)
         actors = trained_actors(policies, options.run.device)
-        flow = straightness(actors, observations, n_steps=options.steps)
+        flow = straightness(actors, observations)
         curvatures = write_rows(out / "curvature.jsonl", flow)
         title = f"{policies[0].task().title}, NFE {options.evaluation.nfe[0]}"
         draw(rows, curvatures, out / "sigma.png", options.evaluation.top_k, title)

@@ -153,7 +153,7 @@ def torchrl(parameters: float, device: str) -> Peer:
     )
 
 
-def features(objects: bool) -> dict[str, Any]:
+def features(objects: bool, device: str) -> dict[str, Any]:
     """What LeRobot's configurations know of the windows."""
     from lerobot.configs.types import FeatureType, PolicyFeature
 
@@ -163,7 +163,8 @@ def features(objects: bool) -> dict[str, Any]:
         shape = (OBJECTS,)
         inputs["observation.environment_state"] = PolicyFeature(type=FeatureType.ENV, shape=shape)
     outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(D_A,))}
-    return {"input_features": inputs, "output_features": outputs, "n_obs_steps": TO, "horizon": H}
+    length = {"n_obs_steps": TO, "horizon": H, "n_action_steps": H - TO + 1}
+    return {"input_features": inputs, "output_features": outputs, "device": device, **length}
 
 
 def lerobot(
@@ -194,9 +195,8 @@ def lerobot_diffusion(parameters: float, device: str) -> Peer:
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
     def make(width: int) -> nn.Module:
-        options = features(objects=True) | {"device": device, "n_action_steps": H - TO + 1}
         dims = (width, 2 * width, 4 * width)
-        return DiffusionPolicy(DiffusionConfig(**options, down_dims=dims))
+        return DiffusionPolicy(DiffusionConfig(**features(True, device), down_dims=dims))
 
     policy = make(nearest(make, range(16, 513, 16), parameters)).to(device)
 
@@ -204,8 +204,8 @@ def lerobot_diffusion(parameters: float, device: str) -> Peer:
         parts = observation.split((VECTOR, OBJECTS), dim=-1)
         return dict(zip(("observation.state", "observation.environment_state"), parts, strict=True))
 
-    steps = partial(setattr, policy.diffusion, "num_inference_steps")
-    return lerobot("lerobot: diffusion (U-Net)", policy, seen, steps, device)
+    set_steps = partial(setattr, policy.diffusion, "num_inference_steps")
+    return lerobot("lerobot: diffusion (U-Net)", policy, seen, set_steps, device)
 
 
 def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
@@ -225,9 +225,8 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
     )
 
     def make(width: int) -> nn.Module:
-        options = features(objects=False) | {"device": device, "n_action_steps": H - TO + 1}
         flow = {"objective": "flow_matching", "hidden_dim": width}
-        return modeling.MultiTaskDiTPolicy(MultiTaskDiTConfig(**options, **flow))
+        return modeling.MultiTaskDiTPolicy(MultiTaskDiTConfig(**features(False, device), **flow))
 
     encoder = classmethod(lambda kind, *args, **kwargs: kind(small))
     with mock.patch.object(modeling.CLIPTextModel, "from_pretrained", encoder):
@@ -239,8 +238,8 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
         named = {f"observation.language.{name}": value for name, value in language.items()}
         return {"observation.state": observation, **named}
 
-    steps = partial(setattr, policy.config, "num_integration_steps")
-    return lerobot("lerobot: multi_task_dit", policy, seen, steps, device)
+    set_steps = partial(setattr, policy.config, "num_integration_steps")
+    return lerobot("lerobot: multi_task_dit", policy, seen, set_steps, device)
 
 
 # How to build each, and the packages that it needs.
@@ -257,19 +256,7 @@ PEERS: dict[str, tuple[Callable[[float, str], Peer], tuple[str, ...]]] = {
 }
 
 
-def synchronised(function: Callable[[], object], device: str) -> Callable[[], object]:
-    """A function that is over when the device is."""
-    if torch.device(device).type != "cuda":
-        return function
-
-    def call() -> None:
-        function()
-        torch.cuda.synchronize(device)
-
-    return call
-
-
-def training_step(peer: Peer, sample: Callable[[], Batch], device: str) -> Callable[[], object]:
+def training_step(peer: Peer, sample: Callable[[], Batch]) -> Callable[[], object]:
     """A step: windows, loss, backward, optimiser."""
     trained = [p for p in peer.module.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(trained, fused=True)
@@ -281,7 +268,7 @@ def training_step(peer: Peer, sample: Callable[[], Batch], device: str) -> Calla
         loss.backward()
         optimizer.step()
 
-    return synchronised(step, device)
+    return step
 
 
 def flop_of(peer: Peer, batch: Batch) -> int:
@@ -296,7 +283,7 @@ def measure(peers: Sequence[Peer], options: argparse.Namespace, clock: Clock) ->
     device, batch = options.device, options.batch_size
     data = steps(400, 200).to(device)
     sample = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO).sample
-    training = clock.times(*(training_step(peer, sample, device) for peer in peers))
+    training = clock.times(*(training_step(peer, sample) for peer in peers))
     rows = [
         {
             "policy": peer.name,
@@ -310,12 +297,12 @@ def measure(peers: Sequence[Peer], options: argparse.Namespace, clock: Clock) ->
         peer.module.eval()
     with torch.no_grad():
         for nfe in NFES:
-            decisions = [synchronised(partial(peer.decide, nfe), device) for peer in peers]
+            decisions = [partial(peer.decide, nfe) for peer in peers]
             for row, seconds in zip(rows, clock.times(*decisions, calls=5), strict=True):
                 row[f"latency_nfe_{nfe}"] = 1000 * statistics.median(seconds)
         for row, peer in zip(rows, peers, strict=True):
             row["own_steps"] = peer.own_steps
-            (seconds,) = clock.times(synchronised(partial(peer.decide, peer.own_steps), device))
+            (seconds,) = clock.times(partial(peer.decide, peer.own_steps))
             row["latency_own"] = 1000 * statistics.median(seconds)
     return rows
 

@@ -55,6 +55,8 @@ class Clock:
                 start = time.perf_counter()
                 for _ in range(calls):
                     things[i]()
+                    if torch.cuda.is_initialized():
+                        torch.cuda.synchronize()
                 if repeat:  # the first round warms up
                     found[i].append((time.perf_counter() - start) / calls)
             self.bar.set_postfix(repeat=f"{repeat}/{self.repeats}")
@@ -66,25 +68,20 @@ class Clock:
         return statistics.median(a / b for a, b in zip(one, two, strict=True))
 
 
-def bare_windows(data: TensorDict, batch: int, select: bool) -> Callable[[], list[torch.Tensor]]:
-    """Windows as one would write them in bare torch: by indexing, or by the faster ``index_select``."""
+def bare_windows(data: TensorDict, batch: int) -> Callable[[], list[torch.Tensor]]:
+    """Windows as one would write them in bare torch."""
     observation, action, episode = (data[key] for key in ("observation", "action", "episode"))
     length = int((episode == 0).sum())
     before, ahead = torch.arange(1 - TO, 1), torch.arange(-H, H)
-
-    def rows(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-        if not select:
-            return values[index]
-        return values.index_select(0, index.flatten()).view(*index.shape, *values.shape[1:])
 
     def sample() -> list[torch.Tensor]:
         frame = torch.randint(len(data), (batch, 1))
         start = frame - frame % length
         index = frame + ahead
         warm = index[:, :1] >= start
-        actions = rows(action, index.clamp(start, start + length - 1))
+        actions = action[index.clamp(start, start + length - 1)]
         history, target = actions[:, :H], actions[:, H:]
-        observations = rows(observation, (frame + before).clamp_min(start))
+        observations = observation[(frame + before).clamp_min(start)]
         is_pad = index[:, H:] >= start + length
         return [observations, target, is_pad, history * warm.unsqueeze(-1), warm]
 
@@ -92,20 +89,11 @@ def bare_windows(data: TensorDict, batch: int, select: bool) -> Callable[[], lis
 
 
 def windows_over_torch(clock: Clock) -> dict[str, float]:
-    """Windows per second of the replay buffer over those of bare torch, by batch and way of gathering."""
+    """Windows per second of the replay buffer over those of bare torch, by batch."""
     data, found = steps(400, 200), {}
     for batch in (BATCH, 1024):
         buffer = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO)
-        for name, select in (("index", False), ("index_select", True)):
-            bare = bare_windows(data, batch, select)
-            found[f"{batch}, {name}"] = clock.ratio(bare, buffer.sample, calls=100)
-    with tempfile.TemporaryDirectory() as folder:
-        mapped = data.memmap(folder, copy_existing=True)
-        buffers = [
-            window_replay_buffer(source, PRIOR, batch_size=BATCH, observation_steps=TO)
-            for source in (data, mapped)
-        ]
-        found["memory-mapped over memory"] = clock.ratio(*(b.sample for b in buffers), calls=100)
+        found[str(batch)] = clock.ratio(bare_windows(data, batch), buffer.sample, calls=100)
     return found
 
 

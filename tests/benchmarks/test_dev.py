@@ -28,7 +28,7 @@ def test_peers_learn_from_the_same_windows(name):
     weights = [p for p in peer.module.parameters() if p.requires_grad]
     before = [p.detach().clone() for p in weights]
     batch = window_replay_buffer(peers.steps(4, 50), GaussianPrior(peers.H), batch_size=8).sample()
-    peers.training_step(peer, lambda: batch, "cpu")()
+    peers.training_step(peer, lambda: batch)()
     moved = [not torch.equal(a, b) for a, b in zip(weights, before, strict=True)]
     assert sum(moved) > 0.8 * len(moved)
     # Every evaluation passes through each layer of the network once.

@@ -35,7 +35,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*curvature is NaN", "ignore:.*d
 
 def flow(run, validation, **more):
     """Measure the flow of a run's policies; the report's text."""
-    few = {"run": run, "validation": validation, "out": f"{run}-flow", "observations": 6, "steps": 3}
+    few = {"run": run, "validation": validation, "out": f"{run}-flow", "observations": 6}
     assert curvature.main(command_line(**few | more)) == 0
     return Path(f"{run}-flow", "report.md").read_text()
 
