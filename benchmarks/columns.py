@@ -6,8 +6,6 @@ Rows are those of `results.jsonl` and `curvature.jsonl`; a table has means over 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 # Name -> (format of its numbers, meaning).
 COLUMNS: dict[str, tuple[str, str]] = {
     # What is compared.
@@ -132,8 +130,3 @@ def column(name: str) -> tuple[str, str]:
         if whole != name and whole in COLUMNS:
             return ".2f" if end == "_ratio" else COLUMNS[whole][0], f"{whole}: {words}"
     raise KeyError(f"no column is called {name!r}: add it to COLUMNS, with its format and meaning")
-
-
-def definitions(names: Iterable[str]) -> str:
-    """A list of columns and their meanings, in Markdown."""
-    return "".join(f"- `{name}`: {column(name)[1]}\n" for name in names)

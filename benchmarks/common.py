@@ -68,21 +68,15 @@ class Policy:
 
     @property
     def folder(self) -> Path:
-        """Where its training lies, or will lie."""
         return self.run.policies / self.name
 
     def __str__(self) -> str:
         return f"{self.facts['task']} {self.facts['data']}, {self.method}, seed {self.training.seed}"
 
     @property
-    def path(self) -> Path:
-        """Where its last policy of averaged weights lies, or will lie."""
-        return policy_path(self.folder, self.training.iterations)
-
-    @property
     def is_trained(self) -> bool:
-        """Whether that policy is there; its file is whole, or not there."""
-        return (self.path / "model.safetensors").is_file()
+        """Whether its last policy of averaged weights is there; the file is whole, or not there."""
+        return (policy_path(self.folder, self.training.iterations) / "model.safetensors").is_file()
 
     @property
     def status(self) -> Path:
@@ -94,7 +88,6 @@ class Policy:
         return cached_task(self.data, *self.place, self.network.observation_steps)
 
     def teacher(self) -> Policy | None:
-        """The policy that it learns from, if any."""
         method = self.method.teacher
         return None if method is None else policy_of(self.task(), self, method)
 
@@ -334,7 +327,6 @@ class Cell:
     guidance: RealTimeChunking | None = None
 
     def facts(self) -> dict[str, Any]:
-        """What the row says of it."""
         found: dict[str, Any] = {"checkpoint": self.checkpoint, "nfe": self.nfe}
         if self.delay is not None:
             guidance = "none" if self.guidance is None else "rtc"

@@ -21,8 +21,6 @@ from robomimic import train_all
 from warmprior.diagnostics import encoded_windows, flow_paths
 from warmprior.diagnostics.flow import sees_history
 
-SHOWN = 40
-
 
 @dataclass(frozen=True)
 class CurvatureOptions(MeasuredOptions):
@@ -53,7 +51,7 @@ def main(argv: list[str] | None) -> None:
         measured = straightness(actors, observations)
         rows = write_rows(out / "curvature.jsonl", measured)
 
-        few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
+        few = observations.subset(torch.linspace(0, len(observations) - 1, 40).long())
         labels = dict(zip(rows.policy, labelled(rows).method, strict=True))
         paths = {}
         for method, by_seed in actors.items():

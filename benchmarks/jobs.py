@@ -140,11 +140,9 @@ class Ray:
         self._running: dict[Future[Any], Any] = {}
 
     def takes(self, job: Job) -> bool:
-        """Whether fewer jobs run than may."""
         return sum(not future.done() for future in self._running) < self.workers
 
     def submit(self, job: Job) -> Future[Any]:
-        """Give it to the cluster."""
         gpus = float(job.training and self._device.startswith("cuda"))
         # Lost ones are started again by `Jobs`, here as on one machine.
         options = {"num_cpus": 1, "num_gpus": gpus, "max_retries": 0}

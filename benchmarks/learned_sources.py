@@ -44,10 +44,7 @@ class Learner(nn.Module):
         check_whole_numbers(hidden_dim=hidden_dim)
         self.hidden_dim = hidden_dim
         if widths is not None:
-            names = ("action_dim", "observation_dim", "observation_steps")
-            given = dict(zip(names, widths, strict=True))
-            check_whole_numbers(**given)
-            self.__dict__.update(given)
+            self.action_dim, self.observation_dim, self.observation_steps = widths
             self.chunk_dim = self.chunk_length * self.action_dim
             observed = self.sees_observation * self.observation_steps * self.observation_dim
             self.seen_dim = self.sees_history * (self.chunk_dim + 1) + observed
@@ -55,7 +52,6 @@ class Learner(nn.Module):
             self.requires_grad_(False)
 
     def build(self) -> None:
-        """Make the networks; one by default."""
         self.network = self.mlp(self.seen_dim, self.heads * self.chunk_dim)
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
@@ -180,18 +176,13 @@ class A2APrior(LearnedPrior):
 
 
 @dataclass(frozen=True)
-class _Decoded(Source):
-    """A source that is Gaussian given a latent draw, and none without."""
+class Drawn(Source):
+    """A source that is drawn in a way of its own."""
 
-    prior: Any = None
-    seen: Any = None
+    draw: Any = None
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        like: dict[str, Any] = {"dtype": self.loc.dtype, "device": self.loc.device}
-        shape = (*self.seen.shape[:-1], self.prior.latent_dim)
-        z = torch.randn(shape, generator=generator, **like)
-        decoded = replace(self, loc=self.prior.decode(self.seen, z), scale=self.prior.sigma)
-        return Source.sample(decoded, generator)
+        return self.draw(generator)
 
 
 class CVAEPrior(LearnedPrior):
@@ -237,9 +228,15 @@ class CVAEPrior(LearnedPrior):
     mean = GaussianPrior.mean  # none: cold everywhere
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
-        """One that decodes a latent of its own for every draw."""
-        loc, scale, warm = super().distribution(history, observation)
-        return _Decoded(loc, scale, warm, prior=self, seen=self.seen(history, observation))
+        """One that decodes a latent of its own for every draw: Gaussian given that, and none without."""
+        source, seen = super().distribution(history, observation), self.seen(history, observation)
+
+        def draw(generator: torch.Generator | None) -> Tensor:
+            like: dict[str, Any] = {"dtype": source.loc.dtype, "device": source.loc.device}
+            z = torch.randn((*seen.shape[:-1], self.latent_dim), generator=generator, **like)
+            return replace(source, loc=self.decode(seen, z), scale=self.sigma).sample(generator)
+
+        return Drawn(*source, draw=draw)
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         seen = self.seen(windows[keys.HISTORY], windows[keys.OBSERVATION])

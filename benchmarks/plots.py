@@ -58,11 +58,11 @@ def dress(axis: Any, title: str = "", x: str = "", y: str = "", rate: bool = Fal
         axis.set_ylim(-0.02, 1.08)
 
 
-def colors_of(rows: DataFrame, name: str = "method") -> dict[Hashable, Any]:
+def colors_of(rows: DataFrame) -> dict[Hashable, Any]:
     """The colour of each method: its prior's, in shades where several methods share a prior."""
     colors: dict[Hashable, Any] = {}
     for prior, group in rows.groupby("prior", sort=False):
-        own, methods = to_rgb(color(prior)), group[name].unique()
+        own, methods = to_rgb(color(prior)), group["method"].unique()
         end = float(sum(own) < 2)
         for place, method in enumerate(methods):
             share = PALEST * place / max(1, len(methods) - 1)

@@ -11,7 +11,7 @@ A frozen policy per source and seed comes from --run (a finished run) or is trai
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, make_dataclass, replace
 from functools import partial
 from itertools import product
@@ -125,7 +125,6 @@ class AgentsOptions(Options):
 
     @property
     def is_toy(self) -> bool:
-        """Whether it is of the navigation toy."""
         return self.data.task == (TOY,)
 
     @property
@@ -159,7 +158,6 @@ class AgentsOptions(Options):
         return [Arm(method, *part) for part in parts]
 
     def agent(self, arm: Arm, seed: int) -> PriorSpaceConfig:
-        """The recipe of one agent."""
         shared: Mapping[str, Any] = asdict(self.rl)
         own: dict[str, Any] = {
             "algorithm": arm.algorithm,
@@ -263,11 +261,9 @@ def adapt(preset: AgentsOptions, asked: AgentsOptions) -> AgentsOptions:
 def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
     """The task, and the frozen policies by method and seed: of --run, or trained now."""
     run = options.policies
+    policies = policies_of(options) if run is None else finished_policies(run, options)
     if run is None:
-        policies = policies_of(options)
         train_all(options, policies)
-    else:
-        policies = finished_policies(run, options)
     actors = trained_actors(policies, options.run.device)
     for method, group in actors.items():
         if missing := sorted(set(options.seeds) - group.keys()):
@@ -277,27 +273,17 @@ def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method
     return facts_of(policies[0].task()), actors
 
 
-def environment(options: AgentsOptions, actor: WarmPriorActor) -> Callable[[int], EnvBase]:
-    """The environment of agents around a frozen policy, as a function of its seed."""
-    if options.is_toy:
-        return partial(toy, actor, options.num_envs)
-    make_env, make_transforms = environment_parts(actor)
-    make_env = partial(make_env, horizon=options.horizon, **options.evaluation.environment)
-    return partial(simulators, actor, make_env, make_transforms, options.num_envs)
-
-
-def toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
-    """The toy, in which nothing but the anchor is random."""
-    transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
-    transforms.append(PriorAnchor(actor))
-    return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
-
-
-def simulators(
-    actor: WarmPriorActor, make_env: Any, make_transforms: Any, num_envs: int, seed: int
+def environment(
+    actor: WarmPriorActor, is_toy: bool, num_envs: int, options: Mapping[str, Any], seed: int
 ) -> EnvBase:
-    """Simulators in workers. Outside of them one anchor draws for all, and one encoder serves all."""
-    workers = parallel_env(make_env, make_transforms, num_envs)
+    """The environment of agents around a frozen policy; the simulator's is in workers."""
+    if is_toy:  # nothing but the anchor is random
+        transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
+        transforms.append(PriorAnchor(actor))
+        return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
+    make_env, make_transforms = environment_parts(actor)
+    workers = parallel_env(partial(make_env, **options), make_transforms, num_envs)
+    # Outside of the workers one anchor draws for all, and one encoder serves all.
     env = TransformedEnv(workers, Compose(*encoding(actor), PriorAnchor(actor)))
     env.set_seed(seed, static_seed=True)
     return env
@@ -313,10 +299,11 @@ def learn(
 ) -> PriorSpaceTraining:
     """Train an agent, or continue it where it was interrupted."""
     actor, name = arm.policy(actor), f"{arm}, seed {seed}"
+    parts = {"horizon": options.horizon, **options.evaluation.environment}
     encoders = encoding(actor)  # one that sees images reads their features, as the agent does
     training = PriorSpaceTraining(
         actor.replace(observation_key=encoders[0].out_keys[0]) if encoders else actor,
-        environment(options, actor),
+        partial(environment, actor, options.is_toy, options.num_envs, parts),
         options.agent(arm, seed),
         out / slug(name.replace(" ", "-")),
         evaluation_seed=EVALUATION_SEED,

@@ -102,9 +102,7 @@ def main(argv: list[str] | None) -> None:
         lines = {"success": "success rate", "boundary_jump": "jump where chunks take effect"}
         for nfe, mine in seeds.groupby("nfe"):
             end = f"_nfe{nfe}.png" if seeds.nfe.nunique() > 1 else ".png"
-            title = (
-                f"NFE {nfe}, {mine.execute.iloc[0]} actions per decision, {options.evaluation.seeds} seed(s)"
-            )
+            title = f"NFE {nfe}, {mine.execute.iloc[0]} actions per decision, {len(options.seeds)} seed(s)"
             mine = mine.assign(delay="delay " + mine.delay.astype(str))
             plot_bars(mine, out / f"real_time_chunking{end}", title, "delay", lines)
         given = {f.name.replace("_", " "): getattr(options.rtc, f.name) for f in fields(options.rtc)}

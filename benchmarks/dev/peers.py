@@ -86,25 +86,19 @@ def nearest(make: Callable[[int], nn.Module], widths: Sequence[int], parameters:
     return min(widths, key=excess)
 
 
-def transformer(width: int, **options: float) -> VelocityNetwork:
-    return ChiTransformer(D_A, D_O, H, TO, embedding_dim=width, **options)
+def ours(kind: type[VelocityNetwork], width: str, widths: range, parameters: float, device: str) -> Peer:
+    """FlowMatchingLoss on one of this library's networks, whose option for the width has a name."""
 
+    def make(number: int) -> VelocityNetwork:
+        return kind(D_A, D_O, H, TO, **{width: number})
 
-def mlp(width: int) -> VelocityNetwork:
-    return VelocityMLP(D_A, D_O, H, TO, hidden_dim=width)
-
-
-def ours(
-    name: str, make: Callable[[int], VelocityNetwork], widths: Sequence[int], parameters: float, device: str
-) -> Peer:
-    """FlowMatchingLoss on one of this library's networks."""
     network = make(nearest(make, widths, parameters)).to(device)
     actor = WarmPriorActor(network, PRIOR)
     loss = FlowMatchingLoss(actor)
     history = window_history(torch.zeros(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
     data = TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
     return Peer(
-        f"warmprior: FlowMatchingLoss, {name}",
+        f"warmprior: FlowMatchingLoss, {kind.__name__}",
         network,
         lambda batch: loss(batch)["loss_flow_matching"],
         lambda nfe: actor(data, nfe=nfe),
@@ -244,12 +238,8 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
 
 # How to build each, and the packages that it needs.
 PEERS: dict[str, tuple[Callable[[float, str], Peer], tuple[str, ...]]] = {
-    "warmprior_transformer": (partial(ours, "ChiTransformer", transformer, range(48, 1024, 24)), ()),
-    "warmprior_transformer_no_dropout": (
-        partial(ours, "ChiTransformer, dropout 0", partial(transformer, dropout=0.0), range(48, 1024, 24)),
-        (),
-    ),
-    "warmprior_mlp": (partial(ours, "VelocityMLP", mlp, range(64, 4096, 32)), ()),
+    "warmprior_transformer": (partial(ours, ChiTransformer, "embedding_dim", range(48, 1024, 24)), ()),
+    "warmprior_mlp": (partial(ours, VelocityMLP, "hidden_dim", range(64, 4096, 32)), ()),
     "torchrl": (torchrl, ()),
     "lerobot_diffusion": (lerobot_diffusion, ("lerobot", "diffusers")),
     "lerobot_multi_task_dit": (lerobot_multi_task_dit, ("lerobot", "diffusers", "transformers")),
@@ -326,8 +316,7 @@ def draw(path: Path, rows: Sequence[Row]) -> None:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     speed, latency = figure.subplots(1, 2)
     names = [row["policy"].replace(": ", ":\n") for row in rows]
-    palette = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3", "#e7298a"]
-    colors = palette[: len(rows)]
+    colors = ["#1f77b4", "#d95f02", "#2ca02c", "#7570b3", "#e7298a"][: len(rows)]
     speed.barh(names, [row["samples_per_second"] for row in rows], color=colors)
     speed.set(xlabel="training, samples/s")
     speed.invert_yaxis()

@@ -83,20 +83,6 @@ def measured(
     return found
 
 
-def report(results: dict[str, Any]) -> str:
-    base, episodes = results["measured"][1], results["episodes"]
-    rows = {
-        f"{n} processes": {
-            "episodes/min": f"{60 * episodes / row['apart']:.1f}",
-            "times as fast": f"{base['apart'] / row['apart']:.2f}",
-            "lockstep": f"{base['apart'] / row['lockstep']:.2f}",
-            "training": f"{base['training'] / row['training']:.2f}",
-        }
-        for n, row in results["measured"].items()
-    }
-    return f"{episodes} episodes:\n\n{pd.DataFrame(rows).T.to_string()}\n"
-
-
 def run(argv: Sequence[str] | None) -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -133,8 +119,17 @@ def run(argv: Sequence[str] | None) -> None:
         "meta": facts_of_machine(torch_threads=1),
     }
     (options.out / "scaling.json").write_text(json.dumps(results, indent=2) + "\n")
-    (options.out / "table.txt").write_text(report(results))
-    print(report(results), f"written to {options.out}", sep="\n")
+    rows = {
+        f"{n} processes": {
+            "episodes/min": f"{60 * options.episodes / row['apart']:.1f}",
+            "times as fast": f"{found[1]['apart'] / row['apart']:.2f}",
+            "lockstep": f"{found[1]['apart'] / row['lockstep']:.2f}",
+            "training": f"{found[1]['training'] / row['training']:.2f}",
+        }
+        for n, row in found.items()
+    }
+    print(f"{options.episodes} episodes:", pd.DataFrame(rows).T.to_string(), sep="\n\n")
+    print(f"\nwritten to {options.out}")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
