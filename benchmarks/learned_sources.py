@@ -179,10 +179,10 @@ class A2APrior(LearnedPrior):
 class Drawn(Source):
     """A source that is drawn in a way of its own."""
 
-    draw: Any = None
+    by: Any = None  # a function of a generator
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        return self.draw(generator)
+        return self.by(generator)
 
 
 class CVAEPrior(LearnedPrior):
@@ -231,12 +231,12 @@ class CVAEPrior(LearnedPrior):
         """One that decodes a latent of its own for every draw: Gaussian given that, and none without."""
         source, seen = super().distribution(history, observation), self.seen(history, observation)
 
-        def draw(generator: torch.Generator | None) -> Tensor:
+        def decoded(generator: torch.Generator | None) -> Tensor:
             like: dict[str, Any] = {"dtype": source.loc.dtype, "device": source.loc.device}
             z = torch.randn((*seen.shape[:-1], self.latent_dim), generator=generator, **like)
             return replace(source, loc=self.decode(seen, z), scale=self.sigma).sample(generator)
 
-        return Drawn(*source, draw=draw)
+        return Drawn(*source, by=decoded)
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         seen = self.seen(windows[keys.HISTORY], windows[keys.OBSERVATION])

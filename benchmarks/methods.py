@@ -56,7 +56,7 @@ class PointPrior(GaussianPrior):
 
     def distribution(self, history: Any, observation: Any = None) -> Source:
         loc, scale, warm = super().distribution(history, observation)
-        return Drawn(loc, torch.zeros_like(scale), warm, draw=lambda generator: loc)
+        return Drawn(loc, torch.zeros_like(scale), warm, by=lambda generator: loc)
 
 
 def reflow(teacher: WarmPriorActor, teacher_nfe: int = 9) -> ReflowCoupling:
