@@ -11,16 +11,16 @@ with the same options are used, not trained again.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from common import Policy, observations_of, policies_of, write_rows
-from options import PRESETS, MeasuredOptions, check_single, parse, script, started, study
+from common import policies_of, write_rows
+from measures import held_out
+from options import PRESETS, MeasuredOptions, check_given, check_single, parse, script, started, study
 from plots import plot_lines
 from report import labelled, per_seed, table, write_report
 from robomimic import compare
 
-from warmprior.diagnostics import SharedObservations, action_error, encoded_windows
+from warmprior.diagnostics import action_error, encoded_windows
 from warmprior.io.files import read_lines
 from warmprior.training import TrainingConfig
 from warmprior.training.options import check_counts
@@ -36,27 +36,12 @@ class BudgetOptions(MeasuredOptions):
         super().check()
         check_single(self, "sigma")
         check_counts(self, "budgets")
-        if not self.budgets:
-            raise ValueError("--budgets needs at least one number of iterations")
+        check_given(self, "budgets")
 
     def trainings(self) -> list[TrainingConfig]:
         """One per budget, the shortest first, each with its last policy alone."""
         budgets = sorted(set(self.budgets))
         return [replace(self.training, iterations=n, checkpoints=1) for n in budgets]
-
-
-def errors(
-    policies: Sequence[Policy], observations: SharedObservations, nfes: Sequence[int]
-) -> dict[tuple[str, int], float]:
-    """Errors on demonstrations that no policy was trained on, by policy and NFE."""
-    found: dict[tuple[str, int], float] = {}
-    for policy in (policy for policy in policies if policy.is_trained):
-        actor = policy.load()
-        windows = observations.windows(actor.prior, see_history=policy.method.parts.sees_history)
-        allowed = policy.method.nfes(nfes)
-        error = action_error(actor, encoded_windows(actor, windows), nfes=allowed)
-        found |= {(policy.name, nfe): value for nfe, value in error.items()}
-    return found
 
 
 @script("budget.py")
@@ -67,9 +52,14 @@ def main(argv: list[str] | None) -> None:
     with started(options, "budget") as out:
         policies = policies_of(options)
         # Before the hours of training: what cannot be measured on is better known now.
-        observations, source = observations_of(options, policies[0])
+        observations, source = held_out(options, policies[0])
         _, failures = compare(options, policies)
-        error = errors(policies, observations, options.evaluation.nfe)
+        error: dict[tuple[str, int], float] = {}
+        for policy in (policy for policy in policies if policy.is_trained):
+            actor, nfes = policy.load(), policy.method.nfes(options.evaluation.nfe)
+            windows = observations.windows(actor.prior, see_history=policy.method.parts.sees_history)
+            found = action_error(actor, encoded_windows(actor, windows), nfes=nfes)
+            error |= {(policy.name, nfe): value for nfe, value in found.items()}
         played = read_lines(out / "results.jsonl")
         measured = [{**row, "action_error": error[row["policy"], row["nfe"]]} for row in played]
         rows = write_rows(out / "results.jsonl", measured)

@@ -6,8 +6,6 @@ Rows are those of `results.jsonl` and `curvature.jsonl`; a table has means over 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 # Name -> (format of its numbers, meaning).
 COLUMNS: dict[str, tuple[str, str]] = {
     # What is compared.
@@ -57,7 +55,6 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "paired": (".2f", "probability of winning an episode that only one of the two solves"),
     "paper": (".1%", "the paper's success rate, on the official demonstrations"),
     "paper_ratio": (".3f", "the paper's ratio of curvatures, on the official demonstrations"),
-    "paper_gain": ("+.1%", "the paper's gain over the Gaussian source"),
     "mean_steps": (".1f", "control steps per episode"),
     "action_error": (".4f", "mean squared error of executed actions on demonstrations held out"),
     # Jumps and distances, in normalised action units.
@@ -86,19 +83,11 @@ COLUMNS: dict[str, tuple[str, str]] = {
     ),
     # The flow.
     "kappa": (".3f", "curvature of the flow (of results.jsonl: over the executed positions)"),
-    "kappa_executed": (".3f", "curvature over the executed positions"),
     "relative_curvature": (".3f", "curvature over the executed positions per squared mean velocity"),
     "relative": (".3f", "curvature per squared mean velocity"),
-    "relative_executed": (".3f", "curvature per squared mean velocity over the executed positions"),
     "speed": (".3f", "squared mean velocity"),
-    "speed_executed": (".3f", "squared mean velocity of the executed positions"),
     "one_step_error": (".3f", "root mean square error of one Euler step"),
-    "one_step_error_executed": (
-        ".3f",
-        "root mean square error of one Euler step over the executed positions",
-    ),
     "bound": (".2f", "bound of the branching cost (of results.jsonl: over the executed positions)"),
-    "bound_executed": (".2f", "bound of the branching cost over the executed positions"),
     "coverage": (".2f", "share of demonstrated actions inside the source's 90% interval"),
     "ratio": (".3f", "kappa over the first policy's, with a 95% bootstrap interval over episodes"),
     "ratio_executed": (".3f", "kappa_executed over the first policy's, with a 95% bootstrap interval"),
@@ -117,13 +106,12 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "distance": (".3f", "mean distance to the height of the nearest demonstration"),
     "jump": (".3f", "mean change of height at chunk boundaries"),
     "jerk": (".3f", "mean norm of the third difference of executed actions"),
-    "shifted_switch_rate": (".3f", "switch_rate with the history shifted"),
-    "shifted_distance": (".3f", "distance with the history shifted"),
-    "shifted_collision_rate": (".3f", "collision_rate with the history shifted"),
 }
 
-# What the end of a name means.
+# What the beginning or end of a name means.
 ENDS = {
+    "_executed": "over the executed positions",
+    "shifted_": "with the history shifted",
     "_std": "standard deviation over training seeds",
     "_low": "lower end of the 95% interval",
     "_high": "upper end of the 95% interval",
@@ -138,11 +126,7 @@ def column(name: str) -> tuple[str, str]:
     if name.startswith("episode_"):
         return ".3f", "what the task measures of an episode under this name, in the mean"
     for end, words in ENDS.items():
-        if name.endswith(end) and name.removesuffix(end) in COLUMNS:
-            return ".2f", f"{name.removesuffix(end)}: {words}"
+        whole = name.removesuffix(end).removeprefix(end)
+        if whole != name and whole in COLUMNS:
+            return ".2f" if end == "_ratio" else COLUMNS[whole][0], f"{whole}: {words}"
     raise KeyError(f"no column is called {name!r}: add it to COLUMNS, with its format and meaning")
-
-
-def definitions(names: Iterable[str]) -> str:
-    """A list of columns and their meanings, in Markdown."""
-    return "".join(f"- `{name}`: {column(name)[1]}\n" for name in names)

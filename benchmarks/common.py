@@ -22,26 +22,16 @@ import pandas as pd
 import torch
 from filelock import FileLock
 from learned_sources import Learner, learn
-from measures import held_out, measured
 from methods import Method
-from options import (
-    Evaluation,
-    MeasuredOptions,
-    Options,
-    Run,
-    of_run,
-    stored_options,
-    with_parts,
-)
+from options import Evaluation, Options, Run, of_run, stored_options, with_parts
 from report import read_rows
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.record.loggers import get_logger
 
 from warmprior import WarmPriorActor
-from warmprior.diagnostics import SharedObservations, mean_revision, smoothness
-from warmprior.envs.tasks import EVALUATION_SEED
+from warmprior.diagnostics import mean_revision, smoothness
 from warmprior.io.distributed import from_leader, leader_first, rank
-from warmprior.io.files import digest_of, read_json, read_lines, write_atomic
+from warmprior.io.files import digest_of, read_json, write_atomic
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.training import (
     DataOptions,
@@ -60,7 +50,6 @@ from warmprior.training.task import task_places
 from warmprior.transforms import policy_transforms
 
 LEARNING_SHARE = 0.25  # gradient steps of sources that learn before the flow, per step of the flow
-EPISODES_PER_JOB = 5  # so few that all cores are busy to the end; so many that policies are loaded seldom
 
 
 @dataclass(frozen=True)
@@ -79,21 +68,15 @@ class Policy:
 
     @property
     def folder(self) -> Path:
-        """Where its training lies, or will lie."""
         return self.run.policies / self.name
 
     def __str__(self) -> str:
         return f"{self.facts['task']} {self.facts['data']}, {self.method}, seed {self.training.seed}"
 
     @property
-    def path(self) -> Path:
-        """Where its last policy of averaged weights lies, or will lie."""
-        return policy_path(self.folder, self.training.iterations)
-
-    @property
     def is_trained(self) -> bool:
-        """Whether that policy is there; its file is whole, or not there."""
-        return (self.path / "model.safetensors").is_file()
+        """Whether its last policy of averaged weights is there; the file is whole, or not there."""
+        return (policy_path(self.folder, self.training.iterations) / "model.safetensors").is_file()
 
     @property
     def status(self) -> Path:
@@ -105,7 +88,6 @@ class Policy:
         return cached_task(self.data, *self.place, self.network.observation_steps)
 
     def teacher(self) -> Policy | None:
-        """The policy that it learns from, if any."""
         method = self.method.teacher
         return None if method is None else policy_of(self.task(), self, method)
 
@@ -139,7 +121,7 @@ def policies_of(options: Options, *more: tuple[str, str], only: bool = False) ->
 
     The tasks are those that the options name and `more`, or with `only` the latter alone.
     """
-    run = replace(options.run, out=options.run.folder.absolute())
+    run = replace(options.run, out=options.run.out.absolute())
     with leader_first():  # other processes find what it has generated, rendered or downloaded
         places = [*([] if only else task_places(options.data)), *more]
         steps = options.network.observation_steps
@@ -245,7 +227,7 @@ def train(policy: Policy) -> None:
             if isinstance(part, Learner):
                 with leader_first():
                     learned(part, policy, training)
-        logger, logs = None, str(policy.run.folder / "logs")
+        logger, logs = None, str(policy.run.out / "logs")
         if policy.run.logger != "none" and not rank():
             logger = get_logger(policy.run.logger, logger_name=logs, experiment_name=policy.name)
         # Every step draws a_0 from `prior`; the loss is `warmprior.FlowMatchingLoss.forward`.
@@ -317,24 +299,6 @@ def learned(learner: Learner, policy: Policy, training: TrainingConfig) -> None:
     save_state(path, module_tensors(learner), policy.method.config())
 
 
-def measure(policy: Policy, nfes: Sequence[int]) -> dict[int, dict[str, Any]]:
-    """Measure the last checkpoint of a policy on its training data, by NFE."""
-    return measured(
-        policy.load(),
-        policy.task().data,
-        policy.method.nfes(nfes),
-        chunk_length=policy.method.chunk_length,
-        observation_steps=policy.network.observation_steps,
-        coupled=policy.method.parts.coupling is not None,
-    )
-
-
-def observations_of(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
-    """Observations that no policy was trained on, where there are some, and what they are in words."""
-    steps = policy.network.observation_steps
-    return held_out(options, policy.data, policy.task(), policy.method.chunk_length, steps)
-
-
 def trained_actors(policies: Sequence[Policy], device: str) -> dict[Method, dict[int, WarmPriorActor]]:
     """The last policies by method and seed; a method of which a seed failed would not compare."""
     seeds = {policy.training.seed for policy in policies}
@@ -370,7 +334,6 @@ class Cell:
     guidance: RealTimeChunking | None = None
 
     def facts(self) -> dict[str, Any]:
-        """What the row says of it."""
         found: dict[str, Any] = {"checkpoint": self.checkpoint, "nfe": self.nfe}
         if self.delay is not None:
             guidance = "none" if self.guidance is None else "rtc"
@@ -383,22 +346,17 @@ class Cell:
 
 def play(policy: Policy, cell: Cell, evaluation: Evaluation, seeds: Sequence[int]) -> list[Episode]:
     """Play episodes. Their noise is that of the policy's seed and the episode's, wherever they are played."""
-    actor, env = prepared(policy, cell.checkpoint, replace(cell, nfe=1), evaluation.play_on)
-    seed = policy.training.seed
-    task = policy.task()
-    return [
-        play_episode(
-            actor, env, episode, nfe=cell.nfe, policy_seed=seed, success=task.success, measures=task.measures
-        )
-        for episode in seeds
-    ]
+    actor, env = prepared(policy, replace(cell, nfe=1), evaluation.play_on)
+    task, noise = policy.task(), {"nfe": cell.nfe, "policy_seed": policy.training.seed}
+    outcome = {"success": task.success, "measures": task.measures}
+    return [play_episode(actor, env, episode, **noise, **outcome) for episode in seeds]
 
 
 @lru_cache(maxsize=1)
-def prepared(policy: Policy, checkpoint: int, cell: Cell, play_on: bool) -> tuple[WarmPriorActor, EnvBase]:
+def prepared(policy: Policy, cell: Cell, play_on: bool) -> tuple[WarmPriorActor, EnvBase]:
     """A policy and its environment: an episode after one of the same policy needs no preparation."""
     key = (policy.data, *policy.place, policy.network.observation_steps)
-    actor = policy.load(checkpoint).replace(guidance=cell.guidance)
+    actor = policy.load(cell.checkpoint).replace(guidance=cell.guidance)
     return actor, environment(policy, simulator(key, play_on), cell)
 
 
@@ -454,17 +412,6 @@ def row(
         "training_seconds": policy.seconds,
         "outcomes": "".join("01"[solved] for solved in solved),
     }
-
-
-def batches(evaluation: Evaluation) -> list[range]:
-    """The seeds of the evaluation episodes, a few per job."""
-    seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)
-    return [seeds[i : i + EPISODES_PER_JOB] for i in range(0, len(seeds), EPISODES_PER_JOB)]
-
-
-def stored_rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a file, if there is one."""
-    return read_lines(path) if path.exists() else []
 
 
 def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:

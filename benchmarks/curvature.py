@@ -10,8 +10,8 @@ import sys
 from dataclasses import dataclass
 
 import torch
-from common import facts_of, finished_policies, observations_of, policies_of, trained_actors, write_rows
-from measures import RATIOS, straightness
+from common import facts_of, finished_policies, policies_of, trained_actors, write_rows
+from measures import RATIOS, held_out, straightness
 from options import PRESETS, FinishedRun, MeasuredOptions, parse, script, started, study
 from paper import PAPER_CURVATURE
 from plots import plot_flow_paths
@@ -21,19 +21,15 @@ from robomimic import train_all
 from warmprior.diagnostics import encoded_windows, flow_paths
 from warmprior.diagnostics.flow import sees_history
 
-SHOWN = 40
-
 
 @dataclass(frozen=True)
 class CurvatureOptions(MeasuredOptions):
     """What to measure."""
 
     policies: FinishedRun = None  # a finished run, whose policies to take instead of training
-    coordinate: int = 0  # of the action, in flow_paths.png
 
     @property
     def name(self) -> str:
-        """Of the output folder."""
         return super().name if self.policies is None else self.policies.resolve().name
 
 
@@ -51,17 +47,14 @@ def main(argv: list[str] | None) -> None:
             raise ValueError(f"--run {run} has fewer seeds than --seeds {options.evaluation.seeds}")
         policies = [policy for policy in policies if policy.training.seed in options.seeds]
         # Before the training: what cannot be measured is better known now.
-        observations, source = observations_of(options, policies[0])
-        width = observations.data["action"].shape[-1]
-        if not 0 <= options.coordinate < width:
-            raise ValueError(f"--coordinate must be in [0, {width}), got {options.coordinate}")
+        observations, source = held_out(options, policies[0])
         if run is None:
             train_all(options, policies)
         task, actors = facts_of(policies[0].task()), trained_actors(policies, options.run.device)
-        measured = straightness(actors, observations, n_steps=options.steps, draws=options.draws)
+        measured = straightness(actors, observations)
         rows = write_rows(out / "curvature.jsonl", measured)
 
-        few = observations.subset(torch.linspace(0, len(observations) - 1, SHOWN).long())
+        few = observations.subset(torch.linspace(0, len(observations) - 1, 40).long())
         labels = dict(zip(rows.policy, labelled(rows).method, strict=True))
         paths = {}
         for method, by_seed in actors.items():
@@ -70,10 +63,9 @@ def main(argv: list[str] | None) -> None:
                 generator = torch.Generator(options.run.device).manual_seed(0)
                 windows = few.windows(actor.prior, see_history=sees_history(actor))
                 windows = encoded_windows(actor, windows)
-                path = flow_paths(actor, windows, options.steps, generator=generator)
-                paths[labels[str(method)]] = path[..., 0, options.coordinate].cpu()
-        where = f"{task['task']} {task['data']}: action coordinate {options.coordinate}"
-        title = f"{where} along the flow,\n{source}"
+                path = flow_paths(actor, windows, 100, generator=generator)
+                paths[labels[str(method)]] = path[..., 0, 0].cpu()
+        title = f"{task['task']} {task['data']}: action coordinate 0 along the flow,\n{source}"
         plot_flow_paths(paths, out / "flow_paths.png", title=title)
         seeds = rows.seed.dropna().nunique()
         notes = [

@@ -14,7 +14,7 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.modules import MLP
 
 from warmprior import keys
-from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
+from warmprior.modules.checks import check_finite_numbers, check_positive, check_whole_numbers
 from warmprior.modules.prior import GaussianPrior, PastPrior, Source
 from warmprior.modules.start import StartPoint
 from warmprior.training.optim import warmup_cosine
@@ -36,24 +36,15 @@ class Learner(nn.Module):
     sees_history: ClassVar[bool] = True
     sees_observation: ClassVar[bool] = True
     heads: ClassVar[int] = 1  # chunks that the network says
-    chunk_length: int
-    action_dim: int
-    observation_dim: int
-    observation_steps: int
-    hidden_dim: int
     chunk_dim: int  # numbers in a chunk, H d_a
     seen_dim: int  # numbers that the network is given
-    network: nn.Module
 
     def _set_widths(self, widths: Sequence[int] | None, hidden_dim: int) -> None:
         """Make the networks, if the widths of the data are known."""
         check_whole_numbers(hidden_dim=hidden_dim)
         self.hidden_dim = hidden_dim
         if widths is not None:
-            names = ("action_dim", "observation_dim", "observation_steps")
-            given = dict(zip(names, widths, strict=True))
-            check_whole_numbers(**given)
-            self.__dict__.update(given)
+            self.action_dim, self.observation_dim, self.observation_steps = widths
             self.chunk_dim = self.chunk_length * self.action_dim
             observed = self.sees_observation * self.observation_steps * self.observation_dim
             self.seen_dim = self.sees_history * (self.chunk_dim + 1) + observed
@@ -61,14 +52,7 @@ class Learner(nn.Module):
             self.requires_grad_(False)
 
     def build(self) -> None:
-        """Make the networks; one by default."""
         self.network = self.mlp(self.seen_dim, self.heads * self.chunk_dim)
-
-    def check_built(self) -> None:
-        """Whether there are networks."""
-        if not hasattr(self, "action_dim"):
-            name = type(self).__name__
-            raise ValueError(f"{name} has no networks yet: give widths=[d_a, d_o, To], and learn(...)")
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         """What the networks minimise on windows; the error of their forecast by default."""
@@ -83,17 +67,7 @@ class Learner(nn.Module):
 
     def seen(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """What the network is given, ``[*B, seen_dim]``."""
-        self.check_built()
-        name = type(self).__name__
-        parts = []
-        if self.sees_observation:
-            if not isinstance(observation, Tensor):
-                found = "none" if observation is None else "nested ones"
-                raise ValueError(
-                    f"{name} takes one tensor [*B, To, d_o] as the observation, and got {found}: concatenate "
-                    "the entries, or use a source that sees none"
-                )
-            parts.append(observation.flatten(-2))
+        parts = [observation.flatten(-2)] if self.sees_observation else []
         if self.sees_history:
             known = history["steps"] >= self.chunk_length
             actions = history["actions"][..., -self.chunk_length :, :]
@@ -103,8 +77,7 @@ class Learner(nn.Module):
 
     def predicted(self, history: TensorDictBase, observation: Tensor | None) -> Tensor:
         """The chunks that the network says, ``[*B, H, d_a]``, with several heads ``[*B, heads H, d_a]``."""
-        seen = self.seen(history, observation)  # first: it tells if there is no network
-        return self.network(seen).unflatten(-1, (-1, self.action_dim))
+        return self.network(self.seen(history, observation)).unflatten(-1, (-1, self.action_dim))
 
 
 class LearnedPrior(PastPrior, Learner, abstract=True):
@@ -145,8 +118,6 @@ class ForecastPrior(LearnedPrior):
     name = "forecast"
     default_sigma = 1.0
     heads = 2  # mean and scale
-    calibration: Tensor
-    typical_scale: Tensor
 
     def build(self) -> None:
         super().build()
@@ -205,18 +176,13 @@ class A2APrior(LearnedPrior):
 
 
 @dataclass(frozen=True)
-class _Decoded(Source):
-    """A source that is Gaussian given a latent draw, and none without."""
+class Drawn(Source):
+    """A source that is drawn in a way of its own."""
 
-    prior: Any = None
-    seen: Any = None
+    by: Any = None  # a function of a generator
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        like: dict[str, Any] = {"dtype": self.loc.dtype, "device": self.loc.device}
-        shape = (*self.seen.shape[:-1], self.prior.latent_dim)
-        z = torch.randn(shape, generator=generator, **like)
-        decoded = replace(self, loc=self.prior.decode(self.seen, z), scale=self.prior.sigma)
-        return Source.sample(decoded, generator)
+        return self.by(generator)
 
 
 class CVAEPrior(LearnedPrior):
@@ -236,8 +202,6 @@ class CVAEPrior(LearnedPrior):
     name = "cvae"
     default_sigma = 0.1
     sees_history = False
-    latent_dim: int
-    beta: float
 
     def __init__(
         self,
@@ -250,9 +214,7 @@ class CVAEPrior(LearnedPrior):
         sigma: float | None = None,
     ) -> None:
         check_whole_numbers(latent_dim=latent_dim)
-        check_finite_numbers(beta=beta)
-        if beta <= 0:
-            raise ValueError(f"beta must be a finite number > 0, got {beta}")
+        check_positive(beta=beta)
         self.__dict__.update(latent_dim=latent_dim, beta=beta)
         super().__init__(chunk_length, widths=widths, hidden_dim=hidden_dim, sigma=sigma)
 
@@ -266,9 +228,15 @@ class CVAEPrior(LearnedPrior):
     mean = GaussianPrior.mean  # none: cold everywhere
 
     def distribution(self, history: TensorDictBase, observation: Any = None) -> Source:
-        """One that decodes a latent of its own for every draw."""
-        loc, scale, warm = super().distribution(history, observation)
-        return _Decoded(loc, scale, warm, prior=self, seen=self.seen(history, observation))
+        """One that decodes a latent of its own for every draw: Gaussian given that, and none without."""
+        source, seen = super().distribution(history, observation), self.seen(history, observation)
+
+        def decoded(generator: torch.Generator | None) -> Tensor:
+            like: dict[str, Any] = {"dtype": source.loc.dtype, "device": source.loc.device}
+            z = torch.randn((*seen.shape[:-1], self.latent_dim), generator=generator, **like)
+            return replace(source, loc=self.decode(seen, z), scale=self.sigma).sample(generator)
+
+        return Drawn(*source, by=decoded)
 
     def learning_loss(self, windows: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
         seen = self.seen(windows[keys.HISTORY], windows[keys.OBSERVATION])
@@ -351,7 +319,6 @@ def learn(
 
     These are every tenth, or of fewer the second.
     """
-    learner.check_built()
     data = without_images(data)  # no learner sees them
     episodes = data[keys.EPISODE].flatten()
     number = episodes.unique(return_inverse=True)[1]

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from common import Policy
 from methods import Method
 from options import MeasuredOptions
 from tensordict import TensorDict, TensorDictBase
@@ -30,7 +31,6 @@ from warmprior.diagnostics import (
     source_leak,
 )
 from warmprior.diagnostics.flow import allowed_nfes, depends_on_history, sees_history
-from warmprior.training import DataOptions, Task
 from warmprior.training.task import demonstrations_of, read_like
 
 MEASURED_WINDOWS = 512  # observations of the training data on which every policy is measured
@@ -45,17 +45,11 @@ RATIOS = {
 }
 
 
-def measured(
-    policy: WarmPriorActor,
-    data: TensorDictBase,
-    nfes: Sequence[int],
-    *,
-    chunk_length: int,
-    observation_steps: int,
-    coupled: bool,
-) -> dict[int, dict[str, float | None]]:
-    """What is measured of a policy on its training data, by NFE: the same observations and draws for all."""
-    shared = SharedObservations(data.to("cpu"), chunk_length, observation_steps=observation_steps)
+def measure(trained: Policy, asked: Sequence[int]) -> dict[int, dict[str, float | None]]:
+    """Measure a policy on its training data, by NFE: on the same observations and draws for all."""
+    policy, data, method = trained.load(), trained.task().data.to("cpu"), trained.method
+    nfes, observation_steps = method.nfes(asked), trained.network.observation_steps
+    shared = SharedObservations(data, method.chunk_length, observation_steps=observation_steps)
     drawn = torch.randperm(len(shared), generator=torch.Generator().manual_seed(0))
     shared = shared.subset(drawn[:MEASURED_WINDOWS].sort()[0])
     windows = shared.windows(policy.prior, see_history=sees_history(policy))
@@ -68,7 +62,19 @@ def measured(
     allowed = allowed_nfes(policy, nfes)
     means = {nfe: mean_error(policy, met, nfe=nfe) for nfe in allowed}
     gains = memory_gain(policy, windows if sees_history(policy) else seen, nfes=nfes)
-    flow = flow_measures(policy, met, coupled=coupled, generator=generator)
+    # How straight the flow is between source and targets, over the executed H.
+    kappa, relative = math.nan, math.nan
+    if policy.ode.max_nfe is None:
+        with warnings.catch_warnings():  # the NaN says that something does not move
+            warnings.simplefilter("ignore")
+            values = curvature(policy, met, 100, generator=generator)
+        kappa, relative = (float(values[key].nanmean()) for key in ("kappa_executed", "relative_executed"))
+    flow = {
+        "kappa": kappa,
+        "relative_curvature": relative,
+        "bound": float(bounds(policy.prior, met, method.parts.coupling is not None)[1]),
+        "coverage": source_coverage(policy, met),
+    }
     return {
         nfe: {
             "mean_error": means[nfe].target,
@@ -82,21 +88,6 @@ def measured(
     }
 
 
-def flow_measures(
-    policy: WarmPriorActor, batch: TensorDictBase, *, coupled: bool, generator: torch.Generator
-) -> dict[str, float]:
-    """How far the source is from its targets, and how straight the flow between them, over the executed H."""
-    found = dict.fromkeys(("kappa", "relative_curvature"), math.nan)
-    if policy.ode.max_nfe is None:
-        with warnings.catch_warnings():  # the NaN says that something does not move
-            warnings.simplefilter("ignore")
-            values = curvature(policy, batch, 100, generator=generator)
-        for name, key in (("kappa", "kappa_executed"), ("relative_curvature", "relative_executed")):
-            found[name] = float(values[key].nanmean())
-    bound = bounds(policy.prior, batch, coupled)[1]
-    return found | {"bound": float(bound), "coverage": source_coverage(policy, batch)}
-
-
 def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
     """Bound of the branching cost, whole and executed; NaN where it does not apply."""
     if not coupled:
@@ -108,28 +99,28 @@ def bounds(prior: Prior, batch: TensorDictBase, coupled: bool) -> Tensor:
     return torch.full((2,), math.nan)
 
 
-def held_out(
-    options: MeasuredOptions, trained_on: DataOptions, task: Task, chunk_length: int, observation_steps: int
-) -> tuple[SharedObservations, str]:
+def held_out(options: MeasuredOptions, policy: Policy) -> tuple[SharedObservations, str]:
     """Observations that no policy of a task was trained on, and what they are in words.
 
     A task of one's own has none: its training data.
     """
     place: Path | str
+    task, chunk_length = policy.task(), policy.method.chunk_length
     facts, device, count = task.facts, options.run.device, options.observations
     given, mask = options.validation, None
     generator = torch.Generator().manual_seed(0)
+    shape = {"observation_steps": policy.network.observation_steps}
     if task.normalizer is None or "file" not in facts:
         if given is not None:
             raise ValueError(f"--validation belongs to robosuite's tasks, and {task.name} is none")
-        shared = SharedObservations(task.data.to(device), chunk_length, observation_steps=observation_steps)
+        shared = SharedObservations(task.data.to(device), chunk_length, **shape)
         if len(shared) > count:
             shared = shared.subset(torch.randperm(len(shared), generator=generator)[:count])
         return shared, "the TRAINING demonstrations (not held out)"
     if given is not None:
         place, words = given, ""
-    elif trained_on.mask == "train":
-        place, words, mask = demonstrations_of(trained_on, task.name, task.style)[0], "", "valid"
+    elif policy.data.mask == "train":
+        place, words, mask = demonstrations_of(policy.data, task.name, task.style)[0], "", "valid"
     elif facts.get("source") != "scripted":
         raise ValueError(
             f"these policies are trained on {facts['file']}: train them with --mask train, to measure "
@@ -145,10 +136,7 @@ def held_out(
     data, called = read_like(place, task.name, facts, mask)
     # A copy: the data are normalised on the CPU, the policy may live elsewhere.
     data = copy.deepcopy(task.normalizer).to("cpu").normalize(data).to(device)
-    shared = SharedObservations(
-        data, chunk_length, observation_steps=observation_steps, count=count, generator=generator
-    )
-    return shared, words or called
+    return SharedObservations(data, chunk_length, **shape, count=count, generator=generator), words or called
 
 
 def straightness(
@@ -195,7 +183,9 @@ def straightness(
         parts = [(s, *pair, base) for s, pair, base in zip(seeds, found, first, strict=True)]
         if len(seeds) > 1:
             values, limits = zip(*found, strict=True)
-            parts.append((None, average(values), torch.stack(limits).mean(0), average(first)))
+            # NaN where any predicts no motion: the others alone would be no average over the seeds.
+            averages = (torch.stack(one).mean(0) for one in (values, limits, first))
+            parts.append((None, *averages))
         for s, values, limits, baseline in parts:
             rows.append(
                 {
@@ -210,12 +200,6 @@ def straightness(
                 }
             )
     return rows
-
-
-def average(per_seed: Sequence[TensorDict]) -> TensorDict:
-    """Over seeds; NaN where any predicts no motion: the others alone would be no average over the seeds."""
-    mean = {key: torch.stack([v[key] for v in per_seed]).mean(0) for key, _ in per_seed[0].items()}
-    return TensorDict(mean, batch_size=per_seed[0].shape)
 
 
 def ratios(values: TensorDict, baseline: TensorDict, episodes: Tensor, seed: int) -> dict[str, float]:

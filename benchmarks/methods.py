@@ -24,8 +24,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
-from learned_sources import A2APrior, CVAEPrior, ForecastPrior, ForecastStart, LeapPrior, Learner
-from torch import Tensor
+from learned_sources import A2APrior, CVAEPrior, Drawn, ForecastPrior, ForecastStart, LeapPrior, Learner
 
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, Prior, WarmPriorActor
 from warmprior.io.files import digest_of
@@ -57,12 +56,7 @@ class PointPrior(GaussianPrior):
 
     def distribution(self, history: Any, observation: Any = None) -> Source:
         loc, scale, warm = super().distribution(history, observation)
-        return _Point(loc, torch.zeros_like(scale), warm)
-
-
-class _Point(Source):
-    def sample(self, generator: torch.Generator | None = None) -> Tensor:
-        return self.loc
+        return Drawn(loc, torch.zeros_like(scale), warm, by=lambda generator: loc)
 
 
 def reflow(teacher: WarmPriorActor, teacher_nfe: int = 9) -> ReflowCoupling:
@@ -205,9 +199,8 @@ class Method:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What every row says of it."""
-        config = {"prior": self.name, "options": self.options, "sigma": self.sigma}
-        return {**config, "chunk": self.chunk_length}
+        known = {"prior": self.name, "options": self.options, "sigma": self.sigma}
+        return {**known, "chunk": self.chunk_length}
 
     @property
     def name(self) -> str:
@@ -263,7 +256,6 @@ class Method:
 
     @property
     def teacher(self) -> Method | None:
-        """The method whose policy it learns from."""
         name = self.parts.teacher
         return None if name is None else Method(name, self.chunk_length)
 
@@ -284,7 +276,6 @@ class Method:
         return self._make(self.parts.prior, widths)
 
     def start(self, widths: Sequence[int] = ()) -> Any:
-        """A fresh start point, or None."""
         return None if self.parts.start is None else self._make(self.parts.start, widths)
 
     def coupling(self, teacher: WarmPriorActor | None = None) -> Coupling | None:

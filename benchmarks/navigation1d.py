@@ -9,12 +9,11 @@ python benchmarks/navigation1d.py --preset paper       # the paper's width and i
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import pandas as pd
 import torch
-from common import Policy, policies_of, trained_actors, write_rows
+from common import policies_of, trained_actors, write_rows
 from measures import straightness
 from options import Evaluation, Options, Sources, check_single, parse, script, started
 from plots import plot_flow_paths, plot_navigation
@@ -38,7 +37,6 @@ class NavigationOptions(Options):
 
     @property
     def name(self) -> str:
-        """Of the output folder."""
         return f"h{'-'.join(map(str, self.sources.chunk))}"
 
     def check(self) -> None:
@@ -78,43 +76,6 @@ NAVIGATION_PRESETS = {
 }
 
 
-def draw(
-    options: NavigationOptions,
-    policies: Sequence[Policy],
-    rows: pd.DataFrame,
-    observations: SharedObservations,
-) -> None:
-    """What the policies of the first seed execute, and the paths of their flows."""
-    seed, chunk = options.training.seed, options.sources.chunk[0]
-    panels, paths = {}, {}
-    shown = labelled(rows).set_index(["policy", "nfe"])
-    for policy in (policy for policy in policies if policy.training.seed == seed):
-        method, actor = policy.method, policy.load()
-        nfe = max(method.nfes(options.evaluation.nfe))
-        row = shown.loc[policy.name, nfe]
-        text = [f"collides {row.collision_rate:.0%}"]
-        if pd.notna(row.switch_rate):
-            text[0] = f"switches sides at {row.switch_rate:.1%} of boundaries, {text[0]}"
-        if method.remembers:
-            text.append(f"with its history shifted: collides {row.shifted_collision_rate:.0%}")
-        rollout = play_navigation(actor, seed, nfe=nfe)
-        panels[row.method] = (executed_actions(rollout)[0].squeeze(-1), text)
-        if method.is_flow:
-            # One window of a demonstration, above the first obstacle, from many source samples.
-            window = observations.windows(actor.prior, see_history=method.parts.sees_history)
-            index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
-            batch = window[index : index + 1].expand(48).contiguous()
-            generator = torch.Generator().manual_seed(seed)
-            paths[row.method] = flow_paths(actor, batch, 100, generator=generator)[..., 0, 0]
-    network, iterations = options.network.hidden_dim, options.training.iterations
-    what = f"H = {chunk}, {network}-d network, {iterations} iterations, seed {seed}"
-    out = options.run.folder
-    title = f"One-dimensional navigation: {what}"
-    plot_navigation(panels, out / "navigation1d.png", chunk_length=chunk, title=title)
-    title = f"Paths of the flow above the first obstacle, after a demonstrated history: {what}"
-    plot_flow_paths(paths, out / "flow_paths.png", title=title)
-
-
 @script("navigation1d.py", together=True)
 def main(argv: list[str] | None) -> None:
     """Train the policies, roll them out and measure their flows."""
@@ -141,7 +102,35 @@ def main(argv: list[str] | None) -> None:
         text += "\n" + table(flow, ["method"], ["kappa_executed", "relative_executed"])
         # Before the pictures, which are the lesser loss: the trainings took the time.
         write_report(out, text, text, pd.concat([rows, curvatures]))
-        draw(options, policies, rows, observations)
+
+        # What the policies of the first seed execute, and the paths of their flows.
+        seed, chunk = options.training.seed, options.sources.chunk[0]
+        panels, paths = {}, {}
+        shown = labelled(rows).set_index(["policy", "nfe"])
+        for policy in (policy for policy in policies if policy.training.seed == seed):
+            method, actor = policy.method, policy.load()
+            nfe = max(method.nfes(options.evaluation.nfe))
+            row = shown.loc[policy.name, nfe]
+            said = [f"collides {row.collision_rate:.0%}"]
+            if pd.notna(row.switch_rate):
+                said[0] = f"switches sides at {row.switch_rate:.1%} of boundaries, {said[0]}"
+            if method.remembers:
+                said.append(f"with its history shifted: collides {row.shifted_collision_rate:.0%}")
+            rollout = play_navigation(actor, seed, nfe=nfe)
+            panels[row.method] = (executed_actions(rollout)[0].squeeze(-1), said)
+            if method.is_flow:
+                # One window of a demonstration, above the first obstacle, from many source samples.
+                window = observations.windows(actor.prior, see_history=method.parts.sees_history)
+                index = int((window["observation"][:60, 0, 0] + 0.45).abs().argmin())
+                batch = window[index : index + 1].expand(48).contiguous()
+                generator = torch.Generator().manual_seed(seed)
+                paths[row.method] = flow_paths(actor, batch, 100, generator=generator)[..., 0, 0]
+        network, iterations = options.network.hidden_dim, options.training.iterations
+        what = f"H = {chunk}, {network}-d network, {iterations} iterations, seed {seed}"
+        title = f"One-dimensional navigation: {what}"
+        plot_navigation(panels, out / "navigation1d.png", chunk_length=chunk, title=title)
+        title = f"Paths of the flow above the first obstacle, after a demonstrated history: {what}"
+        plot_flow_paths(paths, out / "flow_paths.png", title=title)
 
 
 if __name__ == "__main__":

@@ -36,6 +36,13 @@ from warmprior.training.training_config import PAPER
 Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
 
 
+def check_given(options: Any, *names: str) -> None:
+    """Refuse an option that takes several values and has none."""
+    for name in names:
+        if not getattr(options, name):
+            raise ValueError(f"--{name} needs at least one value")
+
+
 @dataclass(frozen=True)
 class Sources:
     """The methods to compare."""
@@ -49,9 +56,7 @@ class Sources:
 
     def __post_init__(self) -> None:
         check_counts(self, "chunk")
-        for name in ("prior", "chunk"):
-            if not getattr(self, name):
-                raise ValueError(f"--{name} needs at least one value")
+        check_given(self, "prior", "chunk")
 
     def methods(self) -> list[Method]:
         """All of them, chunk length by chunk length, each once."""
@@ -77,8 +82,7 @@ class Evaluation:
 
     def __post_init__(self) -> None:
         check_counts(self, "seeds", "episodes", "nfe", "top_k")
-        if not self.nfe:
-            raise ValueError("--nfe needs at least one number of network evaluations")
+        check_given(self, "nfe")
         check_grid(self.grid)
 
     @property
@@ -113,14 +117,9 @@ class Run:
             raise ValueError(f"--device {self.device}: with --engine ray, Ray chooses the GPU: use cuda")
 
     @property
-    def folder(self) -> Path:
-        assert self.out is not None
-        return self.out
-
-    @property
     def policies(self) -> Path:
         """Where policies lie: beside the run, so that others share them."""
-        return self.folder.absolute().parent / "policies"
+        return self.out.absolute().parent / "policies"
 
 
 @dataclass(frozen=True)
@@ -196,15 +195,11 @@ class MeasuredOptions(Options):
 
     validation: Path | None = None  # demonstrations, as --dataset names them (default: newly generated ones)
     observations: int = 500  # how many to measure on; the paper's curvature has 2000
-    steps: int = 100  # Euler steps of a curvature
-    draws: int = 1  # source samples per observation
 
     def check(self) -> None:
         super().check()
         check_single(self, "task", "data", "chunk")
-        check_counts(self, "observations", "draws", "steps")
-        if self.steps < 2:
-            raise ValueError(f"--steps must be at least 2, got {self.steps}")
+        check_counts(self, "observations")
         if self.validation is not None:
             check_place(self.validation, "--validation")
 
@@ -279,8 +274,7 @@ def with_parts[O](options: O, **parts: Any) -> O:
 
 def study[O: Options](kind: type[O], preset: Options, **parts: Any) -> O:
     """A preset of a study: that of the comparison, with further parts or others."""
-    mine: Any = {f.name: getattr(preset, f.name) for f in fields(Options)}
-    return kind(**mine | parts)
+    return kind(**vars(preset) | parts)
 
 
 def parse[O: Options](
@@ -472,7 +466,7 @@ def script(name: str, together: bool = False) -> Callable[[Callable[..., object]
 @contextmanager
 def started(options: Options, study: str) -> Iterator[Path]:
     """The output folder, with the options in it, and without another process."""
-    out = options.run.folder
+    out = options.run.out
     if rank():  # the first process is in it, for all
         yield out
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from pathlib import Path
 from string import ascii_lowercase
 from typing import Any
@@ -58,11 +58,11 @@ def dress(axis: Any, title: str = "", x: str = "", y: str = "", rate: bool = Fal
         axis.set_ylim(-0.02, 1.08)
 
 
-def colors_of(rows: DataFrame, name: str = "method") -> dict[Hashable, Any]:
+def colors_of(rows: DataFrame) -> dict[Hashable, Any]:
     """The colour of each method: its prior's, in shades where several methods share a prior."""
     colors: dict[Hashable, Any] = {}
     for prior, group in rows.groupby("prior", sort=False):
-        own, methods = to_rgb(color(prior)), group[name].unique()
+        own, methods = to_rgb(color(prior)), group["method"].unique()
         end = float(sum(own) < 2)
         for place, method in enumerate(methods):
             share = PALEST * place / max(1, len(methods) - 1)
@@ -93,15 +93,18 @@ def legend_below(figure: Figure) -> None:
 
 
 def side_by_side(
-    axis: Any, rows: DataFrame, group: str, draw: Callable[..., None], colors: Mapping[Hashable, Any]
-) -> None:
-    """Draw the methods of each group beside each other; the legend names each of them once."""
+    axis: Any, rows: DataFrame, group: str, colors: Mapping[Hashable, Any]
+) -> Iterator[tuple[float, DataFrame, dict[str, Any]]]:
+    """The methods of each group beside each other: where to draw which rows, and how.
+
+    The legend names each method once.
+    """
     methods, groups = list(colors), list(rows[group].unique())
     step, named = len(methods) + 0.8, set()
     for g, (_, members) in enumerate(rows.groupby(group, sort=False)):
         for method, cell in members.groupby("method", sort=False):
             name = None if method in named else method
-            draw(g * step + methods.index(method), cell, color=colors[method], label=name)
+            yield g * step + methods.index(method), cell, {"color": colors[method], "label": name}
             named.add(method)
     axis.set_xticks([g * step + (len(methods) - 1) / 2 for g in range(len(groups))], groups)
 
@@ -119,8 +122,7 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
     width = 2.2 + 0.55 * (rows["method"].nunique() + 1) * rows[group].nunique()
     figure, (axis,) = new_figure(width, 4.2)
     grid = np.linspace(0.0, 1.0, 801)
-
-    def draw(x: float, cell: DataFrame, **look: Any) -> None:
+    for x, cell, look in side_by_side(axis, rows, "group", colors_of(rows)):
         k, n = int(cell["successes"].sum()), int(cell["episodes"].sum())
         posterior = success_posterior(k, n)
         density = posterior.pdf(grid)
@@ -128,8 +130,6 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
         axis.fill_betweenx(grid, x - half, x + half, alpha=0.75, lw=0, **look)
         axis.plot([x - 0.3, x + 0.3], [posterior.mean()] * 2, color="black", lw=1.2)
         axis.text(x, -0.025, f"{k}/{n}", ha="center", va="top", fontsize=7, color="0.35")
-
-    side_by_side(axis, rows, "group", draw, colors_of(rows))
     dress(axis, title, y="success rate (posterior density)")
     axis.set_ylim(-0.08, 1.0)
     legend_below(figure)
@@ -155,16 +155,13 @@ def plot_bars(
     places = [(name, panel) for name in measures for panel in panels]
     for axis, (name, panel) in zip(axes, places, strict=True):
         rate = name in RATES
-
-        def draw(x: float, cell: DataFrame, axis: Any = axis, name: str = name, **look: Any) -> None:
+        known = rows[(rows[column] == panel) & rows[name].notna()]
+        for x, cell, look in side_by_side(axis, known, group, colors):
             mean, std = cell[name].mean(), cell[name].std()
-            shown = f"{100 * mean:.0f}" if name in RATES else f"{mean:.2f}"
+            shown = f"{100 * mean:.0f}" if rate else f"{mean:.2f}"
             axis.bar(x, mean, 0.85, yerr=None if math.isnan(std) else std, capsize=3, **look)
             above = mean + (0.0 if math.isnan(std) else std)  # the error bar
             axis.annotate(shown, (x, above), (0, 4), textcoords="offset points", ha="center", fontsize=8)
-
-        known = rows[(rows[column] == panel) & rows[name].notna()]
-        side_by_side(axis, known, group, draw, colors)
         first = panel == panels[0]
         dress(axis, panel, y=measures[name] if first else "", rate=rate)
         if not rate:

@@ -11,7 +11,7 @@ A frozen policy per source and seed comes from --run (a finished run) or is trai
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, field, fields, make_dataclass, replace
 from functools import partial
 from itertools import product
@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, get_type_hints
 
 import pandas as pd
 import tyro
-from common import facts_of, finished_policies, policies_of, slug, stored_rows, trained_actors, write_rows
+from common import facts_of, finished_policies, policies_of, slug, trained_actors, write_rows
 from methods import ColdPrior, Method
 from navigation1d import NAVIGATION_PRESETS
 from options import (
@@ -29,6 +29,7 @@ from options import (
     FinishedRun,
     Options,
     Sources,
+    check_given,
     check_single,
     parse,
     script,
@@ -47,7 +48,7 @@ from warmprior.diagnostics.flow import sees_history
 from warmprior.envs import NavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.envs.tasks import EVALUATION_SEED
-from warmprior.io.files import read_json
+from warmprior.io.files import read_json, read_lines
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 from warmprior.training import DataOptions, parallel_env
 from warmprior.training.options import check_counts
@@ -118,31 +119,26 @@ class AgentsOptions(Options):
     delta: tuple[float, ...] = ()  # half the agents' boxes (default: 0.5 around a mean, 1.5 around zero)
     horizon: int | None = None  # time limit in control steps (default: the task's)
     num_envs: int = 4  # parallel environments of an agent
-    threads: int | None = None  # of a training; in small networks more than one wait for each other
     # Ray actors that collect, with num-envs environments each, with --engine ray (default: none, the training
     # itself collects).
     collectors: int | None = None
 
     @property
     def is_toy(self) -> bool:
-        """Whether it is of the navigation toy."""
         return self.data.task == (TOY,)
 
     @property
     def name(self) -> str:
-        """Of the output folder."""
         return TOY if self.is_toy else super().name
 
     def check(self) -> None:
-        check_counts(self, "horizon", "num_envs", "threads", "collectors")
+        check_counts(self, "horizon", "num_envs", "collectors")
         if self.collectors is not None and self.collectors > 10:  # their seeds are apart from others'
             raise ValueError(f"--collectors must be at most 10, got {self.collectors}")
         if self.is_toy != (self.run.preset == "unit"):
             raise ValueError(f"--task {TOY} and --preset unit belong together")
         check_single(self, "task", "data", "chunk", "sigma", "nfe")
-        for name in ("algorithm", "centre"):
-            if not getattr(self, name):
-                raise ValueError(f"--{name} needs at least one value")
+        check_given(self, "algorithm", "centre")
         if self.collectors is not None and self.run.engine != "ray":
             raise ValueError("--collectors belongs to --engine ray")
         if not self.is_toy and self.policies is None:
@@ -162,7 +158,6 @@ class AgentsOptions(Options):
         return [Arm(method, *part) for part in parts]
 
     def agent(self, arm: Arm, seed: int) -> PriorSpaceConfig:
-        """The recipe of one agent."""
         shared: Mapping[str, Any] = asdict(self.rl)
         own: dict[str, Any] = {
             "algorithm": arm.algorithm,
@@ -196,7 +191,6 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
             alpha_init=0.05,
             evaluate_every=6_000,
         ),
-        threads=1,
     ),
     # The navigation toy with a goal, three seeds: agents around the mean and around zero, in two boxes.
     "unit": AgentsOptions(
@@ -224,7 +218,6 @@ AGENT_PRESETS: dict[str, AgentsOptions] = {
             evaluate_every=6_000,
         ),
         num_envs=32,
-        threads=1,
     ),
     # Fig. 7's four agents with DSRL's hyper-parameters per task, three seeds: needs a GPU. As in DSRL,
     # success does not end the episode. The paper's policies have 3,000 epochs; these have Table 3's.
@@ -268,11 +261,9 @@ def adapt(preset: AgentsOptions, asked: AgentsOptions) -> AgentsOptions:
 def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method, dict[int, WarmPriorActor]]]:
     """The task, and the frozen policies by method and seed: of --run, or trained now."""
     run = options.policies
+    policies = policies_of(options) if run is None else finished_policies(run, options)
     if run is None:
-        policies = policies_of(options)
         train_all(options, policies)
-    else:
-        policies = finished_policies(run, options)
     actors = trained_actors(policies, options.run.device)
     for method, group in actors.items():
         if missing := sorted(set(options.seeds) - group.keys()):
@@ -282,27 +273,17 @@ def frozen_policies(options: AgentsOptions) -> tuple[dict[str, Any], dict[Method
     return facts_of(policies[0].task()), actors
 
 
-def environment(options: AgentsOptions, actor: WarmPriorActor) -> Callable[[int], EnvBase]:
-    """The environment of agents around a frozen policy, as a function of its seed."""
-    if options.is_toy:
-        return partial(toy, actor, options.num_envs)
-    make_env, make_transforms = environment_parts(actor)
-    make_env = partial(make_env, horizon=options.horizon, **options.evaluation.environment)
-    return partial(simulators, actor, make_env, make_transforms, options.num_envs)
-
-
-def toy(actor: WarmPriorActor, num_envs: int, seed: int) -> EnvBase:
-    """The toy, in which nothing but the anchor is random."""
-    transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
-    transforms.append(PriorAnchor(actor))
-    return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
-
-
-def simulators(
-    actor: WarmPriorActor, make_env: Any, make_transforms: Any, num_envs: int, seed: int
+def environment(
+    actor: WarmPriorActor, is_toy: bool, num_envs: int, options: Mapping[str, Any], seed: int
 ) -> EnvBase:
-    """Simulators in workers. Outside of them one anchor draws for all, and one encoder serves all."""
-    workers = parallel_env(make_env, make_transforms, num_envs)
+    """The environment of agents around a frozen policy; the simulator's is in workers."""
+    if is_toy:  # nothing but the anchor is random
+        transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
+        transforms.append(PriorAnchor(actor))
+        return TransformedEnv(NavigationEnv((1, 1), batch_size=[num_envs]), transforms)
+    make_env, make_transforms = environment_parts(actor)
+    workers = parallel_env(partial(make_env, **options), make_transforms, num_envs)
+    # Outside of the workers one anchor draws for all, and one encoder serves all.
     env = TransformedEnv(workers, Compose(*encoding(actor), PriorAnchor(actor)))
     env.set_seed(seed, static_seed=True)
     return env
@@ -318,10 +299,11 @@ def learn(
 ) -> PriorSpaceTraining:
     """Train an agent, or continue it where it was interrupted."""
     actor, name = arm.policy(actor), f"{arm}, seed {seed}"
+    parts = {"horizon": options.horizon, **options.evaluation.environment}
     encoders = encoding(actor)  # one that sees images reads their features, as the agent does
     training = PriorSpaceTraining(
         actor.replace(observation_key=encoders[0].out_keys[0]) if encoders else actor,
-        environment(options, actor),
+        partial(environment, actor, options.is_toy, options.num_envs, parts),
         options.agent(arm, seed),
         out / slug(name.replace(" ", "-")),
         evaluation_seed=EVALUATION_SEED,
@@ -329,7 +311,7 @@ def learn(
         collectors=options.collectors,
         ray_address=options.run.ray_address,
     )
-    with torch_threads(options.threads):
+    with torch_threads(1):  # workers that end set it otherwise
         training.run()
     return training
 
@@ -341,7 +323,7 @@ def main(argv: list[str] | None) -> None:
     with started(options, "rl") as out:
         task, frozen = frozen_policies(options)
         path = out / "results.jsonl"
-        rows, failures = stored_rows(path), []
+        rows, failures = read_lines(path) if path.exists() else [], []
         arms = [arm for method in frozen for arm in options.arms(method)]
         for seed, arm in product(options.seeds, sorted(arms, key=lambda arm: arm.algorithm)):
             actor = frozen[arm.method][seed]

@@ -18,13 +18,13 @@ from typing import Literal
 
 from common import Cell, policies_of
 from methods import Method
-from options import PRESETS, Options, check_single, parse, script, started, study
+from options import PRESETS, Options, check_given, check_single, parse, script, started, study
 from plots import plot_bars
 from report import labelled, per_seed, table, write_report
 from robomimic import compare
 
-from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.real_time_chunking import RealTimeChunking
+from warmprior.training.options import check_counts
 from warmprior.transforms.delay import check_delay
 
 STUDY = "real-time-chunking"
@@ -42,7 +42,6 @@ class DelayOptions(Options):
 
     @property
     def name(self) -> str:
-        """Of the output folder."""
         if self.toy == "alone":
             return "navigation"
         return super().name + ("-navigation" if self.toy == "beside" else "")
@@ -50,11 +49,8 @@ class DelayOptions(Options):
     def check(self) -> None:
         super().check()
         check_single(self, "chunk")
-        for name in ("delay", "guidance"):
-            if not getattr(self, name):
-                raise ValueError(f"--{name} needs at least one value")
-        if self.execute is not None:
-            check_whole_numbers(**{"--execute": self.execute})
+        check_given(self, "delay", "guidance")
+        check_counts(self, "execute")
         if self.toy != "no" and self.evaluation.play_on:
             raise ValueError("the toy has an end of its own: leave out --play-on, or add --toy no")
         for method in self.sources.methods():
@@ -64,8 +60,8 @@ class DelayOptions(Options):
             for cell in cells:
                 delay, execute, length = cell.delay or 0, cell.execute or 1, method.prediction_length
                 try:
-                    if execute > method.chunk_length or delay < 0:
-                        raise ValueError(f"need 0 <= delay and execute <= H = {method.chunk_length}")
+                    if execute > method.chunk_length:
+                        raise ValueError(f"need execute <= H = {method.chunk_length}")
                     check_delay(delay, execute, length)
                     if cell.guidance is not None:
                         cell.guidance.check_delay(delay, length - execute)
@@ -106,16 +102,12 @@ def main(argv: list[str] | None) -> None:
         lines = {"success": "success rate", "boundary_jump": "jump where chunks take effect"}
         for nfe, mine in seeds.groupby("nfe"):
             end = f"_nfe{nfe}.png" if seeds.nfe.nunique() > 1 else ".png"
-            title = (
-                f"NFE {nfe}, {mine.execute.iloc[0]} actions per decision, {options.evaluation.seeds} seed(s)"
-            )
+            title = f"NFE {nfe}, {mine.execute.iloc[0]} actions per decision, {len(options.seeds)} seed(s)"
             mine = mine.assign(delay="delay " + mine.delay.astype(str))
             plot_bars(mine, out / f"real_time_chunking{end}", title, "delay", lines)
         given = {f.name.replace("_", " "): getattr(options.rtc, f.name) for f in fields(options.rtc)}
         guidance = ", ".join(f"{name} {value}" for name, value in given.items() if value is not None)
         notes = [f"{seeds.execute.iloc[0]} actions per decision at every delay. RTC: {guidance}."]
-        if "rtc" in options.guidance and options.rtc.sigma is None:
-            notes.append("Without a sigma, the weight of the guidance is that of the source's own width.")
         names = ["success", "boundary_jump", "inner_jump"]
         text = table(seeds, ["problem", "nfe", "delay", "method"], names, notes)
         write_report(out, text, text, rows, failures)

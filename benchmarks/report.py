@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from columns import COLUMNS, column, definitions
+from columns import COLUMNS, column
 from methods import label
 from options import IMAGES, Options, with_parts
 from pandas import DataFrame, Series
@@ -108,9 +108,7 @@ def summary(rows: DataFrame, top_k: int) -> DataFrame:
     intervals = [stats.success_posterior(*map(int, pair)).interval(0.95) for pair in counts]
     found["low"], found["high"] = zip(*intervals, strict=True)
     firsts = seeds.groupby(keys, sort=False, as_index=False).head(1).to_dict("records")
-    base = {"prior": "gaussian", "sigma": 1.0, "options": ""}
     found["paper"] = [paper_success(row) for row in firsts]
-    found["paper_gain"] = found["paper"] - [paper_success(row | base) for row in firsts]
     return _beside(found, seeds, keys)
 
 
@@ -330,7 +328,8 @@ def write_report(out: Path, short: str, full: str, frame: DataFrame, failures: S
     listed = "".join(f"- {failure}\n" for failure in failures)
     missing = f"\nMissing:\n\n{listed}" if failures else ""
     names = [*frame.columns, *(n for n in COLUMNS if n not in frame and f"| {n} |" in full)]
-    full = f"{full.rstrip()}\n{missing}\nColumns, here and in results.csv:\n\n{definitions(names)}"
+    meanings = "".join(f"- `{name}`: {column(name)[1]}\n" for name in names)
+    full = f"{full.rstrip()}\n{missing}\nColumns, here and in results.csv:\n\n{meanings}"
     write_atomic(out / "report.md", lambda path: path.write_text(full, encoding="utf-8"))
     write_atomic(out / "results.csv", lambda path: frame.to_csv(path, index=False))
     print(f"\n{short.rstrip()}\n{missing}\nRows, report.md, results.csv and pictures: {out}", flush=True)

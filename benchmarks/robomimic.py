@@ -19,29 +19,21 @@ from itertools import product
 from typing import Any
 
 import pandas as pd
-from common import (
-    Cell,
-    Policy,
-    batches,
-    facts_of,
-    measure,
-    play,
-    policies_of,
-    row,
-    stored_rows,
-    train,
-    write_rows,
-)
+from common import Cell, Policy, facts_of, play, policies_of, row, train, write_rows
 from jobs import Jobs
+from measures import measure
 from methods import Method
 from options import PRESETS, Evaluation, Options, parse, script, started
 from pictures import draw
 from report import success_report, summary, terminal_table, unlike, write_report
 
+from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.distributed import go_on_alone, rank, world_size
-from warmprior.io.files import check_writable, write_atomic
+from warmprior.io.files import check_writable, read_lines, write_atomic
 from warmprior.io.script import PartialFailure
 from warmprior.training import Episode
+
+EPISODES_PER_JOB = 5  # so few that all cores are busy to the end; so many that policies are loaded seldom
 
 
 def run(
@@ -91,8 +83,8 @@ def compare(
         rows.sort(key=order)
         write_rows(path, rows)
 
-    path = options.run.folder / "results.jsonl"
-    rows = stored_rows(path)
+    path = options.run.out / "results.jsonl"
+    rows = read_lines(path) if path.exists() else []
     if others := {row["policy"] for row in rows} - places.keys():
         raise ValueError(
             f"{path} has rows of {min(others)}: it was begun with other versions or data. Finish it "
@@ -139,7 +131,7 @@ def begin(options: Options, policies: Sequence[Policy]) -> dict[str, str]:
     tasks = {policy.place: policy.task() for policy in policies}.values()
     text = json.dumps([facts_of(task) for task in tasks], indent=1) + "\n"
     if not rank():
-        write_atomic(options.run.folder / "tasks.json", lambda path: path.write_text(text))
+        write_atomic(options.run.out / "tasks.json", lambda path: path.write_text(text))
 
     failures = {}
     for policy in policies if world_size() > 1 else ():
@@ -187,9 +179,10 @@ def submit(
     after = {"after": first, "group": group}
     if any(cell.checkpoint == last for cell in cells):
         jobs.submit(f"measure {policy}", measure, policy, evaluation.nfe, then=measured, **after)
-    for cell, seeds in product(cells, batches(evaluation)):
-        more = {"then": partial(played, cell), **after}
-        jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, seeds, **more)
+    seeds = range(EVALUATION_SEED, EVALUATION_SEED + evaluation.episodes)
+    for cell, i in product(cells, range(0, len(seeds), EPISODES_PER_JOB)):
+        more, few = {"then": partial(played, cell), **after}, seeds[i : i + EPISODES_PER_JOB]
+        jobs.submit(f"play {policy}, {cell}", play, policy, cell, evaluation, few, **more)
 
 
 @script("robomimic.py", together=True)

@@ -12,11 +12,10 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pandas as pd
-from common import observations_of, policies_of, trained_actors, write_rows
-from measures import straightness
+from common import policies_of, trained_actors, write_rows
+from measures import held_out, straightness
 from options import PRESETS, MeasuredOptions, Options, check_single, parse, script, started, study
 from paper import paper_success
 from plots import plot_lines
@@ -32,20 +31,6 @@ def preset(base: Options) -> MeasuredOptions:
     return study(MeasuredOptions, base, sources=sources, evaluation=evaluation)
 
 
-def draw(rows: pd.DataFrame, curvatures: pd.DataFrame, path: Path, top_k: int, title: str) -> None:
-    """Success and, relative to the first policy, curvature and branching bound against sigma.
-
-    A line per source; one that takes no sigma has a single point.
-    """
-    flow = pooled(curvatures[curvatures["mean"] == "training"])
-    flow = flow.assign(relative_bound=flow.bound_executed / (flow.bound_executed.iloc[0] or math.nan))
-    both = labelled(pd.concat([per_seed(rows, top_k), flow]), "sigma", "chunk")
-    both = both.assign(panel=title).sort_values("sigma", ascending=False, kind="stable")
-    pair = ("ratio_executed", "relative_bound")
-    lines = {"success": "success rate", pair: "curvature (dotted: bound)"}
-    plot_lines(both, path, "", "sigma", lines, column="panel")
-
-
 @script("sigma.py")
 def main(argv: list[str] | None) -> None:
     """Train a policy per source and sigma, play it, and measure its flow."""
@@ -55,13 +40,20 @@ def main(argv: list[str] | None) -> None:
     with started(options, "sigma") as out:
         policies = policies_of(options)
         # Before the hours of training: what cannot be measured on is better known now.
-        observations, source = observations_of(options, policies[0])
+        observations, source = held_out(options, policies[0])
         rows, failures = compare(options, policies)
         actors = trained_actors(policies, options.run.device)
-        flow = straightness(actors, observations, n_steps=options.steps, draws=options.draws)
+        flow = straightness(actors, observations)
         curvatures = write_rows(out / "curvature.jsonl", flow)
         title = f"{policies[0].task().title}, NFE {options.evaluation.nfe[0]}"
-        draw(rows, curvatures, out / "sigma.png", options.evaluation.top_k, title)
+        # A line per source; one that takes no sigma has a single point.
+        flow = pooled(curvatures[curvatures["mean"] == "training"])
+        flow = flow.assign(relative_bound=flow.bound_executed / (flow.bound_executed.iloc[0] or math.nan))
+        both = labelled(pd.concat([per_seed(rows, options.evaluation.top_k), flow]), "sigma", "chunk")
+        both = both.assign(panel=title).sort_values("sigma", ascending=False, kind="stable")
+        pair = ("ratio_executed", "relative_bound")
+        lines = {"success": "success rate", pair: "curvature (dotted: bound)"}
+        plot_lines(both, out / "sigma.png", "", "sigma", lines, column="panel")
         seeds = per_seed(labelled(rows, "sigma"), options.evaluation.top_k)
         seeds = seeds.assign(paper=seeds.apply(paper_success, axis=1))
         text = table(seeds, ["method", "sigma"], ["success", "paper"])

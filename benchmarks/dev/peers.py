@@ -20,7 +20,7 @@ import argparse
 import json
 import statistics
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
@@ -52,8 +52,7 @@ from warmprior.io.machine import facts_of_machine
 from warmprior.io.script import run_script
 
 NFES = (1, 3, 9)
-VECTOR, OBJECTS = 9, D_O - 9
-"""Widths of the robot's own state and of the objects'."""
+VECTOR, OBJECTS = 9, D_O - 9  # widths of the robot's own state and of the objects'
 
 Batch = TensorDictBase
 Row = dict[str, Any]
@@ -61,23 +60,14 @@ Row = dict[str, Any]
 
 @dataclass
 class Peer:
-    """A policy to be measured.
-
-    Attributes:
-        name: of the row.
-        module: what is trained.
-        loss: of a batch of windows.
-        decide: makes a chunk for one observation, with a number of network evaluations.
-        own_steps: the number of evaluations that the package would take.
-        network_pass: the network alone on a batch, where operations of the loss cannot be counted.
-    """
+    """A policy to be measured."""
 
     name: str
-    module: nn.Module
-    loss: Callable[[Batch], torch.Tensor]
-    decide: Callable[[int], object]
-    own_steps: int
-    network_pass: Callable[[Batch], torch.Tensor] | None = None
+    module: nn.Module  # what is trained
+    loss: Callable[[Batch], torch.Tensor]  # of a batch of windows
+    decide: Callable[[int], object]  # makes a chunk for one observation, at a number of network evaluations
+    own_steps: int  # the number of evaluations that the package would take
+    network_pass: Callable[[Batch], torch.Tensor] | None = None  # where a loss's operations are not counted
 
     @property
     def parameters(self) -> int:
@@ -96,15 +86,21 @@ def nearest(make: Callable[[int], nn.Module], widths: Sequence[int], parameters:
     return min(widths, key=excess)
 
 
-def ours(name: str, make: Callable[[int], VelocityNetwork], width: int, device: str) -> Peer:
-    """FlowMatchingLoss on one of this library's networks."""
-    network = make(width).to(device)
+def ours(
+    kind: type[VelocityNetwork], width: str, widths: range, parameters: float, device: str, **options: float
+) -> Peer:
+    """FlowMatchingLoss on one of this library's networks, whose option for the width has a name."""
+
+    def make(number: int) -> VelocityNetwork:
+        return kind(D_A, D_O, H, TO, **{width: number}, **options)
+
+    network = make(nearest(make, widths, parameters)).to(device)
     actor = WarmPriorActor(network, PRIOR)
     loss = FlowMatchingLoss(actor)
     history = window_history(torch.zeros(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
     data = TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
     return Peer(
-        f"warmprior: FlowMatchingLoss, {name}",
+        ", ".join(["warmprior: FlowMatchingLoss", kind.__name__, *(f"{k} {options[k]:g}" for k in options)]),
         network,
         lambda batch: loss(batch)["loss_flow_matching"],
         lambda nfe: actor(data, nfe=nfe),
@@ -113,27 +109,6 @@ def ours(name: str, make: Callable[[int], VelocityNetwork], width: int, device: 
             torch.rand(len(batch), device=device), batch["vla_action", "chunk"], batch["observation"]
         ),
     )
-
-
-def warmprior_transformer(parameters: float, device: str, dropout: float | None = None) -> Peer:
-    """The paper's network, with its own dropout by default."""
-    options = {} if dropout is None else {"dropout": dropout}
-
-    def make(width: int) -> VelocityNetwork:
-        return ChiTransformer(D_A, D_O, H, TO, embedding_dim=width, **options)
-
-    width = nearest(make, range(48, 1024, 24), parameters)
-    name = "ChiTransformer" if dropout is None else f"ChiTransformer, dropout {dropout:g}"
-    return ours(name, make, width, device)
-
-
-def warmprior_mlp(parameters: float, device: str) -> Peer:
-    """The network of the small presets."""
-
-    def make(width: int) -> VelocityNetwork:
-        return VelocityMLP(D_A, D_O, H, TO, hidden_dim=width)
-
-    return ours("VelocityMLP", make, nearest(make, range(64, 4096, 32), parameters), device)
 
 
 def torchrl(parameters: float, device: str) -> Peer:
@@ -174,7 +149,7 @@ def torchrl(parameters: float, device: str) -> Peer:
     )
 
 
-def features(objects: bool) -> dict[str, Any]:
+def features(objects: bool, device: str) -> dict[str, Any]:
     """What LeRobot's configurations know of the windows."""
     from lerobot.configs.types import FeatureType, PolicyFeature
 
@@ -184,7 +159,30 @@ def features(objects: bool) -> dict[str, Any]:
         shape = (OBJECTS,)
         inputs["observation.environment_state"] = PolicyFeature(type=FeatureType.ENV, shape=shape)
     outputs = {"action": PolicyFeature(type=FeatureType.ACTION, shape=(D_A,))}
-    return {"input_features": inputs, "output_features": outputs, "n_obs_steps": TO, "horizon": H}
+    length = {"n_obs_steps": TO, "horizon": H, "n_action_steps": H - TO + 1}
+    return {"input_features": inputs, "output_features": outputs, "device": device, **length}
+
+
+def lerobot(
+    name: str,
+    policy: Any,
+    seen: Callable[[torch.Tensor], dict[str, torch.Tensor]],
+    set_steps: Callable[[int], None],
+    device: str,
+) -> Peer:
+    """A policy of LeRobot's; `seen` names the parts of observations as it does."""
+    now = seen(torch.randn(1, D_O, device=device))
+
+    def loss(batch: Batch) -> torch.Tensor:
+        target = {"action": batch["vla_action", "chunk"], "action_is_pad": batch["action_is_pad"]}
+        return policy(seen(batch["observation"]) | target)[0]
+
+    def decide(nfe: int) -> None:
+        set_steps(nfe)
+        policy.reset()
+        policy.select_action(dict(now))
+
+    return Peer(name, policy, loss, decide, 100)
 
 
 def lerobot_diffusion(parameters: float, device: str) -> Peer:
@@ -193,32 +191,17 @@ def lerobot_diffusion(parameters: float, device: str) -> Peer:
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
     def make(width: int) -> nn.Module:
-        options = features(objects=True) | {"device": device, "n_action_steps": H - TO + 1}
         dims = (width, 2 * width, 4 * width)
-        return DiffusionPolicy(DiffusionConfig(**options, down_dims=dims))
+        return DiffusionPolicy(DiffusionConfig(**features(True, device), down_dims=dims))
 
     policy = make(nearest(make, range(16, 513, 16), parameters)).to(device)
 
-    def lerobots(batch: Batch) -> dict[str, torch.Tensor]:
-        state, objects = batch["observation"].split((VECTOR, OBJECTS), dim=-1)
-        return {
-            "observation.state": state,
-            "observation.environment_state": objects,
-            "action": batch["vla_action", "chunk"],
-            "action_is_pad": batch["action_is_pad"],
-        }
+    def seen(observation: torch.Tensor) -> dict[str, torch.Tensor]:
+        parts = observation.split((VECTOR, OBJECTS), dim=-1)
+        return dict(zip(("observation.state", "observation.environment_state"), parts, strict=True))
 
-    now = {
-        "observation.state": torch.randn(1, VECTOR, device=device),
-        "observation.environment_state": torch.randn(1, OBJECTS, device=device),
-    }
-
-    def decide(nfe: int) -> None:
-        policy.diffusion.num_inference_steps = nfe
-        policy.reset()
-        policy.select_action(dict(now))
-
-    return Peer("lerobot: diffusion (U-Net)", policy, lambda b: policy(lerobots(b))[0], decide, 100)
+    set_steps = partial(setattr, policy.diffusion, "num_inference_steps")
+    return lerobot("lerobot: diffusion (U-Net)", policy, seen, set_steps, device)
 
 
 def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
@@ -238,68 +221,37 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
     )
 
     def make(width: int) -> nn.Module:
-        options = features(objects=False) | {"device": device, "n_action_steps": H - TO + 1}
         flow = {"objective": "flow_matching", "hidden_dim": width}
-        return modeling.MultiTaskDiTPolicy(MultiTaskDiTConfig(**options, **flow))
+        return modeling.MultiTaskDiTPolicy(MultiTaskDiTConfig(**features(False, device), **flow))
 
     encoder = classmethod(lambda kind, *args, **kwargs: kind(small))
     with mock.patch.object(modeling.CLIPTextModel, "from_pretrained", encoder):
         policy = make(nearest(make, range(64, 769, 64), parameters)).to(device)
-    token = {
-        "observation.language.tokens": torch.zeros(1, 1, dtype=torch.long, device=device),
-        "observation.language.attention_mask": torch.ones(1, 1, dtype=torch.bool, device=device),
-    }
 
-    def lerobots(batch: Batch) -> dict[str, torch.Tensor]:
-        language = {k: v.expand(len(batch), 1) for k, v in token.items()}
-        state, action = batch["observation"], batch["vla_action", "chunk"]
-        pad = batch["action_is_pad"]
-        return language | {"observation.state": state, "action": action, "action_is_pad": pad}
+    def seen(observation: torch.Tensor) -> dict[str, torch.Tensor]:
+        token = torch.ones(len(observation), 1, dtype=torch.bool, device=device)
+        language = {"tokens": 0 * token.long(), "attention_mask": token}
+        named = {f"observation.language.{name}": value for name, value in language.items()}
+        return {"observation.state": observation, **named}
 
-    now = {"observation.state": torch.randn(1, D_O, device=device), **token}
+    set_steps = partial(setattr, policy.config, "num_integration_steps")
+    return lerobot("lerobot: multi_task_dit", policy, seen, set_steps, device)
 
-    def decide(nfe: int) -> None:
-        policy.config.num_integration_steps = nfe
-        policy.reset()
-        policy.select_action(dict(now))
 
-    return Peer("lerobot: multi_task_dit", policy, lambda b: policy(lerobots(b))[0], decide, 100)
-
+# How to build each, and the packages that it needs.
+transformer = partial(ours, ChiTransformer, "embedding_dim", range(48, 1024, 24))  # the paper's network
 
 PEERS: dict[str, tuple[Callable[[float, str], Peer], tuple[str, ...]]] = {
-    "warmprior_transformer": (warmprior_transformer, ()),
-    "warmprior_transformer_no_dropout": (partial(warmprior_transformer, dropout=0.0), ()),
-    "warmprior_mlp": (warmprior_mlp, ()),
+    "warmprior_transformer": (transformer, ()),
+    "warmprior_transformer_no_dropout": (partial(transformer, dropout=0.0), ()),
+    "warmprior_mlp": (partial(ours, VelocityMLP, "hidden_dim", range(64, 4096, 32)), ()),
     "torchrl": (torchrl, ()),
     "lerobot_diffusion": (lerobot_diffusion, ("lerobot", "diffusers")),
     "lerobot_multi_task_dit": (lerobot_multi_task_dit, ("lerobot", "diffusers", "transformers")),
 }
-"""By name: how to build it, and the packages that it needs."""
 
 
-def found(names: Sequence[str]) -> Iterator[str]:
-    """Those of the peers whose packages are installed; the others are named."""
-    for name in names:
-        missing = [package for package in PEERS[name][1] if not find_spec(package)]
-        if missing:
-            print(f"{name}: skipped, needs {' and '.join(missing)} (warmprior[vla])")
-        else:
-            yield name
-
-
-def synchronised(function: Callable[[], object], device: str) -> Callable[[], object]:
-    """A function that is over when the device is."""
-    if torch.device(device).type != "cuda":
-        return function
-
-    def call() -> None:
-        function()
-        torch.cuda.synchronize(device)
-
-    return call
-
-
-def training_step(peer: Peer, sample: Callable[[], Batch], device: str) -> Callable[[], object]:
+def training_step(peer: Peer, sample: Callable[[], Batch]) -> Callable[[], object]:
     """A step: windows, loss, backward, optimiser."""
     trained = [p for p in peer.module.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(trained, fused=True)
@@ -311,7 +263,7 @@ def training_step(peer: Peer, sample: Callable[[], Batch], device: str) -> Calla
         loss.backward()
         optimizer.step()
 
-    return synchronised(step, device)
+    return step
 
 
 def flop_of(peer: Peer, batch: Batch) -> int:
@@ -326,7 +278,7 @@ def measure(peers: Sequence[Peer], options: argparse.Namespace, clock: Clock) ->
     device, batch = options.device, options.batch_size
     data = steps(400, 200).to(device)
     sample = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO).sample
-    training = clock.times(*(training_step(peer, sample, device) for peer in peers))
+    training = clock.times(*(training_step(peer, sample) for peer in peers))
     rows = [
         {
             "policy": peer.name,
@@ -340,12 +292,12 @@ def measure(peers: Sequence[Peer], options: argparse.Namespace, clock: Clock) ->
         peer.module.eval()
     with torch.no_grad():
         for nfe in NFES:
-            decisions = [synchronised(partial(peer.decide, nfe), device) for peer in peers]
+            decisions = [partial(peer.decide, nfe) for peer in peers]
             for row, seconds in zip(rows, clock.times(*decisions, calls=5), strict=True):
                 row[f"latency_nfe_{nfe}"] = 1000 * statistics.median(seconds)
         for row, peer in zip(rows, peers, strict=True):
             row["own_steps"] = peer.own_steps
-            (seconds,) = clock.times(synchronised(partial(peer.decide, peer.own_steps), device))
+            (seconds,) = clock.times(partial(peer.decide, peer.own_steps))
             row["latency_own"] = 1000 * statistics.median(seconds)
     return rows
 
@@ -365,20 +317,11 @@ def report(rows: Sequence[Row]) -> str:
     return pd.DataFrame(lines).T.to_string()
 
 
-def over_lerobot(rows: Sequence[Row]) -> dict[str, float]:
-    """Training samples per second of this library's over those of LeRobot's faster policy."""
-    speed = {row["policy"]: row["samples_per_second"] for row in rows}
-    theirs = [value for name, value in speed.items() if name.startswith("lerobot")]
-    mine = {name: value for name, value in speed.items() if name.startswith("warmprior")}
-    return {name: value / max(theirs) for name, value in mine.items()} if theirs else {}
-
-
 def draw(path: Path, rows: Sequence[Row]) -> None:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     speed, latency = figure.subplots(1, 2)
     names = [row["policy"].replace(": ", ":\n") for row in rows]
-    palette = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3", "#e7298a"]
-    colors = palette[: len(rows)]
+    colors = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3", "#e7298a"][: len(rows)]
     speed.barh(names, [row["samples_per_second"] for row in rows], color=colors)
     speed.set(xlabel="training, samples/s")
     speed.invert_yaxis()
@@ -406,7 +349,13 @@ def run(argv: Sequence[str] | None) -> None:
         parser.error("--repeats and --batch-size must be at least 1, --parameters 1e4 to 1e9")
     check_device(options.device)
     torch.manual_seed(0)
-    peers = [PEERS[name][0](options.parameters, options.device) for name in found(options.peers)]
+    peers = []
+    for name in options.peers:
+        make, packages = PEERS[name]
+        if missing := [package for package in packages if not find_spec(package)]:
+            print(f"{name}: skipped, needs {' and '.join(missing)} (warmprior[vla])")
+        else:
+            peers.append(make(options.parameters, options.device))
     if not peers:
         raise ValueError("none of these peers is installed: pip install 'warmprior[vla]'")
     options.out.mkdir(parents=True, exist_ok=True)
@@ -420,8 +369,6 @@ def run(argv: Sequence[str] | None) -> None:
     (options.out / "table.txt").write_text(report(rows) + "\n")
     draw(options.out / "peers.png", rows)
     print(report(rows))
-    for name, ratio in over_lerobot(rows).items():
-        print(f"training over lerobot's faster policy, {name}: {ratio:.2f}")
     print(f"written to {options.out}")
 
 

@@ -73,6 +73,8 @@ class Clock:
                 start = time.perf_counter()
                 for _ in range(calls):
                     things[i]()
+                    if torch.cuda.is_initialized():
+                        torch.cuda.synchronize()
                 if repeat:  # the first round warms up
                     found[i].append((time.perf_counter() - start) / calls)
             self.bar.set_postfix(repeat=f"{repeat}/{self.repeats}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ import torch
 pytest.importorskip("tyro")
 
 import measures
-from measures import measured
+from measures import measure
 from methods import Method
 
 from tests.benchmarks.drift import ACTION_DIM, OBSERVATION_DIM, task
@@ -19,6 +20,7 @@ from tests.diagnostics.fields import Field, policy
 from tests.diagnostics.test_shared_observations import H, steps
 from warmprior import GaussianPrior, PastPrior, PreviewPrior, WarmPriorActor, keys
 from warmprior.diagnostics import SharedObservations
+from warmprior.training import NetworkOptions
 
 
 def straightness(policies, *args, **options):
@@ -121,6 +123,7 @@ def test_the_memory_gain_of_a_network_that_sees_the_history_is_that_of_what_it_s
     seen = slice(OBSERVATION_DIM, OBSERVATION_DIM + length * ACTION_DIM)
     follows = Field(lambda t, a, o: 0.4 * o[:, -1, seen].unflatten(-1, (length, ACTION_DIM)) - a)
     actor = WarmPriorActor(follows, GaussianPrior(length), observation_key=keys.CONDITIONED)
-    options = {"chunk_length": length, "observation_steps": 2, "coupled": False}
-    found = measured(actor, task().data, (1,), **options)
+    method, network = Method("history", length), NetworkOptions()
+    trained = SimpleNamespace(load=lambda: actor, task=task, method=method, network=network)
+    found = measure(trained, (1,))
     assert found[1]["memory_gain"] == pytest.approx(0.4, rel=1e-4)

@@ -118,7 +118,8 @@ def test_around_zero_the_source_is_what_the_agent_says(prior, length):
     assert around_mean is actor and has_anchor(actor)
     assert around_zero.network is network and not has_anchor(around_zero)
     anchors = [
-        benchmark.toy(policy, 2, 0).rollout(2)["prior", "anchor"] for policy in (around_mean, around_zero)
+        benchmark.environment(policy, True, 2, {}, 0).rollout(2)["prior", "anchor"]
+        for policy in (around_mean, around_zero)
     ]
     assert anchors[0].shape == anchors[1].shape == (2, 2, length, 1)
     assert anchors[0].any() and not anchors[1].any()

@@ -53,7 +53,6 @@ def no_work(monkeypatch):
         ("budget", FILE, "train them with --mask train"),
         ("robomimic", "--mask train", "--mask is that of a file"),
         ("curvature", f"{HELD_OUT} --prior regression", "none of these policies has a flow"),
-        ("curvature", f"{HELD_OUT} --observations 20 --coordinate 9", "--coordinate must be in [0, 7)"),
         ("curvature", "--run {tmp}", "there is no run in"),
         ("real_time_chunking", "--delay 5", "too long"),
         ("real_time_chunking", "--prior regression --nfe 1 --guidance rtc", "regression is no flow to guide"),

@@ -41,7 +41,7 @@ def finished(inline, short_episodes, dataset, tmp_path_factory):
 
 
 def measured(out, validation):
-    return {"out": out, "validation": validation, "observations": 20, "steps": 8}
+    return {"out": out, "validation": validation, "observations": 20}
 
 
 def test_curvature_of_a_finished_run_trains_nothing(finished, dataset, validation, tmp_path, capsys):
@@ -145,14 +145,14 @@ def test_a_file_with_masks_is_its_own_validation(tmp_path):
     path, lengths = tmp_path / "lift.hdf5", (30, 5, 40, 25)
     masks = {"train": [0, 1, 2], "valid": [3]}
     write_robomimic_file(path, lengths=lengths, task="lift", masks=masks)
-    few = {"observations": 10, "steps": 8, "prior": ["gaussian", "past"], "nfe": 1}
+    few = {"observations": 10, "prior": ["gaussian", "past"], "nfe": 1}
     out = tmp_path / "runs" / "masked"
     assert curvature.main(options(path, out, mask="train", **few)) == 0
     assert described(out, "tasks")[0]["demonstrations"] == 3
     assert "10 observations of lift.hdf5 (mask valid)" in (out / "report.md").read_text()
     # So of the finished run, whose options are not typed again.
     again = tmp_path / "runs" / "again"
-    assert curvature.main(command_line(run=out, observations=10, steps=8, out=again)) == 0
+    assert curvature.main(command_line(run=out, observations=10, out=again)) == 0
     assert stored(again, "curvature") == stored(out, "curvature")
     # As from a file of those demonstrations alone, beside one of the others.
     for name, kept in masks.items():
