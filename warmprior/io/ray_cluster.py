@@ -161,7 +161,7 @@ def _look_at(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> An
 def _check_node(ray: Any, node: Mapping[str, Any], look: Any) -> None:
     name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
     try:
-        theirs, unseen = ray.get(look, timeout=PATIENCE)
+        theirs, unseen = ray.get(look, timeout=3 * PATIENCE)  # it may start on a busy machine
     except ray.exceptions.RayError as error:
         cause = getattr(error, "cause", None) or error
         raise WorkerError(f"{name} cannot start this library: {cause}") from error
