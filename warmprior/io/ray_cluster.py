@@ -22,7 +22,7 @@ from warmprior.io.workers import WorkerError, available_cores, stop_forking
 __all__ = ["check_ray", "check_versions", "ray_cluster"]
 
 PATIENCE = 60.0
-"""Seconds in which a cluster, and each of its machines, has to answer."""
+"""Seconds in which a cluster has to answer; each machine has three times as long to import this library."""
 
 CONNECT = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
 """What a process does to find out whether there is a cluster."""
@@ -161,7 +161,7 @@ def _look_at(ray: Any, node: Mapping[str, Any], tokens: Mapping[str, str]) -> An
 def _check_node(ray: Any, node: Mapping[str, Any], look: Any) -> None:
     name = f"Ray's node {node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
     try:
-        theirs, unseen = ray.get(look, timeout=3 * PATIENCE)  # it may start on a busy machine
+        theirs, unseen = ray.get(look, timeout=3 * PATIENCE)
     except ray.exceptions.RayError as error:
         cause = getattr(error, "cause", None) or error
         raise WorkerError(f"{name} cannot start this library: {cause}") from error
