@@ -19,8 +19,9 @@ import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Self
 
@@ -194,7 +195,7 @@ class Jobs:
         """Compute all jobs; what failed, by group, and why."""
         running: dict[Future[Any], Job] = {}
         ended = 0
-        with progress() as show:
+        with progress(self.engine.workers) as show:
             while self._waiting or running:
                 while (job := self._next()) is not None:
                     self._waiting.remove(job)
@@ -243,24 +244,33 @@ class Jobs:
 
 
 @contextmanager
-def progress() -> Iterator[Callable[[list[Job], int, int], None]]:
-    """Show a bar of all jobs and how far trainings are; without a terminal that is said now and then.
+def progress(workers: int) -> Iterator[Callable[[list[Job], int, int], None]]:
+    """Show a bar of all jobs and one per worker on a terminal; elsewhere a line per training, now and then.
 
     It gives a function of the running jobs, and of how many jobs are done, of how many.
     """
     spoke = time.monotonic()
-    # disable=None: no bar without a terminal.
-    with tqdm(desc="jobs", leave=False, dynamic_ncols=True, disable=None) as bar:
+    # disable=None: no bars without a terminal.
+    options: dict[str, Any] = {"leave": False, "dynamic_ncols": True, "disable": None}
 
-        def show(running: list[Job], ended: int, total: int) -> None:
-            nonlocal spoke
-            far = [(job.name, done) for job in running if (done := job.iterations())]
-            lines = [f"{name}: {done[0]:,} of {done[1]:,} iterations" for name, done in far]
-            if not bar.disable:
-                bar.total, bar.n = total, ended
-                bar.set_postfix_str("; ".join(lines))
-            elif lines and time.monotonic() - spoke > LINES_EVERY:
-                spoke = time.monotonic()
-                print(*lines, sep="\n", flush=True)
+    def show(running: list[Job], ended: int, total: int) -> None:
+        nonlocal spoke
+        whole.total, whole.n = total, ended
+        whole.refresh()
+        if not whole.disable:
+            for bar, job in zip_longest(bars, running[: len(bars)]):
+                done = job and job.iterations()
+                bar.n, bar.total = done or (0, 1)
+                bar.bar_format = "{desc}: {percentage:3.0f}%|{bar}| {n}/{total}" if done else "{desc}"
+                bar.set_description_str(job.name if job else "")
+        elif time.monotonic() - spoke > LINES_EVERY:
+            spoke = time.monotonic()
+            for job in running:
+                if done := job.iterations():
+                    print(f"{job.name}: {done[0]:,} of {done[1]:,} iterations", flush=True)
 
+    with ExitStack() as stack:
+        whole = stack.enter_context(tqdm(total=1, desc="jobs", **options))
+        worker = {"bar_format": "{desc}", **options}
+        bars = [stack.enter_context(tqdm(position=1 + i, **worker)) for i in range(min(workers, 8))]
         yield show
