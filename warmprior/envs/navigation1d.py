@@ -223,8 +223,8 @@ class NavigationEnv(EnvBase):
                 failed = failed | (step == middle) & (height * side <= 0)
             done = done | failed
         success = done & ~failed
-        told = self._tell(step + 1, height.clone(), collided, success, done)
-        return told.set("reward", success.to(height.dtype))
+        seen = self._tell(step + 1, height.clone(), collided, success, done)
+        return seen.set("reward", success.to(height.dtype))
 
     def _tell(
         self, step: Tensor, height: Tensor, collided: Tensor, success: Tensor, done: Tensor
