@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -18,10 +19,12 @@ from tests.lerobot.seen import watch
 from tests.lerobot.tiny import (
     ACTION,
     LENGTH,
+    make_groot,
     make_pi,
     make_smolvla,
     observations,
     tiny_gemma,
+    tiny_groot,
     tiny_smolvlm,
     windows,
 )
@@ -45,6 +48,7 @@ pytest.importorskip("transformers")
 from lerobot.configs.types import NormalizationMode
 
 STATE, OBJECT = 9, 10  # of lift
+VLA = ["warm_smolvla", "warm_pi05", "warm_groot"]
 
 
 @pytest.fixture(scope="module")
@@ -54,18 +58,19 @@ def found():
     from lerobot.utils.import_utils import register_third_party_plugins
 
     register_third_party_plugins()
-    return {name: get_policy_class(name) for name in ("warm_smolvla", "warm_pi05", "warm_flow")}
+    return {name: get_policy_class(name) for name in (*VLA, "warm_flow")}
 
 
 def warm(found, name, **options):
     kind = found[name]
     config = kind.config_class
-    if name == "warm_smolvla":
-        return make_smolvla(kind, config, **options)
-    return make_pi("pi05", kind, config, **options)
+    make = {"warm_smolvla": make_smolvla, "warm_groot": make_groot}.get(name, partial(make_pi, "pi05"))
+    return make(kind, config, **options)
 
 
 def small(name):
+    if name == "warm_groot":
+        return tiny_groot()
     if name == "warm_smolvla":
         from lerobot.policies.smolvla import smolvlm_with_expert
 
@@ -75,7 +80,7 @@ def small(name):
     return tiny_gemma(modeling_pi05)
 
 
-@pytest.mark.parametrize("name", ["warm_smolvla", "warm_pi05"])
+@pytest.mark.parametrize("name", VLA)
 def test_a_base_checkpoint_becomes_a_warm_policy(found, name, built, tmp_path):
     base = built(name.removeprefix("warm_"))
     base.save_pretrained(tmp_path / "base")
@@ -95,7 +100,7 @@ def test_a_base_checkpoint_becomes_a_warm_policy(found, name, built, tmp_path):
     assert all(map(torch.equal, again.state_dict().values(), policy.state_dict().values()))
 
 
-@pytest.mark.parametrize("name", ["warm_smolvla", "warm_pi05"])
+@pytest.mark.parametrize("name", VLA)
 def test_losses_and_chunks_start_from_the_prior(found, name):
     torch.manual_seed(0)
     family = name.removeprefix("warm_")
@@ -103,7 +108,8 @@ def test_losses_and_chunks_start_from_the_prior(found, name):
     batch = windows(family, 2, LENGTH)
     with watch(family, policy) as seen:
         loss, _ = policy.forward(dict(batch))
-    history, target = batch["action"][:, :LENGTH], batch["action"][:, LENGTH:]
+    history, target = batch["action"][:, :LENGTH], batch["action"][:, -LENGTH:, :ACTION]
+    history = batch.get("action_history", history)
     # On the line between the two, at one time per sample: t = 1 is the source.
     x = seen.x[0][..., :ACTION]
     t = ((x - target) / (history - target)).flatten(1)
@@ -122,6 +128,45 @@ def test_losses_and_chunks_start_from_the_prior(found, name):
     with watch(family, policy) as seen:
         policy.predict_action_chunk(dict(start))
     assert not torch.equal(seen.x[0][..., :ACTION], sources[2])
+
+
+def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
+    """Minima and maxima by hand; the chunk is what GR00T's own processors make of it."""
+    from lerobot.policies.factory import make_pre_post_processors
+    from lerobot.policies.groot import processor_groot
+
+    # What encodes images and language is on the hub.
+    monkeypatch.setattr(processor_groot.GrootN17VLMEncodeStep, "__call__", lambda self, seen: seen)
+    actions = torch.randn(20, 3 + LENGTH, ACTION) * torch.linspace(0.1, 3.0, ACTION) + 5.0
+    flat = actions.flatten(0, 1)
+    low, high = flat.amin(0), flat.amax(0)
+    options = {"dataset_stats": {"action": {"min": low, "max": high}}}
+    config = warm(found, "warm_groot", prior="past,sigma=0.0", prior_chunk=3, n_action_steps=3).config
+    assert config.action_delta_indices == list(range(-3, LENGTH))
+    before, after = make_pre_post_processors(config, **options)
+    raw = {
+        "observation.state": torch.rand(20, *config.input_features["observation.state"].shape),
+        "action": actions,
+        "task": ["push"] * 20,
+    }
+    raw["action_is_pad"] = torch.arange(3 + LENGTH).lt(2).expand(20, -1) | torch.arange(3 + LENGTH).ge(9)
+    before.save_pretrained(tmp_path), after.save_pretrained(tmp_path)
+    again, _ = make_pre_post_processors(config, pretrained_path=str(tmp_path))
+    own, _ = processor_groot.make_groot_pre_post_processors(config, **options)
+    chunk = {name: value[:, 3:] if name.startswith("action") else value for name, value in raw.items()}
+    theirs = own(dict(chunk))
+    for pipeline in (before, again):
+        batch = pipeline(dict(raw))
+        scaled = 2 * (actions[:, :3] - low) / (high - low) - 1
+        torch.testing.assert_close(batch["action_history"], scaled)
+        assert torch.equal(batch["action_history_is_pad"], raw["action_is_pad"][:, :3])
+        for name in ("action", "action_mask", "action_is_pad", "state"):
+            assert torch.equal(batch[name], theirs[name]), name
+        observation = {"observation.state": raw["observation.state"], "task": raw["task"]}
+        assert "action_history" not in pipeline(observation)
+    before.steps[2].modality_config = {"action": {"action_configs": [{"rep": "relative"}]}}
+    with pytest.raises(ValueError, match=r"has relative actions, .* choose an embodiment_tag"):
+        before(dict(raw))
 
 
 STANDARDISED = {"normalization_mapping": {"VISUAL": NormalizationMode.MEAN_STD}}

@@ -147,11 +147,19 @@ def tiny_gemma(modeling: Any) -> Any:
         yield
 
 
-def make_groot(**options: Any) -> Any:
-    """The real action head behind an embedding of tokens."""
-    from lerobot.policies.groot import modeling_groot
+def make_groot(kind: Any = None, config: Any = None, **options: Any) -> Any:
     from lerobot.policies.groot.configuration_groot import GrootConfig
+    from lerobot.policies.groot.modeling_groot import GrootPolicy
+
+    chosen = {**features(), **SIZES, "use_bf16": False, **options}
+    with tiny_groot():
+        return (kind or GrootPolicy)((config or GrootConfig)(**chosen))
+
+
+def tiny_groot() -> Any:
+    """The real action head behind an embedding of tokens."""
     from lerobot.policies.groot.groot_n1_7 import GR00TN17ActionHead, GR00TN17Config
+    from lerobot.policies.groot.modeling_groot import GrootPolicy
     from transformers.feature_extraction_utils import BatchFeature
 
     sizes = GR00TN17Config(
@@ -201,10 +209,7 @@ def make_groot(**options: Any) -> Any:
             head = self.action_head
             return head.get_action(self._seen(inputs), head.prepare_input(inputs), options)
 
-    chosen = {**features(), **SIZES, "use_bf16": False, **options}
-    create = mock.patch.object(modeling_groot.GrootPolicy, "_create_groot_model", lambda self: Model())
-    with create:
-        return modeling_groot.GrootPolicy(GrootConfig(**chosen))
+    return mock.patch.object(GrootPolicy, "_create_groot_model", lambda self: Model())
 
 
 def make_groot_n15(**options: Any) -> Any:

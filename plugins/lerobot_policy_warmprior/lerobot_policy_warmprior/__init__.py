@@ -1,7 +1,8 @@
 """LeRobot finds this package by its name, and these policies by their types."""
 
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
+from lerobot_policy_warmprior.configuration_warm_groot import WarmGrootConfig
 from lerobot_policy_warmprior.configuration_warm_vla import WarmPI05Config, WarmSmolVLAConfig
 from lerobot_policy_warmprior.robosuite_config import RobosuiteEnvConfig
 
-__all__ = ["RobosuiteEnvConfig", "WarmFlowConfig", "WarmPI05Config", "WarmSmolVLAConfig"]
+__all__ = ["RobosuiteEnvConfig", "WarmFlowConfig", "WarmGrootConfig", "WarmPI05Config", "WarmSmolVLAConfig"]

@@ -40,13 +40,14 @@ class WarmConfigMixin:
             ValueError: if there is none of that name and these options.
         """
         kind = find(Prior, self.prior.partition(",")[0])
-        room = self.chunk_size // kind.prediction_chunks
+        room = len(super().action_delta_indices) // kind.prediction_chunks
         return make(Prior, self.prior, room if self.prior_chunk is None else self.prior_chunk)
 
     @property
     def action_delta_indices(self) -> list[int]:
         """Steps that LeRobot loads of every action: the history, and the chunk."""
-        return history_indices(self.make_prior().history_length, self.chunk_size)
+        chunk = super().action_delta_indices
+        return history_indices(self.make_prior().history_length, len(chunk))
 
 
 @PreTrainedConfig.register_subclass("warm_smolvla")

@@ -1,0 +1,73 @@
+"""GR00T's own processors, which keep the remembered actions apart from the chunk."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from lerobot.lerobot_types import EnvTransition, TransitionKey
+from lerobot.policies.groot.processor_groot import GrootN17PackInputsStep, make_groot_pre_post_processors
+from lerobot.processor import ProcessorStepRegistry
+from torch.nn.functional import pad
+
+from lerobot_policy_warmprior.configuration_warm_groot import WarmGrootConfig
+from warmprior.lerobot.adapter import HISTORY, HISTORY_IS_PAD
+
+__all__ = ["WarmGrootPackInputsStep", "make_warm_groot_pre_post_processors"]
+
+DATA, PAD = TransitionKey.COMPLEMENTARY_DATA, "action_is_pad"
+
+
+@dataclass
+@ProcessorStepRegistry.register("warm_groot_pack_inputs")
+class WarmGrootPackInputsStep(GrootN17PackInputsStep):
+    """Packs the chunk as GR00T does, which takes no longer one, and the actions before it beside it."""
+
+    history_length: int = 0
+
+    def __call__(self, transition: EnvTransition) -> EnvTransition:
+        """The packed transition, with ``action_history`` if it has actions.
+
+        Raises:
+            ValueError: if the checkpoint's actions are relative, each position with statistics of its own.
+        """
+        if self._uses_relative_action_groups():
+            raise ValueError(
+                "this checkpoint of GR00T has relative actions, and remembered ones cannot be expressed at "
+                "the next state: choose an embodiment_tag whose actions are absolute"
+            )
+        window, data = transition.get(TransitionKey.ACTION), transition.get(DATA) or {}
+        if window is None:
+            return super().__call__(transition)
+        length, width = self.history_length, window.shape[-1]
+        past = super().__call__({TransitionKey.ACTION: window[:, :length]})[TransitionKey.ACTION]
+        more: dict[str, Any] = {HISTORY: past[:, :length, :width]}
+        if PAD in data:
+            more[HISTORY_IS_PAD], data[PAD] = data[PAD][:, :length], data[PAD][:, length:]
+        transition[TransitionKey.ACTION] = window[:, length:]
+        packed = super().__call__(transition)
+        if PAD in data:  # a chunk shorter than the model's is padded, and so is its mask
+            longer = packed[TransitionKey.ACTION].shape[1] - data[PAD].shape[1]
+            more[PAD] = pad(torch.as_tensor(data[PAD]), (0, longer), value=True)
+        packed[DATA] |= more
+        return packed
+
+    def get_config(self) -> dict[str, Any]:
+        """What is saved."""
+        return super().get_config() | {"history_length": self.history_length}
+
+
+def make_warm_groot_pre_post_processors(
+    config: WarmGrootConfig, dataset_stats: Any = None, dataset_meta: Any = None
+) -> tuple[Any, Any]:
+    """GR00T's processors, the packing step of which knows the length of the history."""
+    before, after = make_groot_pre_post_processors(config, dataset_stats, dataset_meta)
+    (at,) = (i for i, step in enumerate(before.steps) if isinstance(step, GrootN17PackInputsStep))
+    own = {f.name: getattr(before.steps[at], f.name) for f in fields(before.steps[at]) if f.init}
+    pack = WarmGrootPackInputsStep(**own, history_length=config.make_prior().history_length)
+    before.steps[at] = pack
+    for step in after.steps:  # decodes by the state that was packed
+        if hasattr(step, "pack_step"):
+            step.pack_step = pack
+    return before, after
