@@ -57,6 +57,7 @@ def test_rows_have_an_order_and_do_not_depend_on_who_computes(finished, inline, 
     assert untimed(tmp_path / "out") == untimed(finished)
 
 
+@pytest.mark.slow  # a cluster, whose start takes minutes on a busy machine
 @apart
 def test_rows_of_a_ray_cluster_are_those_of_this_machine(finished, tmp_path, ray_address, monkeypatch):
     monkeypatch.chdir(tmp_path)  # that of the cluster is another

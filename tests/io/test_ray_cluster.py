@@ -15,7 +15,7 @@ from warmprior.io.ray_cluster import check_ray, ray_cluster
 pytest.importorskip("ray")
 
 
-@pytest.mark.slow  # the benchmarks compute on a cluster
+@pytest.mark.slow  # a cluster takes most of a minute to start, and minutes on a busy machine
 @apart
 def test_machines_look_for_modules_where_this_process_does(ray_address, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
