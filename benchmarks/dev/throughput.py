@@ -25,7 +25,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import prior_space_figures as prior_space
 import torch
 import training_figures as training
 from tensordict import TensorDict
@@ -34,10 +33,7 @@ from tqdm import tqdm
 from training_figures import BATCH, D_A, D_O, PRIOR, TO, H, paper_network, small_network, step_of, steps
 
 from warmprior import (
-    ChiTransformer,
-    ImageEncoder,
     Normalizer,
-    VisionNetwork,
     WarmPriorActor,
     policy_transforms,
     window_replay_buffer,
@@ -273,24 +269,6 @@ def image_windows_over_h5py(clock: Clock) -> float:
             return clock.ratio(decode, buffer.sample)
 
 
-def encoder_share(clock: Clock) -> dict[str, float]:
-    """Share of a decision's time that the ResNets of two cameras take."""
-    torch.manual_seed(0)
-    cameras = ["agentview_image", "robot0_eye_in_hand_image"]
-    encoder = ImageEncoder(cameras, 9)
-    network = ChiTransformer(D_A, encoder.observation_dim, PRIOR.prediction_length, TO)
-    actor = WarmPriorActor(VisionNetwork(encoder, network), PRIOR).eval()
-    images = {name: torch.zeros(1, TO, 3, 84, 84, dtype=torch.uint8) for name in cameras}
-    observation = TensorDict({"state": torch.randn(1, TO, 9), **images}, [1])
-    history = window_history(torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
-    data = TensorDict({"observation": observation, "history": history}, [1])
-    with torch.no_grad():
-        return {
-            str(nfe): clock.ratio(partial(encoder, observation), partial(actor, data, nfe=nfe))
-            for nfe in (1, 3, 9)
-        }
-
-
 LOAD = """
 import sys
 from warmprior.data import RobomimicExperienceReplay
@@ -367,9 +345,6 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "chunk_step_overhead": (chunk_step_overhead, "<= 0.10"),
     "load_memory_over_data": (load_memory_over_data, "<= 1.3"),
     "image_windows_over_h5py": (image_windows_over_h5py, ">= 5"),
-    "encoder_share": (encoder_share, ""),
-    "prior_space_decoding": (prior_space.decoding, ""),
-    "prior_space_collection_over_env": (prior_space.collection_over_env, ""),
     "job_overhead": (job_overhead, ""),
 }
 
