@@ -29,9 +29,9 @@ def download_robomimic(
 
     robomimic's is ``v1.5/{task}/{style}/low_dim_v15.hdf5`` of the first of :data:`REPOSITORIES` that
     delivers it, and MimicGen's ``source/stack.hdf5`` or ``core/stack_d0.hdf5`` (and the like) of
-    :data:`MIMICGEN_REPOSITORY`, whose licence, CC BY-NC-SA 4.0, excludes commercial use. Before its path is
-    returned it is compared with the digest that the hub gives, where the hub can be reached, and opened; a
-    file that fails is fetched once more.
+    :data:`MIMICGEN_REPOSITORY`, whose licence, CC BY-NC-SA 4.0, excludes commercial use. The file, whose path
+    is returned, is opened and compared with the digest that the hub gives, where that can be reached; one
+    that fails is fetched once more.
 
     Args:
         task: ``lift``, ``can``, ``square``, ``transport`` or ``tool_hang``; ``stack_d0``, ``coffee_d0`` or
@@ -42,13 +42,9 @@ def download_robomimic(
         root: the folder under which to keep the file; by default the hub client's cache.
         force: download again even if the file is there.
 
-    Returns:
-        The path of the local file.
-
     Raises:
         ValueError: if there is no official file of the task or style.
         OSError: if no repository delivers a readable file; names every attempt and its cause.
-        ImportError: if h5py or huggingface_hub is not installed.
 
     Examples:
         >>> from warmprior.data import download_robomimic
@@ -81,9 +77,7 @@ def download_lerobot(
 ) -> Path:
     """Fetch files of a LeRobotDataset, by their patterns, unless they are here already; the dataset's folder.
 
-    A dataset that was recorded here lies in ``$HF_LEROBOT_HOME/REPOSITORY`` and is taken from there, as
-    LeRobot does. Any other is kept in LeRobot's own cache, and read from it without a connection. An
-    ``OSError`` if the repository, or its ``revision`` (by default one of this version), cannot be had.
+    ``$HF_LEROBOT_HOME/REPOSITORY`` comes first, as in LeRobot, then its cache, without a connection.
     """
     default = Path(require("huggingface_hub.constants", "lerobot").HF_HOME) / "lerobot"
     home = Path(os.environ.get("HF_LEROBOT_HOME") or default).expanduser()

@@ -1,9 +1,4 @@
-"""Reading robomimic's HDF5 layout, with errors that say which demo, key and row is wrong.
-
-:func:`read_index` looks at names, shapes and attributes only, and finds all that is wrong with them
-before anything big is read. :class:`RobomimicReader` then reads values, block by block, into memory
-that the caller owns.
-"""
+"""Reading robomimic's HDF5 layout, with errors that say which demo, key and row is wrong."""
 
 from __future__ import annotations
 
@@ -252,11 +247,10 @@ def read_index(
     poses: bool = False,
     demos: int | None = None,
 ) -> DatasetIndex:
-    """Say what a robomimic file holds; a ``DatasetError`` names what is wrong with it. No values are read.
+    """Say what a robomimic file holds, by names, shapes and attributes alone; errors name what is wrong.
 
-    Options as of :class:`~warmprior.data.RobomimicExperienceReplay`. By default the observations are those of
-    the task, or, for an unknown environment, ``object`` and each robot's pose and gripper as far as the file
-    has them; ``poses`` also requires the hand pose of every arm.
+    Options as of :class:`~warmprior.data.RobomimicExperienceReplay`; ``poses`` also requires the hand pose of
+    every arm.
     """
     path = Path(path)
     if demos is not None and demos < 1:

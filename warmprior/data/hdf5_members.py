@@ -1,8 +1,7 @@
 """Opening what an HDF5 file holds itself: no other file, nothing that was never written.
 
-An HDF5 file can name other files of the machine as its contents, and declare more than it stores;
-HDF5 reads the former as data and the rest of the latter as zeros. Everything the readers use is opened
-by :func:`member`, which refuses both.
+It can name other files of the machine as its contents, and declare more than it stores, which HDF5 reads as
+zeros. Everything the readers use is opened by :func:`member`, which refuses both.
 """
 
 from __future__ import annotations

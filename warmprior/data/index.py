@@ -26,13 +26,9 @@ class DatasetIndex:
     Attributes:
         path: the file or folder.
         demos: names of the selected demos, in the order of their numbers.
-        lengths: the number of steps of each.
         observation_keys: the observations to read, in the order of concatenation.
-        observation_dims: the width of each.
-        image_keys: the images to read.
-        image_size: their side in pixels; 0 if there are none.
+        image_size: side of the images to read in pixels; 0 if there are none.
         available_keys: every observation there is.
-        action_dim: the width of the actions.
         env_args: the environment as it is described there; empty if it is unknown.
         task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
     """

@@ -59,10 +59,7 @@ class LeRobotReader(DemonstrationReader):
         self._reward = next((name for name in (REWARD, SUCCESS) if name in features), None)
 
     def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
-        """Read rows of one array of an episode; see the base class.
-
-        Rewards of a dataset without ``next.reward`` are its ``next.success``, or else zeros.
-        """
+        """Rewards of a dataset without ``next.reward`` are its ``next.success``, or else zeros."""
         feature, part = self._place(key)
         if feature is None:
             out[...] = 0
@@ -168,24 +165,20 @@ class LeRobotExperienceReplay(DemonstrationReplay):
             (:func:`warmprior.envs.simulator.task_env_args`), for datasets that :func:`convert_robomimic`
             did not write; those are refused if it names another. Frequency, widths and names are checked
             against it, and robomimic's observations found by it. Without, whole features are observations.
-        filter_key: a mask of the converted file, see :class:`RobomimicExperienceReplay`.
-        demos: likewise.
         observation_keys: observations to concatenate; by default those of the task, or of an unknown
             environment ``"observation.environment_state"`` and ``"observation.state"`` as far as there.
         image_keys: images to read as well: ``"agentview_image"`` is the feature
             ``observation.images.agentview``, of pictures or a video. Take ``storage="memmap"`` where they
             are many.
-        absolute_actions: see :class:`RobomimicExperienceReplay`; of numbers that were rounded to float32.
-        **kwargs: likewise.
+        filter_key: a mask of the converted file. It, ``demos``, ``absolute_actions`` and ``**kwargs`` are as
+            of :class:`RobomimicExperienceReplay`.
 
     Raises:
         FileNotFoundError: if there is no such dataset.
         DatasetError: if the dataset is not as it should be, or does not fit the environment; says which
             folder or file, and why.
-        ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
-            of a controller without pose deltas.
+        ValueError: see :class:`RobomimicExperienceReplay`.
         OSError: if a download fails, or there is no space for memory maps.
-        ImportError: if lerobot is not installed.
 
     Examples:
         >>> from warmprior.data import LeRobotExperienceReplay
@@ -242,7 +235,6 @@ def lerobot_steps(
         FileNotFoundError: if there is no such dataset.
         DatasetError: if there is no such feature, or it is no vector of numbers; if the dataset is damaged.
         OSError: if a download fails.
-        ImportError: if LeRobot is not installed.
 
     Examples:
         >>> from warmprior.data import lerobot_steps

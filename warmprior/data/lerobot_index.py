@@ -65,10 +65,7 @@ class LeRobotIndex(DatasetIndex):
         )
 
     def digest(self) -> str:
-        """SHA-256 of what can be read: all files of numbers, and those of the images that are selected.
-
-        What LeRobot or the hub keeps beside (statistics, a card, a cache) does not count.
-        """
+        """SHA-256 of what can be read: all files of numbers, and those of the images that are selected."""
         meta = ("meta/info.json", DESCRIPTION, "meta/episodes/*/*.parquet")
         files = {path for pattern in meta for path in self.path.glob(pattern)}
         files |= {self.path / file for file in self.files}
@@ -152,17 +149,9 @@ def read_lerobot_index(
 ) -> LeRobotIndex:
     """Say what a LeRobotDataset v3 holds, by its ``meta/``. No values are read.
 
-    Of a dataset in the hub nothing else is fetched, unless ``fetch`` asks for what is to be read.
-
-    A dataset that :func:`warmprior.data.convert_robomimic` wrote says in which environment it was recorded,
-    and where each of robomimic's observations is. In any other ``env_args`` says the former, and of a task of
-    :data:`warmprior.envs.TASKS` the observations are looked for, by their widths, in
-    ``observation.environment_state`` (objects) beside ``observation.state`` (robots), in
-    ``observation.state`` alone, or each in ``observation.<key>``. Beside these every whole feature is an
-    observation, under its own name.
-
-    Options and errors are those of :class:`~warmprior.data.LeRobotExperienceReplay`; ``poses`` also requires
-    the hand pose of every arm, from which absolute actions are built.
+    Of a dataset in the hub nothing else is fetched, unless ``fetch`` asks for what is to be read. Options and
+    errors are those of :class:`~warmprior.data.LeRobotExperienceReplay`; ``poses`` also requires the hand
+    pose of every arm, from which absolute actions are built.
     """
     remote = is_remote(dataset)
     root = download_lerobot(str(dataset), revision=revision) if remote else Path(dataset).expanduser()

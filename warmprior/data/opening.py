@@ -36,10 +36,6 @@ def check_place(place: str | Path, option: str) -> None:
 
     A place is an HDF5 file, or ``lerobot:`` and a folder or repository; errors name it by the option.
 
-    Raises:
-        FileNotFoundError: if there is no such file or folder.
-        ImportError: if what reads it is not installed.
-
     Examples:
         >>> from warmprior.data.opening import check_place
         >>> check_place("lerobot:user/square", "--dataset")
@@ -75,24 +71,15 @@ def resolved_place(place: Path) -> str:
 
 
 class Demonstrations:
-    """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
+    """Demonstrations at one place (:func:`check_place`), of which nothing big is read before :meth:`replay`.
 
-    Args:
-        place: see :func:`check_place`.
-        env_args: of the environment, for a LeRobotDataset that does not describe its own.
-        mask: which of them, such as ``"train"``; all by default.
-
-    Attributes:
-        name: what results call the place.
+    ``env_args`` are for a LeRobotDataset that does not describe its own environment; a ``mask``, such as
+    ``"train"``, selects some of them. ``name`` is what results call the place.
 
     Examples:
         >>> from warmprior.data.opening import Demonstrations
         >>> Demonstrations("lerobot:user/square").name  # nothing is fetched yet
         'lerobot:square'
-        >>> Demonstrations("nowhere.hdf5").index()
-        Traceback (most recent call last):
-            ...
-        FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
 
     def __init__(
@@ -129,12 +116,9 @@ class Demonstrations:
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
     ) -> Demonstrations:
-        """The same demonstrations with images of some cameras.
+        """The same demonstrations with images of some cameras, compared with the simulator's, or rendered.
 
-        Those that are there are compared with the simulator's; others are rendered where states are known.
-
-        Raises:
-            DatasetError: if the images show something else than the simulator, or cannot be rendered.
+        A ``DatasetError`` if they show something else than the simulator, or cannot be rendered.
         """
         from warmprior.data.render import compare_first_images, compare_images, render_demonstrations
 

@@ -47,10 +47,10 @@ def render_demonstrations(
 ) -> Path:
     """Add images to a robomimic file, rendered from the states that it holds.
 
-    The result is a copy of the file in robomimic's layout, with ``obs/<camera>_image`` uint8
-    ``[N, size, size, 3]``, upright and compressed, in every demo, without ``next_obs``. Images of other
-    cameras stay. It appears under its name when it is complete. Finished demos lie in a folder next to it
-    until then: an interrupted call continues from them. The images do not depend on the number of workers.
+    The result, whose path is returned, is a copy of the file in robomimic's layout, with
+    ``obs/<camera>_image`` uint8 ``[N, size, size, 3]``, upright and compressed, in every demo, without
+    ``next_obs``. Images of other cameras stay. It appears when it is complete; finished demos lie in a folder
+    next to it until then, from which an interrupted call continues. The number of workers changes nothing.
 
     Args:
         path: a robomimic HDF5 file with states.
@@ -65,9 +65,6 @@ def render_demonstrations(
             earlier from the same file is returned at once.
         workers: number of processes; ``None`` for one per available core.
         progress: show a bar with the remaining time.
-
-    Returns:
-        The path of the complete file.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -310,8 +307,7 @@ def compare_first_images(
 ) -> None:
     """Compare images of one state, uint8 ``[size, size, 3]`` by name, with what the simulator shows there.
 
-    Without the state nothing is compared, with a warning. A ``DatasetError`` if they are upside down, show
-    something else, or were rendered in the other quality.
+    A ``DatasetError`` if they differ, or are of the other quality; a warning where there is no state.
     """
     path = index.path
     if rendering is not None and bool(rendering["fast"]) != fast:

@@ -148,10 +148,7 @@ def _fill(index: DatasetIndex, data: TensorDictBase, reader: DemonstrationReader
 
 
 class DemonstrationReplay(TensorDictReplayBuffer):
-    """Demonstrations, as one immutable TorchRL replay buffer; formats are subclasses of it.
-
-    Entries, options and errors are those that :class:`RobomimicExperienceReplay` tells.
-    """
+    """What buffers of all formats share; entries and options as :class:`RobomimicExperienceReplay` tells."""
 
     def __init__(
         self,
@@ -213,9 +210,9 @@ class DemonstrationReplay(TensorDictReplayBuffer):
 
     @property
     def env_args(self) -> dict[str, Any]:
-        """The environment of the data, for robosuite 1.5, fit for the actions as they are stored.
+        """The environment of the data, for robosuite 1.5, fit for the actions as they are stored; a copy.
 
-        A copy; see :func:`warmprior.envs.modernize_env_args`. A ``ValueError`` if it is unknown.
+        A ``ValueError`` if it is unknown; see :func:`warmprior.envs.modernize_env_args`.
         """
         return self._described(self._env_args)
 
@@ -241,11 +238,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
 
     @property
     def pose_columns(self) -> Tensor:
-        """Where in ``"observation"`` each gripper's position and quaternion are, int64 ``[arms, 7]``.
-
-        Raises:
-            KeyError: if they were not read.
-        """
+        """Where in ``"observation"`` each gripper's position and quaternion are, int64 ``[arms, 7]``."""
         first = dict(zip(self.observation_keys, np.cumsum([0, *self._index.observation_dims]), strict=False))
         columns: list[list[int]] = []
         while not columns or f"robot{len(columns)}_eef_pos" in first:

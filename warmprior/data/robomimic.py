@@ -39,8 +39,7 @@ class RobomimicExperienceReplay(DemonstrationReplay):
       on the last step of each demo, terminated there if its reward is positive, else truncated;
     - ``"episode"`` ``[N]`` int64, counted from 0, and ``"frame"`` ``[N]`` int64, the row itself.
 
-    Names, shapes and masks are checked before values are read, and reading takes little more memory
-    than the tensors.
+    Names, shapes and masks are checked before values are read.
 
     Args:
         dataset: path of an HDF5 file, or with ``download=True`` the name of a task.
@@ -65,7 +64,6 @@ class RobomimicExperienceReplay(DemonstrationReplay):
         ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
             of a controller without pose deltas.
         OSError: if a download fails, or there is no space for memory maps.
-        ImportError: if h5py, or for a download huggingface_hub, is not installed.
 
     Examples:
         >>> from warmprior.data import RobomimicExperienceReplay

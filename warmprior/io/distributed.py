@@ -54,8 +54,7 @@ def rank() -> int:
 def joined() -> Iterator[None]:
     """Join the processes that ``torchrun`` started, if it did, and leave them at the end.
 
-    Gradients on a CPU are averaged by gloo, those on GPUs by NCCL. Workers that are started from here on are
-    started afresh: the threads of a group do not survive a fork.
+    Gradients on a CPU are averaged by gloo, those on GPUs by NCCL.
 
     Examples:
         >>> from warmprior.io.distributed import joined, rank, world_size

@@ -59,8 +59,7 @@ def save_file(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] |
 def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors and metadata of a safetensors file, from its bytes.
 
-    The format's own reader opens a path twice, and may find another file the second time. So whoever reads
-    a file that may be replaced reads its bytes once.
+    The format's own reader opens a path twice, and may find another file the second time.
     """
     from safetensors.torch import load
 
@@ -69,7 +68,7 @@ def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def is_repository(name: str) -> bool:
-    """Whether a text has the form of a repository's name at the hub.
+    """Whether a text has the form of a repository's name at the hub, ``user/name``.
 
     Examples:
         >>> from warmprior.io.files import is_repository

@@ -21,10 +21,9 @@ _states: dict[str, Any] = {}
 
 
 def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
-    """A loky executor whose processes compute with one thread each.
+    """A loky executor whose processes compute with one thread each, and end when this process ends.
 
-    They are no forks: nothing of this process, such as its threads, simulators and gradients, is in them.
-    Ctrl-C is left to this process, and they end when it ends, however that happens.
+    They are no forks: nothing of this process is in them. Ctrl-C is left to this process.
     """
 
     def begin(parent: int) -> None:
@@ -55,12 +54,9 @@ def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
 
 @contextmanager
 def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]], Future[Any]]]:
-    """Processes that each hold a copy of a state, and call jobs with it.
+    """Processes that each hold a copy of a state; yields what submits ``job(state)``, both picklable.
 
-    Leaving the context with an error, such as Ctrl-C, ends all of them at once, whatever they do.
-
-    Yields a function of a job, which gives the future of ``job(state)``; both are picklable. What a job
-    changes in the state stays in its process. A ``WorkerError`` if a process dies.
+    Leaving the context with an error ends all of them at once. A ``WorkerError`` if a process dies.
     """
     executor, name, pickled = fresh_processes(count), uuid.uuid4().hex, pickle.dumps(state)
     try:

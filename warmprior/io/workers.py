@@ -37,8 +37,7 @@ def worker_died(worker: str, advice: str) -> WorkerError:
 def start_method() -> str:
     """How to start workers: forking takes a second instead of a minute.
 
-    But autograd refuses to work in the child of a process that used it where a GPU is in sight, even if
-    that GPU is never used. See also :func:`stop_forking`.
+    But autograd refuses to work in a fork of a process that used it where a GPU is in sight.
     """
     if not _forks or torch.cuda.is_available():
         return "spawn"
@@ -48,10 +47,7 @@ def start_method() -> str:
 
 @cache
 def count_devices() -> None:
-    """Let autograd count devices now, where there is none: at its first gradient, and in no fork after that.
-
-    Compiling anything, or fake tensors, let it see a GPU that is not there: it has to count before.
-    """
+    """Let autograd count devices now, where there is none: it does so at its first gradient, and once."""
     torch.ones((), requires_grad=True).backward()
 
 
@@ -69,11 +65,7 @@ def available_cores() -> int:
 
 
 def end_with_parent() -> None:
-    """Let this process end when the one that started it dies, however abruptly; a main process goes on.
-
-    A killed process cannot tell its workers to stop, and they would wait for hours: its ends of their
-    pipes stay open in whatever else it forked later.
-    """
+    """Let this process end when the one that started it dies, however abruptly; a main process goes on."""
     if multiprocessing.parent_process() is None:
         return
     parent = os.getppid()

@@ -141,15 +141,12 @@ class WarmPriorAdapter:
         return history_indices(self.prior.history_length, self.source.length, self.source.lead)
 
     def loss(self, batch: Mapping[str, Any], forward: Callable[..., Any] | None = None, **kwargs: Any) -> Any:
-        """The policy's own loss, from the prior's source.
+        """The policy's own loss and information, from the prior's source.
 
         Args:
             batch: preprocessed, with history; see the class.
             forward: the policy's ``forward`` by default.
             kwargs: handed to it.
-
-        Returns:
-            The policy's own loss and information.
 
         Raises:
             KeyError: if ``"action"`` or its mask is missing.
@@ -246,20 +243,15 @@ class WarmPriorAdapter:
     def record_executed(self, action: Tensor) -> None:
         """Replace the last action of :meth:`select_action` by the executed one, as after clipping.
 
-        It is ``[B, d_a]`` in the model's units.
-
-        Raises:
-            ValueError: if none was given yet.
+        It is ``[B, d_a]`` in the model's units. A ``ValueError`` if none was given yet.
         """
         self._memory.correct(action)
 
     def reset(self, mask: Tensor | None = None) -> None:
-        """Begin new episodes: their next chunk starts cold.
+        """Begin new episodes, whose next chunk starts cold, in the environments of a mask, bool ``[B]``.
 
-        Args:
-            mask: of environments, bool ``[B]``; all by default, which also resets the policy. All
-                environments share LeRobot's queue of actions, so the rest of its chunk is executed in any
-                case.
+        In all by default, which also resets the policy. All environments share LeRobot's queue of actions, so
+        the rest of its chunk is executed in any case.
         """
         self.forget(mask)
         if mask is None:

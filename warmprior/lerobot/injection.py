@@ -18,8 +18,7 @@ Source = Callable[[torch.Size, torch.dtype, torch.device], Tensor]
 class SourceInjection(TorchFunctionMode):
     """Replaces the one draw by ``torch.randn`` or ``torch.randn_like`` of a chunk's shape, ``[B, T, D]``.
 
-    A ``RuntimeError`` at the exit if there was none, or more than one: the port was written for another
-    policy.
+    A ``RuntimeError`` at the exit if there was not exactly one: the port is for another policy.
 
     Examples:
         >>> import torch

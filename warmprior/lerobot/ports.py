@@ -73,9 +73,9 @@ def _replaced(policy: Any, path: str, around: Callable[..., Any]) -> Iterator[No
 class FlowPort:
     """Describes a family of policies: the chunk's shape, and where its noise is drawn.
 
-    The policies are not changed. Training and sampling run inside :meth:`training` and :meth:`sampling`,
-    which check that the source is used exactly once. Families that do not draw their noise by ``torch.randn``
-    in the loss and in the sampler are subclasses.
+    Training and sampling run inside :meth:`training` and :meth:`sampling`, which check that the source is
+    used exactly once. Families that do not draw their noise by ``torch.randn`` in the loss and in the sampler
+    are subclasses.
 
     Args:
         chunk_length: where in a policy the length of the noisy chunk is, as a dotted path.
@@ -122,10 +122,7 @@ class FlowPort:
 
     @contextmanager
     def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
-        """Context of ``select_action`` or ``predict_action_chunk``: new chunks start from the source.
-
-        ``record`` is called with each chunk, its positions and dimensions of padding.
-        """
+        """Context in which new chunks start from the source; ``record`` is called with each, padded."""
 
         def sampled(sample: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             output = self.sample(policy, source, sample, *args, **kwargs)
@@ -321,11 +318,7 @@ PORTS: dict[str, dict[str, FlowPort]] = {
 
 
 def port_for(policy: Any) -> FlowPort:
-    """The port of a policy's family, or of a subclass, in the release of lerobot that is installed.
-
-    An ``ImportError`` if there are none for this release, and a ``ValueError`` if there is none for the
-    family, or it does not support the policy's options.
-    """
+    """The port of a policy's family, or of a subclass, in the release of lerobot that is installed."""
     installed = version("lerobot")
     ports = next((PORTS[known] for known in PORTS if f"{installed}.".startswith(f"{known}.")), None)
     supported = "; ".join(f"{release}: {', '.join(known)}" for release, known in PORTS.items())

@@ -52,11 +52,7 @@ class RelativeActions:
             raise ValueError("relative actions are off in the pipeline: leave relative= out")
 
     def state(self) -> Tensor:
-        """Raw state of the last observation, ``[B, d_s]``.
-
-        Raises:
-            ValueError: if no observation has gone through the pipeline.
-        """
+        """Raw state of the last observation, ``[B, d_s]``; a ``ValueError`` if there was none."""
         state = self._relative.get_cached_state()
         if state is None:
             raise ValueError("run the preprocessor before the policy decides: it holds the state")
@@ -64,13 +60,7 @@ class RelativeActions:
         return state.reshape(1, -1) if state.ndim == 1 else state[:, -1] if state.ndim == 3 else state
 
     def reanchor(self, actions: Tensor, before: Tensor, now: Tensor) -> Tensor:
-        """Convert actions relative to one state into actions relative to another.
-
-        Args:
-            actions: as they were predicted, ``[B, *, d_a]``, the model's units.
-            before: raw state ``[B, d_s]`` at that decision.
-            now: raw state ``[B, d_s]``.
-        """
+        """Express actions ``[B, *, d_a]`` relative to one raw state ``[B, d_s]`` relative to another."""
         from lerobot.processor import (
             TransitionKey,
             create_transition,

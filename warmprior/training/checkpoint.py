@@ -102,10 +102,7 @@ def select(prefix: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def module_tensors(module: nn.Module) -> dict[str, Tensor]:
-    """A module's state dict without aliases of the live parameters' autograd history.
-
-    Under the plain names, so that what was trained compiled goes on uncompiled and the reverse.
-    """
+    """A detached state dict under plain names: what was trained compiled goes on uncompiled."""
     return {n: value.detach() for n, value in without_compilation(module.state_dict()).items()}
 
 

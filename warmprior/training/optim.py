@@ -38,11 +38,8 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
 
     Args:
         optimizer: its learning rates are the peaks.
-        iterations: length of the whole training.
-        warmup_ratio: share of the warm-up; 0 starts at the peak.
-
-    Raises:
-        ValueError: if ``iterations < 1`` or ``warmup_ratio`` is not in [0, 1).
+        iterations: length of the whole training, at least 1.
+        warmup_ratio: share of the warm-up, in [0, 1); 0 starts at the peak.
 
     Examples:
         >>> import torch
@@ -72,13 +69,7 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
 def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
     """Exponential moving average of a network's weights; the averaged copy is ``.module``.
 
-    ``rate`` is the decay per update. The first update copies the weights.
-
-    Raises:
-        ValueError: if ``rate`` is not in [0, 1).
-
-    See Also:
-        :class:`~warmprior.training.BehaviourCloning`: saves the averaged weights.
+    ``rate``, in [0, 1), is the decay per update. The first update copies the weights.
 
     Examples:
         >>> from torch import nn

@@ -51,7 +51,7 @@ def check_counts(options: Any, *names: str) -> None:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """What policies are trained on.
+    """What policies are trained on; :func:`~warmprior.training.load_task` reads it.
 
     Attributes:
         task: manipulation tasks (default: square, or the dataset's); or one of your own, as
@@ -70,9 +70,6 @@ class DataOptions:
         cameras: of the images; by default the task's two, or four with two arms.
         image_size: side of the images in pixels.
         fast_rendering: render without reflections, shadows and smooth edges, three to five times faster.
-
-    See Also:
-        :func:`~warmprior.training.load_task`: reads what they name.
 
     Examples:
         >>> from warmprior.training import DataOptions
@@ -102,10 +99,10 @@ class DataOptions:
             )
 
     def check(self) -> None:
-        """Refuse options that cannot work, before anything is generated or downloaded.
+        """Refuse options that cannot work, naming them, before anything is generated or downloaded.
 
         Raises:
-            ValueError: naming the options.
+            ValueError: for options that contradict each other.
             FileNotFoundError: if the file does not exist.
             ImportError: if MimicGen's data are to be fetched without its package, which plays its tasks.
         """
@@ -163,7 +160,7 @@ class NetworkOptions:
     """The velocity network.
 
     Attributes:
-        network: its kind.
+        network: its kind; chi_transformer is the paper's.
         hidden_dim: its width; the class's own by default.
         precondition: by the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
@@ -172,17 +169,13 @@ class NetworkOptions:
         crop_size: side of the random window of an image that is seen in training, the central one else.
         share_encoder: one encoder for all cameras.
 
-    See Also:
-        :class:`~warmprior.ChiTransformer`: the paper's network.
-
     Examples:
         >>> import torch
         >>> from warmprior.training import NetworkOptions
         >>> options = NetworkOptions(network="chi_transformer", hidden_dim=48)
         >>> network = options.make(action_dim=7, observation_dim=23, prediction_length=8)
-        >>> seen, noisy = torch.zeros(1, options.observation_steps, 23), torch.zeros(1, 8, 7)
-        >>> type(network).__name__, network(torch.zeros(1), noisy, seen).shape
-        ('ChiTransformer', torch.Size([1, 8, 7]))
+        >>> network(torch.zeros(1), torch.zeros(1, 8, 7), torch.zeros(1, options.observation_steps, 23)).shape
+        torch.Size([1, 8, 7])
     """
 
     network: Literal["mlp", "chi_transformer"] = "mlp"
@@ -227,9 +220,9 @@ class NetworkOptions:
         prediction_length: int,
         images: Mapping[str, int] | None = None,
     ) -> VelocityNetwork:
-        """A network with fresh weights, for widths ``d_a`` and ``d_o`` (of the vector beside images).
+        """A network with fresh weights, for widths ``d_a`` and ``d_o`` and images of these sides in pixels.
 
-        Images are given by name, with their sides in pixels.
+        Beside images ``d_o`` is the width of the vector.
         """
         kind, width = _NETWORKS[self.network]
         options = {} if self.hidden_dim is None else {width: self.hidden_dim}

@@ -32,6 +32,8 @@ def precondition(
 ) -> PreconditionedNetwork:
     """Wrap a network in what is known of a prior's source and the demonstrations before any training.
 
+    The same data and prior give the same.
+
     Args:
         network: the network to wrap.
         data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`.
@@ -44,16 +46,13 @@ def precondition(
         rest: for absolute actions, to take off what follows from where the grippers are.
         interpolant: the path, that of the loss; linear by default.
 
-    Returns:
-        The preconditioned network; the same for the same data and prior.
-
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP
         >>> from warmprior.envs import navigation_demonstrations
         >>> from warmprior.training import precondition
-        >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
-        >>> demos = navigation_demonstrations()
-        >>> type(precondition(network, demos, PastPrior(4), observation_steps=1)).__name__
+        >>> network = VelocityMLP(1, 9, 4, observation_steps=1, hidden_dim=8)
+        >>> wrapped = precondition(network, navigation_demonstrations(), PastPrior(4), observation_steps=1)
+        >>> type(wrapped).__name__
         'PreconditionedNetwork'
     """
     generator = torch.Generator(data.device or "cpu").manual_seed(0)

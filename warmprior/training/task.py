@@ -69,10 +69,6 @@ class Task:
         ValueError: if ``name`` or ``style`` cannot be part of the name of a file, or for a measure that is
             combined in another way.
 
-    See Also:
-        - :func:`~warmprior.training.load_task`: of demonstrations in robosuite.
-        - :func:`~warmprior.training.navigation_task`: the toy.
-
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -223,9 +219,8 @@ def robosuite_task(
 ) -> Task:
     """The task of demonstrations in robosuite, played in the simulator that recorded them.
 
-    The place is a robomimic HDF5 file, or ``lerobot:`` and the folder or repository of a LeRobotDataset,
-    whose environment is that of ``options.task`` where it does not describe its own. The style decides the
-    time limit of tasks of ours, and the source (``"scripted"``, ``"official"``, ``"file"``) made the file.
+    A LeRobotDataset that does not describe its environment is of that of ``options.task``. The style decides
+    the time limit, and ``source``, ``"scripted"``, ``"official"`` or ``"file"``, says what made the file.
     """
     options = DataOptions() if options is None else options
     # A generated file has as many as were asked for.
@@ -338,10 +333,9 @@ def _name_of(dataset: DemonstrationReplay | DatasetIndex) -> str:
 def read_like(
     place: Path | str, name: str, facts: Mapping[str, Any], mask: str | None = None
 ) -> tuple[TensorDictBase, str]:
-    """Further demonstrations of a task in robosuite, in raw units, as its policies see them.
+    """Further demonstrations of a task in robosuite, in raw units, as policies of these facts see them.
 
-    By its name and facts, all or those of a mask; also what the place (see :func:`robosuite_task`) is called
-    in results. A ``ValueError`` if they are of another task.
+    Also what the place is called in results. A ``ValueError`` if they are of another task.
     """
     found = _open(place, name, mask)
     if (theirs := _name_of(found.index())) != name:  # before images are rendered
@@ -364,11 +358,7 @@ def read_like(
 
 
 def navigation_task() -> Task:
-    """The one-dimensional navigation toy (Fig. 5).
-
-    See Also:
-        - :class:`~warmprior.envs.NavigationEnv`: its environment.
-        - :func:`~warmprior.envs.navigation_demonstrations`: its data.
+    """The one-dimensional navigation toy (Fig. 5): :class:`~warmprior.envs.NavigationEnv` and its data.
 
     Examples:
         >>> from warmprior.training import navigation_task

@@ -116,7 +116,7 @@ def train_policy(
         progress: called with the number of iterations, at the start and after each.
 
     Returns:
-        The last policy of averaged weights, on the CPU. It has the demonstrations' normaliser, and
+        The last policy of averaged weights, on the CPU, with the demonstrations' normaliser.
         :func:`~warmprior.policy_transforms` makes the environment that it acts in.
 
     Raises:
@@ -124,10 +124,6 @@ def train_policy(
         KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
         ValueError: if the demonstrations have another form, or the folder holds another training.
-
-    See Also:
-        - :func:`~warmprior.training.evaluate`: plays episodes.
-        - :func:`~warmprior.training.save_policy`: keeps the policy.
 
     Examples:
         >>> import torch

@@ -18,7 +18,8 @@ Precision = Literal["float32", "bf16"]
 class TrainingConfig:
     """The recipe; the defaults are those of every table here: a small preconditioned network on a CPU.
 
-    They were chosen from success against iterations. :data:`PAPER` is the paper's recipe.
+    They were chosen from success against iterations. :data:`PAPER` is the paper's recipe. A ``ValueError``
+    names a number that is out of its range.
 
     Attributes:
         iterations: gradient steps.
@@ -39,13 +40,6 @@ class TrainingConfig:
         self_distillation: weight of learning in one step where the flow of averaged weights ends.
         precision: of the network's matrix products in training; weights, averages and optimiser are float32.
         cold_probability: share of the windows whose history is withheld; the paper's Algorithm 1 has none.
-
-    Raises:
-        ValueError: for a number out of its range, naming it.
-
-    See Also:
-        - :class:`~warmprior.training.BehaviourCloning`: trains by it.
-        - :class:`~warmprior.rl.PriorSpaceConfig`: the recipe of agents.
 
     Examples:
         >>> from warmprior.training import TrainingConfig

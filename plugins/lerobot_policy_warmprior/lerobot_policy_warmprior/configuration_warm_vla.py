@@ -34,11 +34,7 @@ class WarmConfigMixin:
     cold_probability: float = 0.0
 
     def make_prior(self) -> Prior:
-        """The source distribution.
-
-        Raises:
-            ValueError: if there is none of that name and these options.
-        """
+        """The source distribution; a ``ValueError`` if there is none of that name and these options."""
         kind = find(Prior, self.prior.partition(",")[0])
         room = self.chunk_size // kind.prediction_chunks
         return make(Prior, self.prior, room if self.prior_chunk is None else self.prior_chunk)

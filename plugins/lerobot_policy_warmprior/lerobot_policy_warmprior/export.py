@@ -30,18 +30,11 @@ _FEATURES = {"observation.environment_state": FeatureType.ENV, "observation.stat
 
 
 def export_policy(folder: str | Path, out: str | Path) -> Path:
-    """Write a saved policy, its normaliser included, as LeRobot's ``warm_flow``.
+    """Write a saved policy, its normaliser included, as LeRobot's ``warm_flow``; ``out`` must not exist.
 
     Its observation is what converted demonstrations have (``python -m warmprior convert``): the state of the
     objects as ``observation.environment_state``, that of the robot as ``observation.state``. Of an unknown
     environment all of it is the latter.
-
-    Args:
-        folder: of :func:`~warmprior.training.save_policy`.
-        out: to write; must not exist.
-
-    Returns:
-        ``out``.
 
     Raises:
         FileExistsError: if ``out`` exists.

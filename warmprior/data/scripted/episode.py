@@ -32,15 +32,9 @@ _HOLD = 6  # steps that the task must stay solved for before the episode ends
 class Episode:
     """A recorded demonstration of ``N`` steps.
 
-    Attributes:
-        seed: the simulator's seed.
-        operator: index of the operator, 0 for ``ph``.
-        level: the operator's level.
-        success: whether the task stayed solved to the end.
-        actions: ``[N, d_a]`` float64 in ``[-1, 1]``.
-        states: ``[N, 1 + nq + nv]`` float64, the simulator before each action.
-        rewards: ``[N]`` float64, 1 where the action led to a solved state.
-        observations: name to ``[N + 1, ...]``, the last row after the last action.
+    ``actions`` ``[N, d_a]`` in ``[-1, 1]``; ``states`` ``[N, 1 + nq + nv]``, the simulator before each;
+    ``rewards`` ``[N]``, 1 where the action led to a solved state; ``observations`` ``[N + 1, ...]`` by name,
+    the last row after the last action. All are float64.
     """
 
     seed: int

@@ -43,7 +43,7 @@ def generate_demonstrations(
     workers: int | None = None,
     progress: bool = True,
 ) -> Path:
-    """Generate successful scripted demonstrations in robomimic's HDF5 layout.
+    """Generate successful scripted demonstrations in robomimic's HDF5 layout; the path of the complete file.
 
     Of states; :func:`~warmprior.data.render_demonstrations` makes images of them.
 
@@ -63,11 +63,7 @@ def generate_demonstrations(
         workers: number of processes; ``None`` for one per available core.
         progress: show a bar with the remaining time.
 
-    Returns:
-        The path of the complete file.
-
     Raises:
-        ImportError: if robosuite or h5py is not installed.
         FileExistsError: if there is something at ``path``.
         ValueError: if the task is unknown or has no scripted expert, or an option is out of range.
         RuntimeError: if the experts fail too often to reach ``n``.

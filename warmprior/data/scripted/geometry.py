@@ -21,14 +21,7 @@ def rotation_matrix(vector: np.ndarray) -> np.ndarray:
 
 
 def rotation_vector(matrix: np.ndarray) -> np.ndarray:
-    """Turn a rotation matrix ``[3, 3]`` into the shortest rotation vector ``[3]``.
-
-    Examples:
-        >>> import numpy as np
-        >>> from warmprior.data.scripted.geometry import rotation_matrix, rotation_vector
-        >>> rotation_vector(rotation_matrix(np.array([0.0, 3.0, 0.0]))).round(6).tolist()
-        [0.0, 3.0, 0.0]
-    """
+    """Turn a rotation matrix ``[3, 3]`` into the shortest rotation vector ``[3]``."""
     m = matrix
     sine_axis = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]) / 2
     sine, cosine = float(np.linalg.norm(sine_axis)), (np.trace(m) - 1) / 2

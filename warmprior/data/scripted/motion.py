@@ -70,10 +70,7 @@ def _read(value: np.ndarray | Live) -> np.ndarray:
 
 
 class ArmRunner:
-    """Follows a plan's waypoints with one arm: proportional control, smoothed, with human noise.
-
-    The plan is advanced when a waypoint is reached: it can look at the scene before it decides on the next.
-    """
+    """Follows a plan's waypoints with one arm: proportional control, smoothed, with human noise."""
 
     def __init__(self, loop: StepLoop, arm: int, plan: Plan, person: Demonstrator) -> None:
         self._loop, self._arm, self._plan, self._person = loop, arm, plan, person
@@ -167,9 +164,7 @@ def transfer(
 ) -> Plan:
     """Move along a curve, or axis by axis, through one intermediate waypoint.
 
-    ``turn`` is a signed yaw too large to leave to the shortest rotation: half of it is done at the
-    intermediate waypoint, which keeps the wrist away from its limit. ``options`` are those of
-    :class:`Waypoint`.
+    ``turn`` is a signed yaw too large for the shortest rotation; half of it is done half-way.
     """
     start, start_mat = loop.eef(arm)
     end = _read(pos)
@@ -209,10 +204,7 @@ def carry(
 
 
 def bring(loop: StepLoop, arm: int, body: str, goal: Live) -> Live:
-    """Hand position that puts a held body at ``goal()``, whatever the body's orientation.
-
-    Turning the hand after a body that slips in the fingers would make the arm chase it.
-    """
+    """Hand position that puts a held body at ``goal()``, whatever its orientation, for it may slip."""
     return lambda: goal() + loop.eef(arm)[0] - loop.body(body)[0]
 
 

@@ -1,7 +1,7 @@
 """One-armed experts: lift, can, square, stack.
 
-A plan is a generator of waypoints that looks at the scene whenever it decides on the next one. It
-tries up to four times: a grasp that failed is noticed and repeated, as a person would.
+A plan is a generator of waypoints that looks at the scene whenever it decides on the next one. A grasp that
+failed is noticed and repeated, up to four times.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """The two-armed expert: the hammer goes from one table to the other, the rubbish out of the way.
 
-The giver takes the lid off the start bin, takes the hammer out and offers it in the middle. The
-taker clears the target bin, takes the hammer over and puts it down there. Each arm follows its own
-plan; the two wait for one another through a set of events.
+The giver and the taker each follow a plan, and wait for one another through a set of events.
 """
 
 from __future__ import annotations

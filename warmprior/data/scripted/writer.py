@@ -31,8 +31,7 @@ def write_robomimic(
 ) -> int:
     """Write episodes, one by one, to a file that robomimic's own reader opens; how many samples it has.
 
-    It appears under its name when it is complete; an interrupted writer leaves none. The seed is that of the
-    random split into filter keys; ``model_file`` is the simulator's XML, the same for all episodes.
+    The seed is that of the random split into filter keys, ``model_file`` the simulator's XML.
     """
     h5py = require("h5py", "sim")
     steps: list[int] = []
