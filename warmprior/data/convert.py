@@ -23,8 +23,6 @@ from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
 from warmprior.keys import ACTION, OBSERVATION, STATE
 
-__all__ = ["convert_robomimic", "quietly"]
-
 KINDS = ("image", "video")
 VIDEO_SIZE = 32  # of the least side; the AV1 encoder ends the process at smaller ones
 

@@ -13,8 +13,6 @@ from warmprior.envs.tasks import TASKS
 from warmprior.io.extras import require
 from warmprior.io.files import file_digest
 
-__all__ = ["MIMICGEN_REPOSITORY", "REPOSITORIES", "download_lerobot", "download_robomimic"]
-
 REPOSITORIES = ("robomimic/robomimic_datasets", "amandlek/robomimic")
 """The hub's dataset repositories that hold robomimic's files, in the order of trying."""
 

@@ -26,15 +26,6 @@ from warmprior.io.extras import require
 if TYPE_CHECKING:
     import h5py
 
-__all__ = [
-    "DatasetError",
-    "RobomimicReader",
-    "open_robomimic",
-    "read_index",
-    "read_masks",
-    "read_origin",
-]
-
 _ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
 _IMAGE_BYTES = 2**24  # of images read at once
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."

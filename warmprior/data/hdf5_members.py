@@ -17,8 +17,6 @@ from warmprior.io.extras import require
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["DatasetError", "member", "names", "reading"]
-
 CHUNK_BYTES = 2**28  # HDF5 unpacks whole chunks, however few rows are asked for
 _MAX_SOFT_LINKS = 16
 _AGAIN = "Copy or download the file again."

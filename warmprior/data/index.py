@@ -13,8 +13,6 @@ from torch import Tensor
 from warmprior.data.hdf5_members import DatasetError
 from warmprior.envs.tasks import TaskSpec
 
-__all__ = ["BLOCK", "DatasetIndex", "DemonstrationReader", "check_count", "check_env_args", "store_finite"]
-
 BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
 LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
 

@@ -26,8 +26,6 @@ from warmprior.data.replay import DemonstrationReplay
 from warmprior.io.extras import require
 from warmprior.keys import ACTION, EPISODE, OBSERVATION
 
-__all__ = ["LeRobotExperienceReplay", "LeRobotReader", "lerobot_steps"]
-
 DECODED = 2**26  # bytes of frames unpacked at once
 TOLERANCE = 1e-4  # seconds between a step and its frame, LeRobot's own
 _REBUILD = "Record the episode again or remove it (lerobot-edit-dataset), or leave it out."

@@ -15,21 +15,6 @@ from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
 
-__all__ = [
-    "DESCRIPTION",
-    "ENVIRONMENT_STATE",
-    "REWARD",
-    "ROBOT_STATE",
-    "SUCCESS",
-    "LeRobotIndex",
-    "action_names",
-    "episode_file",
-    "is_remote",
-    "layout_of",
-    "read_lerobot_index",
-    "state_names",
-]
-
 DESCRIPTION = "meta/warmprior.json"
 """What :func:`warmprior.data.convert_robomimic` writes beside LeRobot's own files, which LeRobot ignores."""
 

@@ -19,8 +19,6 @@ from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest
 
-__all__ = ["LEROBOT", "Demonstrations", "check_place", "name_of_place", "resolved_place"]
-
 LEROBOT = "lerobot:"
 """What stands before the folder or repository of a LeRobotDataset where a file could be meant."""
 

@@ -25,8 +25,6 @@ from warmprior.io.files import cache_folder, check_writable, digest_of, exclusiv
 from warmprior.io.processes import working
 from warmprior.io.workers import available_cores
 
-__all__ = ["compare_first_images", "compare_images", "render_demonstrations", "renderer_versions"]
-
 RENDERER_VERSION = 2
 """Part of every cached file's name; raised whenever the same states give other images."""
 

@@ -24,8 +24,6 @@ from warmprior.envs.tasks import TaskSpec
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 
-__all__ = ["DemonstrationReplay"]
-
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
 
 

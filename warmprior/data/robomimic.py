@@ -11,8 +11,6 @@ from warmprior.data.hdf5 import RobomimicReader, open_robomimic, read_index
 from warmprior.data.replay import DemonstrationReplay
 from warmprior.envs.tasks import TASKS
 
-__all__ = ["RobomimicExperienceReplay"]
-
 
 def _locate(dataset: str | Path, style: str | None, download: bool, root: str | Path | None) -> Path:
     path = Path(dataset)

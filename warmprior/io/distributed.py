@@ -12,18 +12,6 @@ import torch.distributed as dist
 
 from warmprior.io.workers import stop_forking
 
-__all__ = [
-    "check_batch",
-    "check_device",
-    "from_leader",
-    "go_on_alone",
-    "joined",
-    "launched",
-    "leader_first",
-    "rank",
-    "world_size",
-]
-
 STEP = timedelta(minutes=10)
 """How long the others may take to arrive where gradients are averaged."""
 

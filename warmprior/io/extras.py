@@ -6,8 +6,6 @@ import importlib
 import importlib.util
 from types import ModuleType
 
-__all__ = ["require"]
-
 
 def require(module: str, extra: str) -> ModuleType:
     """Import an optional module, or say in an ``ImportError`` which extra of this package provides it.

@@ -20,22 +20,6 @@ from typing import Any
 import psutil
 from torch import Tensor
 
-__all__ = [
-    "as_json",
-    "cache_folder",
-    "check_regular",
-    "check_writable",
-    "digest_of",
-    "exclusive",
-    "file_digest",
-    "is_repository",
-    "read_json",
-    "read_lines",
-    "read_tensors",
-    "save_file",
-    "write_atomic",
-]
-
 JSON_BYTES = 2**28  # the largest results file is a hundredth of that
 
 

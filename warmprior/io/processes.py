@@ -14,8 +14,6 @@ from typing import Any
 from warmprior.io.extras import require
 from warmprior.io.workers import worker_died
 
-__all__ = ["fresh_processes", "working"]
-
 _states: dict[str, Any] = {}
 """Of this process: what jobs of :func:`working` work on."""
 

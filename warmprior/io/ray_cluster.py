@@ -19,8 +19,6 @@ from warmprior.io.extras import require
 from warmprior.io.files import write_atomic
 from warmprior.io.workers import WorkerError, available_cores, stop_forking
 
-__all__ = ["check_ray", "check_versions", "ray_cluster"]
-
 PATIENCE = 60.0
 """Seconds in which a cluster has to answer; each machine has three times as long to import this library."""
 

@@ -10,8 +10,6 @@ from functools import cache
 
 import torch
 
-__all__ = ["WorkerError", "available_cores", "end_with_parent", "start_method", "stop_forking", "worker_died"]
-
 _forks = True
 
 

@@ -18,8 +18,6 @@ from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.network import network_observation
 from warmprior.modules.prior import Prior
 
-__all__ = ["LeRobotActor", "LeRobotFlow"]
-
 
 class LeRobotFlow(TensorDictModuleBase):
     """The sampler of a LeRobot policy in place of :class:`~warmprior.ODEActor`.

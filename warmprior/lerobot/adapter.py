@@ -16,8 +16,6 @@ from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
 
-__all__ = ["HISTORY", "HISTORY_IS_PAD", "WarmPriorAdapter", "history_indices"]
-
 HISTORY = "action_history"
 """The actions before the current step, if they are not in front of ``"action"``."""
 

@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 
-__all__ = ["Source", "SourceInjection"]
-
 Source = Callable[[torch.Size, torch.dtype, torch.device], Tensor]
 """``(shape [B, T, D], dtype, device) -> a_0``: replaces a draw."""
 

@@ -11,8 +11,6 @@ from torch import Tensor
 from warmprior.history import advance, cold_history, without
 from warmprior.modules.prior import Prior
 
-__all__ = ["ActionMemory"]
-
 
 class ActionMemory:
     """The history (:mod:`warmprior.history`) from decision to decision, one row per environment.

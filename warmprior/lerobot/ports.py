@@ -16,8 +16,6 @@ from torch import Tensor
 
 from warmprior.lerobot.injection import Source, SourceInjection
 
-__all__ = ["PORTS", "FlowPort", "check_steps", "port_for"]
-
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """``(t [B], a_t [B, T, D]) -> [B, T, D]``."""
 

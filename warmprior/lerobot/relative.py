@@ -6,8 +6,6 @@ from typing import Any
 
 from torch import Tensor
 
-__all__ = ["RelativeActions"]
-
 
 class RelativeActions:
     """Expresses remembered relative actions at the present state.

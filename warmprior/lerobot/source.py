@@ -14,8 +14,6 @@ from warmprior.history import check_history, cold_history, window_history, witho
 from warmprior.lerobot.ports import port_for
 from warmprior.modules.prior import Prior, Source
 
-__all__ = ["ChunkSource", "action_std"]
-
 
 class ChunkSource:
     """Draws ``a_0`` ``[B, T, D]`` for a chunk of ``lead`` past, ``P`` predicted and further positions.

@@ -45,8 +45,6 @@ from warmprior.training.saved import check_saveable, load_policy, save_policy
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer
 
-__all__ = ["BehaviourCloning", "policy_path"]
-
 WINDOWS_SEED = 1_000_003
 """Added to the seed of windows that have a generator of their own: other draws than those of the sources."""
 

@@ -15,8 +15,6 @@ from warmprior.io.files import read_json, read_lines
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.saved import policy_config
 
-__all__ = ["model_card", "policy_results"]
-
 
 def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
     """The rows of a run's results that one of its policies played, with the facts of its demonstrations.

@@ -16,8 +16,6 @@ from torch.optim import Optimizer
 from warmprior.io.files import as_json, check_regular, read_tensors, save_file, write_atomic
 from warmprior.modules.compiled import without_compilation
 
-__all__ = ["load_state", "restore_optimizer", "save_state", "snapshot_optimizer"]
-
 
 def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
     """Write tensors, and JSON-serialisable facts, as one ``.safetensors`` file."""
@@ -44,6 +42,7 @@ def load_state(
 
 
 def digest_of_state(facts: Any, tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of what a state holds."""
     digest = hashlib.sha256(json.dumps(facts).encode())
     for name in sorted(tensors):
         value = tensors[name]

@@ -24,8 +24,6 @@ from warmprior import keys
 from warmprior.io.workers import end_with_parent, start_method, worker_died
 from warmprior.training.threads import torch_threads
 
-__all__ = ["Episode", "evaluate", "parallel_env", "play_episode"]
-
 Act = Callable[[TensorDictBase], TensorDictBase]
 """Writes the next chunk."""
 

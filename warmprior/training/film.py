@@ -21,8 +21,6 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.evaluation import play_episode
 from warmprior.transforms.inner_step import EnvTransform
 
-__all__ = ["Filmstrip", "check_video", "record_filmstrip"]
-
 
 class _Recorder(EnvTransform):
     """Keeps what a function sees after the reset and after every control step."""

@@ -18,8 +18,6 @@ from warmprior.envs.navigation1d import NavigationEnv, navigation_metrics
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms import policy_transforms
 
-__all__ = ["judge_navigation", "play_navigation"]
-
 SHIFT = 0.15
 """Standard deviation of the history shift, a third of the gap between the sides at its narrowest."""
 

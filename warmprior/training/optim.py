@@ -15,8 +15,6 @@ from torch.optim.swa_utils import AveragedModel
 from warmprior.modules.compiled import uncompiled
 from warmprior.modules.network import VelocityNetwork
 
-__all__ = ["ema_of", "make_optimizer", "warmup_cosine"]
-
 
 def make_optimizer(
     network: nn.Module,

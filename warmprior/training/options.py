@@ -22,8 +22,6 @@ from warmprior.modules import (
 from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.encoder import imagenet_weights, load_imagenet
 
-__all__ = ["GENERATED", "PRETRAINED", "DataOptions", "NetworkOptions", "check_counts"]
-
 GENERATED = 150
 """Scripted demonstrations, where no other number is asked for."""
 

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from warmprior.io.distributed import from_leader
 
-__all__ = ["Prefetch", "placed"]
-
 DEVICE_SHARE = 0.5
 """Of a GPU's free memory, what demonstrations may take: the rest is for the network and its training."""
 

@@ -13,8 +13,6 @@ from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.couplings import Coupling
 from warmprior.transforms.window import window_replay_buffer, without_images
 
-__all__ = ["precondition"]
-
 TREND_BATCHES = 16
 """Of 1,024 windows, to which a :class:`PoseTrend` is fitted."""
 

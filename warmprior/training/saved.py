@@ -26,16 +26,6 @@ from warmprior.modules.registry import from_config
 from warmprior.modules.start import StartPoint
 from warmprior.training.checkpoint import load_state, save_state
 
-__all__ = [
-    "check_repository",
-    "check_saveable",
-    "load_policy",
-    "policy_config",
-    "policy_file",
-    "push_policy",
-    "save_policy",
-]
-
 FORMAT = 6
 """Version of the layout that :func:`save_policy` writes."""
 

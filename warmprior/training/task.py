@@ -34,8 +34,6 @@ from warmprior.training.identity import data_digest
 from warmprior.training.options import DataOptions, is_simulated
 from warmprior.transforms.absolute_actions import AbsoluteActions
 
-__all__ = ["Task", "load_task", "navigation_task", "read_like", "robosuite_task", "task_places"]
-
 
 @dataclass(frozen=True)
 class Task:

@@ -28,8 +28,6 @@ from warmprior.training.threads import torch_threads
 from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.history_observation import HistoryObservation
 
-__all__ = ["new_policy", "train_policy"]
-
 
 def new_policy(
     task: Task,

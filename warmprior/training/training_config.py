@@ -9,8 +9,6 @@ from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.objectives.flow_matching import Objective, Weighting, check_objective
 from warmprior.objectives.times import TimesName
 
-__all__ = ["PAPER", "Precision", "TrainingConfig"]
-
 Precision = Literal["float32", "bf16"]
 
 

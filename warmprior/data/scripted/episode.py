@@ -15,8 +15,6 @@ from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.simulator import make_simulator, task_env_args
 from warmprior.envs.tasks import get_task
 
-__all__ = ["PLANS", "Episode", "expert_loop", "operator_of", "run_episode"]
-
 PLANS: dict[str, Callable[[StepLoop, Demonstrator], list[Plan]]] = {
     "lift": lift,
     "can": can,

@@ -23,8 +23,6 @@ from warmprior.io.files import cache_folder
 from warmprior.io.processes import working
 from warmprior.io.workers import available_cores
 
-__all__ = ["GENERATOR_VERSION", "SEEDS_PER_FILE", "generate_demonstrations"]
-
 #: Part of every cached file's name; raised whenever the same arguments give other demonstrations.
 GENERATOR_VERSION = 1
 #: A file of ``seed`` uses the simulator seeds from ``seed * SEEDS_PER_FILE`` on, at most this many.

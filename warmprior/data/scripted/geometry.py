@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["down", "nearest_yaw", "rotation_matrix", "rotation_vector", "turn_z", "wrap", "yaw_of"]
-
 # Gripper pointing down, fingers opening along the world's y axis.
 _HOME = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 

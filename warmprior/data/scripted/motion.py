@@ -12,23 +12,6 @@ from warmprior.data.scripted.geometry import rotation_vector, turn_z
 from warmprior.data.scripted.operators import Demonstrator
 from warmprior.envs.control_loop import StepLoop
 
-__all__ = [
-    "CLOSED",
-    "OPEN",
-    "ArmRunner",
-    "Plan",
-    "Waypoint",
-    "above",
-    "bring",
-    "carry",
-    "grasp",
-    "is_held",
-    "is_raised",
-    "lower",
-    "release",
-    "transfer",
-]
-
 OPEN, CLOSED = -1.0, 1.0
 _ANY = 9.0  # a tolerance that every pose meets
 

@@ -8,8 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 
-__all__ = ["LEVELS", "OPERATORS", "SKILLED", "Demonstrator", "Operator"]
-
 T = TypeVar("T")
 
 #: Skill levels of multi-human data, best first.

@@ -28,8 +28,6 @@ from warmprior.data.scripted.motion import (
 from warmprior.data.scripted.operators import Demonstrator
 from warmprior.envs.control_loop import StepLoop
 
-__all__ = ["can", "lift", "square", "stack"]
-
 _Attempt = Callable[[StepLoop, Demonstrator], Plan]
 _ATTEMPTS = 4
 _PEG = np.array([0.23, 0.1])

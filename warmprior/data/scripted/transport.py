@@ -25,8 +25,6 @@ from warmprior.data.scripted.motion import (
 from warmprior.data.scripted.operators import Demonstrator
 from warmprior.envs.control_loop import StepLoop
 
-__all__ = ["transport"]
-
 _HAMMER, _LID, _TRASH = "payload_root", "transport_start_bin_lid_root", "trash_main"
 _ANY = 9.0
 _ATTEMPTS = 4

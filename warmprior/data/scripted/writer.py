@@ -14,8 +14,6 @@ from warmprior.data.scripted.operators import LEVELS
 from warmprior.io.extras import require
 from warmprior.io.files import write_atomic
 
-__all__ = ["write_robomimic"]
-
 _VALID_FRACTION = 0.1
 _PERCENTAGES = (20, 50)
 
