@@ -14,16 +14,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from warmprior.data.hdf5 import open_robomimic, read_index, read_origin
-from warmprior.data.hdf5_members import DatasetError, member, reading
-from warmprior.data.index import DatasetIndex
+from warmprior.data.hdf5 import member, open_robomimic, read_index, read_origin, reading
+from warmprior.data.replay import DatasetError, DatasetIndex
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer, require_rendering
 from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder, check_writable, digest_of, exclusive, file_digest, write_atomic
-from warmprior.io.processes import working
-from warmprior.io.workers import available_cores
+from warmprior.io.workers import available_cores, working
 
 RENDERER_VERSION = 2
 """Part of every cached file's name; raised whenever the same states give other images."""
@@ -276,22 +274,6 @@ def _write(path: Path, illustrator: _Illustrator, kept: Sequence[str]) -> None:
                     )
         if "mask" in source and len(index.demos) == len(source["data"]):
             source.copy("mask", file)
-
-
-def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) -> None:
-    """Compare the first images of a file with the simulator's, see :func:`compare_first_images`."""
-    index = read_index(path, image_keys=image_keys)
-    rendering, state = read_origin(path, index.demos[0])
-    with open_robomimic(path) as file:
-        images = {key: file[f"data/{index.demos[0]}/obs/{key}"][0] for key in image_keys}
-    compare_first_images(
-        index,
-        images,
-        state=state,
-        rendering=rendering,
-        fast=fast,
-        advice=f"render these anew (python -m warmprior render {path})",
-    )
 
 
 def compare_first_images(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -80,13 +80,12 @@ class ChunkSource:
         valid: Tensor,
         target: Tensor,
         generator: torch.Generator | None = None,
-        coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         cold_probability: float = 0.0,
-    ) -> tuple[Tensor, Tensor]:
-        """Source ``a_0`` ``[B, T, D]`` and target of training windows; only a coupling changes the latter.
+    ) -> Tensor:
+        """Source ``a_0`` ``[B, T, D]`` of training windows with this target, ``[B, T, >= d_a]``.
 
         ``before`` are the prior's ``history_length`` actions before the current step, of which those that are
-        ``valid``, bool ``[B, *]``, lie in the episode. A coupling pairs ``(a0, a1, None) -> (a0, a1)``.
+        ``valid``, bool ``[B, *]``, lie in the episode.
         """
         wanted = target[:, self.positions, : self.action_dim]
         executed = torch.where(valid.unsqueeze(-1), before[..., : self.action_dim], 0.0)
@@ -95,12 +94,7 @@ class ChunkSource:
         if cold_probability > 0:
             draw = torch.rand(len(target), generator=generator, device=target.device)
             history = without(history, draw < cold_probability)
-        a0 = self.draw(history, generator)
-        if coupling is not None:
-            a0, a1 = coupling(a0, wanted, None)
-            target = target.clone()
-            target[:, self.positions, : self.action_dim] = a1
-        return self.place(a0, generator), target
+        return self.place(self.draw(history, generator), generator)
 
     def place(self, a0: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The whole source ``[B, T, D]``: the prior's part ``[B, P, d_a]``, and ``N(0, 1)`` elsewhere."""

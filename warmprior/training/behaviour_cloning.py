@@ -26,9 +26,12 @@ from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
     check_identity,
+    data_digest,
+    fixed_identity,
     load_state,
     module_tensors,
     named,
+    part_identity,
     restore_module,
     restore_optimizer,
     restore_rng,
@@ -38,11 +41,10 @@ from warmprior.training.checkpoint import (
     select,
     snapshot_optimizer,
 )
-from warmprior.training.identity import data_digest, fixed_identity, part_identity
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.options import TrainingConfig
 from warmprior.training.placement import Prefetch
 from warmprior.training.saved import check_saveable, load_policy, save_policy
-from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer
 
 WINDOWS_SEED = 1_000_003

@@ -21,8 +21,7 @@ from torchrl.envs.transforms import ActionScaling, Compose, ObservationNorm
 from tqdm import tqdm
 
 from warmprior import keys
-from warmprior.io.workers import end_with_parent, start_method, worker_died
-from warmprior.training.threads import torch_threads
+from warmprior.io.workers import end_with_parent, start_method, torch_threads, worker_died
 
 Act = Callable[[TensorDictBase], TensorDictBase]
 """Writes the next chunk."""

@@ -16,18 +16,9 @@ from warmprior.modules.compiled import uncompiled
 from warmprior.modules.network import VelocityNetwork
 
 
-def make_optimizer(
-    network: nn.Module,
-    *,
-    learning_rate: float = 1e-4,
-    weight_decay: float = 1e-5,
-) -> AdamW:
+def make_optimizer(network: nn.Module, *, learning_rate: float = 1e-4, weight_decay: float = 1e-5) -> AdamW:
     """AdamW with the paper's values; no decay on biases, norms and position embeddings."""
-    network = uncompiled(network)
-    if isinstance(network, VelocityNetwork):
-        groups = network.parameter_groups(weight_decay)
-    else:
-        groups = [{"params": list(network.parameters()), "weight_decay": weight_decay}]
+    groups = cast(VelocityNetwork, uncompiled(network)).parameter_groups(weight_decay)
     return AdamW(groups, lr=learning_rate, fused=True)
 
 

@@ -17,10 +17,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from warmprior.data import download_robomimic, generate_demonstrations
-from warmprior.data.index import DatasetIndex
 from warmprior.data.opening import Demonstrations
 from warmprior.data.render import renderer_versions
-from warmprior.data.replay import DemonstrationReplay
+from warmprior.data.replay import DatasetIndex, DemonstrationReplay
 from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
@@ -30,7 +29,7 @@ from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.trend import RestingAction
-from warmprior.training.identity import data_digest
+from warmprior.training.checkpoint import data_digest
 from warmprior.training.options import DataOptions, is_simulated
 from warmprior.transforms.absolute_actions import AbsoluteActions
 

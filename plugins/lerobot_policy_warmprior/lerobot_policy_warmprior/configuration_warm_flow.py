@@ -16,8 +16,6 @@ from warmprior.lerobot import history_indices
 from warmprior.modules.registry import make
 from warmprior.training import warmup_cosine
 
-__all__ = ["WarmFlowConfig", "WarmupRatioConfig"]
-
 
 @LRSchedulerConfig.register_subclass("warmup_ratio")
 @dataclass

@@ -12,8 +12,6 @@ from warmprior import Prior
 from warmprior.lerobot import history_indices
 from warmprior.modules.registry import find, make
 
-__all__ = ["WarmPI05Config", "WarmSmolVLAConfig"]
-
 
 @dataclass
 class WarmConfigMixin:

@@ -24,8 +24,6 @@ from warmprior.envs.description import environment_name
 from warmprior.io.script import run_script
 from warmprior.training.saved import load_policy
 
-__all__ = ["export_policy"]
-
 _FEATURES = {"observation.environment_state": FeatureType.ENV, "observation.state": FeatureType.STATE}
 
 

@@ -35,8 +35,6 @@ from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.training import ema_of, precondition
 
-__all__ = ["WarmFlowPolicy"]
-
 
 class WarmFlowPolicy(PreTrainedPolicy):
     """Flow matching from a prior: :class:`~warmprior.WarmPriorActor` and its loss as a policy of LeRobot.

@@ -12,16 +12,21 @@ from typing import Any
 from torchrl._utils import logger
 from tqdm import tqdm
 
-from warmprior.data.scripted.episode import PLANS, Episode, expert_loop, operator_of, run_episode
+from warmprior.data.scripted.episode import (
+    PLANS,
+    Episode,
+    expert_loop,
+    operator_of,
+    run_episode,
+    write_robomimic,
+)
 from warmprior.data.scripted.operators import OPERATORS
-from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs.control_loop import ControlLoop
 from warmprior.envs.simulator import import_robosuite, task_env_args
 from warmprior.envs.tasks import EVALUATION_SEED, get_task
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder
-from warmprior.io.processes import working
-from warmprior.io.workers import available_cores
+from warmprior.io.workers import available_cores, working
 
 #: Part of every cached file's name; raised whenever the same arguments give other demonstrations.
 GENERATOR_VERSION = 1
