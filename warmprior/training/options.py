@@ -51,7 +51,7 @@ def check_counts(options: Any, *names: str) -> None:
 
 @dataclass(frozen=True)
 class DataOptions:
-    """What policies are trained on; :func:`~warmprior.training.load_task` reads it.
+    """What policies are trained on.
 
     Attributes:
         task: manipulation tasks (default: square, or the dataset's); or one of your own, as
@@ -250,7 +250,7 @@ Precision = Literal["float32", "bf16"]
 class TrainingConfig:
     """The recipe; the defaults are those of every table here: a small preconditioned network on a CPU.
 
-    They were chosen from success against iterations. :data:`PAPER` is the paper's recipe. A ``ValueError``
+    They were chosen from success against iterations. :data:`PAPER` is the paper's recipe. A ValueError
     names a number that is out of its range.
 
     Attributes:
