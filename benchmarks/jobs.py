@@ -28,9 +28,8 @@ from typing import Any, Self
 from options import Run
 from tqdm import tqdm
 
-from warmprior.io.processes import fresh_processes
 from warmprior.io.script import ERRORS
-from warmprior.io.workers import available_cores
+from warmprior.io.workers import available_cores, fresh_processes
 
 DEATHS = 3  # workers that a job may lose before it counts as failed
 LINES_EVERY = 30.0  # seconds between two reports on running trainings where there is no terminal

@@ -22,7 +22,7 @@ from robomimic import train_all
 
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
 from warmprior.training import NetworkOptions, TrainingConfig, judge_navigation, play_navigation
-from warmprior.training.training_config import PAPER
+from warmprior.training.options import PAPER
 
 JUDGED = [  # columns of the table
     *("switch_rate", "commit_rate", "collision_rate", "route_entropy", "distance", "jump_ratio"),

@@ -30,8 +30,7 @@ from warmprior.io.script import run_script
 from warmprior.modules import imagenet_weights
 from warmprior.modules.grid import check_grid
 from warmprior.training import DataOptions, NetworkOptions, TrainingConfig
-from warmprior.training.options import GENERATED, PRETRAINED, check_counts, is_simulated
-from warmprior.training.training_config import PAPER
+from warmprior.training.options import GENERATED, PAPER, PRETRAINED, check_counts, is_simulated
 
 Flat = tyro.conf.OmitArgPrefixes  # --episodes, not --evaluation.episodes
 

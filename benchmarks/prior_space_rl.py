@@ -49,10 +49,10 @@ from warmprior.envs import NavigationEnv
 from warmprior.envs.description import environment_parts
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.files import read_json, read_lines
+from warmprior.io.workers import torch_threads
 from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
 from warmprior.training import DataOptions, parallel_env
 from warmprior.training.options import check_counts
-from warmprior.training.threads import torch_threads
 from warmprior.transforms import EncodeObservation
 
 TOY = "navigation"

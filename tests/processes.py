@@ -57,7 +57,7 @@ def apart(function):
 
 @contextmanager
 def here(count, state):
-    """:func:`~warmprior.io.processes.working` in this process, where others would take seconds to start."""
+    """:func:`~warmprior.io.workers.working` in this process, where others would take seconds to start."""
 
     def call(job):
         future = Future()

@@ -27,9 +27,8 @@ from warmprior import WarmPriorActor
 from warmprior.envs.description import environment_of, environment_parts
 from warmprior.envs.tasks import EVALUATION_SEED
 from warmprior.io.machine import facts_of_machine
-from warmprior.io.processes import working
 from warmprior.io.script import run_script
-from warmprior.io.workers import available_cores
+from warmprior.io.workers import available_cores, working
 from warmprior.training import evaluate, load_policy
 from warmprior.training.evaluation import parallel_env, play_episode
 

@@ -39,15 +39,14 @@ from warmprior import (
     window_replay_buffer,
 )
 from warmprior.data import LeRobotExperienceReplay
-from warmprior.data.scripted.episode import Episode
-from warmprior.data.scripted.writer import write_robomimic
+from warmprior.data.scripted.episode import Episode, write_robomimic
 from warmprior.envs import RobosuiteEnv
 from warmprior.envs.simulator import task_env_args
 from warmprior.history import window_history
 from warmprior.io.files import read_json, write_atomic
 from warmprior.io.machine import facts_of_machine
-from warmprior.io.processes import fresh_processes
 from warmprior.io.ray_cluster import ray_cluster
+from warmprior.io.workers import fresh_processes
 from warmprior.training import precondition
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from tests.data.synthetic import write_robomimic_file
 from tests.io.hub_server import Loopback, reachable
-from warmprior.data.download import REPOSITORIES, download_robomimic
+from warmprior.data.robomimic import REPOSITORIES, download_robomimic
 
 pytest.importorskip("huggingface_hub")
 

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from tests.data.synthetic import env_args_15, write_robomimic_file
-from warmprior.data.hdf5 import DatasetError, RobomimicReader, read_index
+from warmprior.data.hdf5 import RobomimicReader, read_index
+from warmprior.data.replay import DatasetError
 
 
 def test_long_demos_are_read_in_blocks(tmp_path, monkeypatch):

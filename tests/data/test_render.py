@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import shutil
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -20,7 +21,7 @@ from tests.processes import apart, here
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.data import DatasetError, RobomimicExperienceReplay, render_demonstrations
 from warmprior.data import render as render_module
-from warmprior.data.render import compare_images
+from warmprior.data.opening import Demonstrations
 from warmprior.envs import RobosuiteEnv, rendering_backend
 
 pytestmark = pytest.mark.skipif(rendering_backend() is None, reason="nothing renders here")
@@ -223,9 +224,11 @@ def test_images_of_another_kind_are_refused(picture, value, said):
 @pytest.mark.slow
 def test_images_upside_down_are_refused(picture):
     key = f"data/demo_0/obs/{IMAGES[0]}"
-    compare_images(picture, IMAGES, fast=True)
+    found = Demonstrations(picture)
+    compare = partial(found.with_images, CAMERAS, 16, demos=None)
+    compare(fast=True)
     with pytest.raises(DatasetError, match=r"rendered fast.*add --fast-rendering"):
-        compare_images(picture, IMAGES, fast=False)
+        compare(fast=False)
     changes = {
         "are upside down": lambda images: images[:, ::-1],
         "have red and blue exchanged": lambda images: images[..., ::-1],
@@ -236,7 +239,7 @@ def test_images_upside_down_are_refused(picture):
     for message, change in changes.items():
         replaced(picture, lambda images, change=change: change(before), key)
         with pytest.raises(DatasetError, match=f"images of agentview {message}"):
-            compare_images(picture, IMAGES, fast=True)
+            compare(fast=True)
 
 
 @pytest.mark.parametrize("storage", ["memory", "memmap"])

@@ -16,8 +16,7 @@ import pytest
 pytest.importorskip("loky")
 
 from tests.processes import ended
-from warmprior.io.processes import working
-from warmprior.io.workers import WorkerError
+from warmprior.io.workers import WorkerError, working
 
 
 def facts(state):

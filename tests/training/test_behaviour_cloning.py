@@ -17,7 +17,7 @@ from warmprior import FlowMatchingLoss, VelocityMLP, window_replay_buffer
 from warmprior.training import TrainingConfig, load_policy
 from warmprior.training.checkpoint import load_state
 from warmprior.training.optim import make_optimizer
-from warmprior.training.training_config import PAPER
+from warmprior.training.options import PAPER
 
 LATER = {"times": "u-shaped", "objective": "l1", "self_distillation": 0.5}
 """Options beside Algorithm 1's; the average is the teacher."""

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from warmprior.data.convert import convert_robomimic
-from warmprior.data.download import download_robomimic
-from warmprior.data.hdf5 import DatasetError
 from warmprior.data.lerobot import LeRobotExperienceReplay, lerobot_steps
 from warmprior.data.render import render_demonstrations
-from warmprior.data.robomimic import RobomimicExperienceReplay
+from warmprior.data.replay import DatasetError
+from warmprior.data.robomimic import RobomimicExperienceReplay, download_robomimic
 from warmprior.data.scripted import generate_demonstrations
 
 __all__ = [

@@ -15,15 +15,13 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from warmprior.data.hdf5 import DatasetError, read_index, read_masks, read_origin
-from warmprior.data.index import DatasetIndex
-from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
+from warmprior.data.hdf5 import read_index, read_masks, read_origin
+from warmprior.data.lerobot import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
+from warmprior.data.replay import DatasetError, DatasetIndex
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
 from warmprior.io.files import check_writable, exclusive, file_digest, write_atomic
 from warmprior.keys import ACTION, OBSERVATION, STATE
-
-__all__ = ["convert_robomimic", "quietly"]
 
 KINDS = ("image", "video")
 VIDEO_SIZE = 32  # of the least side; the AV1 encoder ends the process at smaller ones
@@ -39,9 +37,9 @@ def convert_robomimic(
 ) -> Path:
     """Write the demonstrations of a robomimic HDF5 file as a LeRobotDataset v3, which LeRobot reads.
 
-    :doc:`/data` has a table of what becomes what. Numbers become float32. Simulator states are left out
-    but for the first one, by which images are compared with the simulator's before a training. The folder
-    appears under its name when it is complete; an interrupted call leaves nothing, and is begun again.
+    :doc:`/data` has a table of what becomes what. Numbers become float32. The first simulator state is kept,
+    by which images are compared with the simulator's before a training. The folder, which is returned,
+    appears under its name when it is complete; an interrupted call leaves nothing.
 
     Args:
         path: a robomimic HDF5 file, such as one of scripted demonstrations.
@@ -53,16 +51,12 @@ def convert_robomimic(
         demos: how many to convert, the first ones by their numbers; all if ``None``.
         progress: show a bar with the remaining time.
 
-    Returns:
-        The folder.
-
     Raises:
         FileNotFoundError: if there is no such file.
         FileExistsError: if there is something at ``folder``.
         DatasetError: if the file is not as it should be, or has no images to write.
         ValueError: if ``images`` is unknown, or the file's are too small for a video.
         OSError: if the disk is full, or another process converts to the same folder.
-        ImportError: if lerobot is not installed.
 
     Examples:
         >>> from warmprior.data import convert_robomimic
@@ -216,8 +210,7 @@ def _description(index: DatasetIndex, layout: Mapping[str, Mapping[str, int]]) -
 def quietly() -> Iterator[None]:
     """Without the bars and banners of LeRobot's libraries, and without the priority of its AV1 encoder.
 
-    That gives a process of the superuser real-time priority, and with it all workers that are started later:
-    beside them everything else on the machine stands still.
+    That gives a superuser's process real-time priority, beside which everything else stands still.
     """
     utils = require("lerobot.utils.utils", "lerobot")
     linux = hasattr(os, "sched_setscheduler")

@@ -7,19 +7,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from warmprior.data.hdf5 import read_index
-from warmprior.data.hdf5_members import DatasetError
-from warmprior.data.index import DatasetIndex
-from warmprior.data.lerobot import LeRobotExperienceReplay, LeRobotReader
-from warmprior.data.lerobot_index import LeRobotIndex, is_remote, read_lerobot_index
-from warmprior.data.replay import DemonstrationReplay
+from warmprior.data.hdf5 import read_index, read_origin
+from warmprior.data.lerobot import (
+    LeRobotExperienceReplay,
+    LeRobotIndex,
+    is_remote,
+    read_lerobot_index,
+)
+from warmprior.data.replay import DatasetError, DatasetIndex, DemonstrationReplay
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest
-
-__all__ = ["LEROBOT", "Demonstrations", "check_place", "name_of_place", "resolved_place"]
+from warmprior.keys import OBSERVATION
 
 LEROBOT = "lerobot:"
 """What stands before the folder or repository of a LeRobotDataset where a file could be meant."""
@@ -35,10 +35,6 @@ def check_place(place: str | Path, option: str) -> None:
     """Refuse a place where there can be no demonstrations; nothing is read or fetched.
 
     A place is an HDF5 file, or ``lerobot:`` and a folder or repository; errors name it by the option.
-
-    Raises:
-        FileNotFoundError: if there is no such file or folder.
-        ImportError: if what reads it is not installed.
 
     Examples:
         >>> from warmprior.data.opening import check_place
@@ -75,24 +71,15 @@ def resolved_place(place: Path) -> str:
 
 
 class Demonstrations:
-    """Demonstrations at one place, of which nothing big is read before :meth:`replay`.
+    """Demonstrations at one place (:func:`check_place`), of which nothing big is read before :meth:`replay`.
 
-    Args:
-        place: see :func:`check_place`.
-        env_args: of the environment, for a LeRobotDataset that does not describe its own.
-        mask: which of them, such as ``"train"``; all by default.
-
-    Attributes:
-        name: what results call the place.
+    ``env_args`` are for a LeRobotDataset that does not describe its own environment; a ``mask``, such as
+    ``"train"``, selects some of them. ``name`` is what results call the place.
 
     Examples:
         >>> from warmprior.data.opening import Demonstrations
         >>> Demonstrations("lerobot:user/square").name  # nothing is fetched yet
         'lerobot:square'
-        >>> Demonstrations("nowhere.hdf5").index()
-        Traceback (most recent call last):
-            ...
-        FileNotFoundError: nowhere.hdf5: no such file; check the path
     """
 
     def __init__(
@@ -119,49 +106,46 @@ class Demonstrations:
 
     def digest(self, image_keys: Sequence[str] = (), demos: int | None = None) -> str:
         """SHA-256 of the contents, as far as these images and that many demonstrations are used."""
-        used = {"image_keys": image_keys, "demos": demos}
-        whole = self._fetched(**used).digest() if self._lerobot else file_digest(Path(self._path))
+        used: dict[str, Any] = {"image_keys": image_keys, "demos": demos}
+        if self._lerobot:
+            whole = read_lerobot_index(self._path, fetch=True, **self._options, **used).digest()
+        else:
+            whole = file_digest(Path(self._path))
         return whole if self._mask is None else digest_of(whole, self._mask)
-
-    def _fetched(self, **options: Any) -> LeRobotIndex:
-        return read_lerobot_index(self._path, fetch=True, **self._options, **options)
 
     def with_images(
         self, cameras: Sequence[str], size: int, *, demos: int | None, fast: bool
     ) -> Demonstrations:
-        """The same demonstrations with images of some cameras.
+        """The same demonstrations with images of some cameras, compared with the simulator's, or rendered.
 
-        Those that are there are compared with the simulator's; others are rendered where states are known.
-
-        Raises:
-            DatasetError: if the images show something else than the simulator, or cannot be rendered.
+        A ``DatasetError`` if they show something else than the simulator, or cannot be rendered.
         """
-        from warmprior.data.render import compare_first_images, compare_images, render_demonstrations
+        from warmprior.data.render import compare_first_images, render_demonstrations
 
         keys = [f"{camera}_image" for camera in cameras]
+        advice = "render the robomimic file anew (python -m warmprior render) and convert it again"
         if not self._lerobot:
             path = Path(self._path)
-            if set(cameras) <= set(self.index(demos=demos).cameras):
-                compare_images(path, keys, fast)
-                return self
-            if self._mask is not None:
-                raise DatasetError(
-                    f"{path} has no images of {', '.join(cameras)}, and files are rendered whole: render it "
-                    "first (python -m warmprior render), or leave the mask out"
-                )
-            return Demonstrations(render_demonstrations(path, cameras, size, demos=demos, fast=fast))
-        index, images = self._fetched(image_keys=keys, demos=1), {}
-        for key in keys:
-            image = torch.empty(1, 3, index.image_size, index.image_size, dtype=torch.uint8)
-            LeRobotReader(index).images(index.demos[0], key, image)
-            images[key] = image[0].permute(1, 2, 0).numpy()
-        state = index.described.get("first_state")
+            advice = f"render these anew (python -m warmprior render {path})"
+            if not set(cameras) <= set(self.index(demos=demos).cameras):
+                if self._mask is not None:
+                    raise DatasetError(
+                        f"{path} has no images of {', '.join(cameras)}, and files are rendered whole: render "
+                        "it first (python -m warmprior render), or leave the mask out"
+                    )
+                return Demonstrations(render_demonstrations(path, cameras, size, demos=demos, fast=fast))
+        index = self.index(image_keys=keys, demos=1)
+        if isinstance(index, LeRobotIndex):
+            rendering, state = (index.described.get(name) for name in ("rendering", "first_state"))
+        else:
+            rendering, state = read_origin(index.path, index.demos[0])
+        first = self.replay(image_keys=keys, demos=1).data[OBSERVATION][0]
         compare_first_images(
             index,
-            images,
+            {key: first[key].permute(1, 2, 0).numpy() for key in keys},
             state=None if state is None else np.asarray(state, np.float64),
-            rendering=index.described.get("rendering"),
+            rendering=rendering,
             fast=fast,
-            advice="render the robomimic file anew (python -m warmprior render) and convert it again",
+            advice=advice,
         )
         return self

@@ -14,18 +14,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from warmprior.data.hdf5 import open_robomimic, read_index, read_origin
-from warmprior.data.hdf5_members import DatasetError, member, reading
-from warmprior.data.index import DatasetIndex
+from warmprior.data.hdf5 import member, open_robomimic, read_index, read_origin, reading
+from warmprior.data.replay import DatasetError, DatasetIndex
 from warmprior.envs.env_args import modernize_env_args
 from warmprior.envs.rendering import CameraRenderer, require_rendering
 from warmprior.envs.simulator import isolated_numpy_seed, make_simulator
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder, check_writable, digest_of, exclusive, file_digest, write_atomic
-from warmprior.io.processes import working
-from warmprior.io.workers import available_cores
-
-__all__ = ["compare_first_images", "compare_images", "render_demonstrations", "renderer_versions"]
+from warmprior.io.workers import available_cores, working
 
 RENDERER_VERSION = 2
 """Part of every cached file's name; raised whenever the same states give other images."""
@@ -47,10 +43,10 @@ def render_demonstrations(
 ) -> Path:
     """Add images to a robomimic file, rendered from the states that it holds.
 
-    The result is a copy of the file in robomimic's layout, with ``obs/<camera>_image`` uint8
-    ``[N, size, size, 3]``, upright and compressed, in every demo, without ``next_obs``. Images of other
-    cameras stay. It appears under its name when it is complete. Finished demos lie in a folder next to it
-    until then: an interrupted call continues from them. The images do not depend on the number of workers.
+    The result, whose path is returned, is a copy of the file in robomimic's layout, with
+    ``obs/<camera>_image`` uint8 ``[N, size, size, 3]``, upright and compressed, in every demo, without
+    ``next_obs``. Images of other cameras stay. It appears when it is complete; finished demos lie in a folder
+    next to it until then, from which an interrupted call continues. The number of workers changes nothing.
 
     Args:
         path: a robomimic HDF5 file with states.
@@ -65,9 +61,6 @@ def render_demonstrations(
             earlier from the same file is returned at once.
         workers: number of processes; ``None`` for one per available core.
         progress: show a bar with the remaining time.
-
-    Returns:
-        The path of the complete file.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -283,22 +276,6 @@ def _write(path: Path, illustrator: _Illustrator, kept: Sequence[str]) -> None:
             source.copy("mask", file)
 
 
-def compare_images(path: Path, image_keys: Sequence[str], fast: bool = False) -> None:
-    """Compare the first images of a file with the simulator's, see :func:`compare_first_images`."""
-    index = read_index(path, image_keys=image_keys)
-    rendering, state = read_origin(path, index.demos[0])
-    with open_robomimic(path) as file:
-        images = {key: file[f"data/{index.demos[0]}/obs/{key}"][0] for key in image_keys}
-    compare_first_images(
-        index,
-        images,
-        state=state,
-        rendering=rendering,
-        fast=fast,
-        advice=f"render these anew (python -m warmprior render {path})",
-    )
-
-
 def compare_first_images(
     index: DatasetIndex,
     images: Mapping[str, np.ndarray],
@@ -310,8 +287,7 @@ def compare_first_images(
 ) -> None:
     """Compare images of one state, uint8 ``[size, size, 3]`` by name, with what the simulator shows there.
 
-    Without the state nothing is compared, with a warning. A ``DatasetError`` if they are upside down, show
-    something else, or were rendered in the other quality.
+    A ``DatasetError`` if they differ, or are of the other quality; a warning where there is no state.
     """
     path = index.path
     if rendering is not None and bool(rendering["fast"]) != fast:

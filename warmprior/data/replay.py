@@ -1,9 +1,11 @@
-"""What replay buffers of demonstrations share, whatever format these are stored in."""
+"""What a set of demonstrations holds, whatever format it is stored in, and the replay buffer made of it."""
 
 from __future__ import annotations
 
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -16,15 +18,110 @@ from torch import Tensor
 from torchrl.data import ImmutableDatasetWriter, TensorDictReplayBuffer, TensorStorage
 from tqdm import tqdm
 
-from warmprior.data.hdf5_members import DatasetError
-from warmprior.data.index import BLOCK, DatasetIndex, DemonstrationReader
 from warmprior.envs.env_args import absolute_actions as to_absolute
 from warmprior.envs.env_args import delta_conventions, modernize_env_args
 from warmprior.envs.tasks import TaskSpec
 from warmprior.io.machine import available_memory
 from warmprior.keys import ACTION, EPISODE, FRAME, OBSERVATION, STATE
 
-__all__ = ["DemonstrationReplay"]
+BLOCK = 4096  # rows handled at once: a bound on temporary memory, whatever the length of a demo
+LARGEST = 1e9  # in any unit; a greater value is damage, and would flatten all others of its feature
+
+
+class DatasetError(ValueError):
+    """A demonstration file is not what it should be; the message says where and what to do.
+
+    Examples:
+        >>> from pathlib import Path
+        >>> from tempfile import TemporaryDirectory
+        >>> from warmprior.data import RobomimicExperienceReplay
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "square.hdf5"
+        ...     _ = path.write_bytes(b"a download that broke off")
+        ...     RobomimicExperienceReplay(path)
+        Traceback (most recent call last):
+            ...
+        warmprior.data.replay.DatasetError: ...square.hdf5: not a readable HDF5 file (25 bytes; ...
+    """
+
+
+@dataclass(frozen=True)
+class DatasetIndex:
+    """What demonstrations hold, without their values.
+
+    Attributes:
+        path: the file or folder.
+        demos: names of the selected demos, in the order of their numbers.
+        observation_keys: the observations to read, in the order of concatenation.
+        image_size: side of the images to read in pixels; 0 if there are none.
+        available_keys: every observation there is.
+        env_args: the environment as it is described there; empty if it is unknown.
+        task: the task of :data:`warmprior.envs.TASKS` that uses this environment, or ``None``.
+    """
+
+    path: Path
+    demos: tuple[str, ...]
+    lengths: tuple[int, ...]
+    observation_keys: tuple[str, ...]
+    observation_dims: tuple[int, ...]
+    image_keys: tuple[str, ...]
+    image_size: int
+    available_keys: tuple[str, ...]
+    action_dim: int
+    env_args: dict[str, Any]
+    task: TaskSpec | None
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The cameras whose images there are."""
+        ending = "_image"
+        return tuple(k.removesuffix(ending) for k in self.available_keys if k.endswith(ending))
+
+
+class DemonstrationReader(ABC):
+    """Gives the values of demonstrations, whose :class:`DatasetIndex` is known."""
+
+    @abstractmethod
+    def numbers(self, demo: str, key: str, out: np.ndarray, first: int = 0) -> None:
+        """Read rows of ``"actions"``, ``"rewards"`` or ``"obs/<key>"`` into ``out``, and check them."""
+
+    @abstractmethod
+    def images(self, demo: str, key: str, out: Tensor) -> None:
+        """Read the first images of a demo into uint8 ``[rows, 3, size, size]``."""
+
+    @abstractmethod
+    def name(self, demo: str, key: str) -> str:
+        """What errors call an array of a demo, with the file that holds it."""
+
+
+def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
+    """Refuse what describes no environment as robomimic does: text ``env_name`` and a dict ``env_kwargs``."""
+    for key, kind in (("env_name", str), ("env_kwargs", dict)):
+        if not (isinstance(env_args, dict) and isinstance(env_args.get(key), kind)):
+            raise DatasetError(f"{what} lacks {key}, or it is not a {kind.__name__}")
+    return env_args
+
+
+def check_count(path: Path, demos: int | None, available: int) -> None:
+    """Refuse to take more demonstrations than there are."""
+    if demos is not None and demos > available:
+        raise DatasetError(
+            f"{path}: there are {available} demonstrations, fewer than the {demos} to be taken: ask "
+            "for no more"
+        )
+
+
+def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advice: str) -> None:
+    """Copy numbers to ``out``; a ``DatasetError`` if one is not finite there, or above 1e9."""
+    with np.errstate(over="ignore"):  # an overflow is infinite, which is reported below
+        out[...] = block.reshape(out.shape)
+    usable = (np.abs(out) <= LARGEST).all(-1)  # NaN is not
+    if not usable.all():
+        worst = int(np.argmin(usable))
+        finite = np.isfinite(out[worst]).all()
+        found = f"a value beyond {LARGEST:.0e}" if finite else "NaN or infinity"
+        raise DatasetError(f"{what} has {found} in row {first + worst}. {advice}")
+
 
 UNIT_TOLERANCE = 1e-2  # of the length of a quaternion; recorded ones are off by 1e-6
 
@@ -148,10 +245,7 @@ def _fill(index: DatasetIndex, data: TensorDictBase, reader: DemonstrationReader
 
 
 class DemonstrationReplay(TensorDictReplayBuffer):
-    """Demonstrations, as one immutable TorchRL replay buffer; formats are subclasses of it.
-
-    Entries, options and errors are those that :class:`RobomimicExperienceReplay` tells.
-    """
+    """What buffers of all formats share; entries and options as :class:`RobomimicExperienceReplay` tells."""
 
     def __init__(
         self,
@@ -213,9 +307,9 @@ class DemonstrationReplay(TensorDictReplayBuffer):
 
     @property
     def env_args(self) -> dict[str, Any]:
-        """The environment of the data, for robosuite 1.5, fit for the actions as they are stored.
+        """The environment of the data, for robosuite 1.5, fit for the actions as they are stored; a copy.
 
-        A copy; see :func:`warmprior.envs.modernize_env_args`. A ``ValueError`` if it is unknown.
+        A ``ValueError`` if it is unknown; see :func:`warmprior.envs.modernize_env_args`.
         """
         return self._described(self._env_args)
 
@@ -241,11 +335,7 @@ class DemonstrationReplay(TensorDictReplayBuffer):
 
     @property
     def pose_columns(self) -> Tensor:
-        """Where in ``"observation"`` each gripper's position and quaternion are, int64 ``[arms, 7]``.
-
-        Raises:
-            KeyError: if they were not read.
-        """
+        """Where in ``"observation"`` each gripper's position and quaternion are, int64 ``[arms, 7]``."""
         first = dict(zip(self.observation_keys, np.cumsum([0, *self._index.observation_dims]), strict=False))
         columns: list[list[int]] = []
         while not columns or f"robot{len(columns)}_eef_pos" in first:

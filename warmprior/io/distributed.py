@@ -12,18 +12,6 @@ import torch.distributed as dist
 
 from warmprior.io.workers import stop_forking
 
-__all__ = [
-    "check_batch",
-    "check_device",
-    "from_leader",
-    "go_on_alone",
-    "joined",
-    "launched",
-    "leader_first",
-    "rank",
-    "world_size",
-]
-
 STEP = timedelta(minutes=10)
 """How long the others may take to arrive where gradients are averaged."""
 
@@ -54,8 +42,7 @@ def rank() -> int:
 def joined() -> Iterator[None]:
     """Join the processes that ``torchrun`` started, if it did, and leave them at the end.
 
-    Gradients on a CPU are averaged by gloo, those on GPUs by NCCL. Workers that are started from here on are
-    started afresh: the threads of a group do not survive a fork.
+    Gradients on a CPU are averaged by gloo, those on GPUs by NCCL.
 
     Examples:
         >>> from warmprior.io.distributed import joined, rank, world_size

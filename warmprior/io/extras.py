@@ -6,14 +6,11 @@ import importlib
 import importlib.util
 from types import ModuleType
 
-__all__ = ["require"]
-
 
 def require(module: str, extra: str) -> ModuleType:
     """Import an optional module, or say in an ``ImportError`` which extra of this package provides it.
 
-    It is looked up before it is imported, so an error raised *inside* an installed module is not mistaken for
-    a missing one.
+    It is looked up before, so an error *inside* an installed module is not mistaken for a missing one.
 
     Examples:
         >>> from warmprior.io.extras import require

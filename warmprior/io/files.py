@@ -20,22 +20,6 @@ from typing import Any
 import psutil
 from torch import Tensor
 
-__all__ = [
-    "as_json",
-    "cache_folder",
-    "check_regular",
-    "check_writable",
-    "digest_of",
-    "exclusive",
-    "file_digest",
-    "is_repository",
-    "read_json",
-    "read_lines",
-    "read_tensors",
-    "save_file",
-    "write_atomic",
-]
-
 JSON_BYTES = 2**28  # the largest results file is a hundredth of that
 
 
@@ -59,8 +43,7 @@ def save_file(tensors: dict[str, Tensor], path: Path, metadata: dict[str, str] |
 def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
     """The tensors and metadata of a safetensors file, from its bytes.
 
-    The format's own reader opens a path twice, and may find another file the second time. So whoever reads
-    a file that may be replaced reads its bytes once.
+    The format's own reader opens a path twice, and may find another file the second time.
     """
     from safetensors.torch import load
 
@@ -69,7 +52,7 @@ def read_tensors(data: bytes) -> tuple[dict[str, Tensor], dict[str, str]]:
 
 
 def is_repository(name: str) -> bool:
-    """Whether a text has the form of a repository's name at the hub.
+    """Whether a text has the form of a repository's name at the hub, ``user/name``.
 
     Examples:
         >>> from warmprior.io.files import is_repository

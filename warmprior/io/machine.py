@@ -13,8 +13,6 @@ from typing import Any
 import psutil
 import torch
 
-__all__ = ["available_memory", "facts_of_machine"]
-
 _CONTROL_GROUP = Path("/sys/fs/cgroup")
 
 PACKAGES = ("warmprior", "torch", "torchrl", "tensordict", "robosuite", "mujoco", "numpy", "lerobot")

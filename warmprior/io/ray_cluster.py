@@ -19,8 +19,6 @@ from warmprior.io.extras import require
 from warmprior.io.files import write_atomic
 from warmprior.io.workers import WorkerError, available_cores, stop_forking
 
-__all__ = ["check_ray", "check_versions", "ray_cluster"]
-
 PATIENCE = 60.0
 """Seconds in which a cluster has to answer; each machine has three times as long to import this library."""
 
@@ -29,12 +27,9 @@ CONNECT = "import ray, sys; ray.init(address=sys.argv[1], log_to_driver=False)"
 
 
 def check_ray(address: str | None = None) -> str | None:
-    """Refuse a cluster that cannot be reached, before any work.
+    """Refuse a cluster that cannot be reached: ``HOST:PORT`` of its head, or ``auto``; or ``$RAY_ADDRESS``.
 
-    The address is ``HOST:PORT`` of its head, or ``auto``; by default ``$RAY_ADDRESS``. Returns it, or
-    ``None`` for a cluster of this machine alone, which has yet to be started. A ``ValueError`` if it is no
-    address of a head, and a ``ConnectionError`` if nothing answers there, or the cluster has another Ray or
-    Python.
+    Returns the address, or ``None`` for a cluster of this machine alone, which has yet to be started.
     """
     require("ray", "ray")
     option = "--ray-address" if address else "RAY_ADDRESS"
@@ -112,18 +107,11 @@ def _look(tokens: Mapping[str, str]) -> tuple[dict[str, str], list[str]]:
 def ray_cluster(
     address: str | None = None, num_cpus: int | None = None, folders: Sequence[Path] = ()
 ) -> Iterator[Any]:
-    """A connection to a Ray cluster whose machines can do this library's work.
+    """A connection to a Ray cluster whose machines can do this library's work; yields the module ``ray``.
 
-    One that this process has already is taken, and left as it is.
-
-    Args:
-        address: ``HOST:PORT`` of its head, or ``auto``; by default ``$RAY_ADDRESS``, or a cluster of this
-            machine, which is started, and ended.
-        num_cpus: of the cluster that is started; one per core by default.
-        folders: that all machines have to share.
-
-    Yields the module ``ray``. Errors are those of :func:`check_ray`; a ``WorkerError`` if a machine has other
-    versions or cannot start the library, and an ``OSError`` if it does not see a folder.
+    One that this process has already is taken, and left as it is. Without an address (see :func:`check_ray`)
+    one of this machine is started, and ended. All machines have to share the ``folders``. A ``WorkerError``
+    if one has other versions or cannot start the library, an ``OSError`` if it does not see a folder.
     """
     ray = require("ray", "ray")
     with contextlib.ExitStack() as stack:

@@ -14,8 +14,6 @@ import torch
 from warmprior.io.distributed import joined, launched, rank
 from warmprior.io.workers import WorkerError
 
-__all__ = ["ERRORS", "PartialFailure", "run_script"]
-
 
 class PartialFailure(RuntimeError):
     """Some of the work failed; the rest of it is done and written down."""

@@ -1,16 +1,23 @@
-"""How worker processes start, and that they end with whoever started them."""
+"""Processes and threads that compute: how they start, and that they end with whoever started them."""
 
 from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 import threading
 import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from functools import cache
+from typing import Any
 
 import torch
 
-__all__ = ["WorkerError", "available_cores", "end_with_parent", "start_method", "stop_forking", "worker_died"]
+from warmprior.io.extras import require
 
 _forks = True
 
@@ -37,8 +44,7 @@ def worker_died(worker: str, advice: str) -> WorkerError:
 def start_method() -> str:
     """How to start workers: forking takes a second instead of a minute.
 
-    But autograd refuses to work in the child of a process that used it where a GPU is in sight, even if
-    that GPU is never used. See also :func:`stop_forking`.
+    But autograd refuses to work in a fork of a process that used it where a GPU is in sight.
     """
     if not _forks or torch.cuda.is_available():
         return "spawn"
@@ -48,10 +54,7 @@ def start_method() -> str:
 
 @cache
 def count_devices() -> None:
-    """Let autograd count devices now, where there is none: at its first gradient, and in no fork after that.
-
-    Compiling anything, or fake tensors, let it see a GPU that is not there: it has to count before.
-    """
+    """Let autograd count devices now, where there is none: it does so at its first gradient, and once."""
     torch.ones((), requires_grad=True).backward()
 
 
@@ -69,11 +72,7 @@ def available_cores() -> int:
 
 
 def end_with_parent() -> None:
-    """Let this process end when the one that started it dies, however abruptly; a main process goes on.
-
-    A killed process cannot tell its workers to stop, and they would wait for hours: its ends of their
-    pipes stay open in whatever else it forked later.
-    """
+    """Let this process end when the one that started it dies, however abruptly; a main process goes on."""
     if multiprocessing.parent_process() is None:
         return
     parent = os.getppid()
@@ -84,3 +83,74 @@ def end_with_parent() -> None:
         os._exit(1)  # nobody is left to hear, and the environment may be in the middle of a step
 
     threading.Thread(target=watch, name="end-with-parent", daemon=True).start()
+
+
+_states: dict[str, Any] = {}
+"""Of this process: what jobs of :func:`working` work on."""
+
+
+def fresh_processes(count: int, env: Mapping[str, str] | None = None) -> Any:
+    """A loky executor whose processes compute with one thread each, and end when this process ends.
+
+    They are no forks: nothing of this process is in them. Ctrl-C is left to this process.
+    """
+
+    def begin(parent: int) -> None:
+        # Sent by value, for it is defined here: Ctrl-C, or the end of this process, may come while the other
+        # one imports this library, which takes seconds.
+        import os
+        import signal
+        import sys
+        import threading
+        import time
+
+        def watch() -> None:
+            while os.getppid() == parent:
+                time.sleep(0.2)
+            os._exit(1)
+
+        threading.Thread(target=watch, daemon=True).start()
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # What a process keeps on purpose, such as demonstrations, is no leak to start it anew for.
+        loky: Any = sys.modules["loky.process_executor"]
+        loky._MAX_MEMORY_LEAK_SIZE = sys.maxsize
+
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    return require("loky", "sim").ProcessPoolExecutor(
+        max_workers=count, env={**threads, **(env or {})}, initializer=begin, initargs=(os.getpid(),)
+    )
+
+
+@contextmanager
+def working(count: int, state: Any) -> Iterator[Callable[[Callable[[Any], Any]], Future[Any]]]:
+    """Processes that each hold a copy of a state; yields what submits ``job(state)``, both picklable.
+
+    Leaving the context with an error ends all of them at once. A ``WorkerError`` if a process dies.
+    """
+    executor, name, pickled = fresh_processes(count), uuid.uuid4().hex, pickle.dumps(state)
+    try:
+        yield lambda job: executor.submit(_on_state, name, pickled, job)
+    except BaseException as error:
+        executor.shutdown(kill_workers=True)
+        if isinstance(error, BrokenProcessPool):
+            worker = f"one of {count} workers"
+            raise worker_died(worker, "see above for its own error") from error
+        raise
+    executor.shutdown()
+
+
+def _on_state(name: str, pickled: bytes, job: Callable[[Any], Any]) -> Any:
+    if name not in _states:
+        _states[name] = pickle.loads(pickled)
+    return job(_states[name])
+
+
+@contextmanager
+def torch_threads(number: int | None) -> Iterator[None]:
+    """Let PyTorch compute with as many threads (``None`` leaves them), and as before afterwards."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(number or before)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -18,18 +18,13 @@ from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.network import network_observation
 from warmprior.modules.prior import Prior
 
-__all__ = ["LeRobotActor", "LeRobotFlow"]
-
 
 class LeRobotFlow(TensorDictModuleBase):
     """The sampler of a LeRobot policy in place of :class:`~warmprior.ODEActor`.
 
-    A deterministic map ``(noise, observation) -> chunk``, source and chunk ``[*B, P, d_a]`` in the model's
-    units: the padding around the prior's part of the source is one fixed draw, unless a call passes its own.
-    The policy's weights are not among the parameters of this module. Options as of :class:`LeRobotActor`.
-
-    A ``ValueError`` if gradients are required, which LeRobot's samplers do not compute, or ``padding`` has
-    another shape than the model's source; a ``KeyError`` if an input key is missing.
+    A deterministic map ``(noise, observation) -> chunk``, ``[*B, P, d_a]`` in the model's units: the padding
+    around the prior's part is one fixed draw, unless a call passes its own. The policy's weights are not
+    among its parameters. Options as of :class:`LeRobotActor`.
     """
 
     guidance = None

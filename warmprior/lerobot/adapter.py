@@ -11,12 +11,78 @@ from torch import Tensor
 
 from warmprior.lerobot.memory import ActionMemory
 from warmprior.lerobot.ports import Velocity, check_steps
-from warmprior.lerobot.relative import RelativeActions
 from warmprior.lerobot.source import ChunkSource
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking, with_leftover
 
-__all__ = ["HISTORY", "HISTORY_IS_PAD", "WarmPriorAdapter", "history_indices"]
+
+class RelativeActions:
+    """Expresses remembered relative actions at the present state.
+
+    Policies with relative actions (``use_relative_actions``) predict offsets from the state of the decision,
+    so a mean from one chunk ago is an offset from where the robot was then.
+
+    Args:
+        preprocessor: the policy's pipeline; its step ``RelativeActionsProcessorStep`` holds the raw state of
+            the last observation, so the pipeline must have run before each decision.
+        postprocessor: the policy's pipeline, which undoes the normalisation.
+
+    Raises:
+        ValueError: if the pipelines lack the steps, or have relative actions turned off.
+
+    Examples:
+        >>> from warmprior.lerobot import RelativeActions
+        >>> relative = RelativeActions(preprocessor, postprocessor)  # doctest: +SKIP
+        >>> _ = preprocessor(observation)  # doctest: +SKIP
+        >>> before = relative.state()  # doctest: +SKIP
+        >>> relative.reanchor(chunk, before, before + 0.1).sub(chunk).mean()  # std 1  # doctest: +SKIP
+        tensor(-0.1000)
+    """
+
+    def __init__(self, preprocessor: Any, postprocessor: Any) -> None:
+        from lerobot.processor import (
+            NormalizerProcessorStep,
+            RelativeActionsProcessorStep,
+            UnnormalizerProcessorStep,
+        )
+
+        def step(pipeline: Any, kind: type) -> Any:
+            found = [step for step in pipeline.steps if isinstance(step, kind)]
+            if not found:
+                raise ValueError(f"relative actions need a {kind.__name__} in the pipeline")
+            return found[0]
+
+        self._relative = step(preprocessor, RelativeActionsProcessorStep)
+        self._normalize = step(preprocessor, NormalizerProcessorStep)
+        self._denormalize = step(postprocessor, UnnormalizerProcessorStep)
+        if not self._relative.enabled:
+            raise ValueError("relative actions are off in the pipeline: leave relative= out")
+
+    def state(self) -> Tensor:
+        """Raw state of the last observation, ``[B, d_s]``; a ``ValueError`` if there was none."""
+        state = self._relative.get_cached_state()
+        if state is None:
+            raise ValueError("run the preprocessor before the policy decides: it holds the state")
+        # The last of several observations.
+        return state.reshape(1, -1) if state.ndim == 1 else state[:, -1] if state.ndim == 3 else state
+
+    def reanchor(self, actions: Tensor, before: Tensor, now: Tensor) -> Tensor:
+        """Express actions ``[B, *, d_a]`` relative to one raw state ``[B, d_s]`` relative to another."""
+        from lerobot.processor import (
+            TransitionKey,
+            create_transition,
+            to_absolute_actions,
+            to_relative_actions,
+        )
+
+        def through(step: Any, value: Tensor) -> Tensor:
+            return step(create_transition(action=value))[TransitionKey.ACTION]
+
+        mask = self._relative._build_mask(actions.shape[-1])
+        raw = through(self._denormalize, actions)
+        moved = to_relative_actions(to_absolute_actions(raw, before, mask), now, mask)
+        return through(self._normalize, moved).to(actions)
+
 
 HISTORY = "action_history"
 """The actions before the current step, if they are not in front of ``"action"``."""
@@ -65,8 +131,6 @@ class WarmPriorAdapter:
             ``sigma`` is in units of it, which do not depend on the normalisation; by default ``sigma`` is in
             the normalised action space, as in the paper.
         relative: expresses remembered actions at the next state, for policies with relative actions.
-        coupling: pairs the sources and targets of a batch (:data:`~warmprior.objectives.Coupling`), without
-            observations; in their order by default.
         cold_probability: share of the training windows whose history is withheld.
         nfe: integration steps per chunk; the policy's own by default.
         guidance: of chunks towards the rest of the last one, :class:`~warmprior.RealTimeChunking`, for pi0,
@@ -93,7 +157,6 @@ class WarmPriorAdapter:
         *,
         std: Tensor | None = None,
         relative: RelativeActions | None = None,
-        coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         cold_probability: float = 0.0,
         nfe: int | None = None,
         guidance: RealTimeChunking | None = None,
@@ -119,7 +182,7 @@ class WarmPriorAdapter:
             )
         if not 0.0 <= cold_probability <= 1.0:
             raise ValueError(f"cold_probability must be in [0, 1], got {cold_probability}")
-        self.coupling, self.cold_probability, self.nfe = coupling, cold_probability, nfe
+        self.cold_probability, self.nfe = cold_probability, nfe
         check_steps(nfe)
         self.guidance = guidance
         if guidance is not None:
@@ -141,15 +204,12 @@ class WarmPriorAdapter:
         return history_indices(self.prior.history_length, self.source.length, self.source.lead)
 
     def loss(self, batch: Mapping[str, Any], forward: Callable[..., Any] | None = None, **kwargs: Any) -> Any:
-        """The policy's own loss, from the prior's source.
+        """The policy's own loss and information, from the prior's source.
 
         Args:
             batch: preprocessed, with history; see the class.
             forward: the policy's ``forward`` by default.
             kwargs: handed to it.
-
-        Returns:
-            The policy's own loss and information.
 
         Raises:
             KeyError: if ``"action"`` or its mask is missing.
@@ -158,9 +218,7 @@ class WarmPriorAdapter:
         if kwargs.get("noise") is not None:
             raise ValueError("the prior gives noise=: leave it out")
         before, valid, target, is_pad = self._window(batch)
-        a0, target = self.source.learn(
-            before, valid, target, self.generator, self.coupling, self.cold_probability
-        )
+        a0 = self.source.learn(before, valid, target, self.generator, self.cold_probability)
         inputs = dict(batch)
         for name in (HISTORY, HISTORY_IS_PAD):
             inputs.pop(name, None)
@@ -246,20 +304,15 @@ class WarmPriorAdapter:
     def record_executed(self, action: Tensor) -> None:
         """Replace the last action of :meth:`select_action` by the executed one, as after clipping.
 
-        It is ``[B, d_a]`` in the model's units.
-
-        Raises:
-            ValueError: if none was given yet.
+        It is ``[B, d_a]`` in the model's units. A ``ValueError`` if none was given yet.
         """
         self._memory.correct(action)
 
     def reset(self, mask: Tensor | None = None) -> None:
-        """Begin new episodes: their next chunk starts cold.
+        """Begin new episodes, whose next chunk starts cold, in the environments of a mask, bool ``[B]``.
 
-        Args:
-            mask: of environments, bool ``[B]``; all by default, which also resets the policy. All
-                environments share LeRobot's queue of actions, so the rest of its chunk is executed in any
-                case.
+        In all by default, which also resets the policy. All environments share LeRobot's queue of actions, so
+        the rest of its chunk is executed in any case.
         """
         self.forget(mask)
         if mask is None:

@@ -11,33 +11,12 @@ from torch import Tensor
 from warmprior.history import advance, cold_history, without
 from warmprior.modules.prior import Prior
 
-__all__ = ["ActionMemory"]
-
 
 class ActionMemory:
     """The history (:mod:`warmprior.history`) from decision to decision, one row per environment.
 
     The counterpart of :class:`~warmprior.ActionHistory`: LeRobot's environments keep nothing, and its
     policies share one queue of actions for all rows.
-
-    Args:
-        prior: the policy's prior, of which only the lengths matter.
-        action_dim: ``d_a``.
-
-    Examples:
-        >>> from warmprior.lerobot.memory import ActionMemory
-        >>> import torch
-        >>> from warmprior import PastPrior
-        >>> memory = ActionMemory(PastPrior(2), action_dim=1)
-        >>> memory.decide(3)["steps"].flatten().tolist()
-        [0, 0, 0]
-        >>> memory.record(torch.tensor([[[1.0], [2.0]]]).expand(3, 2, 1))
-        >>> memory.step(), memory.step()
-        (None, None)
-        >>> memory.forget(torch.tensor([False, True, False]))  # a new episode in the second environment
-        >>> history = memory.decide(3)
-        >>> history["actions"][0].flatten().tolist(), history["steps"].flatten().tolist()
-        ([1.0, 2.0], [2, 0, 2])
     """
 
     def __init__(self, prior: Prior, action_dim: int) -> None:
@@ -57,18 +36,9 @@ class ActionMemory:
         device: torch.device | str = "cpu",
         move: Callable[[Tensor], Tensor] | None = None,
     ) -> TensorDict:
-        """The history at the next decision.
+        """The history ``[B]`` at the next decision; ``move`` expresses actions of the last one, at this one.
 
-        Args:
-            batch_size: ``B``.
-            device: where the first history of an episode is made.
-            move: expresses actions of the last decision at this one, ``[B, *, d_a]`` to the same.
-
-        Returns:
-            The history, ``[B]``.
-
-        Raises:
-            ValueError: if there are other environments than before.
+        A ``ValueError`` if there are other environments than before.
         """
         if self._chunk is None:
             self.began = torch.ones(batch_size, dtype=torch.bool, device=device)
@@ -108,14 +78,9 @@ class ActionMemory:
         return self._chunk is not None and not self._executed.any()
 
     def executed(self, steps: int | Tensor) -> None:
-        """Set how many actions of the chunk were executed.
+        """Set how many actions of the chunk were executed, from 0 to ``chunk_length``.
 
-        Args:
-            steps: a number, for all environments whose episode goes on; or ``[B]``, which counts a new
-                episode's own actions.
-
-        Raises:
-            ValueError: if the number is negative, or larger than a decision may execute.
+        A number is for all environments whose episode goes on; ``[B]`` counts a new episode's own actions.
         """
         if self._chunk is None:
             return
@@ -129,22 +94,14 @@ class ActionMemory:
         self._executed = torch.where(counted, self._executed, count.reshape(-1, 1))
 
     def correct(self, action: Tensor) -> None:
-        """Replace the action executed last by this one, ``[B, d_a]``.
-
-        Raises:
-            ValueError: if none was executed since the last decision.
-        """
+        """Replace the action executed last by this one, ``[B, d_a]``; a ``ValueError`` if there is none."""
         if self._chunk is None or not self._executed.all():
             raise ValueError("no action was given since the last decision: nothing to correct")
         last = (self._executed - 1)[..., None].expand(-1, 1, self.action_dim)
         self._chunk = self._chunk.scatter(1, last, action.to(self._chunk)[:, None])
 
     def forget(self, mask: Tensor | None = None) -> None:
-        """Begin new episodes in the environments of a mask, bool ``[B]``; in all by default.
-
-        Raises:
-            ValueError: if the mask has another shape.
-        """
+        """Begin new episodes in the environments of a mask, bool ``[B]``; in all by default."""
         if mask is None:
             self._chunk = None
         elif self._chunk is not None:

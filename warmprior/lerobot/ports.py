@@ -1,4 +1,4 @@
-"""One small port per family of LeRobot's flow policies: where it draws its noise."""
+"""One small port per family of LeRobot's flow policies: where it draws its noise, and what replaces it."""
 
 from __future__ import annotations
 
@@ -6,17 +6,72 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
-from functools import wraps
+from functools import partial, wraps
 from importlib.metadata import version
 from operator import attrgetter
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.overrides import TorchFunctionMode
 
-from warmprior.lerobot.injection import Source, SourceInjection
+Source = Callable[[torch.Size, torch.dtype, torch.device], Tensor]
+"""``(shape [B, T, D], dtype, device) -> a_0``: replaces a draw."""
 
-__all__ = ["PORTS", "FlowPort", "check_steps", "port_for"]
+
+class SourceInjection(TorchFunctionMode):
+    """Replaces the one draw by ``torch.randn`` or ``torch.randn_like`` of a chunk's shape, ``[B, T, D]``.
+
+    A ``RuntimeError`` at the exit if there was not exactly one: the port is for another policy.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior.lerobot.ports import SourceInjection
+        >>> with SourceInjection(4, 2, lambda shape, dtype, device: torch.ones(shape)):
+        ...     noise, other = torch.randn(3, 4, 2), torch.randn(3)
+        >>> bool((noise == 1).all()), other.shape
+        (True, torch.Size([3]))
+        >>> with SourceInjection(4, 2, lambda shape, dtype, device: torch.ones(shape)):
+        ...     noise = torch.rand(3, 4, 2)
+        Traceback (most recent call last):
+            ...
+        RuntimeError: the policy drew normal noise of shape [B, 4, 2] 0 times, not once: ...
+    """
+
+    def __init__(self, length: int, width: int, source: Source) -> None:
+        super().__init__()
+        self.expected = (length, width)
+        self.source = source
+        self.draws = 0
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        """Let all calls pass but the draw."""
+        kwargs = kwargs or {}
+        if func is torch.randn:
+            size = kwargs.get("size", args[0] if args and not isinstance(args[0], int) else args)
+            like = torch.empty(0, dtype=kwargs.get("dtype"), device=kwargs.get("device"))
+        elif func is torch.randn_like:
+            size, like = args[0].shape, args[0]
+        else:
+            return func(*args, **kwargs)
+        if len(size) != 3 or tuple(size[1:]) != self.expected:
+            return func(*args, **kwargs)
+        self.draws += 1
+        dtype, device = kwargs.get("dtype") or like.dtype, kwargs.get("device") or like.device
+        return self.source(torch.Size(size), dtype, torch.device(device))
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        """Check the count, unless an error is under way."""
+        super().__exit__(kind, error, trace)
+        if kind is None and self.draws != 1:
+            length, width = self.expected
+            raise RuntimeError(
+                f"the policy drew normal noise of shape [B, {length}, {width}] {self.draws} times, not "
+                "once: its source cannot be replaced. Use the version of lerobot that this port is for"
+            )
+
 
 Velocity = Callable[[Tensor, Tensor], Tensor]
 """``(t [B], a_t [B, T, D]) -> [B, T, D]``."""
@@ -31,51 +86,34 @@ def check_steps(nfe: int | None) -> None:
         raise ValueError(f"nfe is the number of integration steps: it must be at least 1, got {nfe}")
 
 
-def _place(policy: Any, path: str) -> tuple[Any, str]:
-    """The object below a policy that has the last name of a dotted path, and that name."""
-    owner, _, name = path.rpartition(".")
-    return (attrgetter(owner)(policy) if owner else policy), name
-
-
 @contextmanager
-def _steps(policy: Any, path: str, nfe: int | None) -> Iterator[None]:
-    """Changes the number of integration steps inside the context."""
-    holder, name = _place(policy, path)
-    before = getattr(holder, name)
-    setattr(holder, name, before if nfe is None else nfe)
+def _replaced(policy: Any, path: str, make: Callable[[Any], Any]) -> Iterator[None]:
+    """Inside, what a dotted path below a policy leads to is what ``make`` makes of it."""
+    place, _, name = path.rpartition(".")
+    owner = vars(attrgetter(place)(policy) if place else policy)
+    before = owner.get(name, _replaced)  # a method lies in the class
+    owner[name] = make(attrgetter(path)(policy))
     try:
         yield
     finally:
-        setattr(holder, name, before)
-
-
-@contextmanager
-def _replaced(policy: Any, path: str, around: Callable[..., Any]) -> Iterator[None]:
-    """Calls ``around`` with a method, and its arguments, instead of the method inside the context."""
-    owner, name = _place(policy, path)
-    method, before = getattr(owner, name), vars(owner).get(name)
-
-    @wraps(method)
-    def called(*args: Any, **kwargs: Any) -> Any:
-        return around(method, *args, **kwargs)
-
-    vars(owner)[name] = called
-    try:
-        yield
-    finally:
-        if before is None:
-            del vars(owner)[name]
+        if before is _replaced:
+            del owner[name]
         else:
-            vars(owner)[name] = before
+            owner[name] = before
+
+
+def _around(policy: Any, path: str, call: Callable[..., Any]) -> AbstractContextManager[None]:
+    """Inside, ``call`` is called with a method, and its arguments, instead of the method."""
+    return _replaced(policy, path, lambda method: wraps(method)(partial(call, method)))
 
 
 @dataclass(frozen=True)
 class FlowPort:
     """Describes a family of policies: the chunk's shape, and where its noise is drawn.
 
-    The policies are not changed. Training and sampling run inside :meth:`training` and :meth:`sampling`,
-    which check that the source is used exactly once. Families that do not draw their noise by ``torch.randn``
-    in the loss and in the sampler are subclasses.
+    Training and sampling run inside :meth:`training` and :meth:`sampling`, which check that the source is
+    used exactly once. Families that do not draw their noise by ``torch.randn`` in the loss and in the sampler
+    are subclasses.
 
     Args:
         chunk_length: where in a policy the length of the noisy chunk is, as a dotted path.
@@ -122,17 +160,17 @@ class FlowPort:
 
     @contextmanager
     def sampling(self, policy: Any, source: Source, record: Record, nfe: int | None = None) -> Iterator[None]:
-        """Context of ``select_action`` or ``predict_action_chunk``: new chunks start from the source.
-
-        ``record`` is called with each chunk, its positions and dimensions of padding.
-        """
+        """Context in which new chunks start from the source; ``record`` is called with each, padded."""
 
         def sampled(sample: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
             output = self.sample(policy, source, sample, *args, **kwargs)
             record(output if isinstance(output, Tensor) else output["action_pred"])
             return output
 
-        with _steps(policy, self.steps, nfe), _replaced(policy, self.sampler, sampled):
+        with (
+            _replaced(policy, self.steps, lambda own: own if nfe is None else nfe),
+            _around(policy, self.sampler, sampled),
+        ):
             yield
 
     def sample(
@@ -174,7 +212,7 @@ class OpenPiPort(FlowPort):
             bound.arguments["noise"] = source(actions.shape, torch.float32, actions.device)
             return forward(*bound.args[1:], **bound.kwargs)
 
-        with _replaced(policy, "model.forward", from_source):
+        with _around(policy, "model.forward", from_source):
             yield
         if len(calls) != 1:
             raise RuntimeError(
@@ -209,7 +247,7 @@ class OpenPiPort(FlowPort):
 
             return -guide(velocity)(1 - timestep, x_t)
 
-        return _replaced(policy, "model.denoise_step", guided)
+        return _around(policy, "model.denoise_step", guided)
 
 
 class GrootPort(FlowPort):
@@ -250,7 +288,7 @@ class GrootN15Port(FlowPort):
             return predict(*args, **kwargs)[:, : policy.config.n_action_steps]
 
         with (
-            _replaced(policy, "predict_action_chunk", predicted),
+            _around(policy, "predict_action_chunk", predicted),
             super().sampling(policy, source, record, nfe),
         ):
             yield
@@ -321,11 +359,7 @@ PORTS: dict[str, dict[str, FlowPort]] = {
 
 
 def port_for(policy: Any) -> FlowPort:
-    """The port of a policy's family, or of a subclass, in the release of lerobot that is installed.
-
-    An ``ImportError`` if there are none for this release, and a ``ValueError`` if there is none for the
-    family, or it does not support the policy's options.
-    """
+    """The port of a policy's family, or of a subclass, in the release of lerobot that is installed."""
     installed = version("lerobot")
     ports = next((PORTS[known] for known in PORTS if f"{installed}.".startswith(f"{known}.")), None)
     supported = "; ".join(f"{release}: {', '.join(known)}" for release, known in PORTS.items())

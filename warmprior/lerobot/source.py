@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -14,23 +14,13 @@ from warmprior.history import check_history, cold_history, window_history, witho
 from warmprior.lerobot.ports import port_for
 from warmprior.modules.prior import Prior, Source
 
-__all__ = ["ChunkSource", "action_std"]
-
 
 class ChunkSource:
     """Draws ``a_0`` ``[B, T, D]`` for a chunk of ``lead`` past, ``P`` predicted and further positions.
 
     The prior gives the ``P`` positions from the current step on, in the ``d_a`` dimensions of the action. All
-    other positions and the padded dimensions stay ``N(0, 1)``, as in pretrained checkpoints.
-
-    Args:
-        policy: of LeRobot, of which only the chunk's shape is kept.
-        prior: the source distribution; any that needs no observation.
-        std: standard deviation of the data in the model's units, ``[d_a]``, if ``sigma`` is in units of it;
-            by default ``sigma`` is in the model's units, as in the paper.
-
-    Raises:
-        ValueError: if the prior does not fit the policy, or :func:`port_for` refuses that.
+    other positions and the padded dimensions stay ``N(0, 1)``, as in pretrained checkpoints. ``std`` as of
+    :class:`~warmprior.lerobot.WarmPriorAdapter`.
     """
 
     def __init__(self, policy: Any, prior: Prior, std: Tensor | None = None) -> None:
@@ -69,21 +59,14 @@ class ChunkSource:
         return slice(self.lead, self.lead + self.prior.prediction_length)
 
     def distribution(self, history: TensorDictBase) -> Source:
-        """The prior's source, in units of its ``sigma``, at histories ``[*B]`` in the model's units.
-
-        Raises:
-            KeyError: if an entry of the history is missing.
-        """
+        """The prior's source, in units of its ``sigma``, at histories ``[*B]`` in the model's units."""
         check_history(history, *self._lengths, self.prior)
         unit = self._unit(history["actions"])
         own = {name: history[name] / unit for name in ("actions", "forecast")}
         return self.prior.distribution(history.copy().update(own))
 
     def scaled(self, values: Tensor, warm: Tensor) -> Tensor:
-        """Values of the source ``[*B, P, d_a]``, such as draws, in the model's units.
-
-        They are in units of ``sigma`` where ``warm``, bool ``[*B, P, 1]``, and in the model's elsewhere.
-        """
+        """Values of the source ``[*B, P, d_a]``, where warm in units of ``sigma``, in the model's units."""
         return torch.where(warm, values * self._unit(values), values)
 
     def draw(self, history: TensorDictBase, generator: torch.Generator | None = None) -> Tensor:
@@ -97,22 +80,12 @@ class ChunkSource:
         valid: Tensor,
         target: Tensor,
         generator: torch.Generator | None = None,
-        coupling: Callable[..., tuple[Tensor, Tensor]] | None = None,
         cold_probability: float = 0.0,
-    ) -> tuple[Tensor, Tensor]:
-        """Source and target of training windows.
+    ) -> Tensor:
+        """Source ``a_0`` ``[B, T, D]`` of training windows with this target, ``[B, T, >= d_a]``.
 
-        Args:
-            before: the prior's ``history_length`` actions before the current step, ``[B, *, >= d_a]``, the
-                model's units.
-            valid: which of them lie inside of the episode, bool ``[B, *]``.
-            target: the chunk, ``[B, T, >= d_a]``, the model's units.
-            generator: see :meth:`draw`.
-            coupling: pairs sources and targets ``[B, P, d_a]`` of the model, ``(a0, a1, None) -> (a0, a1)``.
-            cold_probability: share of the windows whose history is withheld.
-
-        Returns:
-            ``a_0`` ``[B, T, D]`` and the target, which only a coupling changes.
+        ``before`` are the prior's ``history_length`` actions before the current step, of which those that are
+        ``valid``, bool ``[B, *]``, lie in the episode.
         """
         wanted = target[:, self.positions, : self.action_dim]
         executed = torch.where(valid.unsqueeze(-1), before[..., : self.action_dim], 0.0)
@@ -121,12 +94,7 @@ class ChunkSource:
         if cold_probability > 0:
             draw = torch.rand(len(target), generator=generator, device=target.device)
             history = without(history, draw < cold_probability)
-        a0 = self.draw(history, generator)
-        if coupling is not None:
-            a0, a1 = coupling(a0, wanted, None)
-            target = target.clone()
-            target[:, self.positions, : self.action_dim] = a1
-        return self.place(a0, generator), target
+        return self.place(self.draw(history, generator), generator)
 
     def place(self, a0: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """The whole source ``[B, T, D]``: the prior's part ``[B, P, d_a]``, and ``N(0, 1)`` elsewhere."""

@@ -7,12 +7,10 @@ from warmprior.training.evaluation import Episode, evaluate, parallel_env, play_
 from warmprior.training.film import Filmstrip, record_filmstrip
 from warmprior.training.navigation import judge_navigation, play_navigation
 from warmprior.training.optim import ema_of, warmup_cosine
-from warmprior.training.options import DataOptions, NetworkOptions
-from warmprior.training.precondition import precondition
+from warmprior.training.options import DataOptions, NetworkOptions, TrainingConfig
 from warmprior.training.saved import load_policy, push_policy, save_policy
 from warmprior.training.task import Task, load_task, navigation_task
-from warmprior.training.train import train_policy
-from warmprior.training.training_config import TrainingConfig
+from warmprior.training.train import precondition, train_policy
 
 __all__ = [
     "BehaviourCloning",

@@ -26,9 +26,12 @@ from warmprior.objectives.couplings import Coupling
 from warmprior.objectives.flow_matching import FlowMatchingLoss
 from warmprior.training.checkpoint import (
     check_identity,
+    data_digest,
+    fixed_identity,
     load_state,
     module_tensors,
     named,
+    part_identity,
     restore_module,
     restore_optimizer,
     restore_rng,
@@ -38,14 +41,11 @@ from warmprior.training.checkpoint import (
     select,
     snapshot_optimizer,
 )
-from warmprior.training.identity import data_digest, fixed_identity, part_identity
 from warmprior.training.optim import ema_of, make_optimizer, warmup_cosine
+from warmprior.training.options import TrainingConfig
 from warmprior.training.placement import Prefetch
 from warmprior.training.saved import check_saveable, load_policy, save_policy
-from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.window import window_replay_buffer
-
-__all__ = ["BehaviourCloning", "policy_path"]
 
 WINDOWS_SEED = 1_000_003
 """Added to the seed of windows that have a generator of their own: other draws than those of the sources."""
@@ -57,14 +57,13 @@ STATE_FORMAT = 6
 class BehaviourCloning:
     """Trains a :class:`~warmprior.WarmPriorActor` on demonstrations by flow matching.
 
-    The folder receives ``state.safetensors`` (everything needed to continue, replaced atomically) and
-    one policy of averaged weights per checkpoint, ``policy_000250/`` and so on. Constructing the same
-    training on a folder with a state continues it; on CPU the result is bitwise that of an
-    uninterrupted run with the same number of threads.
+    The folder receives ``state.safetensors`` (what is needed to continue) and one policy of averaged weights
+    per checkpoint, ``policy_000250/`` and so on. The same training on a folder with a state continues it; on
+    CPU the result is bitwise that of an uninterrupted run with the same number of threads.
 
-    Processes that have :func:`~warmprior.io.distributed.joined` train together: each constructs the same
-    training, runs it and draws its own part of every batch, and PyTorch's DDP averages the gradients. The
-    first process alone writes.
+    Processes that have :func:`~warmprior.io.distributed.joined` train together: each constructs and runs the
+    same training and draws its own part of every batch, PyTorch's DDP averages the gradients, and the first
+    process alone writes.
 
     Args:
         actor: the policy; its network is trained in place.
@@ -82,14 +81,9 @@ class BehaviourCloning:
             the CPU train a network that is not.
 
     Raises:
-        ValueError: if a batch cannot be divided among the processes, the folder's
-            state is damaged or belongs to another recipe, prior, network or dataset, the policy could not be
-            loaded again.
+        ValueError: if a batch cannot be divided among the processes, the state is damaged or belongs to
+            another training, or the policy could not be loaded again.
         TypeError: if the policy cannot be saved.
-
-    See Also:
-        - :class:`~warmprior.training.TrainingConfig`: its recipe.
-        - :func:`~warmprior.training.evaluate`: plays episodes with what it trained.
 
     Examples:
         >>> from pathlib import Path
@@ -97,13 +91,11 @@ class BehaviourCloning:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.envs import navigation_demonstrations
         >>> from warmprior.training import BehaviourCloning, TrainingConfig
-        >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
-        >>> actor = WarmPriorActor(network, PastPrior(4))
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1, hidden_dim=8), PastPrior(4))
         >>> config = TrainingConfig(iterations=2, batch_size=8, checkpoints=1)
         >>> data = navigation_demonstrations()
         >>> with TemporaryDirectory() as folder:
-        ...     training = BehaviourCloning(actor, data, config, folder, observation_steps=1)
-        ...     _ = training.run()
+        ...     BehaviourCloning(actor, data, config, folder, observation_steps=1).run()
         ...     sorted(path.name for path in Path(folder).iterdir())
         ['policy_000002', 'state.safetensors']
     """
@@ -240,15 +232,12 @@ class BehaviourCloning:
         return loss.detach()
 
     def run(self, description: str | None = "train", progress: Callable[[int], object] | None = None) -> None:
-        """Train to the end.
+        """Train to the end; ``progress`` gets the number of iterations, at the start and after each.
 
-        Args:
-            description: of the progress bar; no bar if ``None``.
-            progress: called with the number of iterations, at the start and after each.
+        Without a ``description`` there is no progress bar.
 
         Raises:
-            FloatingPointError: if the loss becomes NaN or infinite; the last saved state and all
-                kept policies stay.
+            FloatingPointError: if the loss becomes NaN or infinite; the last state and all policies stay.
             BlockingIOError: if another process trains in the folder.
         """
         if from_leader(lambda: self.iteration == self.config.iterations and self._is_kept()):
@@ -407,10 +396,9 @@ class BehaviourCloning:
 
 
 class _Loss(nn.Module):
-    """The sum of the losses of a batch, as a module of what is trained.
+    """The sum of the losses of a batch, as a module of what is trained, whose gradients DDP averages.
 
-    DDP averages the gradients of its module's parameters. Those of the loss module are the same, but named
-    and nested as TorchRL's functional modules need it.
+    The loss module's own parameters are the same, but named and nested as functional modules need it.
     """
 
     loss_module: FlowMatchingLoss

@@ -15,15 +15,11 @@ from warmprior.io.files import read_json, read_lines
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.saved import policy_config
 
-__all__ = ["model_card", "policy_results"]
-
 
 def policy_results(run: str | Path, policy: str | Path) -> list[dict[str, Any]]:
     """The rows of a run's results that one of its policies played, with the facts of its demonstrations.
 
-    Args:
-        run: folder of a benchmark, with its ``results.jsonl``.
-        policy: folder of the policy, such as ``.../policies/square-ph-past-seed0-.../policy_005000``.
+    ``run`` is the folder of a benchmark, ``policy`` such as ``.../policies/lift-ph-.../policy_005000``.
 
     Raises:
         FileNotFoundError: if there are no results.
@@ -78,10 +74,6 @@ def model_card(
     Keyword Args:
         repository: where the policy will lie.
         licence: the hub's name of its licence, such as ``"mit"``.
-
-    Raises:
-        TypeError: if the policy cannot be saved, see :func:`~warmprior.training.save_policy`.
-        ImportError: if huggingface_hub is not installed.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor

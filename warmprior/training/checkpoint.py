@@ -1,4 +1,4 @@
-"""Policies, trainings and agents on disk: one safetensors file each, replaced atomically, never a pickle."""
+"""Trainings and agents on disk, and what they are: one safetensors file each, never a pickle."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from warmprior.io.files import as_json, check_regular, read_tensors, save_file, write_atomic
-from warmprior.modules.compiled import without_compilation
-
-__all__ = ["load_state", "restore_optimizer", "save_state", "snapshot_optimizer"]
+from warmprior.modules.compiled import uncompiled, without_compilation
 
 
 def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:
@@ -44,6 +43,7 @@ def load_state(
 
 
 def digest_of_state(facts: Any, tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of what a state holds."""
     digest = hashlib.sha256(json.dumps(facts).encode())
     for name in sorted(tensors):
         value = tensors[name]
@@ -102,10 +102,7 @@ def select(prefix: str, values: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def module_tensors(module: nn.Module) -> dict[str, Tensor]:
-    """A module's state dict without aliases of the live parameters' autograd history.
-
-    Under the plain names, so that what was trained compiled goes on uncompiled and the reverse.
-    """
+    """A detached state dict under plain names: what was trained compiled goes on uncompiled."""
     return {n: value.detach() for n, value in without_compilation(module.state_dict()).items()}
 
 
@@ -129,3 +126,40 @@ def restore_rng(generator: torch.Generator, states: Mapping[str, Tensor]) -> Non
     torch.set_rng_state(states["global"])
     if generator.device.type == "cuda":
         torch.cuda.set_rng_state(states["cuda"], generator.device)
+
+
+HASHED_AT_ONCE = 2**26
+"""Bytes of the data."""
+
+
+def part_identity(part: Any) -> Any:
+    """A part's configuration, or a function's name, with a digest of what is not trained in it."""
+    if part is None:
+        return None
+    part = uncompiled(part)
+    config = getattr(part, "config", None)
+    if config is None:
+        return getattr(part, "__qualname__", type(part).__qualname__)
+    return {**config(), **fixed_identity(part)}
+
+
+def fixed_identity(part: object) -> dict[str, str]:
+    """Digest of what is not trained, such as moments: it is part of what a network, or a prior, is."""
+    if not isinstance(part, nn.Module):
+        return {}
+    trained = {n for n, p in part.named_parameters(remove_duplicate=False) if p.requires_grad}
+    state = part.state_dict()
+    fixed = {name: value.tolist() for name, value in state.items() if name not in trained}
+    digest = hashlib.sha256(json.dumps(fixed, sort_keys=True).encode()).hexdigest()[:16]
+    return {"buffers": digest}
+
+
+def data_digest(data: TensorDictBase) -> str:
+    """Digest of demonstrations: of the names and values of all entries."""
+    digest = hashlib.sha256()
+    for key, value in sorted(data.items(True, True), key=lambda item: str(item[0])):
+        digest.update(str(key).encode())
+        rows = max(1, HASHED_AT_ONCE // max(1, value[:1].nbytes))  # it may be larger than the memory
+        for part in value.split(rows):
+            digest.update(part.cpu().contiguous().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()[:16]

@@ -21,10 +21,7 @@ from torchrl.envs.transforms import ActionScaling, Compose, ObservationNorm
 from tqdm import tqdm
 
 from warmprior import keys
-from warmprior.io.workers import end_with_parent, start_method, worker_died
-from warmprior.training.threads import torch_threads
-
-__all__ = ["Episode", "evaluate", "parallel_env", "play_episode"]
+from warmprior.io.workers import end_with_parent, start_method, torch_threads, worker_died
 
 Act = Callable[[TensorDictBase], TensorDictBase]
 """Writes the next chunk."""
@@ -42,19 +39,15 @@ class Episode:
         decisions: the policy's decisions, ``[D]``: ``("vla_action", "chunk")``, of an agent the decoded one,
             the mean of its source and where that is warm, if it has one, under ``"next"``
             ``"executed_steps"`` and ``"done"``, and the delay with what was left of the chunk before, if
-            chunks took effect late. Episodes concatenated along
-            ``D`` are a rollout for :func:`~warmprior.diagnostics.smoothness`.
+            chunks took effect late. Concatenated along ``D`` episodes are a rollout for
+            :func:`~warmprior.diagnostics.smoothness`.
 
     Examples:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior.training import Episode
         >>> solved = Episode(7, True, 90, decisions=TensorDict({}, [12]))
-        >>> played = [solved, Episode(8, False, 400, decisions=TensorDict({}, [50]))]
-        >>> sum(episode.success for episode in played) / len(played)
-        0.5
-        >>> torch.cat([episode.decisions for episode in played]).batch_size  # a rollout
-        torch.Size([62])
+        >>> solved.success, len(solved.decisions)
+        (True, 12)
     """
 
     seed: int
@@ -119,13 +112,7 @@ def parallel_env(
         make_env: called as ``make_env(seed_offset=i, seed_stride=n)`` in each worker, see
             :class:`~warmprior.envs.RobosuiteEnv`.
         make_transforms: builds the policy's transforms, see :func:`~warmprior.policy_transforms`.
-        num_envs: number of workers.
-
-    Raises:
-        ValueError: if ``num_envs < 1``.
-
-    See Also:
-        :func:`~warmprior.training.evaluate`: plays episodes in it.
+        num_envs: number of workers, at least 1.
 
     Examples:
         >>> from functools import partial
@@ -238,8 +225,7 @@ def play_episode(
 
     The policy's noise belongs to the episode: its generator is seeded by
     ``numpy.random.SeedSequence((policy_seed, seed)).generate_state(1, "uint64")``. With decisions made
-    one at a time and by one thread, the outcome depends on the arguments alone, whatever was played
-    before and wherever.
+    one at a time and by one thread, the outcome depends on the arguments alone.
 
     Args:
         policy: as for :func:`evaluate`.
@@ -260,16 +246,12 @@ def play_episode(
         ValueError: if the environment has batch dimensions, or a seed is negative.
         KeyError: if it lacks ``success``, one of ``measures``, or the policy's transforms.
 
-    See Also:
-        :func:`~warmprior.training.record_filmstrip`: films one.
-
     Examples:
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import NavigationEnv
         >>> from warmprior.training import play_episode
-        >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
-        >>> actor = WarmPriorActor(network, PastPrior(8))
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1, hidden_dim=8), PastPrior(8))
         >>> transforms = policy_transforms(actor.prior, observation_steps=1)
         >>> env = TransformedEnv(NavigationEnv((1, 1)), transforms)
         >>> one, again = (play_episode(actor, env, seed=7, nfe=1) for _ in range(2))
@@ -308,7 +290,9 @@ def evaluate(
     measures: Measures | None = None,
     description: str | None = None,
 ) -> list[Episode]:
-    """Play episodes and report each one's outcome.
+    """Play episodes; their outcomes in order of their seeds.
+
+    The same arguments and number of environments give the same result.
 
     Args:
         policy: a :class:`~warmprior.WarmPriorActor`, or any module that writes chunks, such as an agent
@@ -323,18 +307,13 @@ def evaluate(
 
     Keyword Args:
         episodes: how many; episode ``e`` starts from simulator seed ``first_seed + e``.
-        first_seed: seed of the first episode; keep it away from the data's seeds.
+        first_seed: keep it away from the data's seeds.
         nfe: network evaluations per chunk of a :class:`~warmprior.WarmPriorActor`; its own by default.
-        policy_seed: of what is drawn in this process: by a policy that takes a ``generator``, such as a
-            :class:`~warmprior.WarmPriorActor`, and by what draws from PyTorch's global generator. The latter
-            goes on afterwards as if nothing had been played.
+        policy_seed: of what is drawn in this process: by a policy that takes a ``generator``, and by what
+            draws from PyTorch's global one, which goes on afterwards as if nothing had been played.
         success: see :func:`play_episode`.
         measures: likewise.
         description: of the progress bar; no bar if ``None``.
-
-    Returns:
-        The episodes in order of their seeds. The same arguments and number of environments give the same
-        result.
 
     Raises:
         ValueError: if ``episodes < 1``, or the environment has several batch dimensions, cannot play the
@@ -351,14 +330,12 @@ def evaluate(
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import NavigationEnv
         >>> from warmprior.training import evaluate
-        >>> prior = PastPrior(8)
-        >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
-        >>> transforms = policy_transforms(prior, observation_steps=1)
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1, hidden_dim=8), PastPrior(8))
+        >>> transforms = policy_transforms(actor.prior, observation_steps=1)
         >>> env = TransformedEnv(NavigationEnv((1, 1), batch_size=[4]), transforms)
-        >>> played = evaluate(WarmPriorActor(network, prior), env, episodes=6, first_seed=100)
+        >>> played = evaluate(actor, env, episodes=6, first_seed=100)
         >>> [episode.seed for episode in played]
         [100, 101, 102, 103, 104, 105]
-        >>> rate = sum(episode.success for episode in played) / len(played)
     """
     if episodes < 1:
         raise ValueError(f"episodes must be at least 1, got {episodes}")

@@ -21,8 +21,6 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.training.evaluation import play_episode
 from warmprior.transforms.inner_step import EnvTransform
 
-__all__ = ["Filmstrip", "check_video", "record_filmstrip"]
-
 
 class _Recorder(EnvTransform):
     """Keeps what a function sees after the reset and after every control step."""
@@ -81,16 +79,12 @@ class Filmstrip:
         steps: control steps executed before each frame.
         success: whether the task was solved.
 
-    See Also:
-        :func:`~warmprior.training.record_filmstrip`: makes it.
-
     Examples:
         >>> import numpy as np
         >>> from warmprior.training import Filmstrip
-        >>> frames = [np.zeros((160, 160, 3), np.uint8) for _ in range(3)]
-        >>> strip = Filmstrip(frames, steps=[0, 38, 76], success=True)
-        >>> [f"step {step}" for step in strip.steps], np.hstack(strip.frames).shape
-        (['step 0', 'step 38', 'step 76'], (160, 480, 3))
+        >>> strip = Filmstrip([np.zeros((160, 160, 3), np.uint8)] * 3, steps=[0, 38, 76], success=True)
+        >>> np.hstack(strip.frames).shape
+        (160, 480, 3)
     """
 
     frames: list[np.ndarray]
@@ -111,9 +105,7 @@ def record_filmstrip(
     rate: int | None = None,
     **options: Any,
 ) -> Filmstrip:
-    """Play the episode of one seed and render it at evenly spaced control steps.
-
-    It is the very episode that :func:`play_episode` plays.
+    """Play the episode of one seed, that of :func:`play_episode`, and render evenly spaced control steps.
 
     Args:
         actor: a policy that keeps its environment's description.

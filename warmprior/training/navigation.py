@@ -18,8 +18,6 @@ from warmprior.envs.navigation1d import NavigationEnv, navigation_metrics
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms import policy_transforms
 
-__all__ = ["judge_navigation", "play_navigation"]
-
 SHIFT = 0.15
 """Standard deviation of the history shift, a third of the gap between the sides at its narrowest."""
 
@@ -27,7 +25,7 @@ SHIFT = 0.15
 def play_navigation(
     actor: WarmPriorActor, seed: int, *, nfe: int, rollouts: int = 256, shift: float = 0.0
 ) -> TensorDictBase:
-    """Roll a policy out on the toy.
+    """Roll a policy out on the toy, :class:`~warmprior.envs.NavigationEnv`; ``[rollouts, decisions]``.
 
     Args:
         actor: the policy.
@@ -38,19 +36,11 @@ def play_navigation(
         rollouts: how many.
         shift: standard deviation of the noise on the remembered mean.
 
-    Returns:
-        The rollout, ``[rollouts, decisions]``.
-
-    See Also:
-        - :func:`~warmprior.training.judge_navigation`: measures what it did.
-        - :class:`~warmprior.envs.NavigationEnv`: the toy.
-
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.training import play_navigation
-        >>> network = VelocityMLP(1, 9, prediction_length=4, observation_steps=1, hidden_dim=8)
-        >>> rollout = play_navigation(WarmPriorActor(network, PastPrior(4)), seed=0, nfe=1, rollouts=2)
-        >>> rollout.shape  # 64 steps, four per decision
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1, hidden_dim=8), PastPrior(4))
+        >>> play_navigation(actor, seed=0, nfe=1, rollouts=2).shape  # 64 steps, four per decision
         torch.Size([2, 16])
     """
     generator = torch.Generator().manual_seed(seed)

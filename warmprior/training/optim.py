@@ -15,21 +15,10 @@ from torch.optim.swa_utils import AveragedModel
 from warmprior.modules.compiled import uncompiled
 from warmprior.modules.network import VelocityNetwork
 
-__all__ = ["ema_of", "make_optimizer", "warmup_cosine"]
 
-
-def make_optimizer(
-    network: nn.Module,
-    *,
-    learning_rate: float = 1e-4,
-    weight_decay: float = 1e-5,
-) -> AdamW:
+def make_optimizer(network: nn.Module, *, learning_rate: float = 1e-4, weight_decay: float = 1e-5) -> AdamW:
     """AdamW with the paper's values; no decay on biases, norms and position embeddings."""
-    network = uncompiled(network)
-    if isinstance(network, VelocityNetwork):
-        groups = network.parameter_groups(weight_decay)
-    else:
-        groups = [{"params": list(network.parameters()), "weight_decay": weight_decay}]
+    groups = cast(VelocityNetwork, uncompiled(network)).parameter_groups(weight_decay)
     return AdamW(groups, lr=learning_rate, fused=True)
 
 
@@ -38,11 +27,8 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
 
     Args:
         optimizer: its learning rates are the peaks.
-        iterations: length of the whole training.
-        warmup_ratio: share of the warm-up; 0 starts at the peak.
-
-    Raises:
-        ValueError: if ``iterations < 1`` or ``warmup_ratio`` is not in [0, 1).
+        iterations: length of the whole training, at least 1.
+        warmup_ratio: share of the warm-up, in [0, 1); 0 starts at the peak.
 
     Examples:
         >>> import torch
@@ -72,13 +58,7 @@ def warmup_cosine(optimizer: Optimizer, iterations: int, warmup_ratio: float = 0
 def ema_of(network: nn.Module, rate: float = 0.995) -> AveragedModel:
     """Exponential moving average of a network's weights; the averaged copy is ``.module``.
 
-    ``rate`` is the decay per update. The first update copies the weights.
-
-    Raises:
-        ValueError: if ``rate`` is not in [0, 1).
-
-    See Also:
-        :class:`~warmprior.training.BehaviourCloning`: saves the averaged weights.
+    ``rate``, in [0, 1), is the decay per update. The first update copies the weights.
 
     Examples:
         >>> from torch import nn

@@ -1,11 +1,11 @@
-"""What a training needs to know of data and network, as a command line asks for it."""
+"""What a training is asked for: data, network and recipe, as a command line has them."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from warmprior.data.opening import check_place
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
@@ -19,10 +19,10 @@ from warmprior.modules import (
     VelocityNetwork,
     VisionNetwork,
 )
-from warmprior.modules.checks import check_whole_numbers
+from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.encoder import imagenet_weights, load_imagenet
-
-__all__ = ["GENERATED", "PRETRAINED", "DataOptions", "NetworkOptions", "check_counts"]
+from warmprior.objectives.flow_matching import Objective, Weighting, check_objective
+from warmprior.objectives.times import TimesName
 
 GENERATED = 150
 """Scripted demonstrations, where no other number is asked for."""
@@ -71,9 +71,6 @@ class DataOptions:
         image_size: side of the images in pixels.
         fast_rendering: render without reflections, shadows and smooth edges, three to five times faster.
 
-    See Also:
-        :func:`~warmprior.training.load_task`: reads what they name.
-
     Examples:
         >>> from warmprior.training import DataOptions
         >>> options = DataOptions(data=("ph", "mh"), demonstrations=(20, 60))
@@ -102,10 +99,10 @@ class DataOptions:
             )
 
     def check(self) -> None:
-        """Refuse options that cannot work, before anything is generated or downloaded.
+        """Refuse options that cannot work, naming them, before anything is generated or downloaded.
 
         Raises:
-            ValueError: naming the options.
+            ValueError: for options that contradict each other.
             FileNotFoundError: if the file does not exist.
             ImportError: if MimicGen's data are to be fetched without its package, which plays its tasks.
         """
@@ -163,7 +160,7 @@ class NetworkOptions:
     """The velocity network.
 
     Attributes:
-        network: its kind.
+        network: its kind; chi_transformer is the paper's.
         hidden_dim: its width; the class's own by default.
         precondition: by the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
@@ -172,17 +169,13 @@ class NetworkOptions:
         crop_size: side of the random window of an image that is seen in training, the central one else.
         share_encoder: one encoder for all cameras.
 
-    See Also:
-        :class:`~warmprior.ChiTransformer`: the paper's network.
-
     Examples:
         >>> import torch
         >>> from warmprior.training import NetworkOptions
         >>> options = NetworkOptions(network="chi_transformer", hidden_dim=48)
         >>> network = options.make(action_dim=7, observation_dim=23, prediction_length=8)
-        >>> seen, noisy = torch.zeros(1, options.observation_steps, 23), torch.zeros(1, 8, 7)
-        >>> type(network).__name__, network(torch.zeros(1), noisy, seen).shape
-        ('ChiTransformer', torch.Size([1, 8, 7]))
+        >>> network(torch.zeros(1), torch.zeros(1, 8, 7), torch.zeros(1, options.observation_steps, 23)).shape
+        torch.Size([1, 8, 7])
     """
 
     network: Literal["mlp", "chi_transformer"] = "mlp"
@@ -227,9 +220,9 @@ class NetworkOptions:
         prediction_length: int,
         images: Mapping[str, int] | None = None,
     ) -> VelocityNetwork:
-        """A network with fresh weights, for widths ``d_a`` and ``d_o`` (of the vector beside images).
+        """A network with fresh weights, for widths ``d_a`` and ``d_o`` and images of these sides in pixels.
 
-        Images are given by name, with their sides in pixels.
+        Beside images ``d_o`` is the width of the vector.
         """
         kind, width = _NETWORKS[self.network]
         options = {} if self.hidden_dim is None else {width: self.hidden_dim}
@@ -248,3 +241,103 @@ class NetworkOptions:
             observation_dim = encoder.observation_dim
         network = kind(action_dim, observation_dim, prediction_length, self.observation_steps, **options)
         return network if encoder is None else VisionNetwork(encoder, network)
+
+
+Precision = Literal["float32", "bf16"]
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """The recipe; the defaults are those of every table here: a small preconditioned network on a CPU.
+
+    They were chosen from success against iterations. :data:`PAPER` is the paper's recipe. A ValueError
+    names a number that is out of its range.
+
+    Attributes:
+        iterations: gradient steps.
+        batch_size: windows per step, of all processes together.
+        learning_rate: peak of the schedule.
+        weight_decay: AdamW's decay of matrix weights.
+        warmup_ratio: share of the iterations over which the learning rate rises.
+        ema_rate: decay of the averaged weights that are evaluated.
+        checkpoints: how many policies to keep at most, evenly spaced, the last at the end.
+        save_every: iterations between saves of the training state, ten per checkpoint by default.
+        log_every: iterations per logged mean loss.
+        seed: of initial weights, sampling, source, times and dropout.
+        times: how the times of the loss are distributed.
+        objective: the loss: squared error of velocities, or L1 error of predicted samples (L1 Flow).
+        weighting: of the loss: errors as they are (velocity), or in units of what preconditioning leaves, so
+            that every time counts alike (standardised). By default the latter where the network is
+            preconditioned.
+        self_distillation: weight of learning in one step where the flow of averaged weights ends.
+        precision: of the network's matrix products in training; weights, averages and optimiser are float32.
+        cold_probability: share of the windows whose history is withheld; the paper's Algorithm 1 has none.
+
+    Examples:
+        >>> from warmprior.training import TrainingConfig
+        >>> config = TrainingConfig(iterations=1_000, batch_size=256, checkpoints=4)
+        >>> config.checkpoint_iterations
+        [250, 500, 750, 1000]
+    """
+
+    iterations: int = 10_000
+    batch_size: int = 128
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-5
+    warmup_ratio: float = 0.1
+    ema_rate: float = 0.995
+    checkpoints: int = 1
+    save_every: int | None = None
+    log_every: int = 100
+    seed: int = 0
+    times: TimesName = "uniform"
+    objective: Objective = "velocity"
+    weighting: Weighting | None = None
+    self_distillation: float = 0.0
+    precision: Precision = "float32"
+    cold_probability: float = 0.0
+
+    def __post_init__(self) -> None:
+        counts = ("iterations", "batch_size", "checkpoints", "log_every")
+        check_whole_numbers(**{name: getattr(self, name) for name in counts})
+        if self.save_every is not None:
+            check_whole_numbers(save_every=self.save_every)
+        if not isinstance(self.seed, int) or not 0 <= self.seed < 2**62:  # others are counted from it
+            raise ValueError(f"seed must be a whole number from 0 to 2**62 - 1, got {self.seed!r}")
+        for name, words, fits in (
+            ("learning_rate", "be > 0", lambda value: value > 0),
+            ("weight_decay", "be >= 0", lambda value: value >= 0),
+            ("warmup_ratio", "lie in [0, 1)", lambda value: 0 <= value < 1),
+            ("ema_rate", "lie in [0, 1)", lambda value: 0 <= value < 1),
+            ("cold_probability", "lie in [0, 1]", lambda value: 0 <= value <= 1),
+        ):
+            value = getattr(self, name)
+            check_finite_numbers(**{name: value})
+            if not fits(value):
+                raise ValueError(f"{name} must {words}, got {value}")
+        if self.precision not in get_args(Precision):
+            known = ", ".join(get_args(Precision))
+            raise ValueError(f"precision must be one of {known}, got {self.precision!r}")
+        check_objective(
+            times=self.times,
+            objective=self.objective,
+            weighting=self.weighting,
+            self_distillation=self.self_distillation,
+        )
+
+    @property
+    def checkpoint_iterations(self) -> list[int]:
+        """After which iterations a policy is kept."""
+        n = min(self.checkpoints, self.iterations)
+        return [round(self.iterations * (i + 1) / n) for i in range(n)]
+
+
+PAPER = TrainingConfig(
+    iterations=200_000,
+    batch_size=1024,
+    learning_rate=1e-4,
+    warmup_ratio=0.2,
+    checkpoints=10,
+    weighting="velocity",
+)
+"""The paper's recipe (Table 3: Robomimic, state observations)."""

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from warmprior.io.distributed import from_leader
 
-__all__ = ["Prefetch", "placed"]
-
 DEVICE_SHARE = 0.5
 """Of a GPU's free memory, what demonstrations may take: the rest is for the network and its training."""
 
@@ -32,11 +30,10 @@ def placed(data: TensorDictBase, device: torch.device | str) -> TensorDictBase:
 
 
 class Prefetch:
-    """Batches, each gathered by a thread while the one before is computed with.
+    """Batches, each gathered by a thread while the one before is computed with, and pinned for a GPU.
 
-    The prefetching of TorchRL's replay buffers cannot be used here: batches on their way have been drawn
-    already, so that a stored random state would lose them. This one knows the state that belongs to the batch
-    it gave last. Nothing else may draw from the generator, and batches go to a GPU through pinned memory.
+    Unlike TorchRL's, it knows the generator's state that belongs to the batch it gave last, so that a
+    training can be continued. Nothing else may draw from the generator.
     """
 
     def __init__(

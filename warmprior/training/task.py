@@ -17,10 +17,9 @@ from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
 from warmprior.data import download_robomimic, generate_demonstrations
-from warmprior.data.index import DatasetIndex
 from warmprior.data.opening import Demonstrations
 from warmprior.data.render import renderer_versions
-from warmprior.data.replay import DemonstrationReplay
+from warmprior.data.replay import DatasetIndex, DemonstrationReplay
 from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
 from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
@@ -30,11 +29,9 @@ from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.trend import RestingAction
-from warmprior.training.identity import data_digest
+from warmprior.training.checkpoint import data_digest
 from warmprior.training.options import DataOptions, is_simulated
 from warmprior.transforms.absolute_actions import AbsoluteActions
-
-__all__ = ["Task", "load_task", "navigation_task", "read_like", "robosuite_task", "task_places"]
 
 
 @dataclass(frozen=True)
@@ -68,10 +65,6 @@ class Task:
     Raises:
         ValueError: if ``name`` or ``style`` cannot be part of the name of a file, or for a measure that is
             combined in another way.
-
-    See Also:
-        - :func:`~warmprior.training.load_task`: of demonstrations in robosuite.
-        - :func:`~warmprior.training.navigation_task`: the toy.
 
     Examples:
         >>> import torch
@@ -223,9 +216,8 @@ def robosuite_task(
 ) -> Task:
     """The task of demonstrations in robosuite, played in the simulator that recorded them.
 
-    The place is a robomimic HDF5 file, or ``lerobot:`` and the folder or repository of a LeRobotDataset,
-    whose environment is that of ``options.task`` where it does not describe its own. The style decides the
-    time limit of tasks of ours, and the source (``"scripted"``, ``"official"``, ``"file"``) made the file.
+    A LeRobotDataset that does not describe its environment is of that of ``options.task``. The style decides
+    the time limit, and ``source``, ``"scripted"``, ``"official"`` or ``"file"``, says what made the file.
     """
     options = DataOptions() if options is None else options
     # A generated file has as many as were asked for.
@@ -338,10 +330,9 @@ def _name_of(dataset: DemonstrationReplay | DatasetIndex) -> str:
 def read_like(
     place: Path | str, name: str, facts: Mapping[str, Any], mask: str | None = None
 ) -> tuple[TensorDictBase, str]:
-    """Further demonstrations of a task in robosuite, in raw units, as its policies see them.
+    """Further demonstrations of a task in robosuite, in raw units, as policies of these facts see them.
 
-    By its name and facts, all or those of a mask; also what the place (see :func:`robosuite_task`) is called
-    in results. A ``ValueError`` if they are of another task.
+    Also what the place is called in results. A ``ValueError`` if they are of another task.
     """
     found = _open(place, name, mask)
     if (theirs := _name_of(found.index())) != name:  # before images are rendered
@@ -364,11 +355,7 @@ def read_like(
 
 
 def navigation_task() -> Task:
-    """The one-dimensional navigation toy (Fig. 5).
-
-    See Also:
-        - :class:`~warmprior.envs.NavigationEnv`: its environment.
-        - :func:`~warmprior.envs.navigation_demonstrations`: its data.
+    """The one-dimensional navigation toy (Fig. 5): :class:`~warmprior.envs.NavigationEnv` and its data.
 
     Examples:
         >>> from warmprior.training import navigation_task

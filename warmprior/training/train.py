@@ -1,4 +1,4 @@
-"""From a task and a source to a trained policy."""
+"""From a task and a source to a trained policy: preconditioning, fresh weights and behaviour cloning."""
 
 from __future__ import annotations
 
@@ -14,21 +14,22 @@ from torchrl.record.loggers.common import Logger
 
 from warmprior import keys
 from warmprior.io.distributed import from_leader, world_size
+from warmprior.io.workers import torch_threads
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.interpolant import Interpolant
+from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.modules.start import StartPoint
+from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.couplings import Coupling
 from warmprior.training.behaviour_cloning import BehaviourCloning
-from warmprior.training.options import NetworkOptions
+from warmprior.training.options import NetworkOptions, TrainingConfig
 from warmprior.training.placement import placed
-from warmprior.training.precondition import precondition
 from warmprior.training.saved import load_policy
 from warmprior.training.task import Task
-from warmprior.training.threads import torch_threads
-from warmprior.training.training_config import TrainingConfig
 from warmprior.transforms.history_observation import HistoryObservation
-
-__all__ = ["new_policy", "train_policy"]
+from warmprior.transforms.window import window_replay_buffer, without_images
 
 
 def new_policy(
@@ -104,7 +105,7 @@ def train_policy(
 
     Keyword Args:
         network: the velocity network.
-        training: the recipe; :data:`~warmprior.training.training_config.PAPER` is the paper's.
+        training: the recipe; :data:`~warmprior.training.options.PAPER` is the paper's.
         start: where samplers start; at the source by default.
         coupling: how sources and targets are paired; as they come by default.
         see_history: whether the network sees the last actions.
@@ -116,7 +117,7 @@ def train_policy(
         progress: called with the number of iterations, at the start and after each.
 
     Returns:
-        The last policy of averaged weights, on the CPU. It has the demonstrations' normaliser, and
+        The last policy of averaged weights, on the CPU, with the demonstrations' normaliser.
         :func:`~warmprior.policy_transforms` makes the environment that it acts in.
 
     Raises:
@@ -124,10 +125,6 @@ def train_policy(
         KeyError: if the demonstrations lack an entry.
         FloatingPointError: if the loss becomes NaN or infinite.
         ValueError: if the demonstrations have another form, or the folder holds another training.
-
-    See Also:
-        - :func:`~warmprior.training.evaluate`: plays episodes.
-        - :func:`~warmprior.training.save_policy`: keeps the policy.
 
     Examples:
         >>> import torch
@@ -189,3 +186,62 @@ def train_policy(
         cloning.run(description, progress)
         from_leader(lambda: None)  # other processes wait until the first has written it
         return load_policy(cloning.policy_path())
+
+
+TREND_BATCHES = 16
+"""Of 1,024 windows, to which a :class:`PoseTrend` is fitted."""
+
+
+def precondition(
+    network: VelocityNetwork,
+    data: TensorDictBase,
+    prior: Prior,
+    *,
+    observation_steps: int = 2,
+    coupling: Coupling | None = None,
+    withhold: float = 0.0,
+    rest: RestingAction | None = None,
+    interpolant: Interpolant | None = None,
+) -> PreconditionedNetwork:
+    """Wrap a network in what is known of a prior's source and the demonstrations before any training.
+
+    The same data and prior give the same.
+
+    Args:
+        network: the network to wrap.
+        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`.
+        prior: the source distribution.
+
+    Keyword Args:
+        observation_steps: ``To``.
+        coupling: how the training pairs sources and targets; as they come by default.
+        withhold: share of the windows whose history is withheld.
+        rest: for absolute actions, to take off what follows from where the grippers are.
+        interpolant: the path, that of the loss; linear by default.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> from warmprior.training import precondition
+        >>> network = VelocityMLP(1, 9, 4, observation_steps=1, hidden_dim=8)
+        >>> wrapped = precondition(network, navigation_demonstrations(), PastPrior(4), observation_steps=1)
+        >>> type(wrapped).__name__
+        'PreconditionedNetwork'
+    """
+    generator = torch.Generator(data.device or "cpu").manual_seed(0)
+    if coupling is None:  # which may look at them
+        data = without_images(data)
+    windows = window_replay_buffer(
+        data,
+        prior,
+        batch_size=1024,
+        observation_steps=observation_steps,
+        withhold=withhold,
+        generator=generator,
+    )
+    trend = None
+    if rest is not None:
+        batch = torch.cat([windows.sample() for _ in range(TREND_BATCHES)])
+        trend = PoseTrend.fit(batch, prior, rest, generator=generator)
+    moments = SourceMoments.fit(windows, prior, coupling=coupling, trend=trend, generator=generator)
+    return PreconditionedNetwork(network, moments=moments, trend=trend, interpolant=interpolant)

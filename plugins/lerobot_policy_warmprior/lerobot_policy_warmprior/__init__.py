@@ -3,6 +3,6 @@
 from lerobot_policy_warmprior.configuration_warm_flow import WarmFlowConfig
 from lerobot_policy_warmprior.configuration_warm_groot import WarmGrootConfig
 from lerobot_policy_warmprior.configuration_warm_vla import WarmPI05Config, WarmSmolVLAConfig
-from lerobot_policy_warmprior.robosuite_config import RobosuiteEnvConfig
+from lerobot_policy_warmprior.robosuite_env import RobosuiteEnvConfig
 
 __all__ = ["RobosuiteEnvConfig", "WarmFlowConfig", "WarmGrootConfig", "WarmPI05Config", "WarmSmolVLAConfig"]

@@ -16,8 +16,6 @@ from warmprior.lerobot import history_indices
 from warmprior.modules.registry import make
 from warmprior.training import warmup_cosine
 
-__all__ = ["WarmFlowConfig", "WarmupRatioConfig"]
-
 
 @LRSchedulerConfig.register_subclass("warmup_ratio")
 @dataclass
@@ -87,11 +85,7 @@ class WarmFlowConfig(PreTrainedConfig):
     scheduler_warmup_ratio: float = 0.2
 
     def make_prior(self) -> Prior:
-        """The source distribution.
-
-        Raises:
-            ValueError: if there is none of that name and these options.
-        """
+        """The source distribution; a ``ValueError`` if there is none of that name and these options."""
         return make(Prior, self.prior, self.n_action_steps)
 
     @property
@@ -102,12 +96,7 @@ class WarmFlowConfig(PreTrainedConfig):
         return [name for kind in kinds for name, entry in features if entry.type is kind]
 
     def validate_features(self) -> None:
-        """Refuse datasets that the policy cannot learn from.
-
-        Raises:
-            ValueError: if there is no state, an image has no three channels or is normalised, or there is no
-                such encoder.
-        """
+        """Refuse, by a ``ValueError``, datasets that the policy cannot learn from."""
         encoders = ("resnet18-imagenet", "resnet18", "small")
         if self.encoder not in encoders:
             raise ValueError(f"--policy.encoder must be one of {', '.join(encoders)}, got {self.encoder!r}")

@@ -12,8 +12,6 @@ from warmprior import Prior
 from warmprior.lerobot import history_indices
 from warmprior.modules.registry import find, make
 
-__all__ = ["WarmPI05Config", "WarmSmolVLAConfig"]
-
 
 @dataclass
 class WarmConfigMixin:
@@ -34,11 +32,7 @@ class WarmConfigMixin:
     cold_probability: float = 0.0
 
     def make_prior(self) -> Prior:
-        """The source distribution.
-
-        Raises:
-            ValueError: if there is none of that name and these options.
-        """
+        """The source distribution; a ``ValueError`` if there is none of that name and these options."""
         kind = find(Prior, self.prior.partition(",")[0])
         room = len(super().action_delta_indices) // kind.prediction_chunks
         return make(Prior, self.prior, room if self.prior_chunk is None else self.prior_chunk)

@@ -24,24 +24,15 @@ from warmprior.envs.description import environment_name
 from warmprior.io.script import run_script
 from warmprior.training.saved import load_policy
 
-__all__ = ["export_policy"]
-
 _FEATURES = {"observation.environment_state": FeatureType.ENV, "observation.state": FeatureType.STATE}
 
 
 def export_policy(folder: str | Path, out: str | Path) -> Path:
-    """Write a saved policy, its normaliser included, as LeRobot's ``warm_flow``.
+    """Write a saved policy, its normaliser included, as LeRobot's ``warm_flow``; ``out`` must not exist.
 
     Its observation is what converted demonstrations have (``python -m warmprior convert``): the state of the
     objects as ``observation.environment_state``, that of the robot as ``observation.state``. Of an unknown
     environment all of it is the latter.
-
-    Args:
-        folder: of :func:`~warmprior.training.save_policy`.
-        out: to write; must not exist.
-
-    Returns:
-        ``out``.
 
     Raises:
         FileExistsError: if ``out`` exists.

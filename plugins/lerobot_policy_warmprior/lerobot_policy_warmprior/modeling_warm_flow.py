@@ -35,21 +35,12 @@ from warmprior.modules import load_imagenet
 from warmprior.modules.registry import from_config
 from warmprior.training import ema_of, precondition
 
-__all__ = ["WarmFlowPolicy"]
-
 
 class WarmFlowPolicy(PreTrainedPolicy):
     """Flow matching from a prior: :class:`~warmprior.WarmPriorActor` and its loss as a policy of LeRobot.
 
-    Args:
-        config: its options.
-        dataset_meta: LeRobot's description of the dataset of a training, to which the preconditioning is
-            fitted.
-        kwargs: what else LeRobot says of the dataset; nothing of it is needed.
-
-    Raises:
-        ValueError: if the network does not fit the dataset, the prior has networks of its own, which
-            LeRobot would not train, or ``cold_probability`` is not in [0, 1].
+    A training's ``dataset_meta`` is the dataset to which the preconditioning is fitted. A ``ValueError`` if
+    the network does not fit it, or the prior has networks of its own, which LeRobot would not train.
     """
 
     config_class = WarmFlowConfig
@@ -158,12 +149,8 @@ class WarmFlowPolicy(PreTrainedPolicy):
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Conditional flow matching (Algorithm 1).
 
-        Args:
-            batch: ``"action"`` ``[B, H + P, d_a]`` and ``"action_is_pad"``, with the actions before in front,
-                the observations ``[B, To, d]``, and images in [0, 1] ``[B, To, 3, h, w]``.
-
-        Raises:
-            KeyError: if the mask is missing, without which the history would leak the target.
+        ``batch`` has ``"action"`` ``[B, H + P, d_a]`` and ``"action_is_pad"``, with the actions before in
+        front, the observations ``[B, To, d]``, and images in [0, 1] ``[B, To, 3, h, w]``.
         """
         if "action_is_pad" not in batch:
             raise KeyError(
@@ -203,10 +190,7 @@ class WarmFlowPolicy(PreTrainedPolicy):
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """A new chunk, ``[B, P, d_a]``, normalised.
 
-        Args:
-            batch: the present observations ``[B, d]`` and images ``[B, 3, h, w]``; those before are
-                remembered, since :meth:`reset`.
-            kwargs: nothing of it is needed.
+        From present observations ``[B, d]`` and images ``[B, 3, h, w]``, and those since :meth:`reset`.
         """
         self._remember(batch)
         if self._memory.waits:  # asked for chunks alone

@@ -13,8 +13,6 @@ from torch import Tensor
 from lerobot_policy_warmprior.configuration_warm_vla import WarmPI05Config, WarmSmolVLAConfig
 from warmprior.lerobot import WarmPriorAdapter, action_std
 
-__all__ = ["WarmPI05Policy", "WarmSmolVLAPolicy"]
-
 
 class WarmPolicyMixin:
     """Comes before a policy of LeRobot: its losses and chunks start from the prior."""

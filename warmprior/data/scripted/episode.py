@@ -1,21 +1,23 @@
-"""One scripted demonstration: everything about it follows from its task, style and seed."""
+"""One scripted demonstration, which follows from its task, style and seed, and the files of many."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from warmprior.data.scripted.motion import ArmRunner, Plan
-from warmprior.data.scripted.operators import OPERATORS, SKILLED, Demonstrator
-from warmprior.data.scripted.tasks_single import can, lift, square, stack
-from warmprior.data.scripted.transport import transport
+from warmprior.data.scripted.operators import LEVELS, OPERATORS, SKILLED, Demonstrator
+from warmprior.data.scripted.tasks import can, lift, square, stack, transport
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.simulator import make_simulator, task_env_args
 from warmprior.envs.tasks import get_task
-
-__all__ = ["PLANS", "Episode", "expert_loop", "operator_of", "run_episode"]
+from warmprior.io.extras import require
+from warmprior.io.files import write_atomic
 
 PLANS: dict[str, Callable[[StepLoop, Demonstrator], list[Plan]]] = {
     "lift": lift,
@@ -32,15 +34,9 @@ _HOLD = 6  # steps that the task must stay solved for before the episode ends
 class Episode:
     """A recorded demonstration of ``N`` steps.
 
-    Attributes:
-        seed: the simulator's seed.
-        operator: index of the operator, 0 for ``ph``.
-        level: the operator's level.
-        success: whether the task stayed solved to the end.
-        actions: ``[N, d_a]`` float64 in ``[-1, 1]``.
-        states: ``[N, 1 + nq + nv]`` float64, the simulator before each action.
-        rewards: ``[N]`` float64, 1 where the action led to a solved state.
-        observations: name to ``[N + 1, ...]``, the last row after the last action.
+    ``actions`` ``[N, d_a]`` in ``[-1, 1]``; ``states`` ``[N, 1 + nq + nv]``, the simulator before each;
+    ``rewards`` ``[N]``, 1 where the action led to a solved state; ``observations`` ``[N + 1, ...]`` by name,
+    the last row after the last action. All are float64.
     """
 
     seed: int
@@ -103,3 +99,84 @@ def run_episode(loop: StepLoop, task: str, style: str, seed: int) -> Episode:
         rewards=np.array(rewards),
         observations={key: np.stack([entry[key] for entry in observations]) for key in observations[0]},
     )
+
+
+_VALID_FRACTION = 0.1
+_PERCENTAGES = (20, 50)
+
+
+def write_robomimic(
+    path: Path,
+    episodes: Iterable[Episode],
+    *,
+    env_args: Mapping[str, Any],
+    model_file: str,
+    seed: int = 0,
+    attributes: Mapping[str, Any] | None = None,
+) -> int:
+    """Write episodes, one by one, to a file that robomimic's own reader opens; how many samples it has.
+
+    The seed is that of the random split into filter keys, ``model_file`` the simulator's XML.
+    """
+    h5py = require("h5py", "sim")
+    steps: list[int] = []
+    levels: list[str] = []
+
+    def write(temporary: Path) -> None:
+        with h5py.File(temporary, "w") as file:
+            data = file.create_group("data")
+            for episode in episodes:
+                demo = data.create_group(f"demo_{len(levels)}")
+                _write_demo(demo, episode)
+                demo.attrs["model_file"] = model_file
+                levels.append(episode.level)
+                steps.append(len(episode.actions))
+            data.attrs["total"] = sum(steps)
+            data.attrs["env_args"] = json.dumps(env_args, indent=4)
+            data.attrs.update(attributes or {})
+            for key, demos in _filter_keys(levels, np.random.default_rng(seed)).items():
+                names = sorted(f"demo_{i}" for i in demos)
+                file.create_dataset(f"mask/{key}", data=np.array(names, dtype="S"))
+
+    write_atomic(path, write)
+    return sum(steps)
+
+
+def _write_demo(demo: Any, episode: Episode) -> None:
+    steps = len(episode.actions)
+    dones = (episode.rewards > 0).astype(np.int64)
+    dones[-1] = 1
+    demo.create_dataset("actions", data=episode.actions)
+    demo.create_dataset("states", data=episode.states)
+    demo.create_dataset("rewards", data=episode.rewards)
+    demo.create_dataset("dones", data=dones)
+    for key, values in episode.observations.items():
+        for group, part in (("obs", values[:-1]), ("next_obs", values[1:])):
+            demo.create_dataset(f"{group}/{key}", data=part)
+    demo.attrs["num_samples"] = steps
+    demo.attrs["ep_meta"] = "{}"
+    demo.attrs["seed"] = episode.seed
+    demo.attrs["operator"] = episode.operator
+
+
+def _filter_keys(levels: list[str], rng: np.random.Generator) -> dict[str, set[int]]:
+    """Split the demonstrations as robomimic's files do; empty subsets are left out."""
+    count = len(levels)
+    everything = set(range(count))
+    order = rng.permutation(count).tolist()
+    valid = set(order[: min(count - 1, max(1, round(count * _VALID_FRACTION)))])
+    splits = {"train": everything - valid, "valid": valid}
+    subsets = {}
+    for percentage in _PERCENTAGES:
+        size = max(1, count * percentage // 100)
+        subsets[f"{percentage}_percent"] = set(rng.permutation(count)[:size].tolist())
+    if len(set(levels)) > 1:
+        of = {name: {i for i in everything if levels[i] == name} for name in LEVELS}
+        subsets |= of
+        for first, second in (("okay", "better"), ("worse", "okay"), ("worse", "better")):
+            subsets[f"{first}_{second}"] = of[first] | of[second]
+    found = dict(splits)
+    for name, demos in subsets.items():
+        found[name] = demos
+        found |= {f"{name}_{split}": demos & members for split, members in splits.items()}
+    return {name: demos for name, demos in found.items() if demos}

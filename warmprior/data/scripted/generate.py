@@ -12,18 +12,21 @@ from typing import Any
 from torchrl._utils import logger
 from tqdm import tqdm
 
-from warmprior.data.scripted.episode import PLANS, Episode, expert_loop, operator_of, run_episode
+from warmprior.data.scripted.episode import (
+    PLANS,
+    Episode,
+    expert_loop,
+    operator_of,
+    run_episode,
+    write_robomimic,
+)
 from warmprior.data.scripted.operators import OPERATORS
-from warmprior.data.scripted.writer import write_robomimic
 from warmprior.envs.control_loop import ControlLoop
 from warmprior.envs.simulator import import_robosuite, task_env_args
 from warmprior.envs.tasks import EVALUATION_SEED, get_task
 from warmprior.io.extras import require
 from warmprior.io.files import cache_folder
-from warmprior.io.processes import working
-from warmprior.io.workers import available_cores
-
-__all__ = ["GENERATOR_VERSION", "SEEDS_PER_FILE", "generate_demonstrations"]
+from warmprior.io.workers import available_cores, working
 
 #: Part of every cached file's name; raised whenever the same arguments give other demonstrations.
 GENERATOR_VERSION = 1
@@ -43,7 +46,7 @@ def generate_demonstrations(
     workers: int | None = None,
     progress: bool = True,
 ) -> Path:
-    """Generate successful scripted demonstrations in robomimic's HDF5 layout.
+    """Generate successful scripted demonstrations in robomimic's HDF5 layout; the path of the complete file.
 
     Of states; :func:`~warmprior.data.render_demonstrations` makes images of them.
 
@@ -63,11 +66,7 @@ def generate_demonstrations(
         workers: number of processes; ``None`` for one per available core.
         progress: show a bar with the remaining time.
 
-    Returns:
-        The path of the complete file.
-
     Raises:
-        ImportError: if robosuite or h5py is not installed.
         FileExistsError: if there is something at ``path``.
         ValueError: if the task is unknown or has no scripted expert, or an option is out of range.
         RuntimeError: if the experts fail too often to reach ``n``.

@@ -1,4 +1,4 @@
-"""Waypoints, the runner that follows them, and the movements that every task is made of."""
+"""Rotations, waypoints, the runner that follows them, and the movements that every task is made of."""
 
 from __future__ import annotations
 
@@ -8,26 +8,63 @@ from typing import Any
 
 import numpy as np
 
-from warmprior.data.scripted.geometry import rotation_vector, turn_z
 from warmprior.data.scripted.operators import Demonstrator
 from warmprior.envs.control_loop import StepLoop
 
-__all__ = [
-    "CLOSED",
-    "OPEN",
-    "ArmRunner",
-    "Plan",
-    "Waypoint",
-    "above",
-    "bring",
-    "carry",
-    "grasp",
-    "is_held",
-    "is_raised",
-    "lower",
-    "release",
-    "transfer",
-]
+# Gripper pointing down, fingers opening along the world's y axis.
+_HOME = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+def rotation_matrix(vector: np.ndarray) -> np.ndarray:
+    """Turn a rotation vector ``[3]`` into a matrix ``[3, 3]`` (Rodrigues' formula)."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = np.asarray(vector) / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+
+
+def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    """Turn a rotation matrix ``[3, 3]`` into the shortest rotation vector ``[3]``."""
+    m = matrix
+    sine_axis = np.array([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]]) / 2
+    sine, cosine = float(np.linalg.norm(sine_axis)), (np.trace(m) - 1) / 2
+    angle = np.arctan2(sine, cosine)
+    if cosine > -0.99:
+        return sine_axis * (angle / sine if sine > 1e-9 else 1.0)
+    # Near half a turn the antisymmetric part vanishes; the symmetric one is (1 - cos) a a^T.
+    outer = (m + m.T) / 2 - cosine * np.eye(3)
+    axis = outer[:, np.argmax(np.diag(outer))]
+    axis = axis / np.linalg.norm(axis)
+    return axis * (angle if axis @ sine_axis >= 0 else -angle)
+
+
+def turn_z(yaw: float) -> np.ndarray:
+    """Rotation matrix ``[3, 3]`` about the vertical."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def down(yaw: float, tilt: float = 0.0, roll: float = 0.0) -> np.ndarray:
+    """Orientation ``[3, 3]`` of a gripper that points down, turned by ``yaw`` and slightly tilted."""
+    return turn_z(yaw) @ rotation_matrix(np.array([roll, tilt, 0.0])) @ _HOME
+
+
+def wrap(angle: float) -> float:
+    """Bring an angle into ``[-pi, pi)``."""
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def yaw_of(matrix: np.ndarray) -> float:
+    """Heading of a body's x axis in the horizontal plane."""
+    return np.arctan2(matrix[1, 0], matrix[0, 0])
+
+
+def nearest_yaw(yaw: float, home: float, period: float = np.pi) -> float:
+    """Among the yaws equivalent under a symmetry, the one closest to ``home``."""
+    return float(home + (yaw - home + period / 2) % period - period / 2)
+
 
 OPEN, CLOSED = -1.0, 1.0
 _ANY = 9.0  # a tolerance that every pose meets
@@ -38,19 +75,11 @@ Plan = Iterator["Waypoint"]
 
 @dataclass
 class Waypoint:
-    """A goal pose, constant or read anew at every step, and how to get there.
+    """A goal pose ``[3]`` and ``[3, 3]``, constant or read anew at every step, and how to get there.
 
-    Attributes:
-        pos: ``[3]`` metres, or a function that returns it.
-        mat: ``[3, 3]`` orientation of the grip site, or a function that returns it.
-        grip: :data:`OPEN` or :data:`CLOSED`.
-        tol: distance that counts as arrived, in metres.
-        rtol: angle that counts as arrived, in radians.
-        speed: fraction of the operator's own speed.
-        dwell: steps to stay after arriving.
-        limit: steps after which to go on regardless.
-        noise: fraction of the operator's own noise.
-        until: replaces ``tol`` and ``rtol`` as the test for having arrived.
+    It is reached within ``tol`` metres and ``rtol`` radians, or by ``until``; the arm then stays for
+    ``dwell`` steps, and goes on after ``limit`` steps regardless. ``speed`` and ``noise`` are fractions of
+    the operator's.
     """
 
     pos: np.ndarray | Live
@@ -70,10 +99,7 @@ def _read(value: np.ndarray | Live) -> np.ndarray:
 
 
 class ArmRunner:
-    """Follows a plan's waypoints with one arm: proportional control, smoothed, with human noise.
-
-    The plan is advanced when a waypoint is reached: it can look at the scene before it decides on the next.
-    """
+    """Follows a plan's waypoints with one arm: proportional control, smoothed, with human noise."""
 
     def __init__(self, loop: StepLoop, arm: int, plan: Plan, person: Demonstrator) -> None:
         self._loop, self._arm, self._plan, self._person = loop, arm, plan, person
@@ -167,9 +193,7 @@ def transfer(
 ) -> Plan:
     """Move along a curve, or axis by axis, through one intermediate waypoint.
 
-    ``turn`` is a signed yaw too large to leave to the shortest rotation: half of it is done at the
-    intermediate waypoint, which keeps the wrist away from its limit. ``options`` are those of
-    :class:`Waypoint`.
+    ``turn`` is a signed yaw too large for the shortest rotation; half of it is done half-way.
     """
     start, start_mat = loop.eef(arm)
     end = _read(pos)
@@ -209,10 +233,7 @@ def carry(
 
 
 def bring(loop: StepLoop, arm: int, body: str, goal: Live) -> Live:
-    """Hand position that puts a held body at ``goal()``, whatever the body's orientation.
-
-    Turning the hand after a body that slips in the fingers would make the arm chase it.
-    """
+    """Hand position that puts a held body at ``goal()``, whatever its orientation, for it may slip."""
     return lambda: goal() + loop.eef(arm)[0] - loop.body(body)[0]
 
 

@@ -8,8 +8,6 @@ from typing import TypeVar
 
 import numpy as np
 
-__all__ = ["LEVELS", "OPERATORS", "SKILLED", "Demonstrator", "Operator"]
-
 T = TypeVar("T")
 
 #: Skill levels of multi-human data, best first.
@@ -20,17 +18,10 @@ LEVELS = ("better", "okay", "worse")
 class Operator:
     """The habits of one person.
 
-    Attributes:
-        level: one of :data:`LEVELS`.
-        speed: largest command as a fraction of the full range.
-        noise: scale of the correlated noise on the commands.
-        pause: probability of hesitating before a waypoint.
-        arc: sideways bulge of transfers, in metres, to the left.
-        side: +1 or -1, the preferred side where there are two.
-        high: how much higher than necessary to carry, in metres.
-        choice: 0 takes the cheapest of several ways to grasp or place, 1 the runner-up.
-        axiswise: moves along one axis after the other instead of straight.
-        clumsy: probability of missing a grasp at first.
+    ``speed`` is the largest command as a fraction of the full range, ``noise`` the scale of what is added.
+    ``pause`` and ``clumsy`` are the probabilities of hesitating before a waypoint, and of missing a grasp.
+    Transfers bulge by ``arc`` metres to the left, ``high`` metres higher than necessary, or go ``axiswise``.
+    Where there are two, ``side`` is preferred, and ``choice`` 0 takes the cheapest way, 1 the runner-up.
     """
 
     level: str = "better"
