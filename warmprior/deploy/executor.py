@@ -24,7 +24,7 @@ from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import with_leftover
 from warmprior.transforms.delay import check_delay
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import HistoryObservation
 
 __all__ = ["AsyncExecutor"]
 
@@ -47,8 +47,6 @@ class AsyncExecutor:
             "observation")`` for one that includes the last actions), ``"history"`` and ``("rtc", "delay")``
             (see :mod:`warmprior.keys`), and writes a chunk
             ``[P, d_a]``; set to evaluation mode. It is called without batch dimensions, one call at a time.
-
-    Keyword Args:
         prior: the policy's prior, of which only the lengths matter; that of a
             :class:`~warmprior.WarmPriorActor` by default.
         execute: control steps from one decision to the next; by default ``H``, or as many as ``delay``

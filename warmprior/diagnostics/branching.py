@@ -38,8 +38,6 @@ def branching_cost(
         policy: the policy.
         batch: windows ``[*B]`` of its own prior with a target, see
             :func:`~warmprior.window_replay_buffer`.
-
-    Keyword Args:
         draws: samples of source and time per window; the times are stratified.
         generator: source of randomness on the policy's device; the policy's own by default.
 

@@ -1,4 +1,4 @@
-"""How straight a policy's flow is (Sec. 5.1, Table 2)."""
+"""Paths of a policy's flow, and how straight they are (Sec. 5.1, Table 2)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from warmprior.diagnostics.flow import (
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.ode import integrate
 
-__all__ = ["curvature"]
+__all__ = ["curvature", "flow_paths"]
 
 NO_MOTION = 0.95
 """A field with at least this share of a zero field's loss counts as not having learnt to move."""
@@ -57,8 +57,6 @@ def curvature(
             rollout. In windows WP-Preview's mean is the target itself; see
             :meth:`SharedObservations.deployed` for the history at deployment.
         n_steps: Euler steps.
-
-    Keyword Args:
         draws: source samples per observation, averaged.
         generator: source of randomness on the policy's device; the policy's own by default.
 
@@ -72,10 +70,6 @@ def curvature(
         KeyError: if the batch lacks a key.
         ValueError: for bad batches or options, or a policy that is no flow.
         FloatingPointError: if a path becomes NaN or infinite.
-
-    See Also:
-        - :func:`~warmprior.diagnostics.flow_paths`: the paths themselves.
-        - :func:`~warmprior.diagnostics.source_leak`: how the source's noise reaches the actions.
 
     Examples:
         >>> from warmprior.diagnostics import curvature
@@ -125,6 +119,52 @@ def curvature(
         out["one_step_error" + suffix] = (total(gap.square()) / count).sqrt()
     _flag_no_motion(out, policy, batch)
     return out
+
+
+def flow_paths(
+    policy: WarmPriorActor,
+    batch: TensorDictBase,
+    n_steps: int = 100,
+    *,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Integration paths of a policy's flow, from its source at ``t = 0`` on, for plots (Fig. 4).
+
+    A policy with a :class:`~warmprior.StartPoint` takes other paths than these.
+
+    Args:
+        policy: the policy.
+        batch: ``[*B]``, as in :func:`curvature`.
+        n_steps: Euler steps.
+        generator: source of randomness on the policy's device; the policy's own by default.
+
+    Returns:
+        ``[*B, n_steps + 1, P, d_a]``, normalised action units.
+
+    Raises:
+        KeyError: if the batch lacks a key.
+        ValueError: for bad batches or options, or a policy that is no flow.
+
+    Examples:
+        >>> from warmprior.diagnostics import flow_paths
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.history import cold_history
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), GaussianPrior(8))
+        >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3),
+        ...                     "history": cold_history([5], 8, 8, action_dim=2)}, [5])
+        >>> flow_paths(actor, batch, n_steps=20).shape
+        torch.Size([5, 21, 8, 2])
+    """
+    check_flow(policy, n_steps)
+    windows = flat_windows(policy, batch)
+    with evaluation_mode(policy):
+        generator = policy.sampler.generator if generator is None else generator
+        a0 = policy.prior.sample(windows.history, windows.observation, generator)
+        field = field_of(policy, windows.observation)
+        path = integrate(field, a0, nfe=n_steps, return_path=True)
+    return path.view(*windows.shape, *path.shape[1:])
 
 
 def _measure(

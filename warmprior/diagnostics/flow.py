@@ -14,7 +14,7 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import HistoryObservation
 
 Field = Callable[[Tensor, Tensor], Tensor]
 

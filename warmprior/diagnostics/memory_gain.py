@@ -1,4 +1,4 @@
-"""Memory gain: how far a policy follows its past, whatever it observes."""
+"""How far a policy follows its past, and a policy whose past is slightly wrong."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from warmprior import keys
@@ -23,7 +24,7 @@ from warmprior.diagnostics.flow import (
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_positive
 
-__all__ = ["memory_gain"]
+__all__ = ["HistoryShift", "memory_gain"]
 
 
 def memory_gain(
@@ -60,8 +61,6 @@ def memory_gain(
         policy: the policy; its state stays as it is.
         windows: ``[*B]`` of the policy's own prior, normalised, see :class:`~warmprior.ActionWindow` and
             :meth:`SharedObservations.windows`. Images may be encoded, unless the network sees the history.
-
-    Keyword Args:
         nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
         shift: :math:`\delta`, in normalised action units.
 
@@ -74,9 +73,6 @@ def memory_gain(
             observation's last actions differ from the history's, if ``shift`` is not positive,
             or the prior allows none of the NFEs.
         FloatingPointError: if a prediction is NaN or infinite.
-
-    See Also:
-        :func:`~warmprior.diagnostics.source_leak`: the same for the noise of the source.
 
     Examples:
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
@@ -149,3 +145,44 @@ def _check_seen(policy: WarmPriorActor, windows: TensorDictBase) -> None:
             f"{key!r} does not end in the windows' last actions, as HistoryObservation writes them: pass "
             "windows with images as they are, not encoded"
         )
+
+
+class HistoryShift(TensorDictModuleBase):
+    """Disturbs a policy's history at every decision.
+
+    Adds normal noise to the history's actions and forecast before the policy sees them. The environment's own
+    history stays as it is.
+
+    Args:
+        policy: the policy.
+        std: standard deviation of the noise, normalised action units.
+        generator: source of randomness; PyTorch's global one by default.
+
+    Raises:
+        ValueError: if ``std < 0``.
+    """
+
+    def __init__(
+        self, policy: WarmPriorActor, std: float, *, generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__()
+        if not std >= 0:
+            raise ValueError(f"std must be >= 0, got {std}")
+        self.policy, self.std, self.generator = policy, std, generator
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Disturb the history and act."""
+        history = tensordict[keys.HISTORY]
+        longest = max(history[name].shape[-2] for name in ("actions", "forecast"))
+        actions = history["actions"]
+        noise = torch.randn(
+            (*actions.shape[:-2], longest, actions.shape[-1]),
+            generator=self.generator,
+            dtype=actions.dtype,
+            device=actions.device,
+        )
+        seen = tensordict.clone(recurse=False)
+        seen.set(keys.HISTORY, shifted(history, self.std * noise))
+        out = self.policy(seen_anew(self.policy, seen))
+        return tensordict.update(out.select(*self.out_keys))

@@ -7,13 +7,42 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from warmprior import keys
-from warmprior.diagnostics.flow import depends_on_history, encoded_windows, seen_anew, sees_history
-from warmprior.diagnostics.paths import deployed_history
+from warmprior.diagnostics.flow import (
+    depends_on_history,
+    drawn,
+    encoded_windows,
+    evaluation_mode,
+    flat_windows,
+    seen_anew,
+    sees_history,
+)
+from warmprior.history import advance
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.prior import Prior
 from warmprior.transforms.window import window_transforms
 
-__all__ = ["SharedObservations"]
+__all__ = ["SharedObservations", "deployed_history"]
+
+
+def deployed_history(
+    policy: WarmPriorActor,
+    previous: TensorDictBase,
+    *,
+    generator: torch.Generator | None = None,
+) -> TensorDict:
+    """The history at deployment, from the policy's own prediction one decision earlier.
+
+    ``previous`` are windows ``[*B]``, ``H`` steps before those of interest in the same episodes, with the
+    history of the training. Returns ``[*B]`` with ``"history"``.
+    """
+    windows = flat_windows(policy, previous)
+    data = previous.select(*policy.in_keys).to(windows.loc.device)
+    with evaluation_mode(policy):
+        data.set(keys.NOISE, drawn(policy, data, generator))
+        chunk = policy.integrate(data).get(keys.CHUNK)
+        steps = torch.full((*data.batch_size, 1), policy.prior.chunk_length, device=chunk.device)
+        history = advance(data[keys.HISTORY], chunk, steps)
+    return TensorDict({keys.HISTORY: history}, batch_size=data.batch_size, device=chunk.device)
 
 
 class SharedObservations:
@@ -25,8 +54,6 @@ class SharedObservations:
         data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`. Held-out ones for a fair
             curvature.
         chunk_length: ``H``.
-
-    Keyword Args:
         observation_steps: ``To``.
         count: how many to draw, without replacement; all by default.
         generator: source of the draw, on the CPU; PyTorch's global one by default.
@@ -81,8 +108,6 @@ class SharedObservations:
         Args:
             prior: of which only the lengths matter.
             offset: how many steps earlier to cut them, at most ``H``.
-
-        Keyword Args:
             see_history: whether a network sees the last actions.
 
         Returns:

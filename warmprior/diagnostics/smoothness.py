@@ -25,9 +25,6 @@ class Smoothness:
         jerk: mean norm of the third difference of the executed actions, per step cubed.
         boundaries: number of boundaries.
 
-    See Also:
-        :func:`~warmprior.diagnostics.smoothness`: measures it.
-
     Examples:
         >>> from warmprior.diagnostics import smoothness
         >>> import torch

@@ -47,9 +47,6 @@ class SourceLeak:
         inner_step: mean distance between consecutive actions inside predicted chunks; NaN at ``H = 1``.
         data_inner_step: the same of the targets.
 
-    See Also:
-        :func:`~warmprior.diagnostics.source_leak`: measures it.
-
     Examples:
         >>> from warmprior.diagnostics import SourceLeak
         >>> found = SourceLeak(nfe=1, spread=0.3, data_spread=0.2, ratio_to_last=1.5,
@@ -129,8 +126,6 @@ def source_leak(
         windows: ``[*B]`` of the policy's own prior with observations ``[*B, To, d_o]`` and targets
             ``[*B, P, d_a]``, normalised, see :class:`~warmprior.ActionWindow` and
             :meth:`SharedObservations.windows`.
-
-    Keyword Args:
         nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
         draws: samples of the source per window, at least 2, the same ones for every NFE.
         episodes: each window's episode, ``[*B]``, such as :attr:`SharedObservations.episodes`;
@@ -143,10 +138,6 @@ def source_leak(
         KeyError: if the windows lack a key.
         ValueError: for bad windows or options, a single episode, or if the prior allows none of the NFEs.
         FloatingPointError: if a prediction is NaN or infinite.
-
-    See Also:
-        - :class:`~warmprior.diagnostics.SourceLeak`: what it returns.
-        - :func:`~warmprior.diagnostics.curvature`: how far from straight the flow is.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor

@@ -39,9 +39,6 @@ def success_posterior(successes: int, episodes: int) -> Any:
         ValueError: if not ``0 <= successes <= episodes``.
         ImportError: if scipy is missing.
 
-    See Also:
-        :func:`~warmprior.diagnostics.probability_better`: compares two rates.
-
     Examples:
         >>> from warmprior.diagnostics import success_posterior
         >>> round(float(success_posterior(9, 10).mean()), 3)  # (9 + 1) / (10 + 2)
@@ -154,8 +151,6 @@ def bootstrap_ratio(
         numerator: ``[n]``.
         denominator: ``[n]``, of the same observations.
         groups: the group of each, int64 ``[n]``; its episode, usually.
-
-    Keyword Args:
         generator: source of randomness on the CPU; PyTorch's global one by default.
 
     Returns:
@@ -165,9 +160,6 @@ def bootstrap_ratio(
     Raises:
         ValueError: if the shapes differ.
         ImportError: if scipy is missing.
-
-    See Also:
-        :func:`~warmprior.diagnostics.curvature`: a measure whose ratio it judges.
 
     Examples:
         >>> from warmprior.diagnostics import bootstrap_ratio

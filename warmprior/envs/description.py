@@ -15,7 +15,7 @@ from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.keys import CONDITIONED
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms.absolute_actions import AbsoluteActions
-from warmprior.transforms.camera_images import CameraImages
+from warmprior.transforms.images import CameraImages
 from warmprior.transforms.policy import policy_transforms
 
 __all__ = [

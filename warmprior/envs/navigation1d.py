@@ -143,8 +143,6 @@ class NavigationEnv(EnvBase):
 
     Args:
         route: for each of the two obstacles ``1`` (pass above) or ``-1`` (below); either by default.
-
-    Keyword Args:
         batch_size: ``*B``, independent agents.
         device: of all tensors.
 
@@ -288,10 +286,6 @@ def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
 
     Raises:
         ValueError: if the heights have another shape, are not finite, or a chunk is the whole episode.
-
-    See Also:
-        - :func:`~warmprior.diagnostics.executed_actions`: the heights of a rollout.
-        - :func:`~warmprior.training.judge_navigation`: plays and judges a policy.
 
     Examples:
         >>> from warmprior.envs import navigation_heights, navigation_metrics

@@ -22,10 +22,6 @@ class Interpolant(Registered):
     :math:`\alpha(0)=\beta(1)=1` and :math:`\alpha(1)=\beta(0)=0`, so that the flow starts at the source and
     ends at the data.
 
-    See Also:
-        - :class:`~warmprior.LinearInterpolant`: the default.
-        - :class:`~warmprior.FlowMatchingLoss`: regresses its velocity.
-
     Examples:
         >>> import math
         >>> import torch
@@ -36,8 +32,7 @@ class Interpolant(Registered):
         ...         beta = torch.sin(math.pi / 2 * t) ** 2
         ...         speed = math.pi / 2 * torch.sin(math.pi * t)
         ...         return 1 - beta, beta, -speed, speed
-        >>> path = SineInterpolant()
-        >>> a_t, velocity = path(torch.zeros(1, 2, 1), torch.ones(1, 2, 1), torch.tensor([0.5]))
+        >>> a_t, velocity = SineInterpolant()(torch.zeros(1, 2, 1), torch.ones(1, 2, 1), torch.tensor([0.5]))
         >>> round(float(a_t[0, 0]), 3), round(float(velocity[0, 0]), 3)
         (0.5, 1.571)
     """
@@ -49,16 +44,10 @@ class Interpolant(Registered):
     def __call__(
         self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None
     ) -> tuple[Tensor, Tensor]:
-        r"""Point on the path and the regression target :math:`\dot\alpha a_0 + \dot\beta a_1`.
+        r"""Point on the path and its velocity :math:`\dot\alpha a_0 + \dot\beta a_1`, each ``[*B, P, d_a]``.
 
-        Args:
-            a0: source, ``[*B, P, d_a]``.
-            a1: data, ``[*B, P, d_a]``.
-            t: times, ``[*B]``.
-            generator: of the noise of a path that has some.
-
-        Returns:
-            ``a_t`` and its velocity, each ``[*B, P, d_a]``.
+        Source and data are ``[*B, P, d_a]``, the times ``[*B]``. The generator is of the noise of a path that
+        has some.
         """
         alpha, beta, d_alpha, d_beta = self.coefficients(t[..., None, None])
         return alpha * a0 + beta * a1, d_alpha * a0 + d_beta * a1
@@ -100,9 +89,6 @@ class BridgeInterpolant(Interpolant):
 
     Raises:
         ValueError: if ``sigma`` is not a finite number > 0.
-
-    See Also:
-        :class:`~warmprior.LinearInterpolant`: the path without noise.
 
     Examples:
         >>> import torch

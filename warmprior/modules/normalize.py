@@ -76,8 +76,6 @@ class Normalizer(nn.Module):
         Args:
             data: flat steps ``[N]`` with raw ``[N, d]`` entries.
             keys: the entries to normalise.
-
-        Keyword Args:
             units: per key the raw size ``[d]`` of 1, around the middle of the range; 0 for half the range.
                 Dimensions with such a unit may leave ``[-1, 1]``.
 

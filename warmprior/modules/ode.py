@@ -14,11 +14,73 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior import keys
-from warmprior.modules.grid import check_grid, grid_parts
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking
 
-__all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "integrate"]
+__all__ = ["DEFAULT_NFE", "SOLVERS", "ODEActor", "check_grid", "grid_parts", "integrate"]
+
+
+JUMP = 0.5
+"""Where the dense steps of ``dense-jump`` end; Chen et al. saw fields pull towards training actions later."""
+
+
+def check_grid(grid: str) -> None:
+    """A ``ValueError`` if no grid has this name, or its jump does not start in (0, 1)."""
+    _jump(grid)
+
+
+def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[float, float, int]]:
+    r"""The parts of a grid; within each the steps are equally long.
+
+    - ``"uniform"``: one part.
+    - ``"dense-jump"``: all steps but one up to :math:`t_j`, and the last from there to ``t = 1`` (Dense-Jump
+      Flow Matching, Chen et al., 2025, arXiv:2509.13574). It avoids late steps, which pull towards actions of
+      the training data, and is meant for networks trained at ``u-shaped`` times. :math:`t_j` is half way from
+      ``start_time`` to 1; ``"dense-jump:0.7"`` moves it.
+
+    One step is the same on every grid.
+
+    Args:
+        grid: its name.
+        steps: of the sampler.
+        start_time: where the sampler starts.
+
+    Returns:
+        Begin, end and number of steps of each part.
+
+    Raises:
+        ValueError: see :func:`check_grid`.
+
+    Examples:
+        >>> from warmprior.modules.ode import grid_parts
+        >>> grid_parts("dense-jump:0.75", 4), grid_parts("dense-jump", 1)
+        ([(0.0, 0.75, 3), (0.75, 1.0, 1)], [(0.0, 1.0, 1)])
+    """
+    share = _jump(grid)
+    if share is None or steps == 1:
+        return [(start_time, 1.0, steps)]
+    jump = start_time + share * (1.0 - start_time)
+    return [(start_time, jump, steps - 1), (jump, 1.0, 1)]
+
+
+def _jump(grid: str) -> float | None:
+    """Share of the way before the jump; ``None`` without a jump."""
+    if grid == "uniform":
+        return None
+    name, colon, number = str(grid).partition(":")
+    if name != "dense-jump":
+        raise ValueError(
+            f"unknown grid {grid!r}; choose one of uniform, dense-jump, or dense-jump:TIME with a time in "
+            "(0, 1)"
+        )
+    try:
+        share = float(number) if colon else JUMP
+    except ValueError:
+        share = float("nan")
+    if not 0.0 < share < 1.0:
+        raise ValueError(f"the jump of a grid must start in (0, 1), got {grid!r}")
+    return share
+
 
 DEFAULT_NFE = 9
 """Network evaluations per chunk by default."""
@@ -92,13 +154,11 @@ def integrate(
     Args:
         velocity: ``(t [B], a_t [B, ...]) -> velocity [B, ...]``.
         a0: source, ``[B, ...]``.
-
-    Keyword Args:
         nfe: number of calls of ``velocity``, a multiple of the solver's stages (Euler 1, midpoint and
             Heun 2, RK4 4).
         solver: ``"euler"`` (the paper's), ``"midpoint"``, ``"heun"`` or ``"rk4"``.
         grid: where the steps lie: ``"uniform"`` or ``"dense-jump"``, see
-            :func:`~warmprior.modules.grid.grid_parts`.
+            :func:`~warmprior.modules.ode.grid_parts`.
         start_time: another time to start from, in [0, 1).
         return_path: return every grid point instead of the last.
 
@@ -142,8 +202,6 @@ class ODEActor(TensorDictModuleBase):
     Args:
         network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``. An
             observation of several entries, nested under its key, arrives as a tensordict ``[B]``.
-
-    Keyword Args:
         nfe: number of network evaluations per chunk; per call: ``actor(data, nfe=3)``. 9 by default, or
             ``max_nfe``.
         max_nfe: the largest ``nfe`` that the training allows.
@@ -162,9 +220,6 @@ class ODEActor(TensorDictModuleBase):
         ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend or that exceeds ``max_nfe``, or
             an unknown solver or grid, or guidance with ``max_nfe=1``, which is no flow.
         KeyError: if an input key is missing.
-
-    See Also:
-        :class:`~warmprior.WarmPriorActor`: this with a source before it: a whole policy.
 
     Examples:
         >>> import torch

@@ -27,10 +27,10 @@ CORRELATION_LIMIT = 1 - 1e-6
 
 
 class SourceMoments(nn.Module):
-    r"""Means, variances and covariance of the source :math:`a_0` and the target :math:`a_1`.
+    """Means, variances and covariance of the source :math:`a_0` and the target :math:`a_1`.
 
-    One set per chunk position and action dimension, each ``[P, d_a]`` in normalised units. Variances are
-    at least :data:`VARIANCE_FLOOR` and correlations at most :data:`CORRELATION_LIMIT`, so that constant
+    One set per chunk position and action dimension, each ``[P, d_a]`` in normalised units. Variances are at
+    least :data:`VARIANCE_FLOOR` and correlations at most :data:`CORRELATION_LIMIT`, so that constant
     dimensions, positions that are always padded and deterministic sources stay harmless.
 
     Args:
@@ -42,10 +42,6 @@ class SourceMoments(nn.Module):
 
     Raises:
         ValueError: if the shapes differ, or an entry is NaN or infinite.
-
-    See Also:
-        - :class:`~warmprior.PreconditionedNetwork`: scales inputs and outputs by them.
-        - :func:`~warmprior.training.precondition`: estimates them and wraps a network.
 
     Examples:
         >>> import torch
@@ -119,25 +115,21 @@ class SourceMoments(nn.Module):
         trend: PoseTrend | None = None,
         generator: torch.Generator | None = None,
     ) -> SourceMoments:
-        """Estimate them from training windows and draws of the prior.
+        """Estimate them, as float32, from unpadded positions of training windows and draws of the prior.
+
+        A position that is padded in all windows gets those of independent standard normal ends; no loss reads
+        it.
 
         Args:
-            windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[*B]``.
+            windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[*B]``, used once each.
             prior: the source distribution.
-
-        Keyword Args:
-            coupling: how the training pairs sources and targets, see :data:`~warmprior.objectives.Coupling`;
-                in their order by default.
-            samples: how many windows to draw from a buffer; windows given as a tensordict are used once each.
+            coupling: how the training pairs sources and targets, see :data:`~warmprior.objectives.Coupling`.
+            samples: how many windows to draw from a buffer.
             trend: trend of the pose; the moments are those of the remainder.
             generator: source of randomness of the source samples, on the windows' device.
 
-        Returns:
-            The moments over unpadded positions, as float32. A position that is padded in all windows gets
-            those of independent standard normal ends; no loss reads it.
-
         Raises:
-            ValueError: if ``samples < 2``, there are fewer than two windows, or they are of other lengths.
+            ValueError: if there are fewer than two windows, or they are of other lengths.
         """
         if isinstance(windows, TensorDictBase):
             batches = [windows]
@@ -187,43 +179,37 @@ class SourceMoments(nn.Module):
 class PreconditionedNetwork(VelocityNetwork):
     r"""A velocity network that learns only the remainder of the best linear prediction.
 
-    With :math:`a_t = \alpha a_0 + \beta a_1`, the velocity
-    :math:`u_t = \dot\alpha a_0 + \dot\beta a_1` and the moments of :math:`(a_0, a_1)`, per chunk
-    position and action dimension,
+    With :math:`a_t = \alpha a_0 + \beta a_1`, the velocity :math:`u_t = \dot\alpha a_0 + \dot\beta a_1` and
+    the moments of :math:`(a_0, a_1)`, per chunk position and action dimension,
 
     .. math::
         v_\theta(t, a_t, o) = E[u_t] + \frac{Cov(u_t, a_t)}{Var(a_t)} (a_t - E[a_t])
         + \sqrt{Var(u_t) - \frac{Cov(u_t, a_t)^2}{Var(a_t)}} \;
         F_\theta\Big(t, \frac{a_t - E[a_t]}{\sqrt{Var(a_t)}}, o\Big).
 
-    The first two terms are the best linear predictor of the velocity from the point, and :math:`F` is
-    trained on a standardised remainder: its input and target have mean 0 and variance 1 at every time
-    and for every source. A network that has learnt nothing (:math:`F = 0`) is optimal where
-    :math:`(a_0, a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et
-    al., 2022, Eq. 7), whose constants assume zero means and an independent source.
+    The first two terms predict the velocity linearly from the point, and input and target of :math:`F` have
+    mean 0 and variance 1 at every time and for every source. :math:`F = 0` is optimal where :math:`(a_0,
+    a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et al., 2022,
+    Eq. 7), whose constants assume zero means and an independent source.
 
     Variance and scale are computed without differences, with :math:`s_0 = \sqrt{v_0}` and the deviation
     :math:`q` of the target given the source: :math:`Var(a_t) = (\alpha s_0 + \beta c / s_0)^2 + (\beta q)^2`
     and :math:`|\alpha\dot\beta - \dot\alpha\beta| \, s_0 q / \sqrt{Var(a_t)}`.
 
     Args:
-        network: :math:`F`; or its :meth:`config`.
-
-    Keyword Args:
-        moments: moments of the prior's source and the targets; by default those of independent standard
-            normal ends, to be replaced by loading a state dict.
+        network: :math:`F`; or its ``config()``, as for the next.
+        moments: of the prior's source and the targets; by default those of independent standard normal ends,
+            to be replaced by loading a state dict.
         trend: trend of the gripper poses, which gives :math:`E[a_0 | o]` and :math:`E[a_1 | o]` in place of
-            the means above; the moments are then those of the remainder. None by default. Or its
-            ``config()``.
-        interpolant: the path of the loss; linear by default. Or its ``config()``.
+            the means above; the moments are then those of the remainder.
+        interpolant: the path of the loss; linear by default.
 
     Raises:
         ValueError: if the moments or the trend do not have the network's shapes, or the path has no finite
             velocity at its ends.
 
     See Also:
-        - :class:`~warmprior.SourceMoments`: the moments.
-        - :func:`~warmprior.training.precondition`: estimates the moments and wraps a network.
+        :func:`~warmprior.training.precondition`: estimates the moments and wraps a network.
 
     Examples:
         >>> import torch
@@ -282,10 +268,7 @@ class PreconditionedNetwork(VelocityNetwork):
         return self.network.parameter_groups(weight_decay)
 
     def remainder(self, t: Tensor) -> Tensor:
-        """Standard deviation of the remainder of the velocity at times ``[B]``, the unit of ``F``.
-
-        ``[B, P, d_a]``, larger than 0.
-        """
+        """The unit of ``F`` at times ``[B]``: the remainder's standard deviation, ``[B, P, d_a]``."""
         coefficients = self.interpolant.coefficients(t[:, None, None])
         return self._remainder(*coefficients) * self._scale(*coefficients[:2])
 

@@ -34,10 +34,6 @@ class RestingAction(nn.Module):
         normalizer: normaliser of the observations ``[d_o]`` and the actions ``[10 * arms]``; an identity by
             default, to be replaced by loading a state dict.
 
-    See Also:
-        - :class:`~warmprior.PoseTrend`: fits the deviation from it.
-        - :func:`~warmprior.training.precondition`: removes it from what the network has to learn.
-
     Examples:
         >>> from warmprior import RestingAction
         >>> import torch
@@ -157,8 +153,6 @@ class PoseTrend(nn.Module):
             windows: ``[N]``, see :class:`~warmprior.ActionWindow`, with observations ``[N, To, d_o]``.
             prior: the source distribution.
             rest: the resting action of an observation.
-
-        Keyword Args:
             generator: source of randomness of the source samples, on the windows' device.
 
         Returns:

@@ -48,9 +48,6 @@ class OTCoupling:
             observations are nested.
         ImportError: if scipy is missing.
 
-    See Also:
-        :class:`~warmprior.objectives.ReflowCoupling`: pairs each source with the end of a trained flow.
-
     Examples:
         >>> from warmprior.objectives import OTCoupling
         >>> import torch
@@ -173,9 +170,6 @@ class ReflowCoupling:
     Raises:
         ValueError: if ``nfe`` is no whole number of at least 1, or a batch has chunks of another shape than
             the teacher's.
-
-    See Also:
-        :class:`~warmprior.objectives.OTCoupling`: permutes the sources instead.
 
     Examples:
         >>> from warmprior.objectives import ReflowCoupling

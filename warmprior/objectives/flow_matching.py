@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, cast, get_args
 
@@ -18,9 +19,80 @@ from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.ode import integrate
 from warmprior.objectives.couplings import Coupling
-from warmprior.objectives.times import TIMES, Times
 
-__all__ = ["FlowMatchingLoss", "Objective", "Weighting", "check_objective"]
+__all__ = [
+    "TIMES",
+    "FlowMatchingLoss",
+    "Objective",
+    "Times",
+    "TimesName",
+    "Weighting",
+    "check_objective",
+    "logit_normal_times",
+    "start_times",
+    "u_shaped_times",
+    "uniform_times",
+]
+
+
+Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
+"""Draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
+
+TimesName = Literal["uniform", "u-shaped", "logit-normal", "start"]
+
+STEEPNESS = 4.0
+"""``a`` of :func:`u_shaped_times`: the ends are 3.8 times as dense as the middle."""
+
+
+def uniform_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """All times alike, as in Algorithm 1."""
+    return torch.rand(shape, generator=generator, dtype=dtype, device=device)
+
+
+def u_shaped_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""More often near both ends.
+
+    The density is :math:`p(t) \propto e^{at} + e^{a(1-t)}` with :math:`a = 4` (Lee et al., 2024, "Improving
+    the training of rectified flows"). Their text has :math:`e^{-at}` as the second term, which is no U on [0,
+    1]; this is what their code draws from, by the inverse of
+
+    .. math::
+        F(t) = \frac12 + \frac{\sinh(a(t - \frac12))}{2 \sinh\frac a2}.
+    """
+    u = torch.rand(shape, generator=generator, dtype=dtype, device=device)
+    t = 0.5 + torch.asinh((2 * u - 1) * math.sinh(STEEPNESS / 2)) / STEEPNESS
+    return t.clamp(0.0, 1.0)  # rounding may leave the interval
+
+
+def logit_normal_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""More often in the middle: :math:`\log\frac t{1-t} \sim N(0, 1)` (Esser et al., 2024)."""
+    return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
+
+
+def start_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""``t = 0`` alone: the network regresses :math:`a_1 - a_0`, and one step of Euler's method returns it.
+
+    The field is not trained at any other time: build the policy with ``max_nfe=1``.
+    """
+    return torch.zeros(shape, dtype=dtype, device=device)
+
+
+TIMES: dict[str, Times] = {
+    "uniform": uniform_times,
+    "u-shaped": u_shaped_times,
+    "logit-normal": logit_normal_times,
+    "start": start_times,
+}
+"""Those that have a name."""
+
 
 Objective = Literal["velocity", "l1"]
 
@@ -89,13 +161,10 @@ class FlowMatchingLoss(LossModule):
 
     Args:
         actor_network: the policy whose velocity network is trained; its prior gives the source.
-
-    Keyword Args:
         coupling: pairs the sources and targets of a batch, see :data:`~warmprior.objectives.Coupling`; in
             their order by default (Algorithm 1).
         times: how training times are distributed: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
-            ``"logit-normal"``, ``"start"`` (regression) (``warmprior.objectives.times``), or a function
-            of their signature.
+            ``"logit-normal"``, ``"start"`` (regression), or a function of their signature (:data:`Times`).
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) takes errors as they are. ``"standardised"`` divides them by
             the standard deviation of the remainder (:meth:`PreconditionedNetwork.remainder`), so that every
@@ -128,8 +197,7 @@ class FlowMatchingLoss(LossModule):
             network is preconditioned for.
 
     See Also:
-        - :class:`~warmprior.training.BehaviourCloning`: the training loop around it.
-        - :func:`~warmprior.window_replay_buffer`: its batches.
+        :class:`~warmprior.training.BehaviourCloning`: the training loop around it.
 
     Examples:
         >>> import torch

@@ -17,11 +17,10 @@ from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite
 from warmprior.rl.anchor import has_anchor
-from warmprior.rl.box_normal import BoxTanhNormal
 from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.decoder import PriorDecoder
 from warmprior.rl.dsrl import DSRLNALoss
-from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
+from warmprior.rl.networks import BoxTanhNormal, make_prior_space_actor, make_prior_space_critic
 from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
 

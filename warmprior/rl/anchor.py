@@ -89,8 +89,6 @@ class PriorAnchor(EnvTransform):
 
     Args:
         actor: the policy. A learned prior is copied as it is now, and the copy moves with the environment.
-
-    Keyword Args:
         cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise if the policy
             has an anchor (:func:`~warmprior.rl.has_anchor`), and zero otherwise, which gives vanilla DSRL:
             :math:`a_0 = \Delta`.

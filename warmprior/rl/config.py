@@ -50,10 +50,6 @@ class PriorSpaceConfig:
     Raises:
         ValueError: for a number out of its range, naming it.
 
-    See Also:
-        - :class:`~warmprior.rl.PriorSpaceTraining`: trains by it.
-        - :class:`~warmprior.DSRLNALoss`: the loss of ``dsrl-na``.
-
     Examples:
         >>> from warmprior.rl import PriorSpaceConfig
         >>> config = PriorSpaceConfig(algorithm="dsrl-sac", delta=1.5, hidden_dim=128)

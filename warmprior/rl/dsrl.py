@@ -20,8 +20,8 @@ from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from warmprior import keys
 from warmprior.modules.checks import check_finite, check_positive, check_whole_numbers
-from warmprior.rl.box_normal import BoxTanhNormal
 from warmprior.rl.decoder import PriorDecoder
+from warmprior.rl.networks import BoxTanhNormal
 from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 
 __all__ = ["DSRLNALoss"]
@@ -76,8 +76,6 @@ class DSRLNALoss(LossModule):
         noise_qvalue_network: :math:`Q^W`, which reads ``keys.DELTA``; the same.
         decoder: the frozen policy. Its buffers are in the loss's ``state_dict()`` and move with
             ``loss.to(device)``; ``parameters()`` and target updates never see it.
-
-    Keyword Args:
         backup: how critics are combined, in targets and in the actor's loss: ``"min"`` or ``"mean"``.
         backup_entropy: whether targets include the entropy.
         bootstrap_timeouts: whether the value after a time-out counts. The official implementation treats

@@ -38,8 +38,6 @@ class ResidualSampler(TensorDictModuleBase):
 
     Args:
         decoder: the frozen policy.
-
-    Keyword Args:
         distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
             noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
         generator: source of randomness on the data's device; PyTorch's global one by default.
@@ -47,10 +45,6 @@ class ResidualSampler(TensorDictModuleBase):
     Raises:
         ValueError: for an unknown distribution, or another than ``"uniform"`` for a prior without noise.
         KeyError: (when called) if the anchor is missing.
-
-    See Also:
-        - :class:`~warmprior.PriorDecoder`: decodes what it draws.
-        - :func:`~warmprior.make_prior_space_actor`: the agent that takes its place.
 
     Examples:
         >>> import torch

@@ -44,8 +44,6 @@ class PriorSpaceTraining:
             transforms and :class:`~warmprior.PriorAnchor`; called for training and evaluation.
         config: the recipe.
         directory: the folder.
-
-    Keyword Args:
         evaluation_seed: simulator seed of the first evaluation episode.
         description: of the progress bar; no bar if ``None``.
         collectors: how many actors of a Ray cluster collect, each with its own environments;
@@ -62,10 +60,6 @@ class PriorSpaceTraining:
     Raises:
         ValueError: if the recipe does not suit the policy, or the folder's state belongs to another
             recipe or policy, or its replay buffer to another wiring.
-
-    See Also:
-        - :class:`~warmprior.rl.PriorSpaceConfig`: its recipe.
-        - :func:`~warmprior.training.evaluate`: plays episodes with ``agent.policy``.
 
     Examples:
         >>> from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from warmprior.io.files import as_json, check_regular, read_tensors, save_file, write_atomic
-from warmprior.modules.compiled import without_compilation
+from warmprior.modules.network import without_compilation
 
 __all__ = ["load_state", "restore_optimizer", "save_state", "snapshot_optimizer"]
 

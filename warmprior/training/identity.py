@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from warmprior.modules.compiled import uncompiled
+from warmprior.modules.network import uncompiled
 
 __all__ = ["data_digest", "fixed_identity", "part_identity"]
 

@@ -12,8 +12,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
-from warmprior.modules.compiled import uncompiled
-from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.network import VelocityNetwork, uncompiled
 
 __all__ = ["ema_of", "make_optimizer", "warmup_cosine"]
 

@@ -14,9 +14,8 @@ from torchrl.record.loggers.common import Logger
 
 from warmprior import keys
 from warmprior.io.distributed import from_leader, world_size
-from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.prior import Prior
-from warmprior.modules.start import StartPoint
 from warmprior.objectives.couplings import Coupling
 from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.options import NetworkOptions
@@ -26,7 +25,7 @@ from warmprior.training.saved import load_policy
 from warmprior.training.task import Task
 from warmprior.training.threads import torch_threads
 from warmprior.training.training_config import TrainingConfig
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import HistoryObservation
 
 __all__ = ["new_policy", "train_policy"]
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
-from warmprior.objectives.flow_matching import Objective, Weighting, check_objective
-from warmprior.objectives.times import TimesName
+from warmprior.objectives.flow_matching import Objective, TimesName, Weighting, check_objective
 
 __all__ = ["PAPER", "Precision", "TrainingConfig"]
 

@@ -44,8 +44,6 @@ class ChunkStep(EnvTransform):
 
     Args:
         chunk_length: ``H``.
-
-    Keyword Args:
         execute: ``k``, how many actions of a chunk are executed before the next decision; ``H`` by
             default.
         prediction_length: ``P``, the length of the chunks that the policy gives; ``H`` by default.

@@ -44,10 +44,6 @@ def executed_chunk(tensordict: TensorDictBase) -> Tensor:
         tensordict: ``[*B]`` decisions, such as those of a rollout. Without a recorded delay the chunks are
             executed as they are.
 
-    See Also:
-        - :class:`~warmprior.InferenceDelay`: lets chunks take effect late.
-        - :func:`~warmprior.diagnostics.executed_actions`: the actions of a whole rollout.
-
     Examples:
         >>> import torch
         >>> from warmprior import keys
@@ -83,8 +79,6 @@ class InferenceDelay(EnvTransform):
 
     Args:
         delay: ``d``, control steps until a chunk takes effect.
-
-    Keyword Args:
         execute: actions executed per decision, as :class:`ChunkStep` has it.
 
     Raises:

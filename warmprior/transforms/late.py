@@ -13,7 +13,7 @@ from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform, T
 
 from warmprior import keys
 from warmprior.transforms.absolute_actions import AbsoluteActions
-from warmprior.transforms.camera_images import CameraImages
+from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import InnerStep
 from warmprior.transforms.stack import ObservationStack
 

@@ -10,13 +10,12 @@ from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.compiled import uncompiled
+from warmprior.modules.network import uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.delay import InferenceDelay, check_delay
-from warmprior.transforms.history import ActionHistory
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import ActionHistory, HistoryObservation
 from warmprior.transforms.stack import ObservationStack
 
 __all__ = ["policy_transforms"]
@@ -48,8 +47,6 @@ def policy_transforms(
     Args:
         policy: the policy; or its prior, of which only the lengths matter: the environment serves every
             policy with a prior of these lengths.
-
-    Keyword Args:
         normalizer: the normaliser of the training data; the policy's by default. Give the policy's prior in
             place of the policy if the environment is normalised already.
         actions: converts the policy's actions, in raw units, to the environment's, such as
@@ -70,10 +67,6 @@ def policy_transforms(
         TypeError: for anything else than a policy or a prior.
         ValueError: if the normaliser lacks the action, or numbers do not fit each other, see
             :class:`ChunkStep` and :class:`InferenceDelay`.
-
-    See Also:
-        - :func:`~warmprior.window_transforms`: the same for batches of demonstrations.
-        - :func:`~warmprior.training.evaluate`: plays episodes in the environment that has them.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv

@@ -27,8 +27,6 @@ class ObservationStack(EnvTransform):
 
     Args:
         steps: ``To``.
-
-    Keyword Args:
         observation_key: key of the observation, in and out; or of several, nested under it.
 
     Raises:

@@ -14,8 +14,7 @@ from warmprior import keys
 from warmprior.history import window_history
 from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.prior import Prior
-from warmprior.transforms.history import WithheldHistory
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import HistoryObservation, WithheldHistory
 
 __all__ = ["ActionWindow", "window_replay_buffer", "window_transforms", "without_images"]
 
@@ -34,8 +33,6 @@ class ActionWindow(Transform):
             ``"action"`` ``[N, d_a]`` and ``"episode"`` ``[N]``; in memory, memory-mapped or on a GPU.
             An observation may be an image ``[N, C, H, W]``, or several entries nested under its key.
         chunk_length: ``H``.
-
-    Keyword Args:
         prediction_length: ``P``; ``H`` by default.
         history_length: how many executed actions are remembered; ``H`` by default, and at least.
         observation_steps: ``To``.
@@ -46,10 +43,6 @@ class ActionWindow(Transform):
         ValueError: if not ``1 <= chunk_length <= prediction_length, history_length``, ``data`` is empty or
             not flat, an action is not one vector, an entry holds NaN or Inf, or an episode is not contiguous.
         IndexError: (on a call) for a step that the data do not hold.
-
-    See Also:
-        - :class:`~warmprior.ActionHistory`: writes the same history in an environment.
-        - :func:`~warmprior.window_replay_buffer`: a buffer of such windows.
 
     Examples:
         >>> from warmprior import ActionWindow
@@ -217,8 +210,6 @@ def window_transforms(
         data: contiguous normalised steps, see :class:`ActionWindow`.
         prior: the policy's prior, of which only the lengths matter: the windows serve every prior of these
             lengths.
-
-    Keyword Args:
         observation_steps: ``To``.
         see_history: whether the network sees the last actions.
         withhold: share of the windows whose history is withheld.
@@ -275,8 +266,6 @@ def window_replay_buffer(
         data: contiguous normalised steps, see :class:`ActionWindow`.
         prior: the policy's prior, of which only the lengths matter: the windows serve every prior of these
             lengths.
-
-    Keyword Args:
         batch_size: windows per sample.
         observation_steps: ``To``.
         see_history: see :func:`window_transforms`.
@@ -286,9 +275,6 @@ def window_replay_buffer(
 
     Raises:
         ValueError: if ``batch_size < 1``, or see :class:`ActionWindow`.
-
-    See Also:
-        :class:`~warmprior.FlowMatchingLoss`: takes its batches.
 
     Examples:
         >>> import torch
