@@ -31,13 +31,12 @@ def branching_cost(
         B(o) = \int_0^1 E\left[\|A_1 - A_0 - E[A_1 - A_0 \mid A_t, o]\|^2 \mid o\right] dt,
 
     here with the policy's :math:`v(t, A_t, o)` in place of the conditional expectation, which overestimates
-    it on average over the data. (The equal form with :math:`(1-t)^{-2}` is numerically unstable.) Sums run
-    over coordinates inside the episode, in squared normalised action units.
+    it on average over the data. Sums run over coordinates inside the episode, in squared normalised action
+    units.
 
     Args:
         policy: the policy.
-        batch: windows ``[*B]`` of its own prior with a target, see
-            :func:`~warmprior.window_replay_buffer`.
+        batch: windows ``[*B]`` of its own prior with a target, see :func:`~warmprior.window_replay_buffer`.
         draws: samples of source and time per window; the times are stratified.
         generator: source of randomness on the policy's device; the policy's own by default.
 
@@ -50,10 +49,10 @@ def branching_cost(
         ValueError: for bad batches or options, or a policy that is no flow.
 
     Examples:
-        >>> from warmprior.diagnostics import branching_cost
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor, window_replay_buffer
+        >>> from warmprior.diagnostics import branching_cost
         >>> data = TensorDict({"observation": torch.zeros(50, 3), "action": torch.zeros(50, 2),
         ...                    "episode": torch.arange(50) // 25}, [50])
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8))
@@ -118,15 +117,14 @@ def branching_bound(batch: TensorDictBase, prior: Prior) -> TensorDict:
         ValueError: if the batch is empty or the source is not Gaussian.
 
     Examples:
-        >>> from warmprior.diagnostics import branching_bound
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> from warmprior import PastPrior, window_replay_buffer
+        >>> from warmprior import ActionWindow, PastPrior
+        >>> from warmprior.diagnostics import branching_bound
         >>> data = TensorDict({"observation": torch.zeros(9, 1), "action": torch.arange(9.0)[:, None],
         ...                    "episode": torch.zeros(9, dtype=torch.int64)}, [9])
-        >>> prior = PastPrior(2, sigma=0.5)
-        >>> window = window_replay_buffer(data, prior, batch_size=1).transform[0]
-        >>> bound = branching_bound(window(TensorDict({"frame": torch.tensor([4])}, [1])), prior)
+        >>> windows = ActionWindow(data, 2)(TensorDict({"frame": torch.tensor([4])}, [1]))
+        >>> bound = branching_bound(windows, PastPrior(2, sigma=0.5))
         >>> float(bound["mismatch"]), float(bound["noise"])  # both actions are 2 ahead of the mean
         (8.0, 0.5)
     """

@@ -42,29 +42,29 @@ def curvature(
         \kappa(o) = \int_0^1 \|\dot a_t - \bar v\|^2 dt, \qquad \bar v = \int_0^1 \dot a_t dt,
 
     along the Euler sampler with ``n_steps`` steps, summed over coordinates. It shrinks with the length of the
-    path, whatever its shape, and a source nearer to the data has shorter paths: compare ``"relative"``, which
-    divides by :math:`\|\bar v\|^2`. The paper does not say whether a prediction of ``2H`` counts whole;
-    ``"..._executed"`` counts the first ``H`` positions only.
+    path, and a source nearer to the data has shorter paths: compare ``"relative"``, which divides by
+    :math:`\|\bar v\|^2`. The paper does not say whether a prediction of ``2H`` counts whole;
+    ``"..._executed"`` counts the first ``H`` positions.
 
     A field that predicts no motion is not straight, though its curvature is tiny. So values are NaN, with a
-    warning, for observations whose mean velocity is below 1e-4 per coordinate. All are NaN if the batch has
+    warning, for observations whose mean velocity is below 1e-4 per coordinate, and all if the batch has
     targets (windows do, rollouts do not) and the field's loss is at least 0.95 of that of a zero field.
     Positions past an episode's end do not count.
 
     Args:
         policy: the policy; its ``nfe`` and solver play no role.
-        batch: ``[*B]`` with observation and history: windows of the policy's own lengths or a
-            rollout. In windows WP-Preview's mean is the target itself; see
-            :meth:`SharedObservations.deployed` for the history at deployment.
+        batch: ``[*B]`` with observation and history: windows of the policy's own lengths or a rollout. In
+            windows WP-Preview's mean is the target itself; see :meth:`SharedObservations.deployed` for
+            deployment.
         n_steps: Euler steps.
         draws: source samples per observation, averaged.
         generator: source of randomness on the policy's device; the policy's own by default.
 
     Returns:
         TensorDict ``[*B]`` on the policy's device: ``"kappa"``, ``"speed"`` (:math:`\|\bar v\|^2`),
-        ``"relative"`` (their ratio), ``"one_step_error"`` (root mean square distance per coordinate
-        between one Euler step and the end of the path), and each with ``"_executed"``. Squared
-        normalised action units; the error in normalised action units.
+        ``"relative"`` (their ratio), ``"one_step_error"`` (root mean square distance per coordinate between
+        one Euler step and the end of the path), and each with ``"_executed"``. Squared normalised action
+        units; the error in normalised ones.
 
     Raises:
         KeyError: if the batch lacks a key.
@@ -72,10 +72,10 @@ def curvature(
         FloatingPointError: if a path becomes NaN or infinite.
 
     Examples:
-        >>> from warmprior.diagnostics import curvature
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import curvature
         >>> from warmprior.history import cold_history
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), GaussianPrior(8))
         >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3),
@@ -146,15 +146,14 @@ def flow_paths(
         ValueError: for bad batches or options, or a policy that is no flow.
 
     Examples:
-        >>> from warmprior.diagnostics import flow_paths
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import flow_paths
         >>> from warmprior.history import cold_history
-        >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), GaussianPrior(8))
         >>> batch = TensorDict({"observation": torch.zeros(5, 2, 3),
         ...                     "history": cold_history([5], 8, 8, action_dim=2)}, [5])
-        >>> flow_paths(actor, batch, n_steps=20).shape
+        >>> flow_paths(WarmPriorActor(VelocityMLP(2, 3, 8), GaussianPrior(8)), batch, n_steps=20).shape
         torch.Size([5, 21, 8, 2])
     """
     check_flow(policy, n_steps)

@@ -26,14 +26,7 @@ SPLIT = 4096
 class Windows:
     """A batch of windows, flattened to ``N``, on the policy's device.
 
-    Attributes:
-        shape: the batch's own shape.
-        observation: what the network sees, ``[N, To, d_o]``.
-        history: ``[N]``, see :mod:`warmprior.history`.
-        loc: mean of the source, ``[N, P, d_a]``.
-        warm: where the mean is known, bool ``[N, P, 1]``.
-        counted: positions inside the episode, bool ``[N, P, 1]``.
-        target: ``[N, P, d_a]``, if there is one.
+    ``shape`` is the batch's own, ``counted`` tells positions inside the episode, bool ``[N, P, 1]``.
     """
 
     shape: torch.Size
@@ -132,18 +125,15 @@ def drawn(policy: WarmPriorActor, rows: TensorDictBase, generator: torch.Generat
 def encoded_windows(policy: WarmPriorActor, windows: TensorDictBase, *, split: int = 256) -> TensorDictBase:
     """Windows ``[n]`` whose images are encoded by the policy's network, ``split`` at a time.
 
-    Their observation becomes the features ``[n, To, d_o]``: diagnostics evaluate the network many times at
-    the same observations and compare observations, so they take vectors. Windows without images are returned
-    as they are.
-
-    Raises:
-        ValueError: if there are none.
+    Their observation becomes the features ``[n, To, d_o]``, because diagnostics evaluate the network many
+    times at the same observations. Windows without images are returned as they are. A ``ValueError`` if there
+    are none.
 
     Examples:
         >>> import torch
-        >>> from warmprior.diagnostics import encoded_windows
         >>> from tensordict import TensorDict
         >>> from warmprior import ImageEncoder, PastPrior, VelocityMLP, VisionNetwork, WarmPriorActor
+        >>> from warmprior.diagnostics import encoded_windows
         >>> encoder = ImageEncoder(["agentview_image"], 9, image_size=16, crop_size=12, backbone="small")
         >>> network = VisionNetwork(encoder, VelocityMLP(2, encoder.observation_dim, 4, hidden_dim=8))
         >>> images = torch.zeros(6, 2, 3, 16, 16, dtype=torch.uint8)

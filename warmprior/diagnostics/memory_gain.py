@@ -48,20 +48,19 @@ def memory_gain(
     observation does not show. But a wrong action of the policy's own, which demonstrations never contain, is
     carried on as well.
 
-    The source's noise lowers the gain. Suppose that past and next actions are one height, which varies by
-    :math:`s` at an observation, and that the noise's average over the chunk has the variance :math:`V =
-    \sigma^2 (\rho + (1 - \rho)/H)`, with a ``correlation`` of :math:`\rho`. The gain of an exact flow is then
-    :math:`s^2 / (s^2 + V)` at one Euler step, and :math:`s / \sqrt{s^2 + V}`, which is more, at infinitely
-    many.
+    The source's noise lowers the gain. If past and next actions are one height, which varies by :math:`s` at
+    an observation, and the noise's average over the chunk has the variance :math:`V = \sigma^2 (\rho + (1 -
+    \rho)/H)`, with a ``correlation`` of :math:`\rho`, the gain of an exact flow is :math:`s^2 / (s^2 + V)` at
+    one Euler step, and :math:`s / \sqrt{s^2 + V}` at infinitely many.
 
-    Windows without a history, as at a reset, do not count. Actions beyond the policy's ``clip`` count as 0.
-    The leftover that guides a policy stays as it is.
+    Windows without a history do not count. Actions beyond the policy's ``clip`` count as 0. The leftover that
+    guides a policy stays as it is.
 
     Args:
         policy: the policy; its state stays as it is.
-        windows: ``[*B]`` of the policy's own prior, normalised, see :class:`~warmprior.ActionWindow` and
-            :meth:`SharedObservations.windows`. Images may be encoded, unless the network sees the history.
-        nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
+        windows: ``[*B]`` of the policy's own prior, normalised, see :meth:`SharedObservations.windows`.
+            Images may be encoded, unless the network sees the history.
+        nfes: network evaluations per chunk to measure at; those beyond the policy's maximum are skipped.
         shift: :math:`\delta`, in normalised action units.
 
     Returns:
@@ -69,9 +68,8 @@ def memory_gain(
 
     Raises:
         KeyError: if the windows lack a key.
-        ValueError: if the windows are empty, hold NaN or Inf, or belong to another prediction length, if the
-            observation's last actions differ from the history's, if ``shift`` is not positive,
-            or the prior allows none of the NFEs.
+        ValueError: for bad windows or options, or if the observation's last actions differ from the
+            history's.
         FloatingPointError: if a prediction is NaN or infinite.
 
     Examples:
@@ -148,18 +146,9 @@ def _check_seen(policy: WarmPriorActor, windows: TensorDictBase) -> None:
 
 
 class HistoryShift(TensorDictModuleBase):
-    """Disturbs a policy's history at every decision.
+    """Adds normal noise of deviation ``std`` to a policy's history, actions and forecast, at every decision.
 
-    Adds normal noise to the history's actions and forecast before the policy sees them. The environment's own
-    history stays as it is.
-
-    Args:
-        policy: the policy.
-        std: standard deviation of the noise, normalised action units.
-        generator: source of randomness; PyTorch's global one by default.
-
-    Raises:
-        ValueError: if ``std < 0``.
+    The environment's own history stays as it is. A ``ValueError`` if ``std < 0``.
     """
 
     def __init__(

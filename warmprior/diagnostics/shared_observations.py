@@ -30,10 +30,10 @@ def deployed_history(
     *,
     generator: torch.Generator | None = None,
 ) -> TensorDict:
-    """The history at deployment, from the policy's own prediction one decision earlier.
+    """``[*B]`` with the ``"history"`` at deployment, from the policy's own prediction one decision earlier.
 
     ``previous`` are windows ``[*B]``, ``H`` steps before those of interest in the same episodes, with the
-    history of the training. Returns ``[*B]`` with ``"history"``.
+    history of the training.
     """
     windows = flat_windows(policy, previous)
     data = previous.select(*policy.in_keys).to(windows.loc.device)
@@ -51,8 +51,8 @@ class SharedObservations:
     It uses only steps with ``H`` earlier ones in their episode, so every history is complete.
 
     Args:
-        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`. Held-out ones for a fair
-            curvature.
+        data: contiguous normalised steps, see :class:`~warmprior.ActionWindow`; held-out ones for a fair
+            measure.
         chunk_length: ``H``.
         observation_steps: ``To``.
         count: how many to draw, without replacement; all by default.
@@ -63,8 +63,8 @@ class SharedObservations:
         ValueError: if there are fewer observations than asked for.
 
     Examples:
-        >>> from warmprior.diagnostics import SharedObservations
         >>> from warmprior import PastPrior
+        >>> from warmprior.diagnostics import SharedObservations
         >>> from warmprior.envs import navigation_demonstrations
         >>> shared = SharedObservations(navigation_demonstrations(), 4)  # 6 episodes of 64 steps
         >>> len(shared), shared.windows(PastPrior(4))["history", "actions"].shape
@@ -103,18 +103,10 @@ class SharedObservations:
         return len(self.frames)
 
     def windows(self, prior: Prior, offset: int = 0, *, see_history: bool = False) -> TensorDictBase:
-        """Windows with the history of the training.
+        """Windows ``[n]`` with the history of the training, cut ``offset`` steps earlier, at most ``H``.
 
-        Args:
-            prior: of which only the lengths matter.
-            offset: how many steps earlier to cut them, at most ``H``.
-            see_history: whether a network sees the last actions.
-
-        Returns:
-            Windows ``[n]``, see :class:`~warmprior.ActionWindow`.
-
-        Raises:
-            ValueError: if the prior has another chunk length, or ``offset`` is out of range.
+        Of the prior only the lengths matter. ``see_history`` tells whether a network sees the last actions. A
+        ``ValueError`` if the prior has another chunk length.
         """
         if not 0 <= offset <= self.chunk_length:
             raise ValueError(f"offset must be between 0 and {self.chunk_length}, got {offset}")

@@ -40,8 +40,8 @@ class SourceLeak:
 
     Attributes:
         nfe: network evaluations per chunk.
-        spread: standard deviation of predictions over draws of the source at fixed observation and mean,
-            root mean square over windows, positions and dimensions.
+        spread: standard deviation of predictions over draws of the source at fixed observation and mean, root
+            mean square over windows, positions and dimensions.
         data_spread: the same for the targets at similar observations.
         ratio_to_last: ``spread`` over that at the largest ``nfe`` measured.
         inner_step: mean distance between consecutive actions inside predicted chunks; NaN at ``H = 1``.
@@ -51,8 +51,10 @@ class SourceLeak:
         >>> from warmprior.diagnostics import SourceLeak
         >>> found = SourceLeak(nfe=1, spread=0.3, data_spread=0.2, ratio_to_last=1.5,
         ...                    inner_step=0.11, data_inner_step=0.1)
-        >>> round(found.leak, 2), round(found.inner_step_ratio, 2), found.warning is None
-        (1.5, 1.1, False)
+        >>> round(found.leak, 2), round(found.inner_step_ratio, 2)
+        (1.5, 1.1)
+        >>> found.warning
+        "at NFE 1 the actions carry noise of the source: their spread is 1.50 times the data's (bound 1)"
     """
 
     nfe: int
@@ -74,13 +76,7 @@ class SourceLeak:
 
     @property
     def warning(self) -> str | None:
-        """A sentence that names the exceeded bounds, or ``None``.
-
-        Examples:
-            >>> from warmprior.diagnostics import SourceLeak
-            >>> SourceLeak(1, 0.3, 0.2, 1.5, 0.11, 0.1).warning
-            "at NFE 1 the actions carry noise of the source: their spread is 1.50 times the data's (bound 1)"
-        """
+        """A sentence that names the exceeded bounds, or ``None``."""
         signs = (
             ("spread is", self.leak, LEAK_BOUND),
             ("steps inside chunks are", self.inner_step_ratio, INNER_STEP_BOUND),
@@ -107,36 +103,31 @@ def source_leak(
 
     An exact sampler spreads at most like the targets at the same observation, so the leak is at most 1. A
     velocity network that has not learnt to ignore the noise at ``t = 0`` passes it on to the actions, most of
-    all at few steps. With one step an exact field returns :math:`E[a_1 \mid a_0, o]`. For a standard normal
-    source, which is independent of the target, that does not depend on :math:`a_0`, and the spread is 0. A
-    warm source knows about the target, so its spread is not 0, but still at most the data's, by the law of
-    total variance.
+    all at few steps. With one step an exact field returns :math:`E[a_1 \mid a_0, o]`, whose spread is 0 for a
+    standard normal source, and at most the data's for a warm one, by the law of total variance.
 
     The data's variance is half the mean squared difference between a window's target and that at the nearest
-    observation (Euclidean, all ``To`` steps) of another episode; steps of one episode would agree too well.
-    It is conditioned on the observation alone for every prior, because WP-Preview's training mean is cut from
-    the target. It therefore errs upwards: neighbours' observations differ, and the mean is not taken into
-    account. Several modes at one observation spread far enough to hide a leak, but noise between the actions
-    of one chunk still shows, as steps inside chunks that are longer than the data's.
-
-    Positions past the first ``H`` or past an episode's end do not count.
+    observation (Euclidean, all ``To`` steps) of another episode. It is conditioned on the observation alone
+    for every prior, because WP-Preview's training mean is cut from the target, and therefore errs upwards.
+    Several modes at one observation spread far enough to hide a leak, but noise between the actions of one
+    chunk still shows, as steps inside chunks that are longer than the data's. Positions past the first ``H``
+    or past an episode's end do not count.
 
     Args:
         policy: the policy; its state stays as it is.
-        windows: ``[*B]`` of the policy's own prior with observations ``[*B, To, d_o]`` and targets
-            ``[*B, P, d_a]``, normalised, see :class:`~warmprior.ActionWindow` and
-            :meth:`SharedObservations.windows`.
-        nfes: network evaluations per chunk to measure at; those beyond the prior's maximum are skipped.
+        windows: ``[*B]`` of the policy's own prior with observations ``[*B, To, d_o]`` and targets ``[*B, P,
+            d_a]``, normalised, see :meth:`SharedObservations.windows`.
+        nfes: network evaluations per chunk to measure at; those beyond the policy's maximum are skipped.
         draws: samples of the source per window, at least 2, the same ones for every NFE.
-        episodes: each window's episode, ``[*B]``, such as :attr:`SharedObservations.episodes`;
-            by default ``"episode"`` in the windows; without it every window counts as an episode.
+        episodes: each window's episode, ``[*B]``, such as :attr:`SharedObservations.episodes`; by default
+            ``"episode"`` in the windows; without it every window counts as an episode.
 
     Returns:
         The measures by NFE, in ascending order.
 
     Raises:
         KeyError: if the windows lack a key.
-        ValueError: for bad windows or options, a single episode, or if the prior allows none of the NFEs.
+        ValueError: for bad windows or options, or a single episode.
         FloatingPointError: if a prediction is NaN or infinite.
 
     Examples:
@@ -145,9 +136,8 @@ def source_leak(
         >>> from warmprior.envs import navigation_demonstrations
         >>> shared = SharedObservations(navigation_demonstrations(), 4)
         >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4))
-        >>> windows = shared.windows(untrained.prior)
-        >>> one_step = source_leak(untrained, windows, episodes=shared.episodes)[1]
-        >>> one_step.inner_step_ratio > 2, one_step.warning is None  # noise, to smooth demonstrations
+        >>> leak = source_leak(untrained, shared.windows(untrained.prior), episodes=shared.episodes)[1]
+        >>> leak.inner_step_ratio > 2, leak.warning is None  # noise, to smooth demonstrations
         (True, False)
     """
     if draws < 2:

@@ -1,9 +1,8 @@
 """Two ways through one control step of a robosuite environment: robosuite's own and a lean one.
 
-robosuite spends two thirds of ``env.step`` in the Python of its controllers, 25 times per control
-step. :class:`ControlLoop` computes the same operational-space torques in one compiled function and
-reads the observations once, at the end. Robot positions agree with ``env.step`` to rounding over
-ten control steps; contacts amplify the rounding after that.
+robosuite spends two thirds of ``env.step`` in the Python of its controllers. :class:`ControlLoop` computes
+the same torques in one compiled function and observes once, at the end. Robot positions agree with
+``env.step`` to rounding over ten control steps; contacts amplify the rounding after that.
 """
 
 from __future__ import annotations
@@ -76,8 +75,8 @@ class StepLoop:
     def set_state(self, state: np.ndarray) -> Observations:
         """Put the simulation into a recorded state, ``[1 + nq + nv]`` as of :meth:`state`; observe.
 
-        The gripper's internal command and the solver's starting point are not part of it, so the continuation
-        is close to the recorded one but not identical. A state of another length is a ``ValueError``.
+        The gripper's command and the solver's starting point are not part of it, so the continuation is close
+        to the recorded one but not identical.
         """
         if np.shape(state) != (1 + self._model.nq + self._model.nv,):
             raise ValueError(
@@ -99,10 +98,7 @@ class StepLoop:
         return self.observations(refresh=False), bool(self.env._check_success())
 
     def observations(self, refresh: bool = True) -> Observations:
-        """The observations, float64 under robomimic's names, ``"object"`` among them.
-
-        They are measured now, or with ``refresh=False`` those that the last step measured.
-        """
+        """The observations, float64 under robomimic's names; of the last step unless ``refresh``."""
         found = self.env._get_observations(force_update=refresh)
         return {key: np.atleast_1d(found[name]) for name, key in self._names.items()}
 
@@ -126,9 +122,9 @@ class StepLoop:
 class ControlLoop(StepLoop):
     """Steps a robosuite environment as ``env.step`` does, about 2.5 times faster.
 
-    Supports fixed-base, one-handed arms under ``OSC_POSE`` with fixed impedance, uncoupled position
-    and orientation and no interpolation: what robomimic and MimicGen use. Inputs may be deltas or
-    absolute, in the world or the base frame. Any other robot or controller is a ``ValueError``.
+    Supports fixed-base, one-handed arms under ``OSC_POSE`` with fixed impedance, uncoupled position and
+    orientation and no interpolation: what robomimic and MimicGen use. Any other robot or controller is a
+    ``ValueError``.
     """
 
     def __init__(self, env: Any, keys: Sequence[str] | None = None) -> None:
@@ -194,11 +190,10 @@ class ControlLoop(StepLoop):
         return self.observations(refresh=True)
 
     def look_back(self, states: Sequence[np.ndarray]) -> list[Observations]:
-        """What the last steps' :meth:`step` would have observed, where it was left out (:meth:`advance`).
+        """What the last :meth:`advance` would have observed, from :meth:`state` after each.
 
-        Only for observations that are poses: others are of contacts and velocities that are gone. Takes
-        :meth:`state` after each of the last steps, the current one last. The first one's observations may be
-        wrong: sensors of objects relative to the gripper read poses that were cached a step before.
+        Only for observations that are poses: others are gone. The first one's may be wrong: sensors of
+        objects relative to the gripper read poses that were cached a step before.
         """
         data, found = self._data, []
         for state in states:

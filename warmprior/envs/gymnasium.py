@@ -60,8 +60,7 @@ def gym_env(
         env: a Gymnasium environment whose action is one vector.
         success: name of the ``info`` that says whether the task is solved; bool ``[1]`` under the same key.
         measures: names of further numbers in ``info``, float32 ``[1]`` each.
-        observation_keys: entries of a dictionary of observations, concatenated in this order; all of them, by
-            name, by default.
+        observation_keys: entries of a dictionary of observations, concatenated in this order; by default all.
 
     Raises:
         KeyError: if there is no such entry.

@@ -14,14 +14,7 @@ __all__ = ["Arm", "check_supported", "compiled_torques"]
 
 
 class Arm:
-    """One robot's indices, controller and current goal.
-
-    Attributes:
-        site: index of the grip site.
-        constants: the arguments of the torques that only a reset changes.
-        goal_pos: ``[3]`` where the hand is to be, in the world, metres.
-        goal_mat: ``[3, 3]`` its orientation there.
-    """
+    """One robot's indices, controller and current goal in the world, ``goal_pos`` and ``goal_mat``."""
 
     def __init__(self, env: Any, robot: Any) -> None:
         composite = robot.composite_controller
@@ -73,11 +66,10 @@ class Arm:
     def remembered(
         self, jacp: np.ndarray, jacr: np.ndarray, mass: np.ndarray, qvel: np.ndarray, qpos: np.ndarray
     ) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """Replace the simulator's values by those that the controller measured during the reset.
+        """The pose of the grip site, and joints' velocities and positions, as measured during the reset.
 
         robosuite computes the first torques of an episode from these, although the joints have been put in
-        place since; so does this loop. Returns the pose of the grip site, and velocities and positions of all
-        joints.
+        place since; so does this loop.
         """
         controller = self.controller
         positions, columns = self.constants[:2]

@@ -39,13 +39,10 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 
 @functools.cache
 def rendering_backend() -> str | None:
-    """Find an OpenGL backend that renders without a display.
+    """The OpenGL backend that renders without a display, ``"egl"`` or ``"osmesa"``; ``None`` without one.
 
-    ``MUJOCO_GL`` is tried first if it names one, then ``egl``, then ``osmesa``. Each is tried in a
-    process of its own, because a failed attempt cannot be undone; the answer is kept.
-
-    Returns:
-        ``"egl"``, ``"osmesa"``, or ``None`` if neither works.
+    ``MUJOCO_GL`` is tried first if it names one. Each is tried in a process of its own, because a failed
+    attempt cannot be undone; the answer is kept.
 
     Examples:
         >>> from warmprior.envs import rendering_backend

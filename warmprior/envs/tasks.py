@@ -123,10 +123,7 @@ TASKS: dict[str, TaskSpec] = {
 
 
 def get_task(name: str) -> TaskSpec:
-    """Look a task up by its short name, a key of :data:`TASKS`.
-
-    Raises:
-        ValueError: if there is no such task.
+    """Look a task up by its short name, a key of :data:`TASKS`; a ``ValueError`` if there is none.
 
     Examples:
         >>> from warmprior.envs import get_task

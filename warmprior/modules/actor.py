@@ -24,10 +24,11 @@ __all__ = ["PriorSampler", "StartPoint", "WarmPriorActor"]
 
 
 class StartPoint(Registered, nn.Module):
-    r"""Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
+    """Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.
 
     The flow is trained from the prior's source as usual; at decisions integration starts on the way. A start
-    point is trained before the flow, and saved with the policy.
+    point is trained before the flow, and saved with the policy (``start`` of
+    :class:`~warmprior.WarmPriorActor`).
 
     Attributes:
         time: ``s``.
@@ -65,9 +66,8 @@ class PriorSampler(TensorDictModuleBase):
         start: the point from which samplers start, if that is not the source itself.
         observation_key: key of the observation, ``[*B, To, d_o]``; only start points and priors that override
             :meth:`~Prior.distribution` read it.
-        generator: source of randomness; PyTorch's global generator by default. Per call:
-            ``sampler(data, generator=...)``. Worker processes take none, since all of them would draw the
-            same noise.
+        generator: source of randomness; per call: ``sampler(data, generator=...)``. Worker processes take
+            none, since all of them would draw the same noise.
 
     Raises:
         KeyError: if an entry of the history is missing.
@@ -78,9 +78,9 @@ class PriorSampler(TensorDictModuleBase):
         >>> from tensordict import TensorDict
         >>> from warmprior import PastPrior, PriorSampler
         >>> from warmprior.history import window_history
-        >>> sampler = PriorSampler(PastPrior(2, sigma=0.0))
         >>> executed, steps = torch.ones(3, 2, 1), torch.full((3, 1), 2)
         >>> history = window_history(executed, steps, torch.zeros(3, 2, 1), chunk_length=2)
+        >>> sampler = PriorSampler(PastPrior(2, sigma=0.0))
         >>> sampler(TensorDict({"history": history}, [3]))["prior", "noise"].unique()
         tensor([1.])
     """
@@ -132,25 +132,23 @@ class PriorSampler(TensorDictModuleBase):
 class WarmPriorActor(TensorDictModuleBase):
     """Flow-matching policy with a choice of source: ``(observation, history) -> (loc, warm, noise, chunk)``.
 
-    Composes :class:`PriorSampler` and :class:`ODEActor`. It holds no state between calls.
-    :class:`~warmprior.ActionHistory` in an environment, and :class:`~warmprior.ActionWindow` in a replay
-    buffer, write the history that it reads, so it works unchanged in ``env.rollout``, collectors, batched
-    environments and replay buffers. It ignores TorchRL's ``ExplorationType``, because a flow needs its noise:
-    seed the generator, or take a prior with ``sigma=0``.
+    Composes :class:`PriorSampler` and :class:`ODEActor`, and holds no state between calls. The history that
+    it reads comes from :class:`~warmprior.ActionHistory` or :class:`~warmprior.ActionWindow`, so it works
+    unchanged in ``env.rollout``, collectors, batched environments and replay buffers. It ignores TorchRL's
+    ``ExplorationType``, because a flow needs its noise: seed the generator, or take a prior with ``sigma=0``.
 
     Args:
         network: velocity network, see :class:`ODEActor`.
         prior: the source distribution.
         nfe: network evaluations per chunk; per call: ``actor(data, nfe=1)``. 9 by default, or ``max_nfe``.
-        max_nfe: the largest ``nfe`` that the training allows: 1 for a network that was trained at ``t = 0``
-            alone. Saved with the policy.
+        max_nfe: the largest ``nfe`` that the training allows: 1 for a network that was trained at ``t = 0``.
         start: the point from which samplers start, if that is not the source itself.
         solver: see :func:`~warmprior.modules.ode.integrate`.
         grid: see :func:`~warmprior.modules.ode.integrate`.
         clip: see :class:`ODEActor`.
         guidance: makes chunks continue the one being executed; none by default.
-        normalizer: the normaliser of the data, saved with the policy; its
-            :meth:`~warmprior.Normalizer.env_transforms` go next to the base environment.
+        normalizer: the normaliser of the data; its :meth:`~warmprior.Normalizer.env_transforms` go next to
+            the base environment.
         environment: JSON description of the environment that the policy was made for, saved with the policy
             (``python -m warmprior evaluate FOLDER``).
         generator: source of randomness of the sampler; per call: ``actor(data, generator=...)``.
@@ -159,16 +157,15 @@ class WarmPriorActor(TensorDictModuleBase):
             (:class:`~warmprior.HistoryObservation`).
 
     Raises:
-        ValueError: if the network was built for another prediction length than the prior's, ``nfe`` exceeds
-            ``max_nfe``, the grid is unknown, or the policy to guide is no flow.
+        ValueError: if the network was built for another prediction length than the prior's, or see
+            :class:`ODEActor`.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.history import cold_history
-        >>> prior = PastPrior(chunk_length=8)
-        >>> actor = WarmPriorActor(VelocityMLP(7, 23, prior.prediction_length), prior, nfe=1)
+        >>> actor = WarmPriorActor(VelocityMLP(7, 23, prediction_length=8), PastPrior(chunk_length=8), nfe=1)
         >>> data = TensorDict({
         ...     "observation": torch.zeros(2, 23),  # [To, d_o]: one environment
         ...     "history": cold_history([], 8, 8, action_dim=7),
@@ -242,19 +239,14 @@ class WarmPriorActor(TensorDictModuleBase):
         return self.integrate(self.sampler(tensordict, generator=generator), nfe=nfe)
 
     def integrate(self, tensordict: TensorDictBase, nfe: int | None = None) -> TensorDictBase:
-        """Integrate a given source sample to the chunk, with the policy's guidance.
-
-        The sample, ``[*B, P, d_a]``, stands under ``keys.NOISE``.
-        """
+        """Integrate a given source sample, ``[*B, P, d_a]`` under ``keys.NOISE``, to the chunk."""
         sigma = None if self.ode.guidance is None else self.sampler.source(tensordict).scale
         return self.ode(tensordict, nfe=nfe, sigma=sigma)
 
     def replace(self, **changes: Any) -> WarmPriorActor:
         """A copy of the policy, with the same parts, and some constructor arguments changed.
 
-        Args:
-            changes: constructor arguments, such as ``nfe``, ``generator`` or ``network``. A smaller
-                ``max_nfe`` lowers ``nfe``.
+        A smaller ``max_nfe`` lowers ``nfe``.
 
         Examples:
             >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor

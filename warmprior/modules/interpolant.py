@@ -107,10 +107,7 @@ class BridgeInterpolant(Interpolant):
             raise ValueError(f"sigma must be a finite number > 0, got {sigma}")
         self.sigma = float(sigma)
 
-    def coefficients(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Coefficients of the straight line."""
-        one = torch.ones_like(t)
-        return 1 - t, t, -one, one
+    coefficients = LinearInterpolant.coefficients
 
     def __call__(
         self, a0: Tensor, a1: Tensor, t: Tensor, generator: torch.Generator | None = None

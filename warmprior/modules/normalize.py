@@ -127,10 +127,9 @@ class Normalizer(nn.Module):
         return data
 
     def env_transforms(self) -> list[Transform]:
-        """TorchRL transforms that do the same next to the base environment.
+        """TorchRL transforms that (de)normalise next to the base environment.
 
-        Observations are normalised on the way out and actions denormalised on the way in. Append them
-        before :class:`~warmprior.ChunkStep`, so that they act on every control step.
+        Append them before :class:`~warmprior.ChunkStep`, so that they act on every control step.
         """
         transforms: list[Transform] = []
         for key in self.keys:

@@ -30,7 +30,7 @@ def check_grid(grid: str) -> None:
 
 
 def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[float, float, int]]:
-    r"""The parts of a grid; within each the steps are equally long.
+    """The parts of a grid as begin, end and number of steps; within each the steps are equally long.
 
     - ``"uniform"``: one part.
     - ``"dense-jump"``: all steps but one up to :math:`t_j`, and the last from there to ``t = 1`` (Dense-Jump
@@ -38,18 +38,7 @@ def grid_parts(grid: str, steps: int, *, start_time: float = 0.0) -> list[tuple[
       the training data, and is meant for networks trained at ``u-shaped`` times. :math:`t_j` is half way from
       ``start_time`` to 1; ``"dense-jump:0.7"`` moves it.
 
-    One step is the same on every grid.
-
-    Args:
-        grid: its name.
-        steps: of the sampler.
-        start_time: where the sampler starts.
-
-    Returns:
-        Begin, end and number of steps of each part.
-
-    Raises:
-        ValueError: see :func:`check_grid`.
+    One step is the same on every grid. A ``ValueError`` as of :func:`check_grid`.
 
     Examples:
         >>> from warmprior.modules.ode import grid_parts
@@ -154,11 +143,9 @@ def integrate(
     Args:
         velocity: ``(t [B], a_t [B, ...]) -> velocity [B, ...]``.
         a0: source, ``[B, ...]``.
-        nfe: number of calls of ``velocity``, a multiple of the solver's stages (Euler 1, midpoint and
-            Heun 2, RK4 4).
+        nfe: calls of ``velocity``, a multiple of the solver's stages (Euler 1, midpoint and Heun 2, RK4 4).
         solver: ``"euler"`` (the paper's), ``"midpoint"``, ``"heun"`` or ``"rk4"``.
-        grid: where the steps lie: ``"uniform"`` or ``"dense-jump"``, see
-            :func:`~warmprior.modules.ode.grid_parts`.
+        grid: where the steps lie, see :func:`~warmprior.modules.ode.grid_parts`.
         start_time: another time to start from, in [0, 1).
         return_path: return every grid point instead of the last.
 
@@ -166,14 +153,12 @@ def integrate(
         ``a_1`` ``[B, ...]``, or the path ``[B, steps + 1, ...]`` from ``a_0`` to ``a_1``.
 
     Raises:
-        ValueError: for an unknown solver or grid, an ``nfe`` that the solver cannot spend, or a
-            ``start_time`` outside [0, 1).
+        ValueError: for an option that is unknown or out of range.
 
     Examples:
-        >>> from warmprior import integrate
         >>> import torch
-        >>> a0 = torch.ones(1, 1)
-        >>> float(integrate(lambda t, a: a, a0, nfe=4, solver="rk4"))  # e = 2.71828...
+        >>> from warmprior import integrate
+        >>> float(integrate(lambda t, a: a, torch.ones(1, 1), nfe=4, solver="rk4"))  # e = 2.71828...
         2.7083...
     """
     steps = _steps(nfe, solver)
@@ -202,31 +187,27 @@ class ODEActor(TensorDictModuleBase):
     Args:
         network: velocity network ``(t [B], a_t [B, P, d_a], observation [B, To, d_o]) -> [B, P, d_a]``. An
             observation of several entries, nested under its key, arrives as a tensordict ``[B]``.
-        nfe: number of network evaluations per chunk; per call: ``actor(data, nfe=3)``. 9 by default, or
-            ``max_nfe``.
+        nfe: network evaluations per chunk; per call: ``actor(data, nfe=3)``. 9 by default, or ``max_nfe``.
         max_nfe: the largest ``nfe`` that the training allows.
         start_time: see :func:`integrate`.
         solver: see :func:`integrate`.
         grid: see :func:`integrate`.
-        clip: the chunk is clamped to ``[-clip, clip]``, one bound for all action dimensions or ``d_a`` of
-            them; ``None`` (default) does not clamp. Set it to the range of the normalised data, such as 1, so
-            that the environment executes what the prior remembers.
-        guidance: makes chunks continue the one being executed; none by default. It reads the rest of that
-            chunk, ``("history", "forecast")`` and ``("history", "forecast_steps")``, and the delay, int64
-            ``[*B, 1]``.
+        clip: the chunk is clamped to ``[-clip, clip]``, one bound for all action dimensions or one for each.
+            Set it to the range of the normalised data, such as 1: then the environment executes what the
+            prior remembers.
+        guidance: makes chunks continue the one being executed. It reads the rest of that chunk,
+            ``("history", "forecast")`` and ``("history", "forecast_steps")``, and the delay.
         observation_key: key of the observation, ``[*B, To, d_o]``.
 
     Raises:
-        ValueError: for ``nfe < 1``, an ``nfe`` that the solver cannot spend or that exceeds ``max_nfe``, or
-            an unknown solver or grid, or guidance with ``max_nfe=1``, which is no flow.
+        ValueError: for an option that is unknown, out of range or not what the network is trained for.
         KeyError: if an input key is missing.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import ODEActor, VelocityMLP
-        >>> network = VelocityMLP(action_dim=2, observation_dim=3, prediction_length=4)
-        >>> actor = ODEActor(network, nfe=9)
+        >>> actor = ODEActor(VelocityMLP(action_dim=2, observation_dim=3, prediction_length=4), nfe=9)
         >>> data = TensorDict({"observation": torch.zeros(5, 2, 3),
         ...                    ("prior", "noise"): torch.randn(5, 4, 2)}, [5])
         >>> actor(data, nfe=1)["vla_action", "chunk"].shape
@@ -292,11 +273,7 @@ class ODEActor(TensorDictModuleBase):
     def forward(
         self, tensordict: TensorDictBase, nfe: int | None = None, sigma: Tensor | None = None
     ) -> TensorDictBase:
-        """Write the chunk.
-
-        ``sigma`` is the source's standard deviation for the guidance, broadcastable to ``[*B, P, d_a]``; 1 by
-        default.
-        """
+        """Write the chunk; ``sigma``, 1 by default, is the source's deviation for the guidance."""
         nfe = self.nfe if nfe is None else nfe
         self.check_nfe(nfe)
         inputs = [tensordict.get(key, None) for key in self.in_keys]

@@ -247,17 +247,16 @@ class PreconditionedNetwork(VelocityNetwork):
             )
         shape = (network.prediction_length, network.action_dim)
         self.moments = SourceMoments.identity(*shape) if moments is None else moments
-        if tuple(self.moments.covariance.shape) != shape:
-            raise ValueError(
-                f"the moments are of chunks (P, d_a) = {tuple(self.moments.covariance.shape)}, but the "
-                f"network was built for {shape}"
-            )
         self.trend = PoseTrend.zero(**trend) if isinstance(trend, dict) else trend
-        if self.trend is not None and tuple(self.trend.target.shape) != shape:
-            raise ValueError(
-                f"the trend is of chunks (P, d_a) = {tuple(self.trend.target.shape)}, but the network "
-                f"was built for {shape}"
-            )
+        given = {"moments are": self.moments.covariance}
+        if self.trend is not None:
+            given["trend is"] = self.trend.target
+        for name, value in given.items():
+            if tuple(value.shape) != shape:
+                raise ValueError(
+                    f"the {name} of chunks (P, d_a) = {tuple(value.shape)}, but the network was built for "
+                    f"{shape}"
+                )
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """As the network inside does."""

@@ -26,17 +26,17 @@ _POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, 
 
 
 class RestingAction(nn.Module):
-    r"""The absolute action that asks every gripper to stay where the observation says it is.
+    """The absolute action that asks every gripper to stay where the observation says it is.
 
     Args:
         columns: int64 ``[arms, 7]``, where in the observation each gripper's position and the
             ``(x, y, z, w)`` quaternion of its hand are, as robomimic's files have them.
-        normalizer: normaliser of the observations ``[d_o]`` and the actions ``[10 * arms]``; an identity by
-            default, to be replaced by loading a state dict.
+        normalizer: of the observations ``[d_o]`` and the actions ``[10 * arms]``; an identity by default, to
+            be replaced by loading a state dict.
 
     Examples:
-        >>> from warmprior import RestingAction
         >>> import torch
+        >>> from warmprior import RestingAction
         >>> rest = RestingAction(torch.arange(7)[None])
         >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
         >>> rest(observation).tolist()[:3], rest(observation).shape
@@ -69,10 +69,7 @@ class RestingAction(nn.Module):
         return self.action_loc.numel()
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The action, ``[*B, 10 * arms]`` in normalised units; 0 for the gripper.
-
-        Observations are ``[*B, d_o]``, normalised; further entries at their end are ignored.
-        """
+        """The action, ``[*B, 10 * arms]``, 0 for the gripper, at ``[*B, d_o]``; both normalised."""
         pose = observation[..., self.columns] * self.scale + self.loc
         hand = quaternion_to_matrix(pose[..., 3:])
         site = hand @ quaternion_to_matrix(hand.new_tensor(HAND_TO_SITE))
@@ -82,15 +79,14 @@ class RestingAction(nn.Module):
 
 
 class PoseTrend(nn.Module):
-    r"""Best linear predictions of source :math:`a_0` and target :math:`a_1` from the resting action.
+    """Best linear predictions of source :math:`a_0` and target :math:`a_1` from the resting action.
 
     Absolute poses lie near the present pose, which explains most of their variance. A network without a trend
     spends its precision on that, and passes on source noise that is many times as large as the change of a
     pose in one step. With a trend, :class:`PreconditionedNetwork` learns the remainder: where to go from
-    here, as with deltas.
-
-    Every action dimension is predicted from the same dimension of the resting action at the last observation.
-    A regression on the whole observation fits better, but fails away from the demonstrations.
+    here, as with deltas. Every action dimension is predicted from the same dimension of the resting action at
+    the last observation: a regression on the whole observation fits better, but fails away from the
+    demonstrations.
 
     Args:
         rest: the resting action of an observation.
@@ -147,16 +143,10 @@ class PoseTrend(nn.Module):
         *,
         generator: torch.Generator | None = None,
     ) -> PoseTrend:
-        """Estimate it from training windows and draws of the prior.
+        """Estimate it, as float32, from unpadded positions of windows ``[N]`` and draws of the prior.
 
-        Args:
-            windows: ``[N]``, see :class:`~warmprior.ActionWindow`, with observations ``[N, To, d_o]``.
-            prior: the source distribution.
-            rest: the resting action of an observation.
-            generator: source of randomness of the source samples, on the windows' device.
-
-        Returns:
-            The trend over unpadded positions, as float32; 0 where all are padded.
+        The observations are ``[N, To, d_o]``; a position that is padded in all windows gets 0. The generator
+        is of the source samples, on the windows' device.
         """
         resting = rest(windows[keys.OBSERVATION][:, -1].float()).double()
         centre = resting.mean(0)

@@ -31,14 +31,8 @@ class PriorSpaceAgent:
     """An agent around a copy of a frozen policy, its critics, and one update of them.
 
     Initial weights follow from PyTorch's global generator. A ``ValueError`` if the recipe does not suit the
-    policy.
-
-    Attributes:
-        decoder: the frozen policy as a decoder.
-        state_keys: what the agent and the noise critic read of a state.
-        policy: the agent followed by the decoder.
-        warmup: residuals from the prior, clipped to the agent's box, followed by the decoder.
-        loss: DSRL-NA's or TorchRL's SAC.
+    policy. ``policy`` is the agent followed by the decoder, ``warmup`` residuals from the prior in the
+    agent's place.
     """
 
     def __init__(self, actor: WarmPriorActor, config: PriorSpaceConfig) -> None:
@@ -83,12 +77,10 @@ class PriorSpaceAgent:
                 make_prior_space_critic(**sizes, in_keys=chunk_keys),
                 noise_critic,
                 self.decoder,
-                backup=config.backup,
                 discount="decision",
                 noise_critic_steps=config.noise_critic_steps,
                 distillation=config.distillation,
                 backup_entropy=config.backup_entropy,
-                bootstrap_timeouts=config.bootstrap_timeouts,
                 alpha_init=config.alpha_init,
                 target_entropy=config.target_entropy,
             )

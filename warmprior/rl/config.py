@@ -34,7 +34,6 @@ class PriorSpaceConfig:
         gamma: discount per decision.
         hidden_dim: width of actor and critics.
         num_layers: their number of hidden layers.
-        backup: ``"min"`` or ``"mean"`` over critics, DSRL-NA only.
         backup_entropy: whether the targets of DSRL-NA's critic include the entropy; those of TorchRL's SAC
             always do.
         alpha_init: initial temperature, DSRL's 1. If success ends the episode, take less than ``reward_offset
@@ -42,7 +41,6 @@ class PriorSpaceConfig:
             until the temperature has fallen.
         target_entropy: in units of the box.
         reward_offset: subtracted from every control step's reward; DSRL turns 0/1 into -1/0.
-        bootstrap_timeouts: whether the value after a time-out counts; DSRL treats time-outs as terminations.
         evaluate_every: control steps between evaluations (and saves).
         evaluation_episodes: episodes per evaluation, greedy and stochastic each.
         seed: of everything random.
@@ -71,12 +69,10 @@ class PriorSpaceConfig:
     gamma: float = 0.99
     hidden_dim: int = 2048
     num_layers: int = 3
-    backup: Literal["min", "mean"] = "min"
     backup_entropy: bool = True
     alpha_init: float = 1.0
     target_entropy: float = 0.0
     reward_offset: float = 1.0
-    bootstrap_timeouts: bool = False
     evaluate_every: int = 20_000
     evaluation_episodes: int = 200
     seed: int = 0
@@ -84,10 +80,8 @@ class PriorSpaceConfig:
     def __post_init__(self) -> None:
         if self.algorithm not in ("dsrl-na", "dsrl-sac"):
             raise ValueError(f"algorithm must be dsrl-na or dsrl-sac, got {self.algorithm!r}")
-        if self.backup not in ("min", "mean"):
-            raise ValueError(f"backup must be 'min' or 'mean', got {self.backup!r}")
-        if self.algorithm == "dsrl-sac" and (self.backup, self.backup_entropy) != ("min", True):
-            raise ValueError("dsrl-sac has backup='min' and backup_entropy=True; leave them out")
+        if self.algorithm == "dsrl-sac" and not self.backup_entropy:
+            raise ValueError("dsrl-sac has backup_entropy=True; leave it out")
         if self.algorithm == "dsrl-sac" and self.distillation is not None:
             raise ValueError("dsrl-sac has no noise critic: leave distillation out")
         check_finite_numbers(target_entropy=self.target_entropy, reward_offset=self.reward_offset)

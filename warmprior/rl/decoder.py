@@ -30,33 +30,30 @@ class PriorDecoder(TensorDictModuleBase):
         a_0 = \mu + \Delta, \qquad \Delta \in [-\delta, \delta]^{P \times d_a},
 
     and the policy's own ODE carries :math:`a_0` to the chunk, deterministically. The anchor comes from
-    :class:`~warmprior.PriorAnchor`: the prior's mean where it is warm. With zero anchors this is
-    `DSRL <https://arxiv.org/abs/2506.15799>`_.
+    :class:`~warmprior.PriorAnchor`; with zero anchors this is `DSRL <https://arxiv.org/abs/2506.15799>`_.
 
     Place it behind the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
-    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy's network, in
-    evaluation mode. The copy's parameters are buffers: they move and are saved with the decoder, and never
-    appear in ``parameters()``. ``children()`` is empty, so that PyTorch and TorchRL cannot switch the network
-    to training mode or reset its weights.
+    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy's network in
+    evaluation mode, whose parameters are buffers: they move and are saved with the decoder, and never appear
+    in ``parameters()``. ``children()`` is empty, so that nothing switches the network to training mode.
 
     Args:
         actor: the policy; copied. Or an object with the same parts, such as
             :class:`~warmprior.lerobot.LeRobotActor`.
-        delta: half the side of the agent's box, in units of the normalised action space. The paper uses
-            0.5 around a warm mean and 1.5 around zero.
+        delta: half the side of the agent's box, in units of the normalised action space. The paper uses 0.5
+            around a warm mean and 1.5 around zero.
         nfe: network evaluations per chunk; the actor's own by default.
 
     Raises:
-        ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0``
-            alone or is guided, or ``nfe`` does not suit it.
+        ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0`` alone or is
+            guided, or ``nfe`` does not suit it.
         KeyError: (when called) if an input key is missing.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PastPrior, PriorDecoder, VelocityMLP, WarmPriorActor
-        >>> prior = PastPrior(4)
-        >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), prior, nfe=1), delta=0.5)
+        >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4), nfe=1), delta=0.5)
         >>> data = TensorDict({"observation": torch.zeros(5, 2, 3),
         ...     "prior": {"anchor": torch.zeros(5, 4, 2), "delta": torch.full((5, 4, 2), 0.5)}}, [5])
         >>> decoder(data)["vla_action", "chunk"].shape
@@ -128,7 +125,7 @@ class PriorDecoder(TensorDictModuleBase):
         return tensordict.set(keys.NOISE, noise).set(keys.CHUNK, chunk)
 
     def check_env(self, env: EnvBase) -> None:
-        """Compare the policy with an environment whose action is the chunk: its length and width.
+        """Compare the policy's chunks with those that an environment takes: length and width.
 
         Raises:
             KeyError: if the environment takes no chunk.
@@ -180,17 +177,9 @@ class PriorSpace(EnvTransform):
 
     The other way to use :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
     environment with a bounded action. The transitions are those of ``TensorDictSequential(agent, decoder)``,
-    with the source and the chunk under other keys:
-
-    ========================================  =====================================================
-    ``TensorDictSequential(agent, decoder)``  ``PriorSpace(decoder)``
-    ========================================  =====================================================
-    ``("prior", "noise")``                    ``("next", "decoded", "noise")``
-    ``("vla_action", "chunk")``               ``("next", "decoded", "chunk")``
-    ========================================  =====================================================
-
-    (TorchRL drops what an inverse transform writes, so they are part of the next state. Under their usual
-    names they would be mistaken for those of the next step.)
+    but the source is under ``("next", "decoded", "noise")`` and the chunk under ``("next", "decoded",
+    "chunk")``: TorchRL drops what an inverse transform writes, so they are part of the next state, and under
+    their usual names they would be mistaken for those of the next step.
 
     Append it last, after :class:`~warmprior.PriorAnchor`, and outside batched environments: inside, every
     worker would hold a copy of the network.
@@ -200,8 +189,7 @@ class PriorSpace(EnvTransform):
 
     Raises:
         KeyError: if :class:`~warmprior.ChunkStep` or :class:`~warmprior.PriorAnchor` does not come before.
-        ValueError: if the environment's chunks are not the policy's, see
-            :meth:`PriorDecoder.check_env`.
+        ValueError: if the environment's chunks are not the policy's, see :meth:`PriorDecoder.check_env`.
 
     Examples:
         >>> from torchrl.envs import TransformedEnv
@@ -213,10 +201,8 @@ class PriorSpace(EnvTransform):
         >>> transforms.append(PriorAnchor(actor))
         >>> transforms.append(PriorSpace(PriorDecoder(actor, delta=0.5)))
         >>> env = TransformedEnv(NavigationEnv(batch_size=[3]), transforms)
-        >>> env.action_keys, env.full_action_spec["prior", "delta"].shape
-        ([('prior', 'delta')], torch.Size([3, 4, 1]))
-        >>> env.rollout(2)["next", "decoded", "chunk"].shape
-        torch.Size([3, 2, 4, 1])
+        >>> env.action_keys, env.rollout(2)["next", "decoded", "chunk"].shape
+        ([('prior', 'delta')], torch.Size([3, 2, 4, 1]))
     """
 
     def __init__(self, decoder: PriorDecoder) -> None:

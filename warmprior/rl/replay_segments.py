@@ -47,11 +47,7 @@ class ReplaySegments:
         self._pending.clear()
 
     def load(self) -> TensorDict | None:
-        """All committed transitions ``[N]``, or ``None`` if there are none.
-
-        Raises:
-            ValueError: if a segment is missing or damaged.
-        """
+        """All committed transitions ``[N]`` or ``None``; a ``ValueError`` names a damaged segment."""
         parts = []
         for index in range(self.committed):
             path = self._path(index)

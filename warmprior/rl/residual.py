@@ -7,7 +7,6 @@ from typing import Literal, get_args
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch.nn.init import trunc_normal_
 
 from warmprior import keys
 from warmprior.rl.anchor import has_anchor, residual_sigma
@@ -15,23 +14,16 @@ from warmprior.rl.decoder import PriorDecoder
 
 __all__ = ["ResidualSampler"]
 
-ResidualDistribution = Literal["normal", "clipped", "truncated", "uniform"]
+ResidualDistribution = Literal["normal", "clipped", "uniform"]
 
 
 class ResidualSampler(TensorDictModuleBase):
     r"""Draws residuals without an agent, for the warm-up and for distilling the noise critic.
 
-    :math:`\sigma` is the typical deviation of the source from the centre of the search: the prior's ``sigma``
-    around its mean, the start point's share of noise, or 1 around zero. :math:`\delta` is the decoder's.
-
-    ===============  =============================================================================
-    distribution     residual
-    ===============  =============================================================================
-    ``"normal"``     :math:`\sigma \varepsilon`, the training prior; may leave the agent's box
-    ``"clipped"``    the same, clipped to :math:`[-\delta, \delta]`
-    ``"truncated"``  the same, drawn again until it lies in :math:`[-\delta, \delta]`
-    ``"uniform"``    :math:`U[-\delta, \delta]`
-    ===============  =============================================================================
+    ``"normal"`` draws :math:`\sigma \varepsilon`, the training prior, which may leave the agent's box;
+    ``"clipped"`` clips it to :math:`[-\delta, \delta]`; ``"uniform"`` draws from :math:`U[-\delta, \delta]`.
+    :math:`\delta` is the decoder's, :math:`\sigma` the typical deviation of the source from the centre of the
+    search: the prior's ``sigma`` around its mean, the start point's share of noise, or 1 around zero.
 
     ``TensorDictSequential(ResidualSampler(decoder), decoder)`` is a policy for the first steps of a collector
     (the environment's own random actions would be random *chunks* there).
@@ -71,8 +63,7 @@ class ResidualSampler(TensorDictModuleBase):
             distribution = "normal"
         if distribution not in get_args(ResidualDistribution):
             raise ValueError(
-                "the distribution must be 'normal', 'clipped', 'truncated' or 'uniform', got "
-                f"{distribution!r}"
+                f"the distribution must be 'normal', 'clipped' or 'uniform', got {distribution!r}"
             )
         if distribution != "uniform" and sigma == 0:
             raise ValueError(f"a prior without noise leaves 'uniform', got the distribution {distribution!r}")
@@ -91,9 +82,6 @@ class ResidualSampler(TensorDictModuleBase):
         like = {"dtype": anchor.dtype, "device": anchor.device, "generator": self.generator}
         if self.distribution == "uniform":
             delta = (2.0 * torch.rand(anchor.shape, **like) - 1.0) * self.delta
-        elif self.distribution == "truncated":
-            box = (-self.delta, self.delta)
-            delta = trunc_normal_(torch.empty_like(anchor), 0.0, self.sigma, *box, generator=self.generator)
         else:
             delta = self.sigma * torch.randn(anchor.shape, **like)
         if self.distribution == "clipped":

@@ -40,15 +40,14 @@ class PriorSpaceTraining:
 
     Args:
         actor: the frozen policy; put into evaluation mode.
-        make_env: ``make_env(seed) -> EnvBase``, a batched environment ``[n]`` with the policy's
-            transforms and :class:`~warmprior.PriorAnchor`; called for training and evaluation.
+        make_env: ``make_env(seed) -> EnvBase``, a batched environment ``[n]`` with the policy's transforms
+            and :class:`~warmprior.PriorAnchor`; called for training and evaluation.
         config: the recipe.
         directory: the folder.
         evaluation_seed: simulator seed of the first evaluation episode.
         description: of the progress bar; no bar if ``None``.
-        collectors: how many actors of a Ray cluster collect, each with its own environments;
-            by default this process collects. Another number
-            means other episodes.
+        collectors: how many actors of a Ray cluster collect, each with its own environments; by default this
+            process collects. Another number means other episodes.
         ray_address: of the cluster.
 
     Attributes:
@@ -58,15 +57,15 @@ class PriorSpaceTraining:
         curve (list[dict[str, Any]]): the evaluations so far, see :meth:`run`.
 
     Raises:
-        ValueError: if the recipe does not suit the policy, or the folder's state belongs to another
-            recipe or policy, or its replay buffer to another wiring.
+        ValueError: if the recipe does not suit the policy, or the folder's state is of another recipe, policy
+            or wiring.
 
     Examples:
-        >>> from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
         >>> from tempfile import TemporaryDirectory
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, PriorAnchor, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import NavigationEnv
+        >>> from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
         >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
         >>> actor = WarmPriorActor(network, PastPrior(8))
         >>> def make_env(seed):
@@ -77,8 +76,7 @@ class PriorSpaceTraining:
         ...     environment_steps=40, warmup_steps=20, evaluate_every=40, evaluation_episodes=2,
         ...     batch_size=4, updates=1, noise_critic_steps=1, hidden_dim=8, num_layers=1)
         >>> with TemporaryDirectory() as folder:
-        ...     training = PriorSpaceTraining(
-        ...         actor, make_env, config, folder, evaluation_seed=100)
+        ...     training = PriorSpaceTraining(actor, make_env, config, folder, evaluation_seed=100)
         ...     [row["evaluation"] for row in training.run()]
         ['base', 'greedy', 'stochastic']
     """
@@ -133,8 +131,8 @@ class PriorSpaceTraining:
 
         Raises:
             KeyError: if the environment has no anchor.
-            ValueError: if the environment does not fit the policy, see :meth:`PriorDecoder.check_env`, or
-                executes less than ``H`` actions of a chunk.
+            ValueError: if the environment does not fit the policy, or executes less than ``H`` actions of a
+                chunk.
             FloatingPointError: if a loss, a parameter or a value of the environment becomes NaN or infinite;
                 the last save stays.
             WorkerError: if a worker process of an environment, or a collector, dies, a ``RuntimeError``.
@@ -237,8 +235,7 @@ class PriorSpaceTraining:
         transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
         following = transitions["next"]
         following["reward"] = following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
-        if not self.config.bootstrap_timeouts:
-            following["terminated"] = following["done"].clone()
+        following["terminated"] = following["done"].clone()  # DSRL treats time-outs as terminations
         # Checked before saving: they would end every later training.
         self._check_finite(transitions)
         self._check_executed(following)

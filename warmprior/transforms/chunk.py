@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey, expand_as_right, unravel_key
 from torch import Tensor
-from torchrl.data import Bounded, Composite, TensorSpec, Unbounded
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs.transforms import VecGymEnvTransform
 
 from warmprior import keys
@@ -24,17 +24,16 @@ class ChunkStep(EnvTransform):
 
     One outer step executes the first ``execute`` actions of a chunk ``[*B, P, d_a]``, and stops each
     sub-environment at the end of its own episode. The reward is the discounted sum :math:`\sum_{i<k} \gamma^i
-    r_i` over the ``k`` executed steps. ``k`` itself is written to ``("next", "executed_steps")``. A success
-    at any step is a success of the chunk (see ``success``), and everything else is taken from the last
-    executed step. Unlike
-    :class:`~torchrl.envs.transforms.MultiAction` it keeps the last reward of an episode that ends inside a
-    chunk, and its shapes are fixed, so it works inside and outside batched environments.
+    r_i` over the ``k`` executed steps, written to ``("next", "executed_steps")``; everything but ``success``
+    and ``measures`` is taken from the last of them. Unlike :class:`~torchrl.envs.transforms.MultiAction` it
+    keeps the last reward of an episode that ends inside a chunk, and works inside and outside batched
+    environments.
 
-    Per-step transforms (``StepCounter``, ``RewardSum``, ``ActionScaling``, ``CatFrames``,
-    ``VideoRecorder``) go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after.
-    Per-step transforms run at every control step. If none of them remembers anything (``ObservationNorm``,
-    ``ActionScaling``, :class:`ObservationStack`), they run only at the steps that a chunk's last observation
-    depends on. In a partial step, resting rows keep all observations.
+    Per-step transforms (``StepCounter``, ``RewardSum``, ``ActionScaling``, ``CatFrames``, ``VideoRecorder``)
+    go before it, per-decision ones (:class:`ActionHistory`, ``InitTracker``) after. If none of the former
+    remembers anything (``ObservationNorm``, ``ActionScaling``, :class:`ObservationStack`), they run only at
+    the steps that a chunk's last observation depends on. In a partial step, resting rows keep all
+    observations.
 
     .. note::
         Around a batched environment, TorchRL's transforms with memory, such as ``CatFrames`` or
@@ -44,8 +43,7 @@ class ChunkStep(EnvTransform):
 
     Args:
         chunk_length: ``H``.
-        execute: ``k``, how many actions of a chunk are executed before the next decision; ``H`` by
-            default.
+        execute: ``k``, how many actions of a chunk are executed before the next decision; ``H`` by default.
         prediction_length: ``P``, the length of the chunks that the policy gives; ``H`` by default.
         gamma: discount per control step.
         success: a bool flag that holds after a chunk if it held after any of its executed steps; ignored if
@@ -54,18 +52,16 @@ class ChunkStep(EnvTransform):
             after its executed steps.
 
     Raises:
-        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, or (in an environment) an
-            action is not one vector.
+        ValueError: if not ``1 <= execute <= chunk_length <= prediction_length``, or an action is not one
+            vector.
         KeyError: (in an environment) if there is no such action.
         RuntimeError: (on the first step) if the environment has several rewards or no root ``"done"``, or is
             a vector environment of Gymnasium.
 
     Examples:
+        >>> from torchrl.envs import Compose, GymEnv, StepCounter, TransformedEnv
         >>> from warmprior import ChunkStep
-        >>> import torch
-        >>> from torchrl.envs import GymEnv, StepCounter, TransformedEnv, Compose
-        >>> env = TransformedEnv(
-        ...     GymEnv("Pendulum-v1"), Compose(StepCounter(max_steps=10), ChunkStep(4)))
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(StepCounter(max_steps=10), ChunkStep(4)))
         >>> rollout = env.rollout(5)
         >>> rollout["vla_action", "chunk"].shape  # 10 control steps are 3 decisions
         torch.Size([3, 4, 1])
@@ -248,22 +244,8 @@ class ChunkStep(EnvTransform):
         """The discounted sum of up to ``execute`` rewards."""
         for key, leaf in list(reward_spec.items(True, True)):
             dtype = leaf.dtype if leaf.dtype.is_floating_point else torch.get_default_dtype()
-            options = {"shape": leaf.shape, "dtype": dtype, "device": leaf.device}
-            if isinstance(leaf, Bounded):
-                low, high = leaf.space.low.to(dtype), leaf.space.high.to(dtype)
-                # An episode may end after any number of steps.
-                lows, highs = self._returns(low), self._returns(high)
-                reward_spec[key] = Bounded(lows.amin(0), highs.amax(0), **options)
-            else:
-                reward_spec[key] = Unbounded(**options)
+            reward_spec[key] = Unbounded(leaf.shape, dtype=dtype, device=leaf.device)
         return reward_spec
-
-    def _returns(self, reward: Tensor) -> Tensor:
-        """Sums of 1, 2, ... of the same reward, rounded as :meth:`_step` does."""
-        sums = [reward]
-        for i in range(1, self.execute):
-            sums.append(torch.add(sums[-1], reward, alpha=self.gamma**i))
-        return torch.stack(sums)
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
         """Add the number of executed steps."""

@@ -38,7 +38,7 @@ class ActionHistory(EnvTransform):
         KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks the history.
 
     Examples:
-        >>> from torchrl.envs import GymEnv, TransformedEnv, Compose
+        >>> from torchrl.envs import Compose, GymEnv, TransformedEnv
         >>> from warmprior import ActionHistory, ChunkStep
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(4)))
         >>> rollout = env.rollout(3)
@@ -107,7 +107,8 @@ class ActionHistory(EnvTransform):
 class WithheldHistory(Transform):
     """Withholds the history of some training windows, so that the network also learns the cold start.
 
-    Append it to a replay buffer, like any other augmentation. The paper's Algorithm 1 withholds nothing.
+    Append it to a replay buffer (``withhold`` of :func:`~warmprior.window_replay_buffer`). The paper's
+    Algorithm 1 withholds nothing.
 
     Args:
         probability: share of the windows, in [0, 1].
@@ -118,11 +119,11 @@ class WithheldHistory(Transform):
 
     Examples:
         >>> import torch
-        >>> from warmprior import WithheldHistory
         >>> from tensordict import TensorDict
+        >>> from warmprior import WithheldHistory
         >>> from warmprior.history import window_history
-        >>> steps = torch.full((1000, 1), 2)
-        >>> history = window_history(torch.ones(1000, 2, 1), steps, torch.ones(1000, 2, 1), chunk_length=2)
+        >>> ones = torch.ones(1000, 2, 1)
+        >>> history = window_history(ones, torch.full((1000, 1), 2), ones, chunk_length=2)
         >>> withheld = WithheldHistory(0.25, generator=torch.Generator().manual_seed(0))
         >>> batch = withheld(TensorDict({"history": history}, [1000]))
         >>> 0.2 < float((batch["history", "steps"] == 0).float().mean()) < 0.3
@@ -155,12 +156,10 @@ class WithheldHistory(Transform):
 class HistoryObservation(EnvTransform):
     """Appends the last ``H`` actions to the observation, in environments and replay buffers alike.
 
-    It writes ``keys.CONDITIONED``, ``[*B, To, d_o + H * d_a + 1]``.
-
-    The actions are flattened (zero until there are ``H`` of them), followed by 1 if there are ``H`` and 0
-    otherwise, and repeated over the observation steps. Build the network with ``observation_dim = d_o +
-    HistoryObservation.width(H, d_a)`` and the policy with ``observation_key=keys.CONDITIONED``. In an
-    environment it comes after :class:`~warmprior.ActionHistory`.
+    It writes ``keys.CONDITIONED``, ``[*B, To, d_o + H * d_a + 1]``: the actions, flattened (zero until there
+    are ``H`` of them), and whether there are ``H``, repeated over the observation steps. Build the network
+    with ``observation_dim = d_o + HistoryObservation.width(H, d_a)`` and the policy with
+    ``observation_key=keys.CONDITIONED``. In an environment it comes after :class:`~warmprior.ActionHistory`.
 
     Args:
         observation_key: the observation, ``[*B, To, d_o]``, or one with images nested under the key, whose
