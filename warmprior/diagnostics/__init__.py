@@ -1,7 +1,6 @@
 """Measures of flows, of executed actions and of success rates."""
 
-from warmprior.diagnostics.branching import branching_bound, branching_cost
-from warmprior.diagnostics.curvature import curvature, flow_paths
+from warmprior.diagnostics.curvature import branching_bound, branching_cost, curvature, flow_paths
 from warmprior.diagnostics.errors import MeanError, action_error, mean_error, mean_revision, source_coverage
 from warmprior.diagnostics.flow import encoded_windows
 from warmprior.diagnostics.memory_gain import memory_gain

@@ -13,6 +13,7 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, flat_windows, judged, predict
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_keys
 from warmprior.modules.prior import Source
 
 __all__ = ["MeanError", "action_error", "mean_error", "mean_revision", "source_coverage"]
@@ -147,10 +148,9 @@ def mean_revision(rollout: TensorDictBase) -> float:
         >>> round(mean_revision(rollout), 3)
         1.414
     """
-    found = [rollout.get(key, None) for key in (keys.CHUNK, keys.LOC, keys.WARM)]
-    if any(value is None for value in found):
-        raise KeyError(f"the rollout lacks {keys.CHUNK}, {keys.LOC} or {keys.WARM}: let a policy write them")
-    chunk, loc, warm = found
+    needed = (keys.CHUNK, keys.LOC, keys.WARM)
+    check_keys(rollout, needed, "mean_revision", ": let a policy write them")
+    chunk, loc, warm = (rollout.get(key) for key in needed)
     return _rms((chunk - loc)[warm.expand_as(loc)])
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -15,8 +15,6 @@ from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded
 from warmprior.transforms.history import HistoryObservation
-
-Field = Callable[[Tensor, Tensor], Tensor]
 
 SPLIT = 4096
 """Largest batch of the network, for bounded memory; it changes nothing else."""
@@ -73,11 +71,6 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
 
     observation, target, pad = map(flat, (observation_key, keys.CHUNK, keys.IS_PAD))
     assert observation is not None
-    if target is not None and target.shape[-2] != prior.prediction_length:
-        raise ValueError(
-            f"{keys.CHUNK} has {target.shape[-2]} positions, but {prior} predicts "
-            f"{prior.prediction_length}: make the windows for this length"
-        )
     history = batch.get(keys.HISTORY).reshape(-1).to(device)
     entries = {
         observation_key: observation,
@@ -183,11 +176,6 @@ def check_flow(policy: WarmPriorActor, steps: int) -> None:
         raise ValueError(
             f"the policy is trained for at most {most} network evaluation(s): it has no path of {steps} steps"
         )
-
-
-def field_of(policy: WarmPriorActor, observation: Tensor) -> Field:
-    """The velocity ``(t [n], a_t [n, P, d_a]) -> [n, P, d_a]`` at given observations."""
-    return lambda t, a: policy.network(t, a, observation)
 
 
 @contextmanager

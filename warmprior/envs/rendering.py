@@ -1,8 +1,7 @@
 """Off-screen rendering: which OpenGL backend works here, and one frame on demand.
 
-MuJoCo's backend is chosen by the environment variable ``MUJOCO_GL``, and robosuite overrides it
-when imported. Nothing here runs until a frame is asked for, so machines without OpenGL can still
-simulate.
+robosuite overrides the environment variable ``MUJOCO_GL`` when imported. Nothing here runs until a frame is
+asked for, so machines without OpenGL can still simulate.
 """
 
 from __future__ import annotations
@@ -73,9 +72,8 @@ def require_rendering() -> str:
 
 
 class CameraRenderer:
-    """Renders the cameras of a MuJoCo model, an ``MjModel``, from positions of its joints.
+    """Renders the cameras of a MuJoCo model, an ``MjModel``, at given positions, aside from any episode.
 
-    It has a simulation of its own, in which nothing moves: an episode goes on as if nothing was rendered.
     ``fast`` leaves out reflections, shadows and the smoothing of edges: three to five times faster, and the
     images differ by 1 to 2 of 255 on average.
     """

@@ -155,7 +155,8 @@ class RobosuiteEnv(EnvBase):
                     f"the environment's horizon must be a number of steps, got {horizon!r}; give one with "
                     "horizon="
                 )
-        self.low_dim_keys = None if low_dim_keys is None else tuple(low_dim_keys)
+        default = default_keys(len(self._env.robots))
+        self.low_dim_keys = default if low_dim_keys is None else tuple(low_dim_keys)
         self.horizon = horizon
         self.control_loop = control_loop
         self.from_pixels, self.cameras, self.camera_size = from_pixels, cameras, size
@@ -205,8 +206,6 @@ class RobosuiteEnv(EnvBase):
         super().close(raise_if_closed=raise_if_closed)
 
     def _make_specs(self, env: Any) -> None:
-        if self.low_dim_keys is None:
-            self.low_dim_keys = default_keys(len(env.robots))
         self._loop = _LOOPS[self.control_loop](env, self.low_dim_keys)
         self._late: ControlLoop | None = None  # the loop, where it may observe afterwards
         if isinstance(self._loop, ControlLoop) and self._loop.looks_back:
@@ -246,7 +245,7 @@ class RobosuiteEnv(EnvBase):
 
     def _measure(self, observations: Mapping[str, np.ndarray]) -> dict[str, Any]:
         # This runs between control steps of physics, which leave nothing of other code in the caches.
-        state = [observations[key] for key in self.low_dim_keys or ()]
+        state = [observations[key] for key in self.low_dim_keys]
         found: dict[str, Any] = {
             keys.OBSERVATION: np.concatenate(state, dtype=np.float32, casting="same_kind")
         }

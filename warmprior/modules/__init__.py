@@ -10,10 +10,9 @@ from warmprior.modules.interpolant import (
 from warmprior.modules.network import ChiTransformer, VelocityMLP, VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import ODEActor, integrate
-from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
+from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
 from warmprior.modules.real_time_chunking import RealTimeChunking
-from warmprior.modules.trend import PoseTrend, RestingAction
 
 __all__ = [
     "BridgeInterpolant",

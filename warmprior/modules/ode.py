@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 
 from warmprior import keys
+from warmprior.modules.checks import check_keys
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking
 
@@ -276,12 +277,8 @@ class ODEActor(TensorDictModuleBase):
         """Write the chunk; ``sigma``, 1 by default, is the source's deviation for the guidance."""
         nfe = self.nfe if nfe is None else nfe
         self.check_nfe(nfe)
-        inputs = [tensordict.get(key, None) for key in self.in_keys]
-        missing = [key for key, value in zip(self.in_keys, inputs, strict=True) if value is None]
-        if missing:
-            about = GUIDED_BY_WHOM if set(GUIDED_BY) & set(missing) else ""
-            raise KeyError(f"ODEActor needs the keys {self.in_keys}; missing: {missing}{about}")
-        a0, observation, *rest = inputs
+        check_keys(tensordict, self.in_keys, "ODEActor", "" if self.guidance is None else GUIDED_BY_WHOM)
+        a0, observation, *rest = (tensordict.get(key) for key in self.in_keys)
         velocity = velocity_field(self.network, network_observation(observation, a0.shape[:-2]))
         if self.guidance is not None:
             leftover, left, delay = rest

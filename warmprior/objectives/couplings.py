@@ -122,10 +122,9 @@ class BridgeCoupling(OTCoupling):
     Examples:
         >>> import torch
         >>> from warmprior.objectives import BridgeCoupling
-        >>> couple = BridgeCoupling(sigma=0.1, observation_weight=0.0)
         >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
-        >>> [x.flatten().tolist() for x in couple(a0, a1)], couple.interpolant
-        ([[1.0, 0.0], [5.0, 4.0]], BridgeInterpolant(sigma=0.1))
+        >>> [x.flatten().tolist() for x in BridgeCoupling(sigma=0.1, observation_weight=0.0)(a0, a1)]
+        [[1.0, 0.0], [5.0, 4.0]]
     """
 
     ROUNDS: ClassVar[int] = 5  # of Sinkhorn's iteration at each noise, five times as many at the last

@@ -15,6 +15,7 @@ from torchrl.objectives.common import LossModule
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_keys
 from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.ode import integrate
@@ -299,20 +300,9 @@ class FlowMatchingLoss(LossModule):
         """
         k = self.tensor_keys
         needed = (k.chunk, k.history, k.observation)
-        found = {key: tensordict.get(key, None) for key in needed}
-        missing = [key for key, value in found.items() if value is None]
-        if missing:
-            raise KeyError(
-                f"FlowMatchingLoss needs the keys {list(needed)}; missing: {missing}. Take batches of "
-                "window_replay_buffer"
-            )
-        device = next(iter(self.velocity_network_params.values(True, True)), found[k.chunk]).device
-        a1, history, observation = (value.to(device) for value in found.values())
-        if a1.shape[-2] != self.prior.prediction_length:
-            raise ValueError(
-                f"{k.chunk} has {a1.shape[-2]} positions, but {self.prior} predicts "
-                f"{self.prior.prediction_length}: make the windows for this length"
-            )
+        check_keys(tensordict, needed, "FlowMatchingLoss", ". Take batches of window_replay_buffer")
+        device = next(iter(self.velocity_network_params.values(True, True)), tensordict.get(k.chunk)).device
+        a1, history, observation = (tensordict.get(key).to(device) for key in needed)
         batch = a1.shape[:-2]
         a0 = self.prior.sample(history, observation, self.generator)
         if self.coupling is not None:

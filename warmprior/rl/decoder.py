@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -15,10 +15,11 @@ from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_positive
+from warmprior.modules.checks import check_keys, check_positive
+from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.transforms.inner_step import EnvTransform
 
-__all__ = ["PriorDecoder", "PriorSpace"]
+__all__ = ["PriorDecoder", "PriorSpace", "ResidualSampler"]
 
 
 class PriorDecoder(TensorDictModuleBase):
@@ -102,12 +103,8 @@ class PriorDecoder(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the source and the chunk."""
-        missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
-        if missing:
-            raise KeyError(
-                f"PriorDecoder needs the keys {self.in_keys}; missing: {missing}. PriorAnchor writes the "
-                "anchor in an environment and the agent the residual"
-            )
+        hint = ". PriorAnchor writes the anchor in an environment and the agent the residual"
+        check_keys(tensordict, self.in_keys, "PriorDecoder", hint)
         anchor, delta = tensordict.get(keys.ANCHOR), tensordict.get(keys.DELTA)
         expected = (self.prediction_length, self.action_dim or anchor.shape[-1])
         if tuple(anchor.shape[-2:]) != expected:
@@ -247,3 +244,77 @@ class PriorSpace(EnvTransform):
         for key in self.out_keys:
             observation_spec[key] = anchor.clone()
         return observation_spec
+
+
+ResidualDistribution = Literal["normal", "clipped", "uniform"]
+
+
+class ResidualSampler(TensorDictModuleBase):
+    r"""Draws residuals without an agent, for the warm-up and for distilling the noise critic.
+
+    ``"normal"`` draws :math:`\sigma \varepsilon`, the training prior, which may leave the agent's box;
+    ``"clipped"`` clips it to :math:`[-\delta, \delta]`; ``"uniform"`` draws from :math:`U[-\delta, \delta]`.
+    :math:`\delta` is the decoder's, :math:`\sigma` the typical deviation of the source from the centre of the
+    search: the prior's ``sigma`` around its mean, the start point's share of noise, or 1 around zero.
+
+    ``TensorDictSequential(ResidualSampler(decoder), decoder)`` is a policy for the first steps of a collector
+    (the environment's own random actions would be random *chunks* there).
+
+    Args:
+        decoder: the frozen policy.
+        distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
+            noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
+        generator: source of randomness on the data's device; PyTorch's global one by default.
+
+    Raises:
+        ValueError: for an unknown distribution, or another than ``"uniform"`` for a prior without noise.
+        KeyError: (when called) if the anchor is missing.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, PriorDecoder, ResidualSampler, VelocityMLP, WarmPriorActor
+        >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), delta=0.5)
+        >>> data = TensorDict({"prior": {"anchor": torch.zeros(100, 4, 2)}}, [100])
+        >>> float(ResidualSampler(decoder)(data)["prior", "delta"].abs().max())
+        0.5
+    """
+
+    def __init__(
+        self,
+        decoder: PriorDecoder,
+        *,
+        distribution: ResidualDistribution | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        sigma = residual_sigma(decoder)
+        if distribution is None and has_anchor(decoder):
+            distribution = "clipped" if sigma > 0 else "uniform"
+        elif distribution is None:
+            distribution = "normal"
+        if distribution not in get_args(ResidualDistribution):
+            raise ValueError(
+                f"the distribution must be 'normal', 'clipped' or 'uniform', got {distribution!r}"
+            )
+        if distribution != "uniform" and sigma == 0:
+            raise ValueError(f"a prior without noise leaves 'uniform', got the distribution {distribution!r}")
+        self.distribution = distribution
+        self.sigma = sigma
+        self.delta = decoder.delta
+        self.generator = generator
+        self.in_keys = [keys.ANCHOR]
+        self.out_keys = [keys.DELTA]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the residual."""
+        check_keys(tensordict, self.in_keys, "ResidualSampler", ". PriorAnchor writes it")
+        anchor = tensordict.get(self.in_keys[0])
+        like = {"dtype": anchor.dtype, "device": anchor.device, "generator": self.generator}
+        if self.distribution == "uniform":
+            delta = (2.0 * torch.rand(anchor.shape, **like) - 1.0) * self.delta
+        else:
+            delta = self.sigma * torch.randn(anchor.shape, **like)
+        if self.distribution == "clipped":
+            delta = delta.clamp(-self.delta, self.delta)
+        return tensordict.set(self.out_keys[0], delta)

@@ -19,10 +19,9 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from warmprior import keys
-from warmprior.modules.checks import check_finite, check_positive, check_whole_numbers
-from warmprior.rl.decoder import PriorDecoder
+from warmprior.modules.checks import check_finite, check_keys, check_positive, check_whole_numbers
+from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
 from warmprior.rl.networks import BoxTanhNormal
-from warmprior.rl.residual import ResidualDistribution, ResidualSampler
 
 __all__ = ["DSRLNALoss"]
 
@@ -30,6 +29,11 @@ type Critics = TensorDictModule | list[TensorDictModule]
 
 CRITICS = 2
 """Of each kind, of whose values the smaller counts."""
+
+ELSEWHERE = (
+    ". Data from an environment with PriorSpace hold the chunk under ('next', 'decoded', 'chunk'): "
+    "set_keys(chunk=...)"
+)
 
 
 class DSRLNALoss(LossModule):
@@ -207,15 +211,6 @@ class DSRLNALoss(LossModule):
         needed = dict.fromkeys(unravel_key(key) for module in modules for key in module.in_keys)
         return [key for key in needed if key not in actions]
 
-    def _check_keys(self, tensordict: TensorDictBase, needed: list[NestedKey]) -> None:
-        missing = [key for key in needed if tensordict.get(key, None) is None]
-        if missing:
-            raise KeyError(
-                f"{type(self).__name__} needs the keys {needed}; missing: {missing}. Data from an "
-                'environment with PriorSpace hold the chunk under ("next", "decoded", "chunk"): '
-                "set_keys(chunk=...)"
-            )
-
     def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> None:
         """Choose the discount: ``make_value_estimator(ValueEstimators.TD0, gamma=0.99)``; no other fits."""
         value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
@@ -242,7 +237,7 @@ class DSRLNALoss(LossModule):
 
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """The losses of actor, temperature and action critic on transitions ``[N]``; writes the TD errors."""
-        self._check_keys(tensordict, self._reinforcement_keys())
+        check_keys(tensordict, self._reinforcement_keys(), type(self).__name__, ELSEWHERE)
         weights = self._maybe_get_priority_weight(tensordict)
         alpha = self.log_alpha.exp().detach()
         loss_qvalue, td_error = self._qvalue_loss(tensordict, alpha)
@@ -276,7 +271,7 @@ class DSRLNALoss(LossModule):
 
     def distillation_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss of the noise critic against the action critic, at any states ``[N]``."""
-        self._check_keys(tensordict, self._distillation_keys())
+        check_keys(tensordict, self._distillation_keys(), type(self).__name__)
         weights = self._maybe_get_priority_weight(tensordict)
         with torch.no_grad():
             state = tensordict.select(*self._distillation_keys())

@@ -20,9 +20,8 @@ from tqdm import tqdm
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite
-from warmprior.rl.agent import PriorSpaceAgent
+from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig
 from warmprior.rl.anchor import has_anchor
-from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
 from warmprior.rl.replay_segments import ReplaySegments
 from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state

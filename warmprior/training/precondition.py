@@ -7,9 +7,8 @@ from tensordict import TensorDictBase
 
 from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.network import VelocityNetwork
-from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
+from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
 from warmprior.modules.prior import Prior
-from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.couplings import Coupling
 from warmprior.transforms.window import window_replay_buffer, without_images
 

@@ -253,8 +253,8 @@ def window_replay_buffer(
 ) -> TensorDictReplayBuffer:
     """A replay buffer that samples training windows from demonstrations.
 
-    It stores only the step numbers; :class:`ActionWindow` gathers everything else from ``data``, which
-    is faster than letting the storage read whole steps first.
+    It stores only the step numbers; :class:`ActionWindow` gathers the rest, which is faster than reading
+    whole steps.
 
     Args:
         data: see :func:`window_transforms`.
@@ -267,14 +267,11 @@ def window_replay_buffer(
         ValueError: if ``batch_size < 1``, or see :class:`ActionWindow`.
 
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from warmprior import PreviewPrior, window_replay_buffer
-        >>> data = TensorDict({"observation": torch.zeros(50, 3), "action": torch.zeros(50, 2),
-        ...                    "episode": torch.arange(50) // 25}, [50])
-        >>> batch = window_replay_buffer(data, PreviewPrior(8), batch_size=32).sample()
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> batch = window_replay_buffer(navigation_demonstrations(), PreviewPrior(8), batch_size=32).sample()
         >>> batch["vla_action", "chunk"].shape, batch["observation"].shape
-        (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
+        (torch.Size([32, 16, 1]), torch.Size([32, 2, 9]))
     """
     check_whole_numbers(batch_size=batch_size)
     windows = window_transforms(data, prior, generator=generator, **options)
