@@ -19,9 +19,8 @@ from warmprior.diagnostics.flow import (
 )
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_keys, check_whole_numbers
-from warmprior.modules.interpolant import LinearInterpolant
 from warmprior.modules.network import velocity_field
-from warmprior.modules.ode import integrate
+from warmprior.modules.ode import LinearInterpolant, integrate
 from warmprior.modules.prior import Prior, Source
 
 __all__ = ["branching_bound", "branching_cost", "curvature", "flow_paths"]

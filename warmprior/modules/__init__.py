@@ -2,14 +2,15 @@
 
 from warmprior.modules.actor import PriorSampler, StartPoint, WarmPriorActor
 from warmprior.modules.encoder import ImageEncoder, VisionNetwork, imagenet_weights, load_imagenet
-from warmprior.modules.interpolant import (
+from warmprior.modules.network import ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior.modules.normalize import Normalizer
+from warmprior.modules.ode import (
     BridgeInterpolant,
     Interpolant,
     LinearInterpolant,
+    ODEActor,
+    integrate,
 )
-from warmprior.modules.network import ChiTransformer, VelocityMLP, VelocityNetwork
-from warmprior.modules.normalize import Normalizer
-from warmprior.modules.ode import ODEActor, integrate
 from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
 from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prior, Source
 from warmprior.modules.real_time_chunking import RealTimeChunking

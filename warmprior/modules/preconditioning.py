@@ -12,9 +12,9 @@ from torch.nn.functional import pad
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
-from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
+from warmprior.modules.ode import Interpolant, LinearInterpolant
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
 from warmprior.rotation import HAND_TO_SITE, matrix_to_rotation_6d, quaternion_to_matrix

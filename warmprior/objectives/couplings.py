@@ -16,7 +16,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
-from warmprior.modules.interpolant import BridgeInterpolant
+from warmprior.modules.ode import BridgeInterpolant
 
 __all__ = ["BridgeCoupling", "Coupling", "OTCoupling", "ReflowCoupling"]
 

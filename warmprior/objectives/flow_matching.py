@@ -16,9 +16,8 @@ from torchrl.objectives.common import LossModule
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_keys
-from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import network_observation, velocity_field
-from warmprior.modules.ode import integrate
+from warmprior.modules.ode import Interpolant, LinearInterpolant, integrate
 from warmprior.objectives.couplings import Coupling
 
 __all__ = [

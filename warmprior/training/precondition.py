@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 
-from warmprior.modules.interpolant import Interpolant
 from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.ode import Interpolant
 from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
 from warmprior.modules.prior import Prior
 from warmprior.objectives.couplings import Coupling
