@@ -39,7 +39,8 @@ class PriorSpaceConfig:
         nfe: network evaluations per decoded chunk.
         updates: updates per vector step (one decision of every parallel environment).
         noise_critic_steps: distillation updates per vector step, DSRL-NA only.
-        distillation: where the noise critic learns, DSRL-NA only, see :class:`~warmprior.ResidualSampler`.
+        distillation: where the noise critic learns, see ResidualSampler, DSRL-NA only; by default in the
+            clipped source around a mean, and in the whole source around zero.
         batch_size: transitions per update.
         learning_rate: of actor, critics and temperature.
         tau: of the target critics' averaging.
