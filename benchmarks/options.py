@@ -28,7 +28,7 @@ from warmprior.io.files import check_writable, exclusive, read_json, write_atomi
 from warmprior.io.machine import facts_of_machine
 from warmprior.io.script import run_script
 from warmprior.modules import imagenet_weights
-from warmprior.modules.grid import check_grid
+from warmprior.modules.ode import check_grid
 from warmprior.training import DataOptions, NetworkOptions, TrainingConfig
 from warmprior.training.options import GENERATED, PAPER, PRETRAINED, check_counts, is_simulated
 

@@ -21,7 +21,7 @@ from pandas import DataFrame, Series
 from paper import paper_success
 
 from warmprior import diagnostics as stats
-from warmprior.diagnostics.source_leak import INNER_STEP_BOUND, LEAK_BOUND
+from warmprior.diagnostics.leaks import INNER_STEP_BOUND, LEAK_BOUND
 from warmprior.io.files import read_lines, write_atomic
 from warmprior.io.script import PartialFailure
 

@@ -68,8 +68,8 @@ def advance(history: TensorDictBase, chunk: Tensor, executed: Tensor) -> TensorD
     Examples:
         >>> import torch
         >>> from warmprior.history import advance, cold_history
-        >>> history = cold_history([], 2, 4, 1)
-        >>> history = advance(history, torch.arange(1.0, 5.0)[:, None], torch.tensor([1]))
+        >>> chunk = torch.arange(1.0, 5.0)[:, None]
+        >>> history = advance(cold_history([], 2, 4, 1), chunk, torch.tensor([1]))
         >>> {key: value.flatten().tolist() for key, value in sorted(history.items())}
         {'actions': [0.0, 1.0], 'forecast': [2.0, 3.0, 4.0, 0.0], 'forecast_steps': [3], 'steps': [1]}
     """
@@ -112,9 +112,8 @@ def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: 
         >>> import torch
         >>> from warmprior.history import window_history
         >>> target = torch.arange(1.0, 5.0)[:, None]
-        >>> history = window_history(torch.zeros(2, 1), torch.tensor([0]), target, chunk_length=2)
-        >>> history["forecast"].flatten().tolist(), history["forecast_steps"].tolist()
-        ([1.0, 2.0, 0.0, 0.0], [2])
+        >>> window_history(torch.zeros(2, 1), torch.tensor([0]), target, 2)["forecast"].flatten().tolist()
+        [1.0, 2.0, 0.0, 0.0]
     """
     known = target.shape[-2] - chunk_length
     forecast = torch.cat([target[..., :known, :], torch.zeros_like(target[..., known:, :])], -2)
@@ -123,15 +122,13 @@ def window_history(before: Tensor, steps: Tensor, target: Tensor, chunk_length: 
 
 
 def without(history: TensorDictBase, rows: Tensor) -> TensorDict:
-    """A history ``[*B]`` with some rows, bool ``[*B]``, made cold.
-
-    They begin new episodes, or are windows whose history is withheld.
+    """A history ``[*B]`` with some rows, bool ``[*B]``, made cold: of new episodes, or withheld in training.
 
     Examples:
         >>> import torch
         >>> from warmprior.history import window_history, without
-        >>> history = window_history(
-        ...     torch.ones(2, 1, 1), torch.ones(2, 1, dtype=torch.int64), torch.ones(2, 2, 1), 1)
+        >>> ones = torch.ones(2, 2, 1)
+        >>> history = window_history(ones[:, :1], torch.ones(2, 1, dtype=torch.int64), ones, chunk_length=1)
         >>> without(history, torch.tensor([True, False]))["forecast_steps"].flatten().tolist()
         [0, 1]
     """

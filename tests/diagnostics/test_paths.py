@@ -4,7 +4,8 @@ import torch
 
 from tests.diagnostics.fields import D_A, Field, H, batch, policy, remember
 from warmprior import PastPrior, PreviewPrior, RealTimeChunking, WarmPriorActor
-from warmprior.diagnostics.paths import deployed_history, flow_paths
+from warmprior.diagnostics.curvature import flow_paths
+from warmprior.diagnostics.flow import deployed_history
 
 
 def test_paths_start_at_the_source_and_follow_euler():

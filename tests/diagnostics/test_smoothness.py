@@ -14,7 +14,7 @@ from tensordict import TensorDict
 
 from warmprior import GaussianPrior, HistoryObservation, PastPrior, VelocityMLP, WarmPriorActor, keys
 from warmprior.diagnostics import executed_actions, smoothness
-from warmprior.diagnostics.history_shift import HistoryShift
+from warmprior.diagnostics.leaks import HistoryShift
 from warmprior.history import cold_history
 
 

@@ -64,9 +64,7 @@ def squashed(actor, state, delta):
     [
         ({}, 0.5),
         ({}, 1.5),
-        ({"backup": "mean"}, 0.5),
         ({"backup_entropy": False}, 0.5),
-        ({"bootstrap_timeouts": True}, 0.5),
         ({"discount": "decision"}, 0.5),
         ({"alpha_init": 0.3, "target_entropy": -2.0}, 0.5),
     ],
@@ -80,26 +78,22 @@ def test_losses_by_hand(prior_class, options, delta):
     data = batch(prior)
     actor, q, q_target, q_noise = networks(loss)
     alpha, entropy = options.get("alpha_init", 1.0), options.get("target_entropy", 0.0)
-    combine = torch.mean if options.get("backup") == "mean" else torch.amin
 
     torch.manual_seed(5)
     after = data["next"]
     with torch.no_grad():
         residual, log_prob = squashed(actor, after, delta)
         chunk = decode(loss, after["observation"], after["prior", "anchor"] + residual)
-        v = combine(
-            torch.stack([value(c, OBSERVATION=after["observation"], CHUNK=chunk) for c in q_target]), 0
-        )
+        v = torch.stack([value(c, OBSERVATION=after["observation"], CHUNK=chunk) for c in q_target]).amin(0)
         if options.get("backup_entropy", True):
             v = v - alpha * log_prob
         k = after["executed_steps"][:, 0] if options.get("discount") != "decision" else 1
-        end = after["terminated" if options.get("bootstrap_timeouts") else "done"][:, 0]
-        y = after["reward"][:, 0] + GAMMA**k * ~end * v
+        y = after["reward"][:, 0] + GAMMA**k * ~after["done"][:, 0] * v
         errors = [value(c, OBSERVATION=data["observation"], CHUNK=data["vla_action", "chunk"]) - y for c in q]
         loss_q = sum(0.5 * e.square().mean() for e in errors)
         residual, log_prob = squashed(actor, data, delta)
         inputs = {"OBSERVATION": data["observation"], "ANCHOR": data["prior", "anchor"]}
-        v = combine(torch.stack([value(c, **inputs, DELTA=residual) for c in q_noise]), 0)
+        v = torch.stack([value(c, **inputs, DELTA=residual) for c in q_noise]).amin(0)
         loss_actor = (alpha * log_prob - v).mean()
         loss_alpha = (-math.log(alpha) * (log_prob + entropy)).mean()
 

@@ -19,7 +19,6 @@ from warmprior import DSRLNALoss, PastPrior, keys, make_prior_space_actor, make_
         ("vla_action", "chunk"),
         ("next", "prior", "anchor"),
         ("next", "executed_steps"),
-        ("next", "terminated"),
     ],
 )
 def test_buffer_of_another_wiring(missing):
@@ -71,7 +70,6 @@ def test_networks_that_do_not_fit():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"backup": "max"}, "backup must be 'min' or 'mean'"),
         ({"noise_critic_steps": 0}, "noise_critic_steps must be a whole number of at least 1"),
         ({"alpha_init": 0.0}, "alpha_init must be a finite number > 0"),
         ({"distillation": "laplace"}, "distribution must be"),

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from warmprior.rl.replay_segments import ReplaySegments
+from warmprior.rl.training import ReplaySegments
 
 
 def batch(n, start=0):

@@ -132,7 +132,7 @@ def test_chunks_executed_in_part_are_refused_where_the_mean_would_hold_them(tmp_
         ({"gamma": 1.5}, r"gamma must lie in \(0, 1\], got 1.5"),
         ({"noise_critic_steps": 0}, "noise_critic_steps must be a whole number of at least 1"),
         ({"reward_offset": float("nan")}, "reward_offset must be a finite number"),
-        ({"algorithm": "dsrl-sac", "backup_entropy": False}, "dsrl-sac has .* leave them out"),
+        ({"algorithm": "dsrl-sac", "backup_entropy": False}, "dsrl-sac has .* leave it out"),
     ],
 )
 def test_bad_recipes(options, message):

@@ -97,10 +97,10 @@ def hand_rollout(decisions, lengths):
     return result
 
 
-def check_transitions(training, *, lengths=LENGTHS, offset=1.0, time_outs=False):
+def check_transitions(training, *, lengths=LENGTHS, offset=1.0):
     """What a training of WP-Past stored is what its environments do, with episodes of these lengths.
 
-    The offset is that of rewards; time-outs may count apart from terminations.
+    The offset is that of rewards.
     """
     stored = training.buffer[:]
     expected = hand_rollout(len(stored) // len(lengths), lengths)
@@ -118,7 +118,7 @@ def check_transitions(training, *, lengths=LENGTHS, offset=1.0, time_outs=False)
         assert float(following["reward"]) == pytest.approx(reward - offset * executed)
         assert following["done"] == ended
         # DSRL takes time-outs for terminations.
-        assert following["terminated"] == (ended and not time_outs)
+        assert following["terminated"] == ended
         # The mean of WP-Past is what was executed last.
         if executed == H:
             assert torch.equal(following["prior", "anchor"], row["vla_action", "chunk"])

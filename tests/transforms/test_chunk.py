@@ -187,14 +187,11 @@ class VectorEnv(EnvBase):
 
 @pytest.mark.parametrize("gamma", [1.0, 0.9, 0.0])
 @pytest.mark.parametrize(("low", "high", "reward"), [(0.0, 1.0, 1.0), (-1.0, 0.0, -1.0), (-2.0, -1.0, -1.0)])
-def test_reward_spec_is_that_of_the_sum(low, high, reward, gamma):
+def test_the_sum_may_leave_the_bounds_of_one_reward(low, high, reward, gamma):
     base = VectorEnv(Bounded(low, high, (2, 1)), reward=reward)
     env = TransformedEnv(base, ChunkStep(3, gamma=gamma))
     check_env_specs(env)
     total = 1 + gamma + gamma**2
-    space = env.full_reward_spec["reward"].space
-    torch.testing.assert_close(space.low, torch.full((2, 1), min(low, low * total)))
-    torch.testing.assert_close(space.high, torch.full((2, 1), max(high, high * total)))
     found = env.rollout(2)["next", "reward"]
     torch.testing.assert_close(found[:, 0], torch.full((2, 1), reward * total))
     torch.testing.assert_close(found[1, 1], torch.full((1,), reward))

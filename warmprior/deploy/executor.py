@@ -24,7 +24,7 @@ from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import with_leftover
 from warmprior.transforms.delay import check_delay
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import HistoryObservation
 
 __all__ = ["AsyncExecutor"]
 
@@ -43,24 +43,19 @@ class AsyncExecutor:
     most ``timeout`` seconds and raises ``TimeoutError``: hold the robot, and call it again.
 
     Args:
-        actor: a :class:`~warmprior.WarmPriorActor`, or any module that reads ``"observation"`` (``("prior",
-            "observation")`` for one that includes the last actions), ``"history"`` and ``("rtc", "delay")``
-            (see :mod:`warmprior.keys`), and writes a chunk
-            ``[P, d_a]``; set to evaluation mode. It is called without batch dimensions, one call at a time.
-
-    Keyword Args:
-        prior: the policy's prior, of which only the lengths matter; that of a
-            :class:`~warmprior.WarmPriorActor` by default.
-        execute: control steps from one decision to the next; by default ``H``, or as many as ``delay``
-            allows.
+        actor: a :class:`~warmprior.WarmPriorActor`, or any module that reads ``"observation"`` (or
+            ``("prior", "observation")``, which includes the last actions), ``"history"`` and ``("rtc",
+            "delay")`` and writes a chunk ``[P, d_a]``; set to evaluation mode. It is called without batch
+            dimensions.
+        prior: the policy's prior, of which only the lengths matter; the actor's own by default.
+        execute: control steps between decisions; by default ``H``, or as many as ``delay`` allows.
         delay: expected delay in control steps until delays were measured.
         window: how many last decisions to take the largest delay of.
         observation_steps: ``To``.
         normalizer: converts raw observations and actions, such as the actor's own; by default they are in the
             policy's units.
         timeout: seconds to wait for a late chunk once no action is left; ``None`` for as long as it takes.
-        latency: to simulate: chunks are computed in the calling thread and take effect this many control
-            steps later.
+        latency: to simulate: chunks are computed in the calling thread and take effect this many steps later.
         pool: where to compute; by default in one thread, which :meth:`close` ends.
         action_dim: ``d_a``; that of the actor's network by default.
 
@@ -69,9 +64,9 @@ class AsyncExecutor:
             provide.
 
     Examples:
-        >>> from warmprior.deploy import AsyncExecutor
         >>> import torch
         >>> from warmprior import PastPrior, RealTimeChunking, VelocityMLP, WarmPriorActor
+        >>> from warmprior.deploy import AsyncExecutor
         >>> actor = WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8), guidance=RealTimeChunking())
         >>> with AsyncExecutor(actor, execute=6, latency=2) as executor:
         ...     actions = [executor.act(torch.zeros(3)) for _ in range(21)]
@@ -159,13 +154,7 @@ class AsyncExecutor:
         self._chunk, self._left, self._executed = self._history["forecast"], 0, 0
 
     def act(self, observation: Tensor | TensorDictBase) -> Tensor:
-        """The action of this control step.
-
-        Args:
-            observation: of this step, ``[d_o]``, or a tensordict ``[]`` of several entries.
-
-        Returns:
-            ``[d_a]``, on the CPU.
+        """The action of this control step, ``[d_a]`` on the CPU, at ``[d_o]``, or a tensordict ``[]``.
 
         Raises:
             TimeoutError: if no action is left, and the next chunk is not ready in time.
@@ -284,13 +273,13 @@ class AsyncExecutor:
                 ) from late
         self._collect()
 
-    def close(self, *, wait: bool = True) -> None:
-        """End the thread, after a decision under way if ``wait``; a pool that was given is left as it is."""
+    def close(self) -> None:
+        """End the thread, after a decision under way; a pool that was given is left as it is."""
         self._closed = True
         if self._pending is not None:
             self._pending.cancel()
         if self._owned is not None:
-            self._owned.shutdown(wait=wait, cancel_futures=True)
+            self._owned.shutdown(cancel_futures=True)
 
     def __enter__(self) -> Self:
         return self

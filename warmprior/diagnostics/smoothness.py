@@ -25,19 +25,10 @@ class Smoothness:
         jerk: mean norm of the third difference of the executed actions, per step cubed.
         boundaries: number of boundaries.
 
-    See Also:
-        :func:`~warmprior.diagnostics.smoothness`: measures it.
-
     Examples:
-        >>> from warmprior.diagnostics import smoothness
-        >>> import torch
-        >>> from tensordict import TensorDict
-        >>> rollout = TensorDict({
-        ...     "vla_action": {"chunk": torch.tensor([[[0.0], [1.0]], [[4.0], [5.0]]])},
-        ...     "next": {"executed_steps": torch.tensor([[2], [2]])}}, [2])
-        >>> found = smoothness(rollout)
-        >>> found.boundary_jump, found.inner_jump, found.jump_ratio, found.boundaries
-        (3.0, 1.0, 3.0, 1)
+        >>> from warmprior.diagnostics import Smoothness
+        >>> Smoothness(boundary_jump=3.0, inner_jump=1.5, jerk=0.1, boundaries=1).jump_ratio
+        2.0
     """
 
     boundary_jump: float
@@ -56,23 +47,22 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
 
     Args:
         rollout: ``[*B, D]`` decisions, time last, with ``("vla_action", "chunk")`` ``[*B, D, P, d_a]``,
-            ``("next", "executed_steps")`` ``[*B, D, 1]`` and, if episodes end inside,
-            ``("next", "done")``; where chunks take effect late, also the delay that :class:`InferenceDelay`
-            writes.
+            ``("next", "executed_steps")`` ``[*B, D, 1]`` and, if episodes end inside, ``("next", "done")``;
+            where chunks take effect late, also the delay that :class:`InferenceDelay` writes.
 
     Returns:
-        The actions ``[*B, T, d_a]``, filled up with NaN where a row executed fewer than the longest;
-        the index of the decision that predicted them, int64 ``[*B, T]``, -1 where filled up; and the index
-        of their episode in the row, likewise.
+        The actions ``[*B, T, d_a]``, filled up with NaN where a row executed fewer than the longest; the
+        index of the decision that predicted them, int64 ``[*B, T]``, -1 where filled up; and that of their
+        episode, likewise.
 
     Raises:
         KeyError: if a key is missing.
         ValueError: if there is no time dimension, or an executed action is NaN or infinite.
 
     Examples:
-        >>> from warmprior.diagnostics import executed_actions
         >>> import torch
         >>> from tensordict import TensorDict
+        >>> from warmprior.diagnostics import executed_actions
         >>> rollout = TensorDict({"vla_action": {"chunk": torch.arange(6.0).view(2, 3, 1)},
         ...                       "next": {"executed_steps": torch.tensor([[2], [3]])}}, [2])
         >>> actions, decision, _ = executed_actions(rollout)
@@ -116,28 +106,23 @@ def executed_actions(rollout: TensorDictBase) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def smoothness(rollout: TensorDictBase) -> Smoothness:
-    """Jumps at and inside chunk boundaries, and jerk.
+    """Jumps at and inside chunk boundaries, and jerk, of a rollout (:func:`executed_actions`).
 
-    Args:
-        rollout: see :func:`executed_actions`.
-
-    Returns:
-        Means over all boundaries, steps and rows, in normalised action units.
+    Means over all boundaries, steps and rows, in normalised action units.
 
     Raises:
         KeyError: if a key is missing.
         ValueError: if the rollout has no chunk boundary, or actions are NaN or infinite.
 
     Examples:
-        >>> from warmprior.diagnostics import smoothness
         >>> import torch
         >>> from tensordict import TensorDict
+        >>> from warmprior.diagnostics import smoothness
         >>> rollout = TensorDict({
         ...     "vla_action": {"chunk": torch.tensor([[[1.0], [1.5]], [[-1.0], [-1.5]]])},
         ...     "next": {"executed_steps": torch.tensor([[2], [2]])}}, [2])
-        >>> result = smoothness(rollout)
-        >>> result.boundary_jump, result.inner_jump
-        (2.5, 0.5)
+        >>> smoothness(rollout)
+        Smoothness(boundary_jump=2.5, inner_jump=0.5, jerk=..., boundaries=1)
     """
     actions, decision, episode = executed_actions(rollout)
     together = (episode[..., 1:] == episode[..., :-1]) & (episode[..., 1:] >= 0)

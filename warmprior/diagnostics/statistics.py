@@ -39,9 +39,6 @@ def success_posterior(successes: int, episodes: int) -> Any:
         ValueError: if not ``0 <= successes <= episodes``.
         ImportError: if scipy is missing.
 
-    See Also:
-        :func:`~warmprior.diagnostics.probability_better`: compares two rates.
-
     Examples:
         >>> from warmprior.diagnostics import success_posterior
         >>> round(float(success_posterior(9, 10).mean()), 3)  # (9 + 1) / (10 + 2)
@@ -63,24 +60,12 @@ def probability_better(successes_a: int, episodes_a: int, successes_b: int, epis
             {(\beta_a + i)\, B(1 + i, \beta_a)\, B(\alpha_b, \beta_b)},
 
     the distribution function of a beta negative binomial. Pooled episodes of several training seeds are not
-    quite independent; the probability is then too extreme.
-
-    Args:
-        successes_a: ``k`` of ``a``.
-        episodes_a: ``n`` of ``a``.
-        successes_b: ``k`` of ``b``.
-        episodes_b: ``n`` of ``b``.
-
-    Raises:
-        ValueError: if not ``0 <= successes <= episodes``, for either.
-        ImportError: if scipy is missing.
+    quite independent; the probability is then too extreme. Errors are those of :func:`success_posterior`.
 
     Examples:
         >>> from warmprior.diagnostics import probability_better
-        >>> round(probability_better(18, 20, 12, 20), 3)
-        0.984
-        >>> round(probability_better(0, 0, 0, 0), 3)  # nothing is known
-        0.5
+        >>> round(probability_better(18, 20, 12, 20), 3), round(probability_better(0, 0, 0, 0), 3)
+        (0.984, 0.5)
     """
     (alpha_a, beta_a), (alpha_b, beta_b) = (
         success_posterior(*counts).args for counts in ((successes_a, episodes_a), (successes_b, episodes_b))
@@ -108,30 +93,24 @@ def top_k_mean(rates: Sequence[float], k: int) -> float:
 def paired_probability_better(wins: int, losses: int) -> float:
     r"""Posterior probability that ``a`` beats ``b`` in an episode that only one of them solves.
 
-    Episodes from the same seed with equal outcomes do not say which is better. Under a uniform prior the
-    share of wins among the others is
-    :math:`\mathrm{Beta}(w + 1, l + 1)`, which exceeds one half with probability
+    Under a uniform prior the share of ``wins`` (episodes that ``a`` alone solves, :math:`w`) among these and
+    ``losses`` (that ``b`` alone solves, :math:`l`) is :math:`\mathrm{Beta}(w + 1, l + 1)`, which exceeds one
+    half with probability
 
     .. math::
         P = 2^{-(w + l + 1)} \sum_{i=0}^{w} \binom{w + l + 1}{i},
 
-    the sign test's Bayesian counterpart. It is sharper than :func:`probability_better` where episodes
-    differ in difficulty.
-
-    Args:
-        wins: ``w``, episodes that ``a`` alone solves.
-        losses: ``l``, episodes that ``b`` alone solves.
+    the sign test's Bayesian counterpart. It is sharper than :func:`probability_better` where episodes of the
+    same seeds differ in difficulty.
 
     Raises:
-        ValueError: if one is negative.
+        ValueError: if a count is negative.
         ImportError: if scipy is missing.
 
     Examples:
         >>> from warmprior.diagnostics import paired_probability_better
-        >>> round(paired_probability_better(3, 0), 4)  # 15 / 16
-        0.9375
-        >>> round(paired_probability_better(4, 4), 4)
-        0.5
+        >>> round(paired_probability_better(3, 0), 4), round(paired_probability_better(4, 4), 4)  # 15 / 16
+        (0.9375, 0.5)
     """
     if wins < 0 or losses < 0:
         raise ValueError(f"need counts of at least 0, got {wins} and {losses}")
@@ -154,24 +133,19 @@ def bootstrap_ratio(
         numerator: ``[n]``.
         denominator: ``[n]``, of the same observations.
         groups: the group of each, int64 ``[n]``; its episode, usually.
-
-    Keyword Args:
         generator: source of randomness on the CPU; PyTorch's global one by default.
 
     Returns:
-        The ratio, the lower and the upper end of its interval; NaN if nothing counts, and a NaN
-        interval for a single group.
+        The ratio, the lower and the upper end of its interval; NaN if nothing counts, and a NaN interval for
+        a single group.
 
     Raises:
         ValueError: if the shapes differ.
         ImportError: if scipy is missing.
 
-    See Also:
-        :func:`~warmprior.diagnostics.curvature`: a measure whose ratio it judges.
-
     Examples:
-        >>> from warmprior.diagnostics import bootstrap_ratio
         >>> import torch
+        >>> from warmprior.diagnostics import bootstrap_ratio
         >>> episode = torch.arange(100) // 10
         >>> x = 1.0 + episode.double()
         >>> bootstrap_ratio(2 * x, x, episode)

@@ -15,7 +15,7 @@ from warmprior.envs.robosuite import RobosuiteEnv
 from warmprior.keys import CONDITIONED
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.transforms.absolute_actions import AbsoluteActions
-from warmprior.transforms.camera_images import CameraImages
+from warmprior.transforms.images import CameraImages
 from warmprior.transforms.policy import policy_transforms
 
 __all__ = [
@@ -45,20 +45,14 @@ def environment_description(
         actions: those of the policy: the environment's own pose deltas, or absolute poses (see
             :class:`~warmprior.transforms.AbsoluteActions`).
         images: of a policy that sees some: ``"cameras"`` and ``"size"``, see
-            :class:`~warmprior.transforms.CameraImages`, ``"fast_rendering"``, and ``"low_dim_keys"``, what
-            it sees besides, see :class:`RobosuiteEnv`.
+            :class:`~warmprior.transforms.CameraImages`, ``"fast_rendering"``, and ``"low_dim_keys"``, what it
+            sees besides, see :class:`RobosuiteEnv`.
 
     Examples:
-        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.envs import environment_description
-        >>> from warmprior.envs.description import environment_name
-        >>> kept = environment_description({"env_name": "Lift", "env_kwargs": {}}, "ph", observation_steps=2)
-        >>> kept
+        >>> environment_description({"env_name": "Lift", "env_kwargs": {}}, "ph", observation_steps=2)
         {'robosuite': {'env_args': {'env_name': 'Lift', 'env_kwargs': {}}, 'style': 'ph'},
          'observation_steps': 2}
-        >>> network = VelocityMLP(7, 19, prediction_length=8, hidden_dim=8)
-        >>> environment_name(WarmPriorActor(network, PastPrior(8), environment=kept))
-        'Lift'
     """
     description: dict[str, Any] = {
         "robosuite": {"env_args": dict(env_args), "style": style},
@@ -74,10 +68,9 @@ def environment_description(
 def robosuite_parts(
     description: Mapping[str, Any],
 ) -> tuple[Callable[..., RobosuiteEnv], dict[str, Transform]]:
-    """A function of further options of :class:`RobosuiteEnv`, and the transforms next to it.
+    """A function of further options of :class:`RobosuiteEnv`, and the transforms next to it, by argument.
 
-    The latter are arguments of :func:`~warmprior.policy_transforms`. A ``ValueError`` if the environment
-    takes no pose deltas, from which absolute actions are made.
+    A ``ValueError`` if the environment takes no pose deltas, from which absolute actions are made.
     """
     options: dict[str, Any] = dict(description["robosuite"])
     transforms: dict[str, Transform] = {}
@@ -95,8 +88,7 @@ def robosuite_parts(
 def environment_parts(actor: WarmPriorActor) -> tuple[Callable[..., RobosuiteEnv], Callable[[], Compose]]:
     """What builds the environment that a policy was made for, and what builds the policy's transforms.
 
-    Functions of further options of :class:`RobosuiteEnv`, and of nothing. A ``ValueError`` if the policy
-    keeps no description of an environment.
+    A ``ValueError`` if the policy keeps no description of an environment.
     """
     description: Any = actor.environment
     if not _is_complete(description):
@@ -129,13 +121,8 @@ def environment_of(actor: WarmPriorActor, **options: Any) -> TransformedEnv:
         ValueError: if the policy keeps no description of one.
 
     Examples:
-        >>> from warmprior import WarmPriorActor
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
         >>> from warmprior.envs import environment_of
-        >>> from warmprior.training import load_policy
-        >>> actor = load_policy("policy_010000")  # doctest: +SKIP
-        >>> environment_of(actor).rollout(10, actor)["next", "success"].any()  # doctest: +SKIP
-        tensor(True)
-        >>> from warmprior import PastPrior, VelocityMLP
         >>> environment_of(WarmPriorActor(VelocityMLP(2, 3, 8), PastPrior(8)))
         Traceback (most recent call last):
             ...

@@ -60,29 +60,28 @@ def _modernize_controller(config: dict[str, Any], absolute: bool) -> dict[str, A
 def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> dict[str, Any]:
     """Rewrite the ``env_args`` of any robomimic file for robosuite 1.5.
 
-    :doc:`/data` has a table of what changes. Some files published for 1.5 still carry the old
-    description, so what the file contains decides, not its version. The dynamics of old data are kept
+    :doc:`/data` has a table of what changes. Some files published for 1.5 still carry the old description, so
+    what the file contains decides, not its version. The dynamics of old data are kept
     (``lite_physics=False``). Applying the function twice changes nothing more.
 
     Args:
-        env_args: the parsed JSON of the attribute ``data.attrs["env_args"]``: a dict with
-            ``env_name`` and ``env_kwargs``. Not modified.
-        absolute: make the environment take absolute poses in the world frame
-            (see :func:`absolute_to_env_action`) instead of what the file says.
+        env_args: the parsed JSON of the attribute ``data.attrs["env_args"]``, with ``env_name`` and
+            ``env_kwargs``. Not modified.
+        absolute: make the environment take absolute poses in the world frame (see
+            :func:`absolute_to_env_action`) instead of what the file says.
 
     Returns:
         A deep copy, from which ``robosuite.make(new["env_name"], **new["env_kwargs"])`` works.
 
     Raises:
-        ValueError: if ``env_name`` or ``env_kwargs`` is missing, or ``absolute`` is asked of a
-            controller other than ``OSC_POSE``.
+        ValueError: if ``env_name`` or ``env_kwargs`` is missing, or ``absolute`` is asked of a controller
+            other than ``OSC_POSE``.
 
     Examples:
         >>> from warmprior.envs import modernize_env_args
         >>> old = {"type": "OSC_POSE", "damping": 1, "control_delta": True}
         >>> new = modernize_env_args(
-        ...     {"env_name": "Lift", "env_kwargs": {"robots": ["Panda"], "controller_configs": old}}
-        ... )
+        ...     {"env_name": "Lift", "env_kwargs": {"robots": ["Panda"], "controller_configs": old}})
         >>> arm = new["env_kwargs"]["controller_configs"]["body_parts"]["right"]
         >>> arm["damping_ratio"], arm["input_type"], arm["input_ref_frame"]
         (1, 'delta', 'world')
@@ -113,7 +112,7 @@ def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> d
 
 
 def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
-    """Say in which units and frame an environment reads its pose deltas.
+    """In which units and frame an environment reads its pose deltas.
 
     ``output_max`` ``[6]`` float64, what an input of 1 means (3 in metres, 3 in radians), and
     ``base_rotation`` ``[arms, 3, 3]`` float64, from the frame of the deltas to the world.
@@ -124,9 +123,8 @@ def delta_conventions(env_args: Mapping[str, Any]) -> tuple[Tensor, Tensor]:
     Examples:
         >>> from warmprior.envs import delta_conventions
         >>> arm = {"type": "OSC_POSE", "output_max": [0.05] * 3 + [0.5] * 3}
-        >>> output_max, base_rotation = delta_conventions(
-        ...     {"env_name": "Lift", "env_kwargs": {"robots": "Panda", "controller_configs": arm}}
-        ... )
+        >>> kwargs = {"robots": "Panda", "controller_configs": arm}
+        >>> output_max, base_rotation = delta_conventions({"env_name": "Lift", "env_kwargs": kwargs})
         >>> output_max.tolist(), base_rotation.shape
         ([0.05, 0.05, 0.05, 0.5, 0.5, 0.5], torch.Size([1, 3, 3]))
     """
@@ -172,23 +170,20 @@ def absolute_actions(
     """Turn pose deltas into the poses they ask for, in the world frame.
 
     The goal position is ``eef_pos + output_max[:3] * clip(delta)`` and the goal orientation
-    ``exp(output_max[3:] * clip(turn)) @ R_site``. ``R_site`` is the frame of the gripper site;
-    robomimic's ``robot0_eef_quat`` is that of the hand body, 90 degrees away, and is converted
-    here.
+    ``exp(output_max[3:] * clip(turn)) @ R_site``. ``R_site`` is the frame of the gripper site; robomimic's
+    ``robot0_eef_quat`` is that of the hand body, 90 degrees away, and is converted here.
 
     Args:
-        actions: ``[..., 7]`` or, for two arms, ``[..., 14]``: position delta, rotation delta and
-            gripper.
+        actions: ``[..., 7]`` or, for two arms, ``[..., 14]``: position delta, rotation delta and gripper.
         eef_pos: ``[..., 3]`` or ``[..., 6]`` gripper positions before the action, in metres.
-        eef_quat: ``[..., 4]`` or ``[..., 8]`` hand orientations before the action, ``(x, y, z,
-            w)``.
+        eef_quat: ``[..., 4]`` or ``[..., 8]`` hand orientations before the action, ``(x, y, z, w)``.
         output_max: ``[6]``, what an input of 1 means, in metres and radians.
-        base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; ``None`` if they
-            are in the world frame already (see :func:`delta_conventions`).
+        base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; ``None`` if they are in it
+            (see :func:`delta_conventions`).
 
     Returns:
-        ``[..., 10]`` or ``[..., 20]`` in the dtype of ``actions``: per arm the position in metres,
-        the first two rows of the rotation matrix, and the gripper.
+        ``[..., 10]`` or ``[..., 20]`` in the dtype of ``actions``: per arm the position in metres, the first
+        two rows of the rotation matrix, and the gripper.
 
     Raises:
         ValueError: if a width does not belong to one or two arms, or the widths disagree.
@@ -220,12 +215,12 @@ def absolute_to_env_action(actions: Tensor) -> Tensor:
     """Turn absolute actions into what an environment with absolute inputs takes.
 
     Args:
-        actions: ``[..., 10]`` or ``[..., 20]``, as :func:`absolute_actions` returns them or as a
-            policy predicts them: the six rotation numbers are orthonormalised.
+        actions: ``[..., 10]`` or ``[..., 20]``, as :func:`absolute_actions` returns them or as a policy
+            predicts them: the six rotation numbers are orthonormalised.
 
     Returns:
-        ``[..., 7]`` or ``[..., 14]`` in the dtype of ``actions``: per arm the position in metres,
-        the rotation vector in radians and the gripper.
+        ``[..., 7]`` or ``[..., 14]`` in the dtype of ``actions``: per arm the position in metres, the
+        rotation vector in radians and the gripper.
 
     Raises:
         ValueError: if the width is neither 10 nor 20.

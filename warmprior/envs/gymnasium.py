@@ -58,18 +58,12 @@ def gym_env(
 
     Args:
         env: a Gymnasium environment whose action is one vector.
-
-    Keyword Args:
         success: name of the ``info`` that says whether the task is solved; bool ``[1]`` under the same key.
         measures: names of further numbers in ``info``, float32 ``[1]`` each.
-        observation_keys: entries of a dictionary of observations, concatenated in this order; all of them, by
-            name, by default.
+        observation_keys: entries of a dictionary of observations, concatenated in this order; by default all.
 
     Raises:
         KeyError: if there is no such entry.
-
-    See Also:
-        :class:`~warmprior.training.Task`: takes a function that returns this.
 
     Examples:
         >>> import gymnasium

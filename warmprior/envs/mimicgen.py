@@ -47,16 +47,16 @@ def find_mimicgen() -> Path:
 def register_mimicgen() -> None:
     """Make MimicGen's tasks known to ``robosuite.make``. A second call changes nothing.
 
-    The package has to be that of https://github.com/NVlabs/mimicgen, which is not on the package index;
-    the one of that name there is another project, and is refused without being imported.
+    The package has to be that of https://github.com/NVlabs/mimicgen, which is not on the package index; the
+    one of that name there is another project, and is refused without being imported.
 
     Raises:
         ImportError: if the package is missing, another one, or cannot be imported.
 
     Examples:
-        >>> import robosuite  # doctest: +SKIP
         >>> from warmprior.envs.mimicgen import register_mimicgen
         >>> register_mimicgen()  # doctest: +SKIP
+        >>> import robosuite  # doctest: +SKIP
         >>> robosuite.make("Coffee_D0", "Panda")  # doctest: +SKIP
     """
     folder = find_mimicgen()

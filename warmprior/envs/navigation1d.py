@@ -77,11 +77,8 @@ def _features(x: Tensor) -> Tensor:
 def navigation_demonstrations() -> TensorDict:
     """The six demonstrations as contiguous steps ``[384]``, ready for :class:`~warmprior.ActionWindow`.
 
-    Heights lie in [-1, 1] and need no normalisation.
-
-    Returns:
-        TensorDict with ``"observation"`` ``[384, 9]`` (the position, and its sines and cosines),
-        ``"action"`` ``[384, 1]`` (the height) and ``"episode"`` ``[384]``.
+    ``"observation"`` ``[384, 9]`` is the position, with its sines and cosines, ``"action"`` ``[384, 1]`` the
+    height, in [-1, 1] without normalisation, ``"episode"`` ``[384]``.
 
     Examples:
         >>> from warmprior.envs import navigation_demonstrations
@@ -101,7 +98,7 @@ def navigation_demonstrations() -> TensorDict:
 
 
 def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
-    """Whether the straight segments between consecutive points enter an obstacle, bool ``[*B, T - 1]``.
+    """Whether the segments between consecutive points enter an obstacle, bool ``[*B, T - 1]``.
 
     The points are at positions ``[*B, T]``, increasing, and heights ``[*B, T]``.
     """
@@ -120,9 +117,8 @@ def navigation_collides(x: Tensor, y: Tensor) -> Tensor:
 class NavigationEnv(EnvBase):
     """An agent that moves from left to right at constant speed and chooses its height at every step.
 
-    There are no dynamics: the action *is* the height, the position advances by itself, and an episode
-    lasts 64 steps. Inconsistent choices are therefore the policy's own. The environment holds no
-    state: what it needs arrives in the tensordict.
+    There are no dynamics: the action *is* the height, the position advances by itself, and an episode lasts
+    64 steps. The environment holds no state: what it needs arrives in the tensordict.
 
     =================  ==================  ===============================================
     key                shape               meaning
@@ -136,15 +132,13 @@ class NavigationEnv(EnvBase):
     ``"success"``      ``[*B, 1]`` bool    whether it ended without collision, on the route
     =================  ==================  ===============================================
 
-    With a route it is a small task with a sparse reward, solved on that route alone. The demonstrations know
-    the goal as little as a policy cloned from them does, so that such a policy succeeds on a share of the
-    episodes and reinforcement learning has something to find. Then an episode ends at the first collision,
-    and at the first obstacle passed on the wrong side, with reward 0.
+    With a route it is a small task with a sparse reward: an episode ends at the first collision, and at the
+    first obstacle passed on the wrong side, with reward 0. The demonstrations do not know the route, so that
+    a policy cloned from them succeeds on a share of the episodes and reinforcement learning has something to
+    find.
 
     Args:
         route: for each of the two obstacles ``1`` (pass above) or ``-1`` (below); either by default.
-
-    Keyword Args:
         batch_size: ``*B``, independent agents.
         device: of all tensors.
 
@@ -156,11 +150,9 @@ class NavigationEnv(EnvBase):
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import NavigationEnv
         >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), GaussianPrior(4))
-        >>> transforms = policy_transforms(actor.prior, observation_steps=1)
-        >>> env = TransformedEnv(NavigationEnv(batch_size=[32]), transforms)
-        >>> rollout = env.rollout(100, actor)  # 64 steps are 16 decisions
-        >>> rollout.shape, bool(rollout["next", "done"][:, -1].all())
-        (torch.Size([32, 16]), True)
+        >>> env = TransformedEnv(NavigationEnv(batch_size=[32]), policy_transforms(actor))
+        >>> env.rollout(100, actor).shape  # 64 steps are 16 decisions
+        torch.Size([32, 16])
     """
 
     strided_seeds = True
@@ -252,12 +244,12 @@ class NavigationMetrics:
     """What became of a set of rollouts.
 
     Attributes:
-        switch_rate: share of chunk boundaries at which the side changes, among those with a side
-            before and after; NaN if there is none.
+        switch_rate: share of chunk boundaries at which the side changes, among those with a side before and
+            after; NaN if there is none.
         commit_rate: share of rollouts that never change sides.
         collision_rate: share of rollouts that enter an obstacle.
-        route_entropy: entropy in bits of the four routes (above or below each obstacle): 1 if only
-            the two demonstrated ones occur equally often, 2 if all four do.
+        route_entropy: entropy in bits of the four routes (above or below each obstacle): 1 if only the two
+            demonstrated ones occur equally often, 2 if all four do.
         recombination_rate: share of rollouts on the two routes that were not demonstrated.
         distance: mean distance to the nearest demonstration's height.
         jump: mean change of height at chunk boundaries.
@@ -280,18 +272,10 @@ class NavigationMetrics:
 
 
 def navigation_metrics(heights: Tensor, chunk_length: int) -> NavigationMetrics:
-    """Judge executed heights.
-
-    Args:
-        heights: ``[n, 64]``.
-        chunk_length: ``H``, how many of them each decision executed.
+    """Judge executed heights ``[n, 64]``, of which each decision executed ``chunk_length``.
 
     Raises:
         ValueError: if the heights have another shape, are not finite, or a chunk is the whole episode.
-
-    See Also:
-        - :func:`~warmprior.diagnostics.executed_actions`: the heights of a rollout.
-        - :func:`~warmprior.training.judge_navigation`: plays and judges a policy.
 
     Examples:
         >>> from warmprior.envs import navigation_heights, navigation_metrics

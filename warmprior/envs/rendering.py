@@ -1,8 +1,7 @@
 """Off-screen rendering: which OpenGL backend works here, and one frame on demand.
 
-MuJoCo's backend is chosen by the environment variable ``MUJOCO_GL``, and robosuite overrides it
-when imported. Nothing here runs until a frame is asked for, so machines without OpenGL can still
-simulate.
+robosuite overrides the environment variable ``MUJOCO_GL`` when imported. Nothing here runs until a frame is
+asked for, so machines without OpenGL can still simulate.
 """
 
 from __future__ import annotations
@@ -39,13 +38,10 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), mujoco.mjtFontSca
 
 @functools.cache
 def rendering_backend() -> str | None:
-    """Find an OpenGL backend that renders without a display.
+    """The OpenGL backend that renders without a display, ``"egl"`` or ``"osmesa"``; ``None`` without one.
 
-    ``MUJOCO_GL`` is tried first if it names one, then ``egl``, then ``osmesa``. Each is tried in a
-    process of its own, because a failed attempt cannot be undone; the answer is kept.
-
-    Returns:
-        ``"egl"``, ``"osmesa"``, or ``None`` if neither works.
+    ``MUJOCO_GL`` is tried first if it names one. Each is tried in a process of its own, because a failed
+    attempt cannot be undone; the answer is kept.
 
     Examples:
         >>> from warmprior.envs import rendering_backend
@@ -76,9 +72,8 @@ def require_rendering() -> str:
 
 
 class CameraRenderer:
-    """Renders the cameras of a MuJoCo model, an ``MjModel``, from positions of its joints.
+    """Renders the cameras of a MuJoCo model, an ``MjModel``, at given positions, aside from any episode.
 
-    It has a simulation of its own, in which nothing moves: an episode goes on as if nothing was rendered.
     ``fast`` leaves out reflections, shadows and the smoothing of edges: three to five times faster, and the
     images differ by 1 to 2 of 255 on average.
     """

@@ -48,33 +48,31 @@ class RobosuiteEnv(EnvBase):
     ``"truncated"``     ``[1]`` bool: out of time
     ==================  =============================================================
 
-    The n-th reset after :meth:`set_seed` (or after construction) plays the episode of simulator
-    seed ``seed + seed_offset + n * seed_stride``. With ``seed_offset=i, seed_stride=workers`` and
-    the same seed for all (``set_seed(seed, static_seed=True)``), worker ``i`` of a
-    :class:`~torchrl.envs.ParallelEnv` plays every ``workers``-th episode and no two play the same.
-    The global generators of numpy and Python are left as they were.
+    The n-th reset after :meth:`set_seed` (or after construction) plays the episode of simulator seed ``seed +
+    seed_offset + n * seed_stride``. With ``seed_offset=i, seed_stride=workers`` and the same seed for all
+    (``set_seed(seed, static_seed=True)``), worker ``i`` of a :class:`~torchrl.envs.ParallelEnv` plays every
+    ``workers``-th episode. The global generators of numpy and Python are left as they were.
 
     Args:
         task: a name of :data:`warmprior.envs.TASKS`. Those that end in ``_d0`` are MimicGen's and need its
             package (see :func:`~warmprior.envs.mimicgen.register_mimicgen`).
-        env_args: instead of ``task``: the parsed ``data.attrs["env_args"]`` of a robomimic or
-            MimicGen file of any version.
+        env_args: instead of ``task``: the parsed ``data.attrs["env_args"]`` of a robomimic or MimicGen file
+            of any version.
         env: instead of both: a robosuite environment. Its own time limit, reward and renderer are not used.
         style: of the data whose time limit applies: ``"ph"``, ``"mh"``, ``"source"`` or ``"core"``.
-        low_dim_keys: robomimic names of the observations to concatenate; ``None`` for
-            ``"object"`` and each arm's pose and gripper.
-        horizon: time limit in control steps; ``None`` for the task's, or for an environment that is
-            not in the table its own.
-        control_loop: ``"lean"`` for :class:`~warmprior.envs.control_loop.ControlLoop`,
-            ``"robosuite"`` for ``env.step``.
+        low_dim_keys: robomimic names of the observations to concatenate; by default ``"object"`` and each
+            arm's pose and gripper.
+        horizon: time limit in control steps; by default the task's, or else the environment's own.
+        control_loop: ``"lean"`` for :class:`~warmprior.envs.control_loop.ControlLoop`, ``"robosuite"`` for
+            ``env.step``.
         from_pixels: render ``camera`` at every step. Policies that see images need them at decisions alone,
             where :class:`~warmprior.transforms.CameraImages` renders them.
         camera: the camera rendered, or several; ``None`` for the task's first, or ``"agentview"``.
         camera_size: side of the image in pixels, or its height and width.
         fast_rendering: see :class:`~warmprior.envs.rendering.CameraRenderer`.
         sim_state: tell the simulator's state.
-        eef_pose: tell the grippers' poses in the world: rotation and, in the last column, position in
-            metres (see :class:`~warmprior.transforms.AbsoluteActions`).
+        eef_pose: tell the grippers' poses in the world: rotation and, in the last column, position in metres
+            (see :class:`~warmprior.transforms.AbsoluteActions`).
         seed: of the first episodes.
         seed_offset: added to every seed.
         seed_stride: between the seeds of consecutive episodes.
@@ -90,8 +88,7 @@ class RobosuiteEnv(EnvBase):
 
     Examples:
         >>> from warmprior.envs import RobosuiteEnv
-        >>> env = RobosuiteEnv("lift", seed=3)  # doctest: +SKIP
-        >>> env.rollout(5)["observation"].shape  # doctest: +SKIP
+        >>> RobosuiteEnv("lift", seed=3).rollout(5)["observation"].shape  # doctest: +SKIP
         torch.Size([5, 19])
         >>> RobosuiteEnv("life")
         Traceback (most recent call last):
@@ -158,7 +155,8 @@ class RobosuiteEnv(EnvBase):
                     f"the environment's horizon must be a number of steps, got {horizon!r}; give one with "
                     "horizon="
                 )
-        self.low_dim_keys = None if low_dim_keys is None else tuple(low_dim_keys)
+        default = default_keys(len(self._env.robots))
+        self.low_dim_keys = default if low_dim_keys is None else tuple(low_dim_keys)
         self.horizon = horizon
         self.control_loop = control_loop
         self.from_pixels, self.cameras, self.camera_size = from_pixels, cameras, size
@@ -190,7 +188,7 @@ class RobosuiteEnv(EnvBase):
         """Render a state, with or without ``from_pixels``: uint8 ``[h, w, 3]``, the right way up.
 
         By default the first camera shows the present state in ``camera_size``; a state is given as
-        ``"sim_state"`` and ``loop.state()`` tell it. The episode goes on as if nothing was rendered.
+        ``"sim_state"`` tells it. The episode goes on as if nothing was rendered.
 
         Raises:
             ValueError: if there is no such camera.
@@ -208,8 +206,6 @@ class RobosuiteEnv(EnvBase):
         super().close(raise_if_closed=raise_if_closed)
 
     def _make_specs(self, env: Any) -> None:
-        if self.low_dim_keys is None:
-            self.low_dim_keys = default_keys(len(env.robots))
         self._loop = _LOOPS[self.control_loop](env, self.low_dim_keys)
         self._late: ControlLoop | None = None  # the loop, where it may observe afterwards
         if isinstance(self._loop, ControlLoop) and self._loop.looks_back:
@@ -249,7 +245,7 @@ class RobosuiteEnv(EnvBase):
 
     def _measure(self, observations: Mapping[str, np.ndarray]) -> dict[str, Any]:
         # This runs between control steps of physics, which leave nothing of other code in the caches.
-        state = [observations[key] for key in self.low_dim_keys or ()]
+        state = [observations[key] for key in self.low_dim_keys]
         found: dict[str, Any] = {
             keys.OBSERVATION: np.concatenate(state, dtype=np.float32, casting="same_kind")
         }
@@ -300,18 +296,12 @@ class RobosuiteEnv(EnvBase):
         return result
 
     def control_steps(self, actions: torch.Tensor, keep: int) -> list[TensorDictBase]:
-        """Take control steps until the episode ends, with nothing but physics in between where possible.
+        """Take up to ``n`` control steps until the episode ends; what each led to.
 
         :class:`~warmprior.ChunkStep` executes chunks by it, where no transform and no subclass's ``_step``
-        has to see every step. Observations that are no poses, pictures among them, are taken at every step.
-
-        Args:
-            actions: ``[n, d_a]``, ``n >= 1``, in the environment's units.
-            keep: of how many of the last steps, at least 1, to tell the observations; of the others only the
-                reward, ``"success"`` and the done flags.
-
-        Returns:
-            What each step led to, ``n`` or fewer.
+        has to see every step. ``actions`` are ``[n, d_a]``, ``n >= 1``. Only the last ``keep``, at least 1,
+        tell observations; the others reward, ``"success"`` and done flags alone. Observations that are no
+        poses are taken at every step.
         """
         if keep < 1:
             raise ValueError(f"keep must be at least 1, got {keep}")

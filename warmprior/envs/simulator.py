@@ -79,8 +79,7 @@ def isolated_numpy_seed(seed: int) -> Iterator[None]:
 def task_env_args(task: str) -> dict[str, Any]:
     """Describe a task's environment as the ``env_args`` of a robomimic file, which JSON can hold.
 
-    Every option that changes what an action means is written out: pose deltas of at most 5 cm and
-    0.5 rad in the world frame, 20 Hz control.
+    Every option that changes what an action means is written out.
     """
     spec = get_task(task)
     kwargs: dict[str, Any] = {
@@ -108,9 +107,7 @@ def task_env_args(task: str) -> dict[str, Any]:
 def make_simulator(env_args: Mapping[str, Any]) -> Any:
     """Make a robosuite environment for stepping: no renderer, no time limit, cheap resets.
 
-    Frames are rendered on demand elsewhere, and time limits belong to the wrapper, so the options of
-    ``env_args`` (in the terms of robosuite 1.5) that concern either are overridden. The model is loaded once
-    (``hard_reset=False``), under a fixed seed.
+    Frames are rendered on demand elsewhere, and time limits belong to the wrapper.
     """
     robosuite = import_robosuite()
     name = env_args["env_name"]
@@ -138,8 +135,7 @@ def make_simulator(env_args: Mapping[str, Any]) -> Any:
 def action_limits(env: Any) -> list[float]:
     """The largest magnitude of each entry of an environment's action.
 
-    Deltas are fractions of the largest delta. Absolute poses are in metres and radians, and their
-    limits only say what is worth sampling.
+    Those of absolute poses, in metres and radians, only say what is worth sampling.
     """
     limits: list[float] = []
     for robot in env.robots:

@@ -41,10 +41,8 @@ class TaskSpec:
     Examples:
         >>> from warmprior.envs import TaskSpec
         >>> door = TaskSpec("door", "Door", arms=1, horizon_ph=300, horizon_mh=500, object_dim=22)
-        >>> door.observation_dim, door.action_dim, door.horizon("mh")
-        (31, 7, 500)
-        >>> door.low_dim_keys[0], door.low_dim_widths["object"]
-        ('object', 22)
+        >>> door.observation_dim, door.action_dim, door.horizon("mh"), door.low_dim_widths["object"]
+        (31, 7, 500, 22)
     """
 
     name: str
@@ -123,10 +121,7 @@ TASKS: dict[str, TaskSpec] = {
 
 
 def get_task(name: str) -> TaskSpec:
-    """Look a task up by its short name, a key of :data:`TASKS`.
-
-    Raises:
-        ValueError: if there is no such task.
+    """Look a task up by its short name, a key of :data:`TASKS`; a ``ValueError`` if there is none.
 
     Examples:
         >>> from warmprior.envs import get_task

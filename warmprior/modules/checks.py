@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from numbers import Integral
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
-__all__ = ["check_finite", "check_finite_numbers", "check_positive", "check_whole_numbers"]
+__all__ = ["check_finite", "check_finite_numbers", "check_keys", "check_positive", "check_whole_numbers"]
 
 
 def check_finite_numbers(**values: Any) -> None:
@@ -36,6 +38,13 @@ def check_positive(**values: float) -> None:
     for name, value in values.items():
         if not (value > 0 and math.isfinite(value)):
             raise ValueError(f"{name} must be a finite number > 0, got {value}")
+
+
+def check_keys(tensordict: TensorDictBase, needed: Iterable[NestedKey], whose: str, hint: str = "") -> None:
+    """A ``KeyError`` names the needed keys that are missing, and hints at who writes them."""
+    missing = [key for key in needed if tensordict.get(key, None) is None]
+    if missing:
+        raise KeyError(f"{whose} needs the keys {list(needed)}; missing: {missing}{hint}")
 
 
 def check_finite(

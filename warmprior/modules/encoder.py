@@ -1,4 +1,4 @@
-"""Encoders of observations that hold images."""
+"""Encoders of observations that hold images, and velocity networks behind them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from torchrl.modules import ConvNet
 
 from warmprior import keys
 from warmprior.io.extras import require
+from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.registry import from_config
 
-__all__ = ["ImageEncoder", "imagenet_weights", "load_imagenet"]
+__all__ = ["ImageEncoder", "VisionNetwork", "imagenet_weights", "load_imagenet"]
+
 
 Backbone = Literal["resnet18", "small"]
 
@@ -47,44 +50,32 @@ def _small(crop_size: int) -> tuple[nn.Module, int]:
 
 
 class ImageEncoder(nn.Module):
-    r"""Encodes an observation of images and a vector: one vector per observation step.
+    """Encodes an observation of images and a vector: one vector per observation step.
 
-    Every camera has its own network, ResNet-18 with group norm as in the paper (Table 3). Features are
-    appended to the vector. In training mode the network sees a random window of the image, the same one for
-    all ``To`` images of a camera; otherwise the central one. Pixels are scaled by ImageNet's
-    statistics.
+    Every camera has its own network, ResNet-18 with group norm as in the paper (Table 3), whose features are
+    appended to the vector. In training mode it sees a random window of the image, the same one for all ``To``
+    images of a camera and drawn by PyTorch's global generator; otherwise the central one. Pixels are scaled
+    by ImageNet's statistics.
 
     Args:
         cameras: names of the images in the observation.
         state_dim: width of the vector ``"state"`` in it; 0 if there is none.
-
-    Keyword Args:
         image_size: side of the images in pixels.
         crop_size: side of the window.
         backbone: ``"resnet18"``, or ``"small"``: three convolutions and a linear layer, for small budgets.
         share: one network for all cameras.
 
     Raises:
-        ValueError: if there are no cameras or one is named twice, a size is out of range, or there is no
-            such backbone.
+        ValueError: if there are no cameras or one is named twice, or for an option out of range.
         ImportError: if ResNet-18 is asked for and torchvision is missing.
 
-    .. note::
-        PyTorch's global generator draws the windows of a training, as it draws dropout.
-
-    See Also:
-        - :class:`~warmprior.VisionNetwork`: a velocity network behind it.
-        - :class:`~warmprior.EncodeObservation`: runs it next to the environment.
-
     Examples:
-        >>> from warmprior import ImageEncoder
         >>> import torch
         >>> from tensordict import TensorDict
+        >>> from warmprior import ImageEncoder
         >>> encoder = ImageEncoder(["agentview_image"], 9, image_size=32, crop_size=28, backbone="small")
-        >>> observation = TensorDict({
-        ...     "state": torch.zeros(4, 2, 9),
-        ...     "agentview_image": torch.zeros(4, 2, 3, 32, 32, dtype=torch.uint8),
-        ... }, [4])
+        >>> images = torch.zeros(4, 2, 3, 32, 32, dtype=torch.uint8)
+        >>> observation = TensorDict({"state": torch.zeros(4, 2, 9), "agentview_image": images}, [4])
         >>> encoder(observation).shape, encoder.observation_dim
         (torch.Size([4, 2, 73]), 73)
     """
@@ -138,14 +129,10 @@ class ImageEncoder(nn.Module):
         }
 
     def forward(self, observation: TensorDictBase) -> Tensor:
-        """Encode an observation.
+        """The vector, and the features of the cameras in their order, ``[*B, To, observation_dim]``.
 
-        Args:
-            observation: ``[*B]``, with ``"state"`` ``[*B, To, state_dim]`` and images uint8
-                ``[*B, To, 3, image_size, image_size]`` under the names of the cameras.
-
-        Returns:
-            ``[*B, To, observation_dim]``: the vector, and the features of the cameras in their order.
+        The observation ``[*B]`` has ``"state"`` ``[*B, To, state_dim]`` and images uint8
+        ``[*B, To, 3, image_size, image_size]`` under the names of the cameras.
 
         Raises:
             KeyError: if an entry is missing.
@@ -214,9 +201,6 @@ def imagenet_weights() -> dict[str, Tensor]:
         OSError: if the weights are not stored here and cannot be downloaded, or the stored file is damaged.
         ImportError: if torchvision is missing.
 
-    See Also:
-        :func:`~warmprior.modules.load_imagenet`: puts them into an encoder.
-
     Examples:
         >>> from warmprior.modules import imagenet_weights
         >>> imagenet_weights()["conv1.weight"].shape  # doctest: +SKIP
@@ -238,9 +222,7 @@ def imagenet_weights() -> dict[str, Tensor]:
 
 
 def load_imagenet(encoder: ImageEncoder) -> None:
-    """Give the ResNets of an encoder the weights of ImageNet, in place.
-
-    Group norm, which replaces batch norm, starts from no effect.
+    """Give the ResNets of an encoder the weights of ImageNet, in place; group norm starts from no effect.
 
     Raises:
         ValueError: if it has another backbone.
@@ -249,7 +231,6 @@ def load_imagenet(encoder: ImageEncoder) -> None:
     Examples:
         >>> from warmprior import ImageEncoder
         >>> from warmprior.modules import load_imagenet
-        >>> load_imagenet(ImageEncoder(["agentview_image"], 9))  # doctest: +SKIP
         >>> load_imagenet(ImageEncoder(["agentview_image"], 9, backbone="small"))
         Traceback (most recent call last):
             ...
@@ -263,3 +244,56 @@ def load_imagenet(encoder: ImageEncoder) -> None:
         # Those of the convolutions: batch norm's have the names of group norm's.
         taken = {name: weights[name] for name in mine if mine[name].ndim == 4}
         network.load_state_dict(mine | taken)
+
+
+class VisionNetwork(VelocityNetwork):
+    """A velocity network that sees observations with images through an encoder.
+
+    The encoder runs once per decision, not once per integration step: samplers and losses call :meth:`encode`
+    first and pass the result on.
+
+    Args:
+        encoder: of observations; or its ``config()``.
+        network: of the velocity, built for ``encoder.observation_dim``; or its ``config()``.
+
+    Raises:
+        ValueError: if the network was built for other observations.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import ImageEncoder, VelocityMLP, VisionNetwork
+        >>> encoder = ImageEncoder(["agentview_image"], 9, image_size=32, crop_size=28, backbone="small")
+        >>> network = VisionNetwork(encoder, VelocityMLP(7, encoder.observation_dim, 8))
+        >>> images = torch.zeros(4, 2, 3, 32, 32, dtype=torch.uint8)
+        >>> observation = TensorDict({"state": torch.zeros(4, 2, 9), "agentview_image": images}, [4])
+        >>> network(torch.rand(4), torch.randn(4, 8, 7), observation).shape
+        torch.Size([4, 8, 7])
+    """
+
+    encodes = True
+
+    def __init__(
+        self, encoder: ImageEncoder | dict[str, Any], network: VelocityNetwork | dict[str, Any]
+    ) -> None:
+        if isinstance(encoder, dict):
+            encoder = ImageEncoder(**encoder)
+        if isinstance(network, dict):
+            network = from_config(VelocityNetwork, network)
+        if network.observation_dim != encoder.observation_dim:
+            raise ValueError(
+                f"the network was built for observation_dim={network.observation_dim}, but the encoder "
+                f"gives {encoder.observation_dim}"
+            )
+        super().__init__(
+            network.action_dim, network.observation_dim, network.prediction_length, network.observation_steps
+        )
+        self.encoder, self.network = encoder, network
+
+    def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
+        """The encoded observation, ``[B, To, d_o]``; an encoded one is returned as it is."""
+        return self.encoder(observation) if isinstance(observation, TensorDictBase) else observation
+
+    def forward(self, t: Tensor, a: Tensor, observation: Tensor | TensorDictBase) -> Tensor:
+        """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        return self.network(t, a, self.encode(observation))

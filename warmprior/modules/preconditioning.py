@@ -1,4 +1,4 @@
-"""Preconditioning of velocity networks by the second moments of a prior's source and its targets."""
+"""Preconditioning of velocity networks by second moments of source and targets, and by the present pose."""
 
 from __future__ import annotations
 
@@ -8,16 +8,22 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+from torch.nn.functional import pad
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
-from warmprior.modules.interpolant import Interpolant, LinearInterpolant
 from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.normalize import Normalizer
+from warmprior.modules.ode import Interpolant, LinearInterpolant
 from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
-from warmprior.modules.trend import PoseTrend
+from warmprior.rotation import HAND_TO_SITE, matrix_to_rotation_6d, quaternion_to_matrix
 
-__all__ = ["PreconditionedNetwork", "SourceMoments"]
+__all__ = ["PoseTrend", "PreconditionedNetwork", "RestingAction", "SourceMoments"]
+
+
+DRAWS = 16
+"""Of the source, per window: their mean has little noise, which belongs to no observation."""
 
 VARIANCE_FLOOR = 1e-4
 """A standard deviation of 0.01, half a percent of the normalised range; smaller ones count as constant."""
@@ -25,12 +31,163 @@ VARIANCE_FLOOR = 1e-4
 CORRELATION_LIMIT = 1 - 1e-6
 """Above this correlation source and target determine each other."""
 
+_POSE, _ABSOLUTE = 7, 10  # numbers per arm: position and quaternion; position, rotation and gripper
+
+
+class RestingAction(nn.Module):
+    """The absolute action that asks every gripper to stay where the observation says it is.
+
+    Args:
+        columns: int64 ``[arms, 7]``, where in the observation each gripper's position and the
+            ``(x, y, z, w)`` quaternion of its hand are, as robomimic's files have them.
+        normalizer: of the observations ``[d_o]`` and the actions ``[10 * arms]``; an identity by default, to
+            be replaced by loading a state dict.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import RestingAction
+        >>> rest = RestingAction(torch.arange(7)[None])
+        >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0])
+        >>> rest(observation).tolist()[:3], rest(observation).shape
+        ([0.1..., 0.2..., 0.3...], torch.Size([10]))
+    """
+
+    columns: Tensor
+    loc: Tensor
+    scale: Tensor
+    action_loc: Tensor
+    action_scale: Tensor
+
+    def __init__(self, columns: Tensor, normalizer: Normalizer | None = None) -> None:
+        super().__init__()
+        if columns.ndim != 2 or columns.shape[1] != _POSE:
+            raise ValueError(f"columns must be [arms, {_POSE}], got {list(columns.shape)}")
+        shapes = columns.shape, (len(columns), _ABSOLUTE)
+        affine = [make(shape) for shape in shapes for make in (torch.zeros, torch.ones)]
+        if normalizer is not None:
+            ends = normalizer.loc, normalizer.scale
+            affine = [end(keys.OBSERVATION)[columns] for end in ends]
+            affine += [end(keys.ACTION).unflatten(0, (-1, _ABSOLUTE)) for end in ends]
+        self.register_buffer("columns", columns)
+        for name, value in zip(("loc", "scale", "action_loc", "action_scale"), affine, strict=True):
+            self.register_buffer(name, value.clone())
+
+    @property
+    def width(self) -> int:
+        """``d_a``."""
+        return self.action_loc.numel()
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The action, ``[*B, 10 * arms]``, 0 for the gripper, at ``[*B, d_o]``; both normalised."""
+        pose = observation[..., self.columns] * self.scale + self.loc
+        hand = quaternion_to_matrix(pose[..., 3:])
+        site = hand @ quaternion_to_matrix(hand.new_tensor(HAND_TO_SITE))
+        action = torch.cat((pose[..., :3], matrix_to_rotation_6d(site)), -1)
+        normalised = (action - self.action_loc[:, :-1]) / self.action_scale[:, :-1]
+        return pad(normalised, (0, 1)).flatten(-2)
+
+
+class PoseTrend(nn.Module):
+    """Best linear predictions of source :math:`a_0` and target :math:`a_1` from the resting action.
+
+    Absolute poses lie near the present pose, which explains most of their variance. A network without a trend
+    spends its precision on that, and passes on source noise that is many times as large as the change of a
+    pose in one step. With a trend, :class:`PreconditionedNetwork` learns the remainder: where to go from
+    here, as with deltas. Every action dimension is predicted from the same dimension of the resting action at
+    the last observation: a regression on the whole observation fits better, but fails away from the
+    demonstrations.
+
+    Args:
+        rest: the resting action of an observation.
+        centre: ``[d_a]``, its mean.
+        source: ``[P, d_a]``, slopes of :math:`a_0 - E[a_0]`.
+        target: ``[P, d_a]``, slopes of :math:`a_1 - E[a_1]`.
+
+    Raises:
+        ValueError: if the shapes differ, or an entry is NaN or infinite.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import PoseTrend, RestingAction
+        >>> rest = RestingAction(torch.arange(7)[None])
+        >>> trend = PoseTrend(rest, torch.zeros(10), torch.zeros(4, 10), torch.ones(4, 10))
+        >>> observation = torch.tensor([0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0]).expand(2, 1, 7)
+        >>> source, target = trend(observation)  # the targets follow the gripper, the source does not
+        >>> source.abs().max(), target[1, 3, :3]
+        (tensor(0.), tensor([0.1000, 0.2000, 0.3000]))
+    """
+
+    centre: Tensor
+    source: Tensor
+    target: Tensor
+
+    def __init__(self, rest: RestingAction, centre: Tensor, source: Tensor, target: Tensor) -> None:
+        super().__init__()
+        shapes = [tuple(value.shape) for value in (centre, source, target)]
+        width = rest.width
+        if source.ndim != 2 or shapes != [(width,), (len(source), width), (len(source), width)]:
+            raise ValueError(
+                f"a trend of {width} actions needs [d_a] and twice [P, d_a], got the shapes {shapes}"
+            )
+        self.rest = rest
+        for name, value in (("centre", centre), ("source", source), ("target", target)):
+            if not torch.isfinite(value).all():
+                raise ValueError(f"the trend's {name} holds NaN or infinity: check the data")
+            self.register_buffer(name, value.clone())
+
+    @classmethod
+    def zero(cls, arms: int, prediction_length: int) -> PoseTrend:
+        """No trend, to be replaced by loading a state dict."""
+        rest = RestingAction(torch.zeros(arms, _POSE, dtype=torch.int64))
+        none = torch.zeros(prediction_length, _ABSOLUTE * arms)
+        return cls(rest, none[0], none, none)
+
+    @classmethod
+    @torch.no_grad()
+    def fit(
+        cls,
+        windows: TensorDictBase,
+        prior: Prior,
+        rest: RestingAction,
+        *,
+        generator: torch.Generator | None = None,
+    ) -> PoseTrend:
+        """Estimate it, as float32, from unpadded positions of windows ``[N]`` and draws of the prior.
+
+        The observations are ``[N, To, d_o]``; a position that is padded in all windows gets 0. The generator
+        is of the source samples, on the windows' device.
+        """
+        resting = rest(windows[keys.OBSERVATION][:, -1].float()).double()
+        centre = resting.mean(0)
+        source = prior.distribution(windows[keys.HISTORY], windows[keys.OBSERVATION])
+        draws = [source.sample(generator).double() for _ in range(DRAWS)]
+        ends = torch.stack((torch.stack(draws).mean(0), windows[keys.CHUNK].double()))
+        # Padded positions do not count: they would pull the trend to the episode's last action.
+        weight = (~windows[keys.IS_PAD]).double().unsqueeze(-1)
+        weight = weight / weight.sum(0).clamp_min(1)
+        deviation = resting.unsqueeze(1) - (weight * resting.unsqueeze(1)).sum(0)
+        variance = (weight * deviation.square()).sum(0)
+        slopes = (weight * deviation * ends).sum(1) / variance.clamp_min(VARIANCE_FLOOR)
+        return cls(rest, centre.float(), *slopes.float())
+
+    def config(self) -> dict[str, Any]:
+        """JSON-serialisable arguments of :meth:`zero`; the values themselves are buffers."""
+        return {"arms": len(self.rest.columns), "prediction_length": len(self.source)}
+
+    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor]:
+        """The predicted deviations of source and target from their means, each ``[B, P, d_a]``.
+
+        Of normalised observations ``[B, To, d_o]`` the last step counts.
+        """
+        deviation = (self.rest(observation[:, -1]) - self.centre).unsqueeze(1)
+        return deviation * self.source, deviation * self.target
+
 
 class SourceMoments(nn.Module):
-    r"""Means, variances and covariance of the source :math:`a_0` and the target :math:`a_1`.
+    """Means, variances and covariance of the source :math:`a_0` and the target :math:`a_1`.
 
-    One set per chunk position and action dimension, each ``[P, d_a]`` in normalised units. Variances are
-    at least :data:`VARIANCE_FLOOR` and correlations at most :data:`CORRELATION_LIMIT`, so that constant
+    One set per chunk position and action dimension, each ``[P, d_a]`` in normalised units. Variances are at
+    least :data:`VARIANCE_FLOOR` and correlations at most :data:`CORRELATION_LIMIT`, so that constant
     dimensions, positions that are always padded and deterministic sources stay harmless.
 
     Args:
@@ -42,10 +199,6 @@ class SourceMoments(nn.Module):
 
     Raises:
         ValueError: if the shapes differ, or an entry is NaN or infinite.
-
-    See Also:
-        - :class:`~warmprior.PreconditionedNetwork`: scales inputs and outputs by them.
-        - :func:`~warmprior.training.precondition`: estimates them and wraps a network.
 
     Examples:
         >>> import torch
@@ -119,25 +272,21 @@ class SourceMoments(nn.Module):
         trend: PoseTrend | None = None,
         generator: torch.Generator | None = None,
     ) -> SourceMoments:
-        """Estimate them from training windows and draws of the prior.
+        """Estimate them, as float32, from unpadded positions of training windows and draws of the prior.
+
+        A position that is padded in all windows gets those of independent standard normal ends; no loss reads
+        it.
 
         Args:
-            windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[*B]``.
+            windows: a buffer of :func:`~warmprior.window_replay_buffer`, or windows ``[*B]``, used once each.
             prior: the source distribution.
-
-        Keyword Args:
-            coupling: how the training pairs sources and targets, see :data:`~warmprior.objectives.Coupling`;
-                in their order by default.
-            samples: how many windows to draw from a buffer; windows given as a tensordict are used once each.
+            coupling: how the training pairs sources and targets, see :data:`~warmprior.objectives.Coupling`.
+            samples: how many windows to draw from a buffer.
             trend: trend of the pose; the moments are those of the remainder.
             generator: source of randomness of the source samples, on the windows' device.
 
-        Returns:
-            The moments over unpadded positions, as float32. A position that is padded in all windows gets
-            those of independent standard normal ends; no loss reads it.
-
         Raises:
-            ValueError: if ``samples < 2``, there are fewer than two windows, or they are of other lengths.
+            ValueError: if there are fewer than two windows, or they are of other lengths.
         """
         if isinstance(windows, TensorDictBase):
             batches = [windows]
@@ -150,11 +299,6 @@ class SourceMoments(nn.Module):
         batch = TensorDict.cat([batch.reshape(-1) for batch in batches])
         if len(batch) < 2:
             raise ValueError(f"moments need at least 2 windows, got {len(batch)}")
-        if batch[keys.CHUNK].shape[-2] != prior.prediction_length:
-            raise ValueError(
-                f"the windows have {batch[keys.CHUNK].shape[-2]} positions, but {prior} predicts "
-                f"{prior.prediction_length}: make them for its lengths"
-            )
         observation = batch.get(keys.OBSERVATION, None)
         a0, a1 = prior.sample(batch[keys.HISTORY], observation, generator), batch[keys.CHUNK]
         if coupling is not None:
@@ -187,43 +331,37 @@ class SourceMoments(nn.Module):
 class PreconditionedNetwork(VelocityNetwork):
     r"""A velocity network that learns only the remainder of the best linear prediction.
 
-    With :math:`a_t = \alpha a_0 + \beta a_1`, the velocity
-    :math:`u_t = \dot\alpha a_0 + \dot\beta a_1` and the moments of :math:`(a_0, a_1)`, per chunk
-    position and action dimension,
+    With :math:`a_t = \alpha a_0 + \beta a_1`, the velocity :math:`u_t = \dot\alpha a_0 + \dot\beta a_1` and
+    the moments of :math:`(a_0, a_1)`, per chunk position and action dimension,
 
     .. math::
         v_\theta(t, a_t, o) = E[u_t] + \frac{Cov(u_t, a_t)}{Var(a_t)} (a_t - E[a_t])
         + \sqrt{Var(u_t) - \frac{Cov(u_t, a_t)^2}{Var(a_t)}} \;
         F_\theta\Big(t, \frac{a_t - E[a_t]}{\sqrt{Var(a_t)}}, o\Big).
 
-    The first two terms are the best linear predictor of the velocity from the point, and :math:`F` is
-    trained on a standardised remainder: its input and target have mean 0 and variance 1 at every time
-    and for every source. A network that has learnt nothing (:math:`F = 0`) is optimal where
-    :math:`(a_0, a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et
-    al., 2022, Eq. 7), whose constants assume zero means and an independent source.
+    The first two terms predict the velocity linearly from the point, and input and target of :math:`F` have
+    mean 0 and variance 1 at every time and for every source. :math:`F = 0` is optimal where :math:`(a_0,
+    a_1)` is jointly Gaussian and independent of the observation. This generalises EDM (Karras et al., 2022,
+    Eq. 7), whose constants assume zero means and an independent source.
 
     Variance and scale are computed without differences, with :math:`s_0 = \sqrt{v_0}` and the deviation
     :math:`q` of the target given the source: :math:`Var(a_t) = (\alpha s_0 + \beta c / s_0)^2 + (\beta q)^2`
     and :math:`|\alpha\dot\beta - \dot\alpha\beta| \, s_0 q / \sqrt{Var(a_t)}`.
 
     Args:
-        network: :math:`F`; or its :meth:`config`.
-
-    Keyword Args:
-        moments: moments of the prior's source and the targets; by default those of independent standard
-            normal ends, to be replaced by loading a state dict.
+        network: :math:`F`; or its ``config()``, as for the next.
+        moments: of the prior's source and the targets; by default those of independent standard normal ends,
+            to be replaced by loading a state dict.
         trend: trend of the gripper poses, which gives :math:`E[a_0 | o]` and :math:`E[a_1 | o]` in place of
-            the means above; the moments are then those of the remainder. None by default. Or its
-            ``config()``.
-        interpolant: the path of the loss; linear by default. Or its ``config()``.
+            the means above; the moments are then those of the remainder.
+        interpolant: the path of the loss; linear by default.
 
     Raises:
         ValueError: if the moments or the trend do not have the network's shapes, or the path has no finite
             velocity at its ends.
 
     See Also:
-        - :class:`~warmprior.SourceMoments`: the moments.
-        - :func:`~warmprior.training.precondition`: estimates the moments and wraps a network.
+        :func:`~warmprior.training.precondition`: estimates the moments and wraps a network.
 
     Examples:
         >>> import torch
@@ -261,17 +399,16 @@ class PreconditionedNetwork(VelocityNetwork):
             )
         shape = (network.prediction_length, network.action_dim)
         self.moments = SourceMoments.identity(*shape) if moments is None else moments
-        if tuple(self.moments.covariance.shape) != shape:
-            raise ValueError(
-                f"the moments are of chunks (P, d_a) = {tuple(self.moments.covariance.shape)}, but the "
-                f"network was built for {shape}"
-            )
         self.trend = PoseTrend.zero(**trend) if isinstance(trend, dict) else trend
-        if self.trend is not None and tuple(self.trend.target.shape) != shape:
-            raise ValueError(
-                f"the trend is of chunks (P, d_a) = {tuple(self.trend.target.shape)}, but the network "
-                f"was built for {shape}"
-            )
+        given = {"moments are": self.moments.covariance}
+        if self.trend is not None:
+            given["trend is"] = self.trend.target
+        for name, value in given.items():
+            if tuple(value.shape) != shape:
+                raise ValueError(
+                    f"the {name} of chunks (P, d_a) = {tuple(value.shape)}, but the network was built for "
+                    f"{shape}"
+                )
 
     def encode(self, observation: Tensor | TensorDictBase) -> Tensor | TensorDictBase:
         """As the network inside does."""
@@ -282,10 +419,7 @@ class PreconditionedNetwork(VelocityNetwork):
         return self.network.parameter_groups(weight_decay)
 
     def remainder(self, t: Tensor) -> Tensor:
-        """Standard deviation of the remainder of the velocity at times ``[B]``, the unit of ``F``.
-
-        ``[B, P, d_a]``, larger than 0.
-        """
+        """The unit of ``F`` at times ``[B]``: the remainder's standard deviation, ``[B, P, d_a]``."""
         coefficients = self.interpolant.coefficients(t[:, None, None])
         return self._remainder(*coefficients) * self._scale(*coefficients[:2])
 

@@ -68,26 +68,18 @@ class Prior(Registered):
         a_0[\tau] = \mu_\tau + \sigma \varepsilon_\tau \;\; (\tau \in W), \qquad
         a_0[\tau] = \varepsilon_\tau \;\; (\tau \in C), \qquad \varepsilon \sim N(0, I).
 
-    The mean is a function of the history (:mod:`warmprior.history`). Training windows, environments and
-    robots write the same history, so the mean cannot differ between them. Override :meth:`distribution` for
-    another source, such as a learned one: a subclass that is an ``nn.Module`` as well (call
-    ``nn.Module.__init__`` first) is trained, saved and frozen with the policy.
+    The mean is a function of the history (:mod:`warmprior.history`), which training and deployment write
+    alike. Override :meth:`distribution` for another source, such as a learned one: a subclass that is an
+    ``nn.Module`` as well (call ``nn.Module.__init__`` first) is trained, saved and frozen with the policy.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
-
-    Keyword Args:
-        sigma: standard deviation around the mean, in units of the normalised action space. ``0`` is the
-            deterministic limit.
+        sigma: standard deviation around the mean, in normalised action units; 0 is the deterministic limit.
         correlation: share of the noise's variance that all warm positions of a dimension have in common, in
-            [0, 1]. ``0`` is the paper's white noise; a network that averages over the chunk sees through it.
+            [0, 1]. 0 is the paper's white noise, through which a network sees by averaging over the chunk.
 
     Raises:
-        ValueError: if ``chunk_length < 1``, ``sigma`` is not a finite number >= 0, or ``correlation`` is not
-            in [0, 1].
-
-    See Also:
-        :class:`~warmprior.PriorSampler`: draws from it.
+        ValueError: for a number out of its range.
 
     Examples:
         >>> import torch
@@ -97,10 +89,9 @@ class Prior(Registered):
         ...     def mean(self, history):
         ...         actions, warm = history["actions"], (history["steps"] > 0).unsqueeze(-1)
         ...         return actions[..., -1:, :].expand_as(actions), warm.expand_as(actions[..., :1])
-        >>> prior = LastAction(4, sigma=0.1)
         >>> chunk, executed = torch.arange(4.0).view(1, 4, 1).expand(2, 4, 1), torch.tensor([[4], [2]])
-        >>> loc, scale, warm = prior.distribution(advance(cold_history([2], 4, 4, 1), chunk, executed))
-        >>> loc[..., 0].tolist()
+        >>> history = advance(cold_history([2], 4, 4, 1), chunk, executed)
+        >>> LastAction(4, sigma=0.1).distribution(history).loc[..., 0].tolist()
         [[3.0, 3.0, 3.0, 3.0], [1.0, 1.0, 1.0, 1.0]]
     """
 
@@ -133,25 +124,18 @@ class Prior(Registered):
         return self.chunk_length
 
     def mean(self, history: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Mean of the source.
+        """Of histories ``[*B]`` the mean, ``loc`` ``[*B, P, d_a]``, and ``warm``, bool ``[*B, P, 1]``.
 
-        Args:
-            history: ``[*B]``, see :mod:`warmprior.history`. Training knows only the first ``P - H`` steps of
-                the forecast.
-
-        Returns:
-            ``loc`` ``[*B, P, d_a]``, ignored on cold positions, and ``warm``, bool ``[*B, P, 1]``.
+        ``loc`` is ignored on cold positions. Training knows only the first ``P - H`` steps of the forecast.
         """
         raise NotImplementedError(f"{type(self).__name__} needs a method mean(history)")
 
     def distribution(
         self, history: TensorDictBase, observation: Tensor | TensorDictBase | None = None
     ) -> Source:
-        """The source of histories (Eq. 1); unpacks into ``loc``, ``scale`` and ``warm``.
+        """The source of histories ``[*B]`` (Eq. 1); unpacks into ``loc``, ``scale`` and ``warm``.
 
-        Args:
-            history: ``[*B]``, see :mod:`warmprior.history`.
-            observation: what the network sees, ``[*B, To, d_o]``; the paper's sources ignore it.
+        The paper's sources ignore the observation, what the network sees, ``[*B, To, d_o]``.
 
         Raises:
             KeyError: if an entry of the history is missing.
@@ -196,7 +180,7 @@ class GaussianPrior(Prior):
     """The usual standard normal source: nothing is ever warm.
 
     Args:
-        chunk_length: see :class:`Prior`.
+        chunk_length: ``H``, the number of actions executed per decision.
 
     Examples:
         >>> from warmprior import GaussianPrior
@@ -217,16 +201,14 @@ class GaussianPrior(Prior):
 
 
 class PastPrior(Prior):
-    r"""WP-Past: the mean is the last ``H`` executed actions (Eq. 2).
+    """WP-Past: the mean is the last ``H`` executed actions (Eq. 2).
 
     Nothing is warm before ``H`` actions of the episode were executed.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
-
-    Keyword Args:
-        sigma: standard deviation around the mean, 0.5 by default; see :class:`Prior`.
-        correlation: share of the noise's variance that the whole chunk has in common, 0 by default.
+        sigma: standard deviation around the mean, 0.5 by default.
+        correlation: see :class:`Prior`.
 
     See Also:
         :class:`~warmprior.HistoryObservation`: lets the network see the last actions instead.
@@ -253,23 +235,17 @@ class PastPrior(Prior):
 
 
 class PreviewPrior(Prior):
-    r"""WP-Preview: the mean is the policy's own earlier forecast of this chunk.
+    """WP-Preview: the mean is the policy's own earlier forecast of this chunk.
 
-    The network predicts ``P = 2H`` actions. In training the target's own first ``H`` actions are the forecast
-    (Eq. 3); at decisions it is the previous prediction's ``[k, k+H)`` (Eq. 4). The second half is always
-    cold.
-
-    .. note::
-        Algorithm 1 never shows the network a cold first half, which it meets at the first decision of every
-        episode. :class:`~warmprior.WithheldHistory` does; it matters for small ``sigma``.
+    The network predicts ``P = 2H`` actions. In training the target's own first ``H`` are the forecast (Eq.
+    3); at decisions it is the previous prediction's ``[k, k+H)`` (Eq. 4). The second half is always cold.
+    Algorithm 1 never shows the network a cold first half, which begins every episode;
+    :class:`~warmprior.WithheldHistory` does, which matters for small ``sigma``.
 
     Args:
         chunk_length: ``H``, the number of actions executed per decision.
-
-    Keyword Args:
-        sigma: standard deviation around the mean, 1 by default; see :class:`Prior`.
-        correlation: share of the noise's variance that the forecast's ``H`` positions have in common, 0 by
-            default.
+        sigma: standard deviation around the mean, 1 by default.
+        correlation: see :class:`Prior`.
 
     Examples:
         >>> import torch

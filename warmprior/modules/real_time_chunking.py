@@ -28,12 +28,9 @@ Schedule = Literal["exp", "linear", "ones", "zeros"]
 
 
 def with_leftover(chunk: Tensor, leftover: Tensor, delay: Tensor) -> Tensor:
-    """A late chunk as it is executed: until it takes effect, the rest of the old one is.
+    """A late chunk ``[*B, P, d_a]`` as it is executed: the first ``delay``, ``[*B, 1]``, from the leftover.
 
-    Args:
-        chunk: the prediction, ``[*B, P, d_a]``.
-        leftover: what the chunk before holds for the same control steps, ``[*B, P, d_a]``.
-        delay: control steps until ``chunk`` takes effect, int64 ``[*B, 1]``.
+    The leftover is what the chunk before holds for the same control steps, ``[*B, P, d_a]``.
     """
     late = torch.arange(chunk.shape[-2], device=chunk.device) < delay
     return torch.where(late.unsqueeze(-1), leftover.to(chunk.dtype), chunk)
@@ -44,31 +41,28 @@ class RealTimeChunking:
     r"""Guidance of `Real-Time Chunking <https://arxiv.org/abs/2506.07339>`_, for any source.
 
     While a chunk is computed, the old one is executed for ``d`` more control steps (the delay), and the new
-    one should continue it. Velocities are corrected towards the leftover :math:`Y` of the old
-    chunk, with :math:`\hat a = a_t + (1-t)\,v(t, a_t)` and :math:`J = \partial \hat a / \partial a_t`:
+    one should continue it. Velocities are corrected towards the leftover :math:`Y` of the old chunk, with
+    :math:`\hat a = a_t + (1-t)\,v(t, a_t)` and :math:`J = \partial \hat a / \partial a_t`:
 
     .. math::
         v' = v + \min\!\big(g(t), \beta\big)\; J^\top W (Y - \hat a), \qquad
         g(t) = \frac{\sigma^2}{S^2} \frac{1-t}{t} + \frac{t}{1-t}.
 
-    :math:`g` is exact for a source :math:`N(\mu, \sigma^2)` and Gaussian data of standard deviation
-    :math:`S` (docs/real_time_chunking.md derives it); :math:`\mu` drops out. :math:`\sigma = S = 1` is the
-    published weight, :math:`\frac{1-t}{t} \cdot \frac{t^2 + (1-t)^2}{(1-t)^2}`. It assumes straight paths
-    (:class:`~warmprior.LinearInterpolant`).
-
-    :math:`W` is 1 on the positions before the delay, which are executed as they are in the old chunk, falls
-    behind it by ``schedule``, and is 0 from ``horizon`` on.
+    :math:`g` is exact for a source :math:`N(\mu, \sigma^2)` and Gaussian data of standard deviation :math:`S`
+    (docs/real_time_chunking.md derives it). :math:`\sigma = S = 1` is the published weight,
+    :math:`\frac{1-t}{t} \cdot \frac{t^2 + (1-t)^2}{(1-t)^2}`. It assumes straight paths
+    (:class:`~warmprior.LinearInterpolant`). :math:`W` is 1 on the positions before the delay, which are
+    executed as they are in the old chunk, falls behind it by ``schedule``, and is 0 from ``horizon`` on.
 
     Args:
         horizon: first position without guidance (LeRobot's execution_horizon, the official code's
-            prefix_attention_horizon); None, the default, guides up to the end of the old chunk, as in the
-            official studies.
+            prefix_attention_horizon); by default the end of the old chunk, as in the official studies.
         schedule: "exp" (the official default), "linear" (LeRobot's), "ones" or "zeros".
         max_guidance_weight: :math:`\beta`; 5 in the official code, 10 in LeRobot.
         jacobian: False takes the identity for :math:`J`, as LeRobot 0.6 does. That needs no gradients and 0.6
             of the time, but is no longer exact in the Gaussian case.
-        sigma: the source's standard deviation in the weight; its own by default. 1 gives the published weight
-            for every source.
+        sigma: the source's standard deviation in the weight; its own by default. 1 gives the published
+            weight.
         data_std: :math:`S`, the standard deviation of actions at a known observation, in normalised units.
             POTR (arXiv 2605.24433) has such a scale too, :math:`\sigma_d`.
         trust_region: bound of the correction perpendicular to the velocity, as a share of the velocity's
@@ -78,11 +72,10 @@ class RealTimeChunking:
         ValueError: for an unknown schedule, or a number that is not positive.
 
     Examples:
-        >>> from warmprior import RealTimeChunking
         >>> import torch
+        >>> from warmprior import RealTimeChunking
         >>> rtc = RealTimeChunking(schedule="linear")
-        >>> weights = rtc.weights(torch.tensor(2), torch.tensor(6), 8)  # of 8 positions 6 are left
-        >>> (10 * weights).round().tolist()
+        >>> (10 * rtc.weights(torch.tensor(2), torch.tensor(6), 8)).round().tolist()  # 6 of 8 are left
         [10.0, 10.0, 8.0, 6.0, 4.0, 2.0, 0.0, 0.0]
         >>> rtc.guidance_weight(torch.tensor([0.0, 0.5, 0.75])).tolist()
         [5.0, 2.0, 3.33...]
@@ -116,11 +109,7 @@ class RealTimeChunking:
         return asdict(self)
 
     def check_delay(self, delay: int, left: int) -> None:
-        """Check that chunks with this delay can be guided by so many actions of the old chunk.
-
-        Raises:
-            ValueError: if the delay exceeds the leftover or the horizon.
-        """
+        """A ``ValueError`` if the delay exceeds the horizon, or what is left of the old chunk."""
         if not 0 <= delay <= left:
             raise ValueError(
                 f"a delay of {delay} control steps needs as many actions of the old chunk, and {left} are "
@@ -133,11 +122,7 @@ class RealTimeChunking:
             )
 
     def weights(self, delay: Tensor, left: Tensor, length: int, dtype: torch.dtype | None = None) -> Tensor:
-        """:math:`W` by position, ``[*B, P]``, between 0 and 1.
-
-        For a ``delay`` and ``left`` positions of the leftover, each int64 ``[*B]``, of ``length`` ``P``; the
-        other positions have weight 0.
-        """
+        """:math:`W` by position, ``[*B, P]``, for a ``delay`` and positions ``left``, each int64 ``[*B]``."""
         i = torch.arange(length, device=delay.device)
         end = (left if self.horizon is None else left.clamp(max=self.horizon)).unsqueeze(-1)
         start = torch.minimum(delay.unsqueeze(-1), end)
@@ -156,7 +141,7 @@ class RealTimeChunking:
     def guided(
         self, velocity: Velocity, leftover: Tensor, left: Tensor, delay: Tensor, sigma: Tensor | float = 1.0
     ) -> Velocity:
-        """A velocity that makes chunks continue the leftover.
+        """A velocity that makes chunks continue the leftover; ``velocity`` itself if no row has one.
 
         It works under ``torch.no_grad()``, and its result is detached.
 
@@ -166,9 +151,6 @@ class RealTimeChunking:
             left: how many of its first positions count, int64 ``[B, 1]``. Rows with 0 are not guided.
             delay: ``d``, int64 ``[B, 1]``.
             sigma: standard deviation of the source, broadcastable to ``[B, P, d_a]``.
-
-        Returns:
-            A velocity of the same form; ``velocity`` itself if no row has a leftover.
 
         Raises:
             ValueError: if the shapes do not fit, or see :meth:`check_delay`.

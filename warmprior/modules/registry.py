@@ -15,8 +15,7 @@ __all__ = ["Registered", "find", "from_config", "make", "options_of"]
 class Registered:
     """Subclasses are known by name, and objects remember their constructor's arguments.
 
-    Every direct subclass has a registry of its own subclasses, except for those declared with
-    ``abstract=True``.
+    Every direct subclass has a registry of its own subclasses, except for those declared ``abstract=True``.
 
     Raises:
         ValueError: when a subclass takes the name of another, or a name that no file can have.
@@ -77,11 +76,8 @@ class Registered:
         """Name and constructor arguments as JSON holds them; :func:`from_config` reverses it.
 
         An argument that the constructor chose, as for ``sigma=None``, is taken from the object's attribute of
-        that name, if it is a number or text. Arguments that have a ``config()`` are saved as that, and all
-        others as given.
-
-        Raises:
-            TypeError: if JSON cannot hold an argument.
+        that name, if it is a number or text; one that has a ``config()`` is saved as that. A ``TypeError`` if
+        JSON cannot hold one.
         """
         if "name" in self._arguments:
             raise TypeError(f"{type(self).__name__} takes an argument called name: rename it")
@@ -110,10 +106,8 @@ class Registered:
 def find[T: Registered](base: type[T], name: str) -> type[T]:
     """The subclass of a name, or at a place such as ``"mypackage.priors:Anchor"``, which is imported.
 
-    Importing runs code, so use this for names that a user typed, and never for names in a file.
-
-    Raises:
-        ValueError: if there is none, or it is a base class.
+    Importing runs code, so use this for names that a user typed, and never for names in a file. A
+    ``ValueError`` if there is none, or it is a base class.
     """
     module, colon, attribute = name.partition(":")
     if not colon:
@@ -131,11 +125,8 @@ def find[T: Registered](base: type[T], name: str) -> type[T]:
 def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
     """Build what a user typed: a name as for :func:`find`, and options behind it, as in :func:`options_of`.
 
-    ``args`` are further arguments of the constructor.
-
-    Raises:
-        ValueError: if there is no such class, or an argument is out of range or unknown, naming it and what
-            the constructor takes.
+    ``args`` are further arguments of the constructor. A ``ValueError`` names what is wrong and what the
+    constructor takes.
 
     Examples:
         >>> from warmprior.modules.registry import make
@@ -155,12 +146,9 @@ def make[T: Registered](base: type[T], text: str, *args: Any) -> T:
 
 
 def options_of(text: str) -> dict[str, Any]:
-    """The options of ``name,option=value,...``, as JSON or plain text.
+    """The options of ``name,option=value,...``, as JSON or plain text; a ``ValueError`` if they are none.
 
     A comma separates options if ``option=`` follows, and belongs to the value otherwise.
-
-    Raises:
-        ValueError: if they are not written like this, or one is given twice.
     """
     options: dict[str, Any] = {}
     _, comma, rest = text.partition(",")

@@ -16,7 +16,7 @@ from warmprior.io.extras import require
 from warmprior.io.files import digest_of
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
-from warmprior.modules.interpolant import BridgeInterpolant
+from warmprior.modules.ode import BridgeInterpolant
 
 __all__ = ["BridgeCoupling", "Coupling", "OTCoupling", "ReflowCoupling"]
 
@@ -38,25 +38,21 @@ class OTCoupling:
 
     (Tong et al., 2024; Pooladian et al., 2023), exactly, in nearly equal groups of at most 256. At decisions
     the source is independent of the observation, so pairs across observations bias the policy; ``w``
-    penalises them. ``w = 0`` ignores the observation; a large ``w`` leaves all pairs as they are.
+    penalises them.
 
     Args:
-        observation_weight: ``w``, for normalised observations, each one tensor.
+        observation_weight: ``w``, for normalised observations, each one tensor; 0 ignores them.
 
     Raises:
         ValueError: if the weight is negative or not finite, a batch has fewer than two windows, or its
             observations are nested.
         ImportError: if scipy is missing.
 
-    See Also:
-        :class:`~warmprior.objectives.ReflowCoupling`: pairs each source with the end of a trained flow.
-
     Examples:
-        >>> from warmprior.objectives import OTCoupling
         >>> import torch
-        >>> couple = OTCoupling(observation_weight=0.0)
+        >>> from warmprior.objectives import OTCoupling
         >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
-        >>> [x.flatten().tolist() for x in couple(a0, a1)]
+        >>> [x.flatten().tolist() for x in OTCoupling(observation_weight=0.0)(a0, a1)]
         [[1.0, 0.0], [5.0, 4.0]]
     """
 
@@ -126,10 +122,9 @@ class BridgeCoupling(OTCoupling):
     Examples:
         >>> import torch
         >>> from warmprior.objectives import BridgeCoupling
-        >>> couple = BridgeCoupling(sigma=0.1, observation_weight=0.0)
         >>> a0, a1 = torch.tensor([[[0.0]], [[1.0]]]), torch.tensor([[[5.0]], [[4.0]]])
-        >>> [x.flatten().tolist() for x in couple(a0, a1)], couple.interpolant
-        ([[1.0, 0.0], [5.0, 4.0]], BridgeInterpolant(sigma=0.1))
+        >>> [x.flatten().tolist() for x in BridgeCoupling(sigma=0.1, observation_weight=0.0)(a0, a1)]
+        [[1.0, 0.0], [5.0, 4.0]]
     """
 
     ROUNDS: ClassVar[int] = 5  # of Sinkhorn's iteration at each noise, five times as many at the last
@@ -171,16 +166,12 @@ class ReflowCoupling:
         nfe: its Euler steps.
 
     Raises:
-        ValueError: if ``nfe`` is no whole number of at least 1, or a batch has chunks of another shape than
-            the teacher's.
-
-    See Also:
-        :class:`~warmprior.objectives.OTCoupling`: permutes the sources instead.
+        ValueError: if ``nfe`` is no whole number of at least 1, or chunks differ in shape from the teacher's.
 
     Examples:
-        >>> from warmprior.objectives import ReflowCoupling
         >>> import torch
         >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.objectives import ReflowCoupling
         >>> couple = ReflowCoupling(WarmPriorActor(VelocityMLP(2, 3, 4), GaussianPrior(4)), nfe=2)
         >>> a0, a1, seen = torch.randn(5, 4, 2), torch.zeros(5, 4, 2), torch.zeros(5, 2, 3)
         >>> source, target = couple(a0, a1, seen)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, cast, get_args
 
@@ -14,13 +15,84 @@ from torchrl.objectives.common import LossModule
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.interpolant import Interpolant, LinearInterpolant
+from warmprior.modules.checks import check_keys
 from warmprior.modules.network import network_observation, velocity_field
-from warmprior.modules.ode import integrate
+from warmprior.modules.ode import Interpolant, LinearInterpolant, integrate
 from warmprior.objectives.couplings import Coupling
-from warmprior.objectives.times import TIMES, Times
 
-__all__ = ["FlowMatchingLoss", "Objective", "Weighting", "check_objective"]
+__all__ = [
+    "TIMES",
+    "FlowMatchingLoss",
+    "Objective",
+    "Times",
+    "TimesName",
+    "Weighting",
+    "check_objective",
+    "logit_normal_times",
+    "start_times",
+    "u_shaped_times",
+    "uniform_times",
+]
+
+
+Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
+"""Draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
+
+TimesName = Literal["uniform", "u-shaped", "logit-normal", "start"]
+
+STEEPNESS = 4.0
+"""``a`` of :func:`u_shaped_times`: the ends are 3.8 times as dense as the middle."""
+
+
+def uniform_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    """All times alike, as in Algorithm 1."""
+    return torch.rand(shape, generator=generator, dtype=dtype, device=device)
+
+
+def u_shaped_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""More often near both ends.
+
+    The density is :math:`p(t) \propto e^{at} + e^{a(1-t)}` with :math:`a = 4` (Lee et al., 2024, "Improving
+    the training of rectified flows"). Their text has :math:`e^{-at}` as the second term, which is no U on [0,
+    1]; this is what their code draws from, by the inverse of
+
+    .. math::
+        F(t) = \frac12 + \frac{\sinh(a(t - \frac12))}{2 \sinh\frac a2}.
+    """
+    u = torch.rand(shape, generator=generator, dtype=dtype, device=device)
+    t = 0.5 + torch.asinh((2 * u - 1) * math.sinh(STEEPNESS / 2)) / STEEPNESS
+    return t.clamp(0.0, 1.0)  # rounding may leave the interval
+
+
+def logit_normal_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""More often in the middle: :math:`\log\frac t{1-t} \sim N(0, 1)` (Esser et al., 2024)."""
+    return torch.randn(shape, generator=generator, dtype=dtype, device=device).sigmoid()
+
+
+def start_times(
+    shape: torch.Size, generator: torch.Generator | None, dtype: torch.dtype, device: torch.device
+) -> Tensor:
+    r"""``t = 0`` alone: the network regresses :math:`a_1 - a_0`, and one step of Euler's method returns it.
+
+    The field is not trained at any other time: build the policy with ``max_nfe=1``.
+    """
+    return torch.zeros(shape, dtype=dtype, device=device)
+
+
+TIMES: dict[str, Times] = {
+    "uniform": uniform_times,
+    "u-shaped": u_shaped_times,
+    "logit-normal": logit_normal_times,
+    "start": start_times,
+}
+"""Those that have a name."""
+
 
 Objective = Literal["velocity", "l1"]
 
@@ -56,80 +128,63 @@ def check_objective(*, times: str, objective: str, weighting: str | None, self_d
 class FlowMatchingLoss(LossModule):
     r"""Conditional flow matching with the actor's own source (Algorithm 1, training).
 
-    For each window: draw :math:`a_0` from the prior, pair it with :math:`a_1`, draw
-    :math:`t \sim U(0, 1)`, set :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regress
-    :math:`v_\theta(t, a_t, o)` on :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's end do
-    not count. Two options for few integration steps work with any prior, and need the straight path:
+    For each window: draw :math:`a_0` from the prior, pair it with :math:`a_1`, draw :math:`t \sim U(0, 1)`,
+    set :math:`a_t = \alpha(t) a_0 + \beta(t) a_1`, and regress :math:`v_\theta(t, a_t, o)` on
+    :math:`\dot\alpha a_0 + \dot\beta a_1`. Positions past the episode's end do not count. Two options for few
+    integration steps work with any prior, and need the straight path:
 
     **The L1 objective** compares predicted samples instead of velocities (L1 Flow, Song et al., 2025,
-    arXiv:2511.17898). The sample that a velocity predicts is :math:`\hat a_1 = a_t + (1 - t) v`, so a
-    coordinate costs
+    arXiv:2511.17898). With :math:`\hat a_1 = a_t + (1 - t) v` a coordinate costs
 
     .. math::
         |\hat a_1 - a_1| = (1 - t) \, |v_\theta(t, a_t, o) - (a_1 - a_0)|,
 
-    and their two-step sampler, half an integration step and then the predicted sample, is Euler's method
-    with NFE 2. Their network gives :math:`\hat a_1`, ours the velocity of the same sample.
+    and their two-step sampler is Euler's method with NFE 2.
 
-    **Self-distillation** trains the sampler of one step, :math:`v_\theta(s, a_s, o)` at the time :math:`s`
-    at which the policy's samplers start, on where the flow of averaged weights
-    :math:`\bar\theta` ends,
+    **Self-distillation** trains the sampler of one step, :math:`v_\theta(s, a_s, o)` at the time :math:`s` at
+    which the policy's samplers start, on where the flow of averaged weights :math:`\bar\theta` ends,
 
     .. math::
         \left\| v_\theta(s, a_s, o) - \frac{\hat a_1 - a_s}{1 - s} \right\|^2, \qquad
         \hat a_1 = \Phi^{\bar\theta}_{s + h \to 1}(a_{s + h}), \qquad h = \frac{1 - s}{9},
 
     where :math:`\Phi` is the flow by Euler's method with steps of :math:`h`, and :math:`a_{s+h}` lies on the
-    data's own path. It replaces the velocity at the one time :math:`s`; at all others the network stays a
-    flow. The idea is the self-consistency of One-Step Flow Policy (Li et al., 2026, arXiv:2603.12480). Three
-    things differ: only the whole interval is learnt, because a velocity network has no input for another one;
-    the teacher crosses it in steps, as in progressive distillation, so no schedule is needed; and there is no
-    self-guidance. A quarter of the batch is distilled, as in shortcut models (Frans et al., 2025); a training
-    step takes about twice the time.
+    data's own path; at all other times the network stays a flow. The idea is the self-consistency of One-Step
+    Flow Policy (Li et al., 2026, arXiv:2603.12480), but only the whole interval is learnt, the teacher
+    crosses it in steps (progressive distillation), and there is no self-guidance. A quarter of the batch is
+    distilled, as in shortcut models (Frans et al., 2025); a training step takes about twice the time.
 
     Args:
         actor_network: the policy whose velocity network is trained; its prior gives the source.
-
-    Keyword Args:
         coupling: pairs the sources and targets of a batch, see :data:`~warmprior.objectives.Coupling`; in
             their order by default (Algorithm 1).
         times: how training times are distributed: ``"uniform"`` (Algorithm 1), ``"u-shaped"``,
-            ``"logit-normal"``, ``"start"`` (regression) (``warmprior.objectives.times``), or a function
-            of their signature.
+            ``"logit-normal"``, ``"start"`` (regression), or a function of their signature (:data:`Times`).
         objective: ``"velocity"`` (Algorithm 1) or ``"l1"``.
         weighting: ``"velocity"`` (Algorithm 1) takes errors as they are. ``"standardised"`` divides them by
             the standard deviation of the remainder (:meth:`PreconditionedNetwork.remainder`), so that every
-            time, position and dimension counts alike, as in EDM (Karras et al., 2022, Table 1). It is the
-            default for a :class:`PreconditionedNetwork`, and the recipe of the tables here. Without it,
-            errors near the source count little: with a standard normal source and data of deviation
-            :math:`s`, those at ``t = 0``, where one-step samplers are, count :math:`s^2` times those at ``t =
-            1``.
+            time, position and dimension counts alike, as in EDM (Karras et al., 2022, Table 1); the default
+            for a :class:`PreconditionedNetwork`. Without it, with a standard normal source and data of
+            deviation :math:`s`, errors at ``t = 0``, where one-step samplers are, count :math:`s^2` times
+            those at ``t = 1``.
         self_distillation: weight of the self-distillation; 0 turns it off.
         teacher: the network of averaged weights that self-distillation learns from; by default the trained
             network itself. It is neither trained nor saved with the loss.
-        interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or the
-            straight line.
-        reduction: ``"mean"`` over unpadded coordinates (Algorithm 1 divided by their number),
-            ``"sum"`` (Algorithm 1's squared norm, summed over the batch) or ``"none"``
-            (``[*B, P, d_a]``, zero where padded).
+        interpolant: the path; by default that of the :class:`~warmprior.PreconditionedNetwork`, or the line.
+        reduction: ``"mean"`` over unpadded coordinates (Algorithm 1 divided by their number), ``"sum"``
+            (Algorithm 1's) or ``"none"`` (``[*B, P, d_a]``, zero where padded).
         generator: source of randomness of ``t`` and :math:`a_0`; the actor sampler's by default.
 
     .. note::
-        Keys read (all renameable by :meth:`set_keys`): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool
-        ``[*B, P]`` (True = padded; optional), the history (:mod:`warmprior.history`) and
-        ``observation`` ``[*B, To, d_o]``; by default those of the actor. Batches are moved to the network's
-        device, where the generator has to be.
+        Keys read (renameable by :meth:`set_keys`): ``chunk`` ``[*B, P, d_a]``, ``pad_mask`` bool ``[*B, P]``
+        (optional), the ``history`` (:mod:`warmprior.history`) and ``observation`` ``[*B, To, d_o]``. Batches
+        are moved to the network's device, where the generator has to be.
 
     Raises:
-        ValueError: for an unknown ``reduction``, ``times``, ``objective`` or ``weighting``, or a negative
-            weight; for standardised errors of a network that is not preconditioned; for a curved path with an
-            option that needs the straight one; for an option that needs a flow with ``times="start"``, or
-            those times with a policy of more than one network evaluation; or for another path than the
-            network is preconditioned for.
+        ValueError: for an unknown option, or options that do not fit each other, the network or the policy.
 
     See Also:
-        - :class:`~warmprior.training.BehaviourCloning`: the training loop around it.
-        - :func:`~warmprior.window_replay_buffer`: its batches.
+        :class:`~warmprior.training.BehaviourCloning`: the training loop around it.
 
     Examples:
         >>> import torch
@@ -138,13 +193,10 @@ class FlowMatchingLoss(LossModule):
         >>> from warmprior import window_replay_buffer
         >>> data = TensorDict({"observation": torch.randn(100, 3), "action": torch.randn(100, 2),
         ...                    "episode": torch.arange(100) // 25}, [100])
-        >>> prior = PastPrior(8)
-        >>> actor = WarmPriorActor(VelocityMLP(2, 3, prior.prediction_length), prior)
-        >>> loss_module = FlowMatchingLoss(actor)
-        >>> batch = window_replay_buffer(data, prior, batch_size=16).sample()
-        >>> loss_module(batch)["loss_flow_matching"].backward()
-        >>> loss_module = FlowMatchingLoss(actor, times="u-shaped", self_distillation=1.0)
-        >>> sorted(loss_module(batch).keys())
+        >>> actor = WarmPriorActor(VelocityMLP(2, 3, prediction_length=8), PastPrior(8))
+        >>> batch = window_replay_buffer(data, actor.prior, batch_size=16).sample()
+        >>> FlowMatchingLoss(actor)(batch)["loss_flow_matching"].backward()
+        >>> sorted(FlowMatchingLoss(actor, times="u-shaped", self_distillation=1.0)(batch).keys())
         ['loss_flow_matching', 'loss_self_distillation']
     """
 
@@ -180,6 +232,7 @@ class FlowMatchingLoss(LossModule):
         super().__init__()
         if reduction not in ("none", "mean", "sum"):
             raise ValueError(f"reduction must be 'none', 'mean' or 'sum', got {reduction!r}")
+        self.reduction = reduction
         self.convert_to_functional(actor_network.network, "velocity_network")
         self.prior, self.coupling = actor_network.prior, coupling
         self.start_time = actor_network.ode.start_time
@@ -227,7 +280,6 @@ class FlowMatchingLoss(LossModule):
                 raise ValueError(f"one step from t = 0 ends at the data {straight}")
             if objective != "velocity" or self_distillation:
                 raise ValueError(f"a velocity predicts the sample {straight}")
-        self.reduction = reduction
         self.generator = actor_network.sampler.generator if generator is None else generator
         self.out_keys = ["loss_flow_matching"]
         if self_distillation:
@@ -240,35 +292,16 @@ class FlowMatchingLoss(LossModule):
         self.in_keys = [k.observation, k.chunk, k.pad_mask, k.history]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Compute the loss.
+        """Of a batch of windows ``"loss_flow_matching"`` and, weighted, ``"loss_self_distillation"``.
 
-        Args:
-            tensordict: a batch of windows, see the class docstring.
-
-        Returns:
-            TensorDict with ``"loss_flow_matching"`` and, with self-distillation, its weighted
-            ``"loss_self_distillation"``, reduced as configured. Unreduced, the latter is of the distilled
-            windows, ``[n, P, d_a]``.
-
-        Raises:
-            KeyError: if a needed key is missing.
+        Unreduced, the latter is of the distilled windows, ``[n, P, d_a]``. A ``KeyError`` if a needed key is
+        missing.
         """
         k = self.tensor_keys
         needed = (k.chunk, k.history, k.observation)
-        found = {key: tensordict.get(key, None) for key in needed}
-        missing = [key for key, value in found.items() if value is None]
-        if missing:
-            raise KeyError(
-                f"FlowMatchingLoss needs the keys {list(needed)}; missing: {missing}. Take batches of "
-                "window_replay_buffer"
-            )
-        device = next(iter(self.velocity_network_params.values(True, True)), found[k.chunk]).device
-        a1, history, observation = (value.to(device) for value in found.values())
-        if a1.shape[-2] != self.prior.prediction_length:
-            raise ValueError(
-                f"{k.chunk} has {a1.shape[-2]} positions, but {self.prior} predicts "
-                f"{self.prior.prediction_length}: make the windows for this length"
-            )
+        check_keys(tensordict, needed, "FlowMatchingLoss", ". Take batches of window_replay_buffer")
+        device = next(iter(self.velocity_network_params.values(True, True)), tensordict.get(k.chunk)).device
+        a1, history, observation = (tensordict.get(key).to(device) for key in needed)
         batch = a1.shape[:-2]
         a0 = self.prior.sample(history, observation, self.generator)
         if self.coupling is not None:

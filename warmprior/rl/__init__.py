@@ -1,13 +1,10 @@
 """Reinforcement learning in the source space of a frozen policy."""
 
+from warmprior.rl.agent import PriorSpaceConfig
 from warmprior.rl.anchor import PriorAnchor, has_anchor
-from warmprior.rl.box_normal import BoxTanhNormal
-from warmprior.rl.config import PriorSpaceConfig
-from warmprior.rl.decoder import PriorDecoder
+from warmprior.rl.decoder import PriorDecoder, PriorSpace, ResidualSampler
 from warmprior.rl.dsrl import DSRLNALoss
-from warmprior.rl.environment import PriorSpace
-from warmprior.rl.networks import make_prior_space_actor, make_prior_space_critic
-from warmprior.rl.residual import ResidualSampler
+from warmprior.rl.networks import BoxTanhNormal, make_prior_space_actor, make_prior_space_critic
 from warmprior.rl.training import PriorSpaceTraining
 
 __all__ = [

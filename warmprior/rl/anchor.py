@@ -25,8 +25,8 @@ def has_anchor(actor: Any) -> bool:
     agents search around zero, as in DSRL.
 
     Examples:
-        >>> from warmprior.rl import has_anchor
         >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.rl import has_anchor
         >>> network, priors = VelocityMLP(2, 3, 4), (GaussianPrior(4), PastPrior(4))
         >>> [has_anchor(WarmPriorActor(network, prior)) for prior in priors]
         [False, True]
@@ -42,10 +42,9 @@ def has_anchor(actor: Any) -> bool:
 
 
 def source_anchor(actor: Any, history: TensorDictBase, observation: Tensor | None) -> tuple[Tensor, Tensor]:
-    """The centre of the source at decisions: the mean where it is warm, or that of the start point.
+    """The centre of the source at decisions, ``[*B, P, d_a]``, and where it is known, bool ``[*B, P, 1]``.
 
-    Of histories ``[*B]`` and what the policy's network sees, ``[*B, To, d_o]``: the anchor, ``[*B, P, d_a]``,
-    and where it is known, bool ``[*B, P, 1]``.
+    Of histories ``[*B]`` and what the policy's network sees, ``[*B, To, d_o]``.
     """
     if actor.start is not None:
         centre = actor.start.centre(history, observation)
@@ -73,24 +72,21 @@ class PriorAnchor(EnvTransform):
 
     The first chunk of an episode has no mean, and neither has the second half of a preview. A small box
     around zero would confine these positions to the middle of the source that the policy was trained on; a
-    box around a draw of that source does not. This transform makes the draw before the agent acts, and writes
-    it next to the observation. So the agent sees the noise, the decision process stays Markov (for WP-Past if
-    whole chunks are executed, see :func:`~warmprior.make_prior_space_actor`) and the decoder deterministic.
-    For a policy with a :class:`~warmprior.StartPoint` the mean is that of the start point.
+    box around a draw of that source does not. This transform makes the draw before the agent acts, so that
+    the agent sees the noise, the decision process stays Markov (for WP-Past if whole chunks are executed, see
+    :func:`~warmprior.make_prior_space_actor`) and the decoder deterministic. For a policy with a
+    :class:`~warmprior.StartPoint` the mean is that of the start point.
 
-    Append it after :class:`ActionHistory`, inside or outside of batched environments. Resting rows keep their
-    anchor in a partial step.
+    Append it after :class:`ActionHistory`, inside or outside of batched environments.
 
     .. note::
-        ``env.set_seed`` seeds simulators. It seeds PyTorch's global generator only in the workers of a
-        ``ParallelEnv`` (not with ``use_buffers=False``) and of a ``MultiCollector``: in your own process call
-        ``torch.manual_seed``. Workers without a seed, or with the same one (``static_seed=True``), draw the
-        same noise: append the transform outside of them.
+        ``env.set_seed`` seeds PyTorch's global generator only in the workers of a ``ParallelEnv`` (not with
+        ``use_buffers=False``) and of a ``MultiCollector``: in your own process call ``torch.manual_seed``.
+        Workers without a seed, or with the same one, draw the same noise: append the transform outside of
+        them.
 
     Args:
         actor: the policy. A learned prior is copied as it is now, and the copy moves with the environment.
-
-    Keyword Args:
         cold: ``"noise"`` draws the cold source, N(0, I); ``"zero"`` puts zero. By default noise if the policy
             has an anchor (:func:`~warmprior.rl.has_anchor`), and zero otherwise, which gives vanilla DSRL:
             :math:`a_0 = \Delta`.
@@ -101,7 +97,7 @@ class PriorAnchor(EnvTransform):
         KeyError: if :class:`ActionHistory` does not come before.
 
     Examples:
-        >>> from torchrl.envs import GymEnv, TransformedEnv, Compose
+        >>> from torchrl.envs import Compose, GymEnv, TransformedEnv
         >>> from warmprior import ActionHistory, ChunkStep, PastPrior, PriorAnchor
         >>> from warmprior import VelocityMLP, WarmPriorActor
         >>> actor = WarmPriorActor(VelocityMLP(1, 3, 4), PastPrior(4))

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
+from typing import Any, Literal, get_args
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torch.nn.init import trunc_normal_
+from torchrl.data import Bounded, Composite
 from torchrl.envs import EnvBase
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_positive
+from warmprior.modules.checks import check_keys, check_positive
+from warmprior.rl.anchor import has_anchor, residual_sigma
+from warmprior.transforms.inner_step import EnvTransform
 
-__all__ = ["PriorDecoder"]
+__all__ = ["PriorDecoder", "PriorSpace", "ResidualSampler"]
 
 
 class PriorDecoder(TensorDictModuleBase):
@@ -27,35 +32,30 @@ class PriorDecoder(TensorDictModuleBase):
         a_0 = \mu + \Delta, \qquad \Delta \in [-\delta, \delta]^{P \times d_a},
 
     and the policy's own ODE carries :math:`a_0` to the chunk, deterministically. The anchor comes from
-    :class:`~warmprior.PriorAnchor`: the prior's mean where it is warm. With zero anchors this is
-    `DSRL <https://arxiv.org/abs/2506.15799>`_.
+    :class:`~warmprior.PriorAnchor`; with zero anchors this is `DSRL <https://arxiv.org/abs/2506.15799>`_.
 
     Place it behind the agent, ``TensorDictSequential(agent, decoder)``, or before the environment, as
-    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy's network, in
-    evaluation mode. The copy's parameters are buffers: they move and are saved with the decoder, and never
-    appear in ``parameters()``. ``children()`` is empty, so that PyTorch and TorchRL cannot switch the network
-    to training mode or reset its weights.
+    :class:`~warmprior.PriorSpace`. It computes under ``no_grad`` with a copy of the policy's network in
+    evaluation mode, whose parameters are buffers: they move and are saved with the decoder, and never appear
+    in ``parameters()``. ``children()`` is empty, so that nothing switches the network to training mode.
 
     Args:
         actor: the policy; copied. Or an object with the same parts, such as
             :class:`~warmprior.lerobot.LeRobotActor`.
-
-    Keyword Args:
-        delta: half the side of the agent's box, in units of the normalised action space. The paper uses
-            0.5 around a warm mean and 1.5 around zero.
+        delta: half the side of the agent's box, in units of the normalised action space. The paper uses 0.5
+            around a warm mean and 1.5 around zero.
         nfe: network evaluations per chunk; the actor's own by default.
 
     Raises:
-        ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0``
-            alone or is guided, or ``nfe`` does not suit it.
+        ValueError: if ``delta`` is not a finite number > 0, the policy is trained at ``t = 0`` alone or is
+            guided, or ``nfe`` does not suit it.
         KeyError: (when called) if an input key is missing.
 
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
         >>> from warmprior import PastPrior, PriorDecoder, VelocityMLP, WarmPriorActor
-        >>> prior = PastPrior(4)
-        >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), prior, nfe=1), delta=0.5)
+        >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4), nfe=1), delta=0.5)
         >>> data = TensorDict({"observation": torch.zeros(5, 2, 3),
         ...     "prior": {"anchor": torch.zeros(5, 4, 2), "delta": torch.full((5, 4, 2), 0.5)}}, [5])
         >>> decoder(data)["vla_action", "chunk"].shape
@@ -104,12 +104,8 @@ class PriorDecoder(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the source and the chunk."""
-        missing = [key for key in self.in_keys if tensordict.get(key, None) is None]
-        if missing:
-            raise KeyError(
-                f"PriorDecoder needs the keys {self.in_keys}; missing: {missing}. PriorAnchor writes the "
-                "anchor in an environment and the agent the residual"
-            )
+        hint = ". PriorAnchor writes the anchor in an environment and the agent the residual"
+        check_keys(tensordict, self.in_keys, "PriorDecoder", hint)
         anchor, delta = tensordict.get(keys.ANCHOR), tensordict.get(keys.DELTA)
         expected = (self.prediction_length, self.action_dim or anchor.shape[-1])
         if tuple(anchor.shape[-2:]) != expected:
@@ -127,7 +123,7 @@ class PriorDecoder(TensorDictModuleBase):
         return tensordict.set(keys.NOISE, noise).set(keys.CHUNK, chunk)
 
     def check_env(self, env: EnvBase) -> None:
-        """Compare the policy with an environment whose action is the chunk: its length and width.
+        """Compare the policy's chunks with those that an environment takes: length and width.
 
         Raises:
             KeyError: if the environment takes no chunk.
@@ -172,3 +168,159 @@ def _freeze(module: nn.Module) -> None:
             delattr(child, name)
             child.register_buffer(name, buffer)
         child.train(False)
+
+
+class PriorSpace(EnvTransform):
+    r"""Makes the residual the environment's action: :math:`\Delta \in [-\delta, \delta]^{P \times d_a}`.
+
+    The other way to use :class:`~warmprior.PriorDecoder`, for agents and tools that expect a plain
+    environment with a bounded action. The transitions are those of ``TensorDictSequential(agent, decoder)``,
+    but the source is under ``("next", "decoded", "noise")`` and the chunk under ``("next", "decoded",
+    "chunk")``: TorchRL drops what an inverse transform writes, so they are part of the next state, and under
+    their usual names they would be mistaken for those of the next step.
+
+    Append it last, after :class:`~warmprior.PriorAnchor`, and outside batched environments: inside, every
+    worker would hold a copy of the network.
+
+    Args:
+        decoder: the frozen policy.
+
+    Raises:
+        KeyError: if :class:`~warmprior.ChunkStep` or :class:`~warmprior.PriorAnchor` does not come before.
+        ValueError: if the environment's chunks are not the policy's, see :meth:`PriorDecoder.check_env`.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from warmprior import PastPrior, PriorAnchor, PriorDecoder, PriorSpace, VelocityMLP
+        >>> from warmprior import WarmPriorActor, policy_transforms
+        >>> from warmprior.envs import NavigationEnv
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4), nfe=1)
+        >>> transforms = policy_transforms(actor.prior, observation_steps=1)
+        >>> transforms.append(PriorAnchor(actor))
+        >>> transforms.append(PriorSpace(PriorDecoder(actor, delta=0.5)))
+        >>> env = TransformedEnv(NavigationEnv(batch_size=[3]), transforms)
+        >>> env.action_keys, env.rollout(2)["next", "decoded", "chunk"].shape
+        ([('prior', 'delta')], torch.Size([3, 2, 4, 1]))
+    """
+
+    def __init__(self, decoder: PriorDecoder) -> None:
+        written = [keys.DECODED_NOISE, keys.DECODED_CHUNK]
+        super().__init__(out_keys=written, in_keys_inv=[keys.CHUNK], out_keys_inv=[keys.DELTA])
+        self.decoder = decoder
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self.decoder(tensordict)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        for key, out_key in zip(self.decoder.out_keys, self.out_keys, strict=True):
+            next_tensordict.set(out_key, tensordict.get(key))
+        return next_tensordict
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        anchor = self._anchor_of(tensordict_reset)
+        for key in self.out_keys:
+            tensordict_reset.set(key, torch.zeros_like(anchor))
+        return tensordict_reset
+
+    def _anchor_of(self, observations: Any) -> Any:
+        if keys.ANCHOR not in observations.keys(True, True):
+            raise KeyError(
+                f"PriorSpace found no {keys.ANCHOR} among the observations: append it after PriorAnchor"
+            )
+        return observations[keys.ANCHOR]
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Replace the chunk by the bounded residual."""
+        self.decoder.check_env(self.parent)
+        actions = input_spec["full_action_spec"]
+        leaf, delta = actions[keys.CHUNK], self.decoder.delta
+        actions[keys.DELTA] = Bounded(-delta, delta, leaf.shape, dtype=leaf.dtype, device=leaf.device)
+        # With its branch, which would count as an action when it is empty.
+        del actions[keys.CHUNK[0]]
+        return input_spec
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the source and the chunk."""
+        anchor = self._anchor_of(observation_spec)
+        for key in self.out_keys:
+            observation_spec[key] = anchor.clone()
+        return observation_spec
+
+
+ResidualDistribution = Literal["normal", "clipped", "truncated", "uniform"]
+
+
+class ResidualSampler(TensorDictModuleBase):
+    r"""Draws residuals without an agent, for the warm-up and for distilling the noise critic.
+
+    ``"normal"`` draws :math:`\sigma \varepsilon`, the training prior, which may leave the agent's box;
+    ``"clipped"`` clips it to :math:`[-\delta, \delta]`, ``"truncated"`` draws it again until it lies there,
+    and ``"uniform"`` draws from :math:`U[-\delta, \delta]`.
+    :math:`\delta` is the decoder's, :math:`\sigma` the typical deviation of the source from the centre of the
+    search: the prior's ``sigma`` around its mean, the start point's share of noise, or 1 around zero.
+
+    ``TensorDictSequential(ResidualSampler(decoder), decoder)`` is a policy for the first steps of a collector
+    (the environment's own random actions would be random *chunks* there).
+
+    Args:
+        decoder: the frozen policy.
+        distribution: see above. By default ``"clipped"`` around a mean (``"uniform"`` if the prior has no
+            noise) and ``"normal"`` around zero, as in DSRL-NA; DSRL-SAC uses ``"clipped"`` around zero.
+        generator: source of randomness on the data's device; PyTorch's global one by default.
+
+    Raises:
+        ValueError: for an unknown distribution, or another than ``"uniform"`` for a prior without noise.
+        KeyError: (when called) if the anchor is missing.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import PastPrior, PriorDecoder, ResidualSampler, VelocityMLP, WarmPriorActor
+        >>> decoder = PriorDecoder(WarmPriorActor(VelocityMLP(2, 3, 4), PastPrior(4)), delta=0.5)
+        >>> data = TensorDict({"prior": {"anchor": torch.zeros(100, 4, 2)}}, [100])
+        >>> float(ResidualSampler(decoder)(data)["prior", "delta"].abs().max())
+        0.5
+    """
+
+    def __init__(
+        self,
+        decoder: PriorDecoder,
+        *,
+        distribution: ResidualDistribution | None = None,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        sigma = residual_sigma(decoder)
+        if distribution is None and has_anchor(decoder):
+            distribution = "clipped" if sigma > 0 else "uniform"
+        elif distribution is None:
+            distribution = "normal"
+        if distribution not in get_args(ResidualDistribution):
+            raise ValueError(
+                "the distribution must be 'normal', 'clipped', 'truncated' or 'uniform', got "
+                f"{distribution!r}"
+            )
+        if distribution != "uniform" and sigma == 0:
+            raise ValueError(f"a prior without noise leaves 'uniform', got the distribution {distribution!r}")
+        self.distribution = distribution
+        self.sigma = sigma
+        self.delta = decoder.delta
+        self.generator = generator
+        self.in_keys = [keys.ANCHOR]
+        self.out_keys = [keys.DELTA]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the residual."""
+        check_keys(tensordict, self.in_keys, "ResidualSampler", ". PriorAnchor writes it")
+        anchor = tensordict.get(self.in_keys[0])
+        like = {"dtype": anchor.dtype, "device": anchor.device, "generator": self.generator}
+        if self.distribution == "uniform":
+            delta = (2.0 * torch.rand(anchor.shape, **like) - 1.0) * self.delta
+        elif self.distribution == "truncated":
+            box = (-self.delta, self.delta)
+            delta = trunc_normal_(torch.empty_like(anchor), 0.0, self.sigma, *box, generator=self.generator)
+        else:
+            delta = self.sigma * torch.randn(anchor.shape, **like)
+        if self.distribution == "clipped":
+            delta = delta.clamp(-self.delta, self.delta)
+        return tensordict.set(self.out_keys[0], delta)

@@ -19,17 +19,21 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from torchrl.objectives.utils import _vmap_func, dispatch_value_estimator
 
 from warmprior import keys
-from warmprior.modules.checks import check_finite, check_positive, check_whole_numbers
-from warmprior.rl.box_normal import BoxTanhNormal
-from warmprior.rl.decoder import PriorDecoder
-from warmprior.rl.residual import ResidualDistribution, ResidualSampler
+from warmprior.modules.checks import check_finite, check_keys, check_positive, check_whole_numbers
+from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
+from warmprior.rl.networks import BoxTanhNormal
 
 __all__ = ["DSRLNALoss"]
 
 type Critics = TensorDictModule | list[TensorDictModule]
 
 CRITICS = 2
-"""Of each kind, of whose values the smaller, or the mean, counts."""
+"""Of each kind, of whose values the smaller counts."""
+
+ELSEWHERE = (
+    ". Data from an environment with PriorSpace hold the chunk under ('next', 'decoded', 'chunk'): "
+    "set_keys(chunk=...)"
+)
 
 
 class DSRLNALoss(LossModule):
@@ -50,8 +54,8 @@ class DSRLNALoss(LossModule):
         L_\alpha = -\log \alpha \, (\log \pi + \mathcal{H})
 
     with stopped gradients where SAC has them; batch means throughout. Log-probabilities count in units of the
-    box, :math:`\Delta / \delta \in [-1, 1]`, as in the official implementation, so that entropies do not
-    depend on :math:`\delta`. The defaults are the official ones but for the discount. The official schedule
+    box, :math:`\Delta / \delta \in [-1, 1]`, as in the official implementation, and time-outs count as
+    terminations, as there. The defaults are the official ones but for the discount. The official schedule
     takes several updates per step and then distils on batches of its own:
 
     .. code-block:: python
@@ -66,38 +70,30 @@ class DSRLNALoss(LossModule):
             if "loss_qvalue" in losses.keys():
                 updater.step()
 
-    One optimiser is enough: Adam skips parameters without gradient.
-
     Args:
         actor_network: the policy over residuals, see :func:`~warmprior.make_prior_space_actor`.
-        qvalue_network: :math:`Q^A`, which reads ``keys.CHUNK`` (all ``P`` actions, or its targets
-            would not be Markov for WP-Preview; see :func:`~warmprior.make_prior_space_critic`); one module,
-            of which two copies are initialised, or a list.
+        qvalue_network: :math:`Q^A`, which reads ``keys.CHUNK`` (all ``P`` actions, see
+            :func:`~warmprior.make_prior_space_critic`); one module, of which two copies are initialised, or a
+            list.
         noise_qvalue_network: :math:`Q^W`, which reads ``keys.DELTA``; the same.
         decoder: the frozen policy. Its buffers are in the loss's ``state_dict()`` and move with
             ``loss.to(device)``; ``parameters()`` and target updates never see it.
-
-    Keyword Args:
-        backup: how critics are combined, in targets and in the actor's loss: ``"min"`` or ``"mean"``.
         backup_entropy: whether targets include the entropy.
-        bootstrap_timeouts: whether the value after a time-out counts. The official implementation treats
-            time-outs as terminations.
         discount: ``"step"`` discounts by :math:`\gamma^k` for ``k`` executed control steps, with the
-            ``gamma`` given to :class:`~warmprior.ChunkStep`; ``"decision"`` by :math:`\gamma`
-            whatever ``k``, as the official implementation does (with undiscounted rewards inside chunks).
+            ``gamma`` given to :class:`~warmprior.ChunkStep`; ``"decision"`` by :math:`\gamma` whatever ``k``,
+            as the official implementation does (with undiscounted rewards inside chunks).
         noise_critic_steps: distillation steps per round of :meth:`schedule`.
-        distillation: :math:`q`, see :class:`~warmprior.ResidualSampler`. By default ``"normal"`` around
-            zero, the official one, and ``"clipped"`` around a mean.
+        distillation: :math:`q`, see :class:`~warmprior.ResidualSampler`. By default ``"normal"`` around zero,
+            the official one, and ``"clipped"`` around a mean.
         alpha_init: initial temperature.
         target_entropy: :math:`\mathcal{H}`, of the residual in units of the box.
 
     .. note::
-        Keys (renameable by :meth:`set_keys`): ``chunk``, the decoded chunk of the transition (set it to
-        ``("next", "decoded", "chunk")`` for data from :class:`~warmprior.PriorSpace`); under ``"next"``
-        ``reward``, ``done``, ``terminated`` and ``executed``; ``priority``, where the TD error of each
-        row is written; ``priority_weight``; ``state_action_value``, the critics' output. It also reads the
-        ``in_keys`` of the networks and the decoder, at the root and under ``"next"``, but not the residual
-        that led to the chunk. ``loss.in_keys`` lists everything:
+        Keys (renameable by :meth:`set_keys`): ``chunk``, the decoded chunk of the transition (``("next",
+            "decoded",
+        "chunk")`` in data from :class:`~warmprior.PriorSpace`); under ``"next"`` ``reward``, ``done`` and
+        ``executed``; ``priority``, where the TD error of each row is written; ``priority_weight``;
+        ``state_action_value``, the critics' output. ``loss.in_keys`` lists all that it reads:
         ``buffer.extend(data.reshape(-1).select(*loss.in_keys))``.
 
     Raises:
@@ -128,7 +124,6 @@ class DSRLNALoss(LossModule):
         chunk: NestedKey = keys.CHUNK
         reward: NestedKey = "reward"
         done: NestedKey = "done"
-        terminated: NestedKey = "terminated"
         executed: NestedKey = keys.EXECUTED
         state_action_value: NestedKey = "state_action_value"
         priority: NestedKey = "td_error"
@@ -158,17 +153,13 @@ class DSRLNALoss(LossModule):
         noise_qvalue_network: Critics,
         decoder: PriorDecoder,
         *,
-        backup: Literal["min", "mean"] = "min",
         backup_entropy: bool = True,
-        bootstrap_timeouts: bool = False,
         discount: Literal["step", "decision"] = "step",
         noise_critic_steps: int = 10,
         distillation: ResidualDistribution | None = None,
         alpha_init: float = 1.0,
         target_entropy: float = 0.0,
     ) -> None:
-        if backup not in ("min", "mean"):
-            raise ValueError(f"backup must be 'min' or 'mean', got {backup!r}")
         if discount not in ("step", "decision"):
             raise ValueError(f"discount must be 'step' or 'decision', got {discount!r}")
         check_whole_numbers(noise_critic_steps=noise_critic_steps)
@@ -178,9 +169,7 @@ class DSRLNALoss(LossModule):
         _check_networks(actor_network, qvalue_network, noise_qvalue_network, decoder)
         super().__init__()
         self.decoder = decoder
-        self.backup = backup
         self.backup_entropy = backup_entropy
-        self.bootstrap_timeouts = bootstrap_timeouts
         self.discount = discount
         self.noise_critic_steps = noise_critic_steps
         self.reduction = "mean"
@@ -204,7 +193,7 @@ class DSRLNALoss(LossModule):
     def _reinforcement_keys(self) -> list[NestedKey]:
         k = self.tensor_keys
         after = self._states(self.actor_network, self.decoder, self.qvalue_network)
-        after += [k.reward, k.done, k.terminated, *[k.executed] * (self.discount == "step")]
+        after += [k.reward, k.done, *[k.executed] * (self.discount == "step")]
         before = self._states(self.actor_network, self.qvalue_network, self.noise_qvalue_network)
         return [*before, k.chunk, *(unravel_key(("next", key)) for key in after)]
 
@@ -222,20 +211,8 @@ class DSRLNALoss(LossModule):
         needed = dict.fromkeys(unravel_key(key) for module in modules for key in module.in_keys)
         return [key for key in needed if key not in actions]
 
-    def _check_keys(self, tensordict: TensorDictBase, needed: list[NestedKey]) -> None:
-        missing = [key for key in needed if tensordict.get(key, None) is None]
-        if missing:
-            raise KeyError(
-                f"{type(self).__name__} needs the keys {needed}; missing: {missing}. Data from an "
-                'environment with PriorSpace hold the chunk under ("next", "decoded", "chunk"): '
-                "set_keys(chunk=...)"
-            )
-
     def make_value_estimator(self, value_type: ValueEstimators | None = None, **hyperparams: Any) -> None:
-        """Choose the discount: ``make_value_estimator(ValueEstimators.TD0, gamma=0.99)``.
-
-        ``TD0`` is the only one that fits, besides an estimator of the user's.
-        """
+        """Choose the discount: ``make_value_estimator(ValueEstimators.TD0, gamma=0.99)``; no other fits."""
         value_type, hyperparams = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
         if value_type is not None:
             dispatch_value_estimator(
@@ -243,10 +220,9 @@ class DSRLNALoss(LossModule):
             )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """All four losses on one batch of transitions ``[N]``.
+        """All four losses on one batch of transitions ``[N]``, scalars.
 
-        They are scalars: ``loss_actor``, ``loss_alpha``, ``loss_qvalue`` and ``loss_qvalue_noise``, and
-        detached ``alpha``, ``entropy`` (units of the box) and ``td_error``.
+        And detached ``alpha``, ``entropy`` (units of the box) and ``td_error``.
         """
         return self.reinforcement_loss(tensordict).update(self.distillation_loss(tensordict))
 
@@ -254,17 +230,14 @@ class DSRLNALoss(LossModule):
         """The official order: the first three losses ``updates`` times, then the distillation.
 
         The methods to call, each on a batch of its own. ``updates`` is the official ``utd``: updates per
-        vector step, 20 for four environments. A ``ValueError`` if it is below 1.
+        vector step, 20 for four environments.
         """
         check_whole_numbers(updates=updates)
         return iter([self.reinforcement_loss] * updates + [self.distillation_loss] * self.noise_critic_steps)
 
     def reinforcement_loss(self, tensordict: TensorDictBase) -> TensorDict:
-        """The losses of the actor, the temperature and the action critic, and the diagnostics.
-
-        On transitions ``[N]``, to which the TD errors are written.
-        """
-        self._check_keys(tensordict, self._reinforcement_keys())
+        """The losses of actor, temperature and action critic on transitions ``[N]``; writes the TD errors."""
+        check_keys(tensordict, self._reinforcement_keys(), type(self).__name__, ELSEWHERE)
         weights = self._maybe_get_priority_weight(tensordict)
         alpha = self.log_alpha.exp().detach()
         loss_qvalue, td_error = self._qvalue_loss(tensordict, alpha)
@@ -275,7 +248,7 @@ class DSRLNALoss(LossModule):
         # Gradients reach the residual, not the critic.
         frozen = self.noise_qvalue_network_params.detach()
         value = self._vmap_noise_qvalue(state.set(keys.DELTA, delta), frozen)
-        loss_actor = alpha * log_prob - self._combine(value)
+        loss_actor = alpha * log_prob - self._values(value).amin(0)
         loss_alpha = -self.log_alpha * (log_prob.detach() + self.target_entropy)
         losses = {"loss_actor": loss_actor, "loss_alpha": loss_alpha, "loss_qvalue": loss_qvalue}
         diagnostics = {"alpha": alpha, "entropy": -log_prob.detach().mean(), "td_error": td_error.mean()}
@@ -287,7 +260,7 @@ class DSRLNALoss(LossModule):
             state = after.select(*self._states(self.actor_network, self.decoder, self.qvalue_network))
             delta, log_prob = self._act(state)
             state = self.decoder(state.set(keys.DELTA, delta))
-            value = self._combine(self._vmap_qvalue(state, self.target_qvalue_network_params))
+            value = self._values(self._vmap_qvalue(state, self.target_qvalue_network_params)).amin(0)
             if self.backup_entropy:
                 value = value - alpha * log_prob
             target = self._td_target(after, value)
@@ -297,11 +270,8 @@ class DSRLNALoss(LossModule):
         return 0.5 * error.square().sum(0), error.detach().abs().amax(0)
 
     def distillation_loss(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss of the noise critic against the action critic on decoded residuals, head by head.
-
-        On any states ``[N]``; actions, rewards and next states are not read.
-        """
-        self._check_keys(tensordict, self._distillation_keys())
+        """The loss of the noise critic against the action critic, at any states ``[N]``."""
+        check_keys(tensordict, self._distillation_keys(), type(self).__name__)
         weights = self._maybe_get_priority_weight(tensordict)
         with torch.no_grad():
             state = tensordict.select(*self._distillation_keys())
@@ -316,11 +286,10 @@ class DSRLNALoss(LossModule):
         estimator = self.value_estimator
         e = estimator.tensor_keys
         reward = after.get(k.reward)
-        ended = after.get(k.terminated if self.bootstrap_timeouts else k.done)
         data = TensorDict({}, batch_size=after.batch_size)
         data.set(("next", e.reward), reward)
-        data.set(("next", e.done), after.get(k.done))
-        data.set(("next", e.terminated), ended)
+        for flag in (e.done, e.terminated):  # as in the official implementation, a time-out ends it all
+            data.set(("next", flag), after.get(k.done))
         if self.discount == "step":
             data.set(e.steps_to_next_obs, after.get(k.executed))
         return estimator.value_estimate(data, next_value=value.view_as(reward)).squeeze(-1)
@@ -349,10 +318,6 @@ class DSRLNALoss(LossModule):
             found = "none" if values is None else f"the shape {tuple(values.shape)}"
             raise ValueError(f"every critic must give one value [*B, 1] at {key!r}, found {found}")
         return values.squeeze(-1)
-
-    def _combine(self, data: TensorDictBase) -> Tensor:
-        values = self._values(data)
-        return values.amin(0) if self.backup == "min" else values.mean(0)
 
     def _finish(
         self, losses: dict[str, Tensor], tensordict: TensorDictBase, weights: Tensor | None

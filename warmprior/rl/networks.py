@@ -15,16 +15,56 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from warmprior import keys
 from warmprior.modules.checks import check_positive, check_whole_numbers
 
-__all__ = ["make_prior_space_actor", "make_prior_space_critic"]
+__all__ = ["BoxTanhNormal", "make_prior_space_actor", "make_prior_space_critic"]
+
+
+class BoxTanhNormal(TanhNormal):
+    r""":class:`~torchrl.modules.TanhNormal` with log-probabilities in units of its box.
+
+    For :math:`\Delta \in [-\delta, \delta]^n` they are those of :math:`\Delta / \delta \in [-1, 1]^n`, larger
+    by :math:`n \log \delta`. With it TorchRL's own losses measure entropy as DSRL and
+    :class:`~warmprior.DSRLNALoss` do, whatever the box: ``make_prior_space_actor(...,
+    distribution_class=BoxTanhNormal)``, with ``SACLoss(..., target_entropy=0.0)`` as in DSRL.
+
+    Args:
+        loc: as for the parent.
+        scale: as for the parent.
+        kwargs (Any): as for the parent, ``low`` and ``high`` among them.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import BoxTanhNormal
+        >>> loc, scale = torch.zeros(2), torch.ones(2)
+        >>> small = BoxTanhNormal(loc, scale, low=-0.5, high=0.5, event_dims=1)
+        >>> large = BoxTanhNormal(loc, scale, low=-1.5, high=1.5, event_dims=1)
+        >>> bool(torch.isclose(small.log_prob(0.1 * torch.ones(2)), large.log_prob(0.3 * torch.ones(2))))
+        True
+    """
+
+    def _change_of_units(self) -> Tensor:
+        half = (self.high - self.low) / 2
+        return half.log().expand(self.event_shape).sum()
+
+    def log_prob(self, value: Tensor) -> Tensor:
+        """The log-density of ``value`` in units of the box."""
+        return super().log_prob(value) + self._change_of_units()
+
+    def rsample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+        """A draw with pathwise gradients and its log-density in units of the box."""
+        sample, log_prob = super().rsample_and_log_prob(sample_shape)
+        return sample, log_prob + self._change_of_units()
+
+    def sample_and_log_prob(self, sample_shape: torch.Size | tuple[int, ...] = ()) -> tuple[Tensor, Tensor]:
+        """A draw without pathwise gradients and its log-density in units of the box."""
+        sample, log_prob = super().sample_and_log_prob(sample_shape)
+        return sample, log_prob + self._change_of_units()
+
 
 LOG_STD_RANGE = (-20.0, 2.0)
 
 
 class _Trunk(nn.Module):
-    """``num_layers`` times Linear, LayerNorm and Tanh, then linear, on flattened and concatenated inputs.
-
-    The first input is an observation ``[*B, To, d_o]``, the others are ``[*B, P, d_a]``.
-    """
+    """``num_layers`` times Linear, LayerNorm and Tanh, then linear, on flattened and concatenated inputs."""
 
     def __init__(
         self,
@@ -104,8 +144,6 @@ def make_prior_space_actor(
         observation_dim: ``d_o``.
         prediction_length: ``P``.
         observation_steps: ``To``.
-
-    Keyword Args:
         delta: half the side of the box; :attr:`PriorDecoder.delta`.
         hidden_dim: width of the layers.
         num_layers: number of layers.
@@ -119,14 +157,13 @@ def make_prior_space_actor(
         ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
 
     Examples:
-        >>> from warmprior import make_prior_space_actor
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> actor = make_prior_space_actor(2, 3, 4, delta=0.5)
-        >>> data = actor(TensorDict({"observation": torch.zeros(5, 2, 3),
-        ...                          "prior": {"anchor": torch.zeros(5, 4, 2)}}, [5]))
-        >>> data["prior", "delta"].shape, data["prior", "delta_log_prob"].shape
-        (torch.Size([5, 4, 2]), torch.Size([5]))
+        >>> from warmprior import make_prior_space_actor
+        >>> data = TensorDict({"observation": torch.zeros(5, 2, 3),
+        ...                    "prior": {"anchor": torch.zeros(5, 4, 2)}}, [5])
+        >>> make_prior_space_actor(2, 3, 4, delta=0.5)(data)["prior", "delta"].shape
+        torch.Size([5, 4, 2])
     """
     check_positive(delta=delta)
     chunk = (prediction_length, action_dim)
@@ -161,7 +198,7 @@ def make_prior_space_critic(
     """A critic of residuals or of chunks, with the trunk of :func:`make_prior_space_actor`.
 
     The default judges residuals, for TorchRL's losses and as the noise critic of
-    :class:`~warmprior.DSRLNALoss`. ``in_keys=(keys.OBSERVATION, keys.CHUNK)`` makes the latter's action
+    :class:`~warmprior.DSRLNALoss`; ``in_keys=(keys.OBSERVATION, keys.CHUNK)`` makes the latter's action
     critic. It judges all ``P`` actions of a chunk, which determine the next mean for WP-Preview, and for
     WP-Past if whole chunks are executed. With ``execute < H`` earlier actions are part of the next mean: give
     actor and critics ``keys.ACTIONS`` as well.
@@ -171,8 +208,6 @@ def make_prior_space_critic(
         observation_dim: ``d_o``.
         prediction_length: ``P``.
         observation_steps: ``To``.
-
-    Keyword Args:
         delta: residuals are divided by it, so that the critic sees [-1, 1].
         hidden_dim: width of the layers.
         num_layers: number of layers.
@@ -183,9 +218,9 @@ def make_prior_space_critic(
         ValueError: if a size is not positive, or ``delta`` not a finite number > 0.
 
     Examples:
-        >>> from warmprior import make_prior_space_critic
         >>> import torch
         >>> from tensordict import TensorDict
+        >>> from warmprior import make_prior_space_critic
         >>> critic = make_prior_space_critic(2, 3, 4, in_keys=["observation", ("vla_action", "chunk")])
         >>> critic(TensorDict({"observation": torch.zeros(5, 2, 3),
         ...     "vla_action": {"chunk": torch.zeros(5, 4, 2)}}, [5]))["state_action_value"].shape

@@ -79,14 +79,10 @@ def ray_rounds(
 ) -> Iterator[Iterator[TensorDictBase]]:
     """Rounds of decisions, ``[collectors, num_envs, 1]``: one by each environment of several Ray actors.
 
-    Each has a CPU, and ``make_env(seed)`` makes its ``num_envs`` environments. Before every round all receive
-    the current weights of ``policy``, and wait for the slowest. Actor ``i`` draws from
-    ``seed + 10_000 * i``, so the same arguments give the same decisions on any number of machines. Local
-    collection gives others.
-
-    Raises:
-        ValueError: if the cluster has fewer CPUs than there are to be actors.
-        WorkerError: if an actor dies, or an environment in it fails, a ``RuntimeError``.
+    Before every round all receive the current weights of ``policy``, and wait for the slowest. Actor ``i``
+    has a CPU and draws from ``seed + 10_000 * i``, so the same arguments give the same decisions on any
+    number of machines. A ``ValueError`` if the cluster has too few CPUs, a ``WorkerError`` if an actor dies
+    or its environment fails.
     """
     with ray_cluster(address, collectors) as ray:
         from torchrl.collectors.distributed import RayCollector

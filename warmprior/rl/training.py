@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, unravel_key
 from torchrl.data import LazyTensorStorage, ReplayBuffer
@@ -18,17 +19,69 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
 from warmprior import keys
+from warmprior.io.files import read_tensors, save_file, write_atomic
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite
-from warmprior.rl.agent import PriorSpaceAgent
+from warmprior.rl.agent import PriorSpaceAgent, PriorSpaceConfig
 from warmprior.rl.anchor import has_anchor
-from warmprior.rl.config import PriorSpaceConfig
 from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
-from warmprior.rl.replay_segments import ReplaySegments
 from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state
 from warmprior.training.evaluation import evaluate, watched
 
-__all__ = ["PriorSpaceTraining"]
+__all__ = ["PriorSpaceTraining", "ReplaySegments"]
+
+
+class ReplaySegments:
+    """A folder of safetensors files, one per save, with the transitions since the one before.
+
+    A segment is valid once :attr:`committed` counts it. If a process dies between writing a segment and its
+    training state, the next one replaces that segment. Of a folder that exists ``segments`` are kept.
+    """
+
+    def __init__(self, directory: Path, segments: int = 0) -> None:
+        self.directory = directory
+        self.committed = segments
+        self._pending: list[TensorDictBase] = []
+
+    def _path(self, index: int) -> Path:
+        return self.directory / f"{index:06d}.safetensors"
+
+    def append(self, transitions: TensorDictBase) -> None:
+        """Remember transitions ``[n]`` for the next :meth:`write`."""
+        self._pending.append(transitions.cpu())
+
+    def write(self) -> None:
+        """Write what was appended as one new segment, if anything was."""
+        if not self._pending:
+            return
+        data: Any = torch.cat(self._pending)  # type: ignore[arg-type]
+        tensors = {
+            json.dumps(key): value.contiguous()  # names may hold any separator
+            for key, value in data.items(True, True)
+        }
+        write_atomic(self._path(self.committed), lambda path: save_file(tensors, path))
+        self.committed += 1
+        self._pending.clear()
+
+    def load(self) -> TensorDict | None:
+        """All committed transitions ``[N]`` or ``None``; a ``ValueError`` names a damaged segment."""
+        parts = []
+        for index in range(self.committed):
+            path = self._path(index)
+            try:
+                tensors, _ = read_tensors(path.read_bytes())
+            except Exception as error:
+                raise ValueError(
+                    f"{path}, a part of the replay buffer, is missing or damaged ({error}): restore it, "
+                    "or choose another output folder"
+                ) from error
+            size = len(next(iter(tensors.values())))
+            part = TensorDict({}, batch_size=[size])
+            for name, value in tensors.items():
+                key = json.loads(name)
+                part.set(tuple(key) if isinstance(key, list) else key, value)
+            parts.append(part)
+        return torch.cat(parts) if parts else None
 
 
 class PriorSpaceTraining:
@@ -40,17 +93,14 @@ class PriorSpaceTraining:
 
     Args:
         actor: the frozen policy; put into evaluation mode.
-        make_env: ``make_env(seed) -> EnvBase``, a batched environment ``[n]`` with the policy's
-            transforms and :class:`~warmprior.PriorAnchor`; called for training and evaluation.
+        make_env: ``make_env(seed) -> EnvBase``, a batched environment ``[n]`` with the policy's transforms
+            and :class:`~warmprior.PriorAnchor`; called for training and evaluation.
         config: the recipe.
         directory: the folder.
-
-    Keyword Args:
         evaluation_seed: simulator seed of the first evaluation episode.
         description: of the progress bar; no bar if ``None``.
-        collectors: how many actors of a Ray cluster collect, each with its own environments;
-            by default this process collects. Another number
-            means other episodes.
+        collectors: how many actors of a Ray cluster collect, each with its own environments; by default this
+            process collects. Another number means other episodes.
         ray_address: of the cluster.
 
     Attributes:
@@ -60,19 +110,15 @@ class PriorSpaceTraining:
         curve (list[dict[str, Any]]): the evaluations so far, see :meth:`run`.
 
     Raises:
-        ValueError: if the recipe does not suit the policy, or the folder's state belongs to another
-            recipe or policy, or its replay buffer to another wiring.
-
-    See Also:
-        - :class:`~warmprior.rl.PriorSpaceConfig`: its recipe.
-        - :func:`~warmprior.training.evaluate`: plays episodes with ``agent.policy``.
+        ValueError: if the recipe does not suit the policy, or the folder's state is of another recipe, policy
+            or wiring.
 
     Examples:
-        >>> from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
         >>> from tempfile import TemporaryDirectory
         >>> from torchrl.envs import TransformedEnv
         >>> from warmprior import PastPrior, PriorAnchor, VelocityMLP, WarmPriorActor, policy_transforms
         >>> from warmprior.envs import NavigationEnv
+        >>> from warmprior.rl import PriorSpaceConfig, PriorSpaceTraining
         >>> network = VelocityMLP(1, 9, prediction_length=8, observation_steps=1, hidden_dim=8)
         >>> actor = WarmPriorActor(network, PastPrior(8))
         >>> def make_env(seed):
@@ -83,8 +129,7 @@ class PriorSpaceTraining:
         ...     environment_steps=40, warmup_steps=20, evaluate_every=40, evaluation_episodes=2,
         ...     batch_size=4, updates=1, noise_critic_steps=1, hidden_dim=8, num_layers=1)
         >>> with TemporaryDirectory() as folder:
-        ...     training = PriorSpaceTraining(
-        ...         actor, make_env, config, folder, evaluation_seed=100)
+        ...     training = PriorSpaceTraining(actor, make_env, config, folder, evaluation_seed=100)
         ...     [row["evaluation"] for row in training.run()]
         ['base', 'greedy', 'stochastic']
     """
@@ -139,8 +184,8 @@ class PriorSpaceTraining:
 
         Raises:
             KeyError: if the environment has no anchor.
-            ValueError: if the environment does not fit the policy, see :meth:`PriorDecoder.check_env`, or
-                executes less than ``H`` actions of a chunk.
+            ValueError: if the environment does not fit the policy, or executes less than ``H`` actions of a
+                chunk.
             FloatingPointError: if a loss, a parameter or a value of the environment becomes NaN or infinite;
                 the last save stays.
             WorkerError: if a worker process of an environment, or a collector, dies, a ``RuntimeError``.
@@ -243,8 +288,7 @@ class PriorSpaceTraining:
         transitions = data.select(*self._keys).reshape(-1).contiguous().clone()
         following = transitions["next"]
         following["reward"] = following["reward"] - self.config.reward_offset * following[keys.EXECUTED]
-        if not self.config.bootstrap_timeouts:
-            following["terminated"] = following["done"].clone()
+        following["terminated"] = following["done"].clone()  # DSRL treats time-outs as terminations
         # Checked before saving: they would end every later training.
         self._check_finite(transitions)
         self._check_executed(following)

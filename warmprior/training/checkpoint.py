@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from warmprior.io.files import as_json, check_regular, read_tensors, save_file, write_atomic
-from warmprior.modules.compiled import uncompiled, without_compilation
+from warmprior.modules.network import uncompiled, without_compilation
 
 
 def save_state(path: Path, tensors: Mapping[str, Tensor], facts: Mapping[str, Any]) -> None:

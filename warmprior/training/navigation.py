@@ -12,7 +12,7 @@ from torchrl.envs import TransformedEnv
 
 from warmprior import keys
 from warmprior.diagnostics.flow import sees_history
-from warmprior.diagnostics.history_shift import HistoryShift
+from warmprior.diagnostics.leaks import HistoryShift
 from warmprior.diagnostics.smoothness import executed_actions, smoothness
 from warmprior.envs.navigation1d import NavigationEnv, navigation_metrics
 from warmprior.modules.actor import WarmPriorActor

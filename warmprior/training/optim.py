@@ -12,8 +12,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
-from warmprior.modules.compiled import uncompiled
-from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.network import VelocityNetwork, uncompiled
 
 
 def make_optimizer(network: nn.Module, *, learning_rate: float = 1e-4, weight_decay: float = 1e-5) -> AdamW:

@@ -21,8 +21,7 @@ from warmprior.modules import (
 )
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.encoder import imagenet_weights, load_imagenet
-from warmprior.objectives.flow_matching import Objective, Weighting, check_objective
-from warmprior.objectives.times import TimesName
+from warmprior.objectives.flow_matching import Objective, TimesName, Weighting, check_objective
 
 GENERATED = 150
 """Scripted demonstrations, where no other number is asked for."""

@@ -16,14 +16,12 @@ from torch import Tensor, nn
 
 from warmprior.io.extras import require
 from warmprior.io.files import as_json, is_repository, read_json, write_atomic
-from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.compiled import uncompiled, without_compilation
-from warmprior.modules.network import VelocityNetwork
+from warmprior.modules.actor import StartPoint, WarmPriorActor
+from warmprior.modules.network import VelocityNetwork, uncompiled, without_compilation
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import from_config
-from warmprior.modules.start import StartPoint
 from warmprior.training.checkpoint import load_state, save_state
 
 FORMAT = 6

@@ -28,7 +28,7 @@ from warmprior.envs.tasks import TASKS
 from warmprior.io.files import digest_of
 from warmprior.keys import ACTION, EPISODE, OBSERVATION, STATE, SUCCESS
 from warmprior.modules.normalize import Normalizer
-from warmprior.modules.trend import RestingAction
+from warmprior.modules.preconditioning import RestingAction
 from warmprior.training.checkpoint import data_digest
 from warmprior.training.options import DataOptions, is_simulated
 from warmprior.transforms.absolute_actions import AbsoluteActions

@@ -15,20 +15,18 @@ from torchrl.record.loggers.common import Logger
 from warmprior import keys
 from warmprior.io.distributed import from_leader, world_size
 from warmprior.io.workers import torch_threads
-from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.interpolant import Interpolant
+from warmprior.modules.actor import StartPoint, WarmPriorActor
 from warmprior.modules.network import VelocityNetwork
-from warmprior.modules.preconditioning import PreconditionedNetwork, SourceMoments
+from warmprior.modules.ode import Interpolant
+from warmprior.modules.preconditioning import PoseTrend, PreconditionedNetwork, RestingAction, SourceMoments
 from warmprior.modules.prior import Prior
-from warmprior.modules.start import StartPoint
-from warmprior.modules.trend import PoseTrend, RestingAction
 from warmprior.objectives.couplings import Coupling
 from warmprior.training.behaviour_cloning import BehaviourCloning
 from warmprior.training.options import NetworkOptions, TrainingConfig
 from warmprior.training.placement import placed
 from warmprior.training.saved import load_policy
 from warmprior.training.task import Task
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import HistoryObservation
 from warmprior.transforms.window import window_replay_buffer, without_images
 
 

@@ -1,12 +1,10 @@
 """Transforms of replay buffers and environments."""
 
 from warmprior.transforms.absolute_actions import AbsoluteActions
-from warmprior.transforms.camera_images import CameraImages
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.delay import InferenceDelay, executed_chunk
-from warmprior.transforms.encode import EncodeObservation
-from warmprior.transforms.history import ActionHistory, WithheldHistory
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import ActionHistory, HistoryObservation, WithheldHistory
+from warmprior.transforms.images import CameraImages, EncodeObservation
 from warmprior.transforms.policy import policy_transforms
 from warmprior.transforms.stack import ObservationStack
 from warmprior.transforms.window import ActionWindow, window_replay_buffer, window_transforms

@@ -16,44 +16,36 @@ from warmprior.transforms.inner_step import KEPT, EnvTransform
 __all__ = ["AbsoluteActions"]
 
 _DELTA, _ABSOLUTE = 7, 10  # numbers per arm
-_OBTUSE = -0.9  # cosine of an angle from which on the axis loses digits, up to half a turn
-_TINY = 1e-150
 _REACH = 2.0  # metres, in the specification of actions: it only says what is worth sampling
 
 
 class AbsoluteActions(EnvTransform):
     r"""Turns the pose that an action asks for into the delta from where the gripper is now.
 
-    Per arm an action holds a position in metres in the world, the first two rows of a rotation matrix and the
-    gripper, as :func:`~warmprior.envs.absolute_actions` computes them from demonstrations: ``"action"``
-    ``[*B, 10 * arms]``. The environment below gets ``[*B, 7 * arms]``,
+    Per arm an action holds a position in metres in the world, the first two rows of a rotation matrix (any
+    two that are not parallel) and the gripper, as :func:`~warmprior.envs.absolute_actions` computes them:
+    ``"action"`` ``[*B, 10 * arms]``. The environment below gets ``[*B, 7 * arms]``,
 
     .. math:: \mathrm{clip}\bigl((p^* - p) / s_p\bigr), \quad
               \mathrm{clip}\bigl(\log(R^* R^\top) / s_R\bigr)
 
-    and the gripper, where :math:`(p, R)` is the gripper's pose before the step, which the environment writes
-    under ``"eef_pose"``, ``[*B, arms, 3, 4]`` (:mod:`warmprior.keys`). The result is clipped to the
-    :math:`[-1, 1]` that the controller takes, so a pose beyond the reach of one control step is approached at
-    full speed.
-    Any two rows that are not parallel will do; they are orthonormalised.
-
-    It acts on every control step: place it before :class:`ChunkStep` and next to the environment, so that
-    actions are denormalised before they get here (:func:`policy_transforms` does so).
+    and the gripper, where :math:`(p, R)` is the gripper's pose before the step, ``"eef_pose"`` ``[*B, arms,
+    3, 4]`` (:mod:`warmprior.keys`). A pose beyond the reach of one control step is approached at full speed.
+    It acts on every control step: place it next to the environment (:func:`policy_transforms` does so).
 
     Args:
         output_max: ``[6]``, what an input of 1 means, in metres and radians; see
             :func:`~warmprior.envs.delta_conventions`, also for the next.
-        base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; one arm in the world frame
-            by default.
+        base_rotation: ``[arms, 3, 3]`` from the frame of the deltas to the world; by default one arm in it.
 
     Raises:
         ValueError: if the shapes do not fit each other, or (in an environment) its actions.
         KeyError: if there is no pose.
 
     Examples:
-        >>> from warmprior import AbsoluteActions
         >>> import torch
         >>> from tensordict import TensorDict
+        >>> from warmprior import AbsoluteActions
         >>> transform = AbsoluteActions([0.05] * 3 + [0.5] * 3)
         >>> here = torch.eye(3, 4)[None]  # at the origin, turned by nothing
         >>> action = torch.tensor([0.02, 0.0, 0.3, 1, 0, 0, 0, 1, 0, -1])
@@ -85,22 +77,16 @@ class AbsoluteActions(EnvTransform):
 
     @property
     def one_step(self) -> Tensor:
-        """How far one control step can move each number of an action, ``[10 * arms]``; 0 for the gripper.
-
-        In these units (see :meth:`Normalizer.fit`) poses and deltas are comparable.
-        """
+        """How far one control step can move each number of an action, ``[10 * arms]``; 0 for the gripper."""
         position, turn = self.scale[:3], self.scale[3:].amin()
         return torch.cat((position, turn.expand(6), turn.new_zeros(1))).repeat(self.arms)
 
     def delta(self, action: Tensor, pose: Tensor) -> Tensor:
-        """The delta ``[*B, 7 * arms]`` in ``[-1, 1]`` towards the pose that an action asks for.
-
-        As far as one step goes, from actions ``[*B, 10 * arms]`` and poses ``[*B, arms, 3, 4]``.
-        """
+        """The delta ``[*B, 7 * arms]`` towards actions ``[*B, 10 * arms]`` at poses ``[*B, arms, 3, 4]``."""
         target, now = action.double().unflatten(-1, (self.arms, _ABSOLUTE)), pose.double()
         move = target[..., :3] - now[..., 3]
         turn = rotation_6d_to_matrix(target[..., 3:9]) @ now[..., :3].mT
-        step = torch.stack((move, _rotvec(turn)), -2) @ self.base_rotation
+        step = torch.stack((move, matrix_to_rotvec(turn)), -2) @ self.base_rotation
         delta = torch.cat((step.flatten(-2) / self.scale, target[..., 9:]), -1)
         return delta.clamp(-1, 1).flatten(-2).to(action.dtype)
 
@@ -137,13 +123,3 @@ class AbsoluteActions(EnvTransform):
         limit = limit.to(leaf.dtype).expand(*leaf.shape[:-1], self.arms * _ABSOLUTE)
         actions[keys.ACTION] = Bounded(-limit, limit, device=leaf.device)
         return input_spec
-
-
-def _rotvec(turn: Tensor) -> Tensor:
-    """Like :func:`matrix_to_rotvec`, three times as fast: this runs at every control step."""
-    cosine = (turn.diagonal(dim1=-2, dim2=-1).sum(-1, keepdim=True) - 1) / 2
-    if bool((cosine < _OBTUSE).any()):
-        return matrix_to_rotvec(turn)
-    axis = 0.5 * (turn - turn.mT)[..., (2, 0, 1), (1, 2, 0)]
-    sine = axis.norm(dim=-1, keepdim=True)
-    return axis * (torch.atan2(sine, cosine) / sine.clamp_min(_TINY)).clamp_min(1.0)

@@ -38,21 +38,15 @@ def check_delay(delay: int, execute: int, length: int | None = None) -> None:
 
 
 def executed_chunk(tensordict: TensorDictBase) -> Tensor:
-    """The chunks of decisions as they are executed: a late chunk begins with the rest of the one before.
+    """The chunks of decisions ``[*B]`` as they are executed: a late one begins with the rest of the last.
 
-    Args:
-        tensordict: ``[*B]`` decisions, such as those of a rollout. Without a recorded delay the chunks are
-            executed as they are.
-
-    See Also:
-        - :class:`~warmprior.InferenceDelay`: lets chunks take effect late.
-        - :func:`~warmprior.diagnostics.executed_actions`: the actions of a whole rollout.
+    Without a recorded delay they are executed as they are.
 
     Examples:
         >>> import torch
+        >>> from tensordict import TensorDict
         >>> from warmprior import keys
         >>> from warmprior.transforms import executed_chunk
-        >>> from tensordict import TensorDict
         >>> chunk, forecast = torch.ones(1, 3, 1), torch.zeros(1, 3, 1)
         >>> data = TensorDict({keys.CHUNK: chunk, keys.FORECAST: forecast}, [1])
         >>> executed_chunk(data.set(keys.DELAY, torch.tensor([[1]]))).flatten().tolist()
@@ -65,26 +59,19 @@ def executed_chunk(tensordict: TensorDictBase) -> Tensor:
 
 
 class InferenceDelay(EnvTransform):
-    r"""Makes every chunk take effect ``delay`` control steps after the observation that it answers.
+    """Makes every chunk take effect ``delay`` control steps after the observation that it answers.
 
     Simulators wait for policies, and robots do not. Here the robot goes on meanwhile: the first ``delay`` of
-    the ``execute`` actions come from the chunk before, and the rest from the new chunk, from position
-    ``delay`` on. At the first decision of an episode the robot waits. With ``delay=0`` the transform only
-    writes the delay.
+    the ``execute`` actions come from the chunk before, and the rest from the new chunk. At the first decision
+    of an episode the robot waits. The policy decides every ``execute`` steps, so predictions have to reach
+    ``execute + delay``: with ``H = P`` (Gaussian source, WP-Past) fewer actions are executed per decision.
 
-    Like :class:`ActionHistory` it has no state. Append it after that transform, which then remembers what was
-    executed: WP-Past's mean is the last ``H`` executed actions, WP-Preview's the forecast for the same
-    control steps. The policy decides every ``execute`` steps, so predictions have to reach ``execute +
-    delay`` steps: with ``H = P`` (Gaussian source, WP-Past) fewer actions are executed per decision.
-
-    It writes ``("rtc", "delay")``, int64 ``[*B, 1]``: ``delay``, and 0 at the first decision of an episode.
-    :class:`~warmprior.RealTimeChunking` reads it, and takes the rest of the chunk before from the history.
-    :func:`executed_chunk` gives the executed chunks of a rollout.
+    It has no state. Append it after :class:`ActionHistory`, which then remembers what was executed. It writes
+    ``("rtc", "delay")``, int64 ``[*B, 1]``: ``delay``, and 0 at the first decision of an episode, which
+    :class:`~warmprior.RealTimeChunking` reads. :func:`executed_chunk` gives the executed chunks of a rollout.
 
     Args:
         delay: ``d``, control steps until a chunk takes effect.
-
-    Keyword Args:
         execute: actions executed per decision, as :class:`ChunkStep` has it.
 
     Raises:
@@ -94,10 +81,9 @@ class InferenceDelay(EnvTransform):
         RuntimeError: (on a step) if a decision executed more than ``execute`` actions.
 
     Examples:
-        >>> from warmprior.transforms import executed_chunk
-        >>> import torch
         >>> from torchrl.envs import GymEnv, TransformedEnv
         >>> from warmprior import GaussianPrior, policy_transforms
+        >>> from warmprior.transforms import executed_chunk
         >>> env = TransformedEnv(
         ...     GymEnv("Pendulum-v1"), policy_transforms(GaussianPrior(4), execute=3, delay=1))
         >>> rollout = env.rollout(3)

@@ -1,11 +1,14 @@
-"""The environment's side of the history, and histories withheld in training."""
+"""The environment's side of the history, and what networks see of it."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
-from torchrl.data import TensorSpec, Unbounded
+from tensordict.utils import NestedKey, unravel_key
+from torch import Tensor
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Transform
 
@@ -14,7 +17,8 @@ from warmprior.history import ENTRIES, advance, cold_history, without
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
-__all__ = ["ActionHistory", "WithheldHistory"]
+__all__ = ["ActionHistory", "HistoryObservation", "WithheldHistory"]
+
 
 HISTORY_KEYS: list[NestedKey] = [(keys.HISTORY, name) for name in ENTRIES]
 
@@ -33,11 +37,8 @@ class ActionHistory(EnvTransform):
         ValueError: if ``history_length < 1``.
         KeyError: if :class:`ChunkStep` does not come before, or a step's input lacks the history.
 
-    See Also:
-        :class:`~warmprior.ActionWindow`: writes the same layout in training windows.
-
     Examples:
-        >>> from torchrl.envs import GymEnv, TransformedEnv, Compose
+        >>> from torchrl.envs import Compose, GymEnv, TransformedEnv
         >>> from warmprior import ActionHistory, ChunkStep
         >>> env = TransformedEnv(GymEnv("Pendulum-v1"), Compose(ChunkStep(4), ActionHistory(4)))
         >>> rollout = env.rollout(3)
@@ -106,27 +107,23 @@ class ActionHistory(EnvTransform):
 class WithheldHistory(Transform):
     """Withholds the history of some training windows, so that the network also learns the cold start.
 
-    Append it to a replay buffer, like any other augmentation. The paper's Algorithm 1 withholds nothing.
+    Append it to a replay buffer (``withhold`` of :func:`~warmprior.window_replay_buffer`). The paper's
+    Algorithm 1 withholds nothing.
 
     Args:
         probability: share of the windows, in [0, 1].
-
-    Keyword Args:
         generator: source of randomness on the windows' device; PyTorch's global one by default.
 
     Raises:
         ValueError: if the probability is not in [0, 1].
 
-    See Also:
-        :func:`~warmprior.window_replay_buffer`: appends it, with ``withhold``.
-
     Examples:
         >>> import torch
-        >>> from warmprior import WithheldHistory
         >>> from tensordict import TensorDict
+        >>> from warmprior import WithheldHistory
         >>> from warmprior.history import window_history
-        >>> steps = torch.full((1000, 1), 2)
-        >>> history = window_history(torch.ones(1000, 2, 1), steps, torch.ones(1000, 2, 1), chunk_length=2)
+        >>> ones = torch.ones(1000, 2, 1)
+        >>> history = window_history(ones, torch.full((1000, 1), 2), ones, chunk_length=2)
         >>> withheld = WithheldHistory(0.25, generator=torch.Generator().manual_seed(0))
         >>> batch = withheld(TensorDict({"history": history}, [1000]))
         >>> 0.2 < float((batch["history", "steps"] == 0).float().mean()) < 0.3
@@ -154,3 +151,92 @@ class WithheldHistory(Transform):
         device = history["actions"].device
         draw = torch.rand(history.batch_size, generator=self.generator, device=device)
         return tensordict.set(keys.HISTORY, without(history, draw < self.probability))
+
+
+class HistoryObservation(EnvTransform):
+    """Appends the last ``H`` actions to the observation, in environments and replay buffers alike.
+
+    It writes ``keys.CONDITIONED``, ``[*B, To, d_o + H * d_a + 1]``: the actions, flattened (zero until there
+    are ``H`` of them), and whether there are ``H``, repeated over the observation steps. Build the network
+    with ``observation_dim = d_o + HistoryObservation.width(H, d_a)`` and the policy with
+    ``observation_key=keys.CONDITIONED``. In an environment it comes after :class:`~warmprior.ActionHistory`.
+
+    Args:
+        observation_key: the observation, ``[*B, To, d_o]``, or one with images nested under the key, whose
+            vector ``"state"`` is extended.
+
+    Raises:
+        KeyError: if an input key is missing.
+        ValueError: if the observation has several entries, but no vector ``"state"``.
+
+    Examples:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from warmprior import GaussianPrior, HistoryObservation, policy_transforms
+        >>> transforms = policy_transforms(GaussianPrior(2), observation_steps=1, see_history=True)
+        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), transforms)
+        >>> seen = env.rollout(2)["prior", "observation"]  # 3 observations, 2 actions, whether there are 2
+        >>> seen.shape, seen[:, 0, -1].tolist(), 3 + HistoryObservation.width(2, action_dim=1)
+        (torch.Size([2, 1, 6]), [0.0, 1.0], 6)
+    """
+
+    def __init__(self, *, observation_key: NestedKey = keys.OBSERVATION) -> None:
+        read = [unravel_key(observation_key), keys.ACTIONS, keys.STEPS]
+        super().__init__(in_keys=read, out_keys=[keys.CONDITIONED])
+
+    @staticmethod
+    def width(history_length: int, action_dim: int) -> int:
+        """How much wider the observation becomes: ``H * d_a + 1``."""
+        return history_length * action_dim + 1
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the extended observation."""
+        observation, actions, steps = self._read(tensordict)
+        known = steps >= actions.shape[-2]
+        seen = torch.where(known.unsqueeze(-1), actions, 0.0).flatten(-2)
+        context = torch.cat([seen, known.to(seen)], dim=-1).unsqueeze(-2)
+
+        def extend(vector: Tensor) -> Tensor:
+            added = context.expand(*vector.shape[:-1], context.shape[-1]).to(vector.dtype)
+            return torch.cat([vector, added], dim=-1)
+
+        return tensordict.set(self.out_keys[0], _with_vector(observation, extend))
+
+    def _read(self, place: TensorDictBase | Composite) -> list[Any]:
+        """The values or specs under the input keys."""
+        known = place.keys(True)
+        missing = [key for key in self.in_keys if key not in known]
+        if missing:
+            raise KeyError(
+                f"HistoryObservation needs the keys {self.in_keys}; missing: {missing}. In an environment "
+                "append it after ActionHistory"
+            )
+        return [place[key] for key in self.in_keys]
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the extended observation."""
+        observation, actions, _ = self._read(observation_spec)
+
+        def extend(vector: Unbounded) -> Unbounded:
+            shape = (*vector.shape[:-1], vector.shape[-1] + self.width(*actions.shape[-2:]))
+            return Unbounded(shape, dtype=vector.dtype, device=vector.device)
+
+        observation_spec[self.out_keys[0]] = _with_vector(observation, extend)
+        return observation_spec
+
+
+def _with_vector(observation: Any, extend: Any) -> Any:
+    """An observation or its spec, a vector or several entries, with its vector extended."""
+    if not isinstance(observation, TensorDictBase | Composite):
+        return extend(observation)
+    if keys.STATE not in observation.keys():  # noqa: SIM118
+        raise ValueError(
+            "HistoryObservation appends the last actions to an observation vector [*B, To, d_o], but it has "
+            f"the entries {sorted(map(str, observation.keys(True, True)))}: concatenate them before, or "
+            f"call one {keys.STATE!r}"
+        )
+    whole = observation.clone() if isinstance(observation, Composite) else observation.copy()
+    whole[keys.STATE] = extend(observation[keys.STATE])
+    return whole

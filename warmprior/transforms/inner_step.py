@@ -30,10 +30,10 @@ class EnvTransform(Transform):
 
 
 class InnerStep:
-    """Steps the environment that a transform sees below itself.
+    """Steps the environment that a transform sees below itself, through the container's own transforms.
 
-    ``Transform.parent`` is that environment too, but around *copies* of the transforms: what the copies
-    count, record or estimate would be lost. This one runs the container's own transforms.
+    ``Transform.parent`` is that environment too, but around *copies*: what they count or record would be
+    lost.
     """
 
     def __init__(self, transform: Transform) -> None:
@@ -59,10 +59,7 @@ class InnerStep:
         self._branches = {key[0] for key in (*inverse, *self.observed) if isinstance(key, tuple)}
 
     def __call__(self, tensordict: TensorDictBase, rows: Tensor | None = None) -> TensorDictBase:
-        """Take the step: of all rows, or of those in ``rows``, bool ``[*B]``; the others are undefined.
-
-        Entries are added at the root of the input ``[*B]``; nested ones stay as they are.
-        """
+        """Take the step of all rows, or of those in ``rows``, bool ``[*B]``; the others are undefined."""
         for branch in self._branches:
             if branch in tensordict:
                 tensordict.set(branch, tensordict.get(branch).copy())
@@ -93,7 +90,7 @@ def set_aside(tensordict: TensorDictBase, observed: Iterable[NestedKey]) -> None
     """Keep observations, under :data:`KEPT`, from a batched environment that takes a partial step.
 
     For the rows that it leaves out it returns what it finds in the step's input, and fails, or casts
-    silently, if a transform gave that another shape or dtype than the environment's own.
+    silently, if a transform gave that another shape or dtype.
     """
     kept = tensordict.get(KEPT, None)
     if kept is None:

@@ -10,13 +10,12 @@ from torchrl.envs.transforms import Compose, Transform
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.compiled import uncompiled
+from warmprior.modules.network import uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.transforms.chunk import ChunkStep
 from warmprior.transforms.delay import InferenceDelay, check_delay
-from warmprior.transforms.history import ActionHistory
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import ActionHistory, HistoryObservation
 from warmprior.transforms.stack import ObservationStack
 
 __all__ = ["policy_transforms"]
@@ -39,41 +38,32 @@ def policy_transforms(
 ) -> Compose:
     """Everything that a :class:`~warmprior.WarmPriorActor` needs from an environment.
 
-    In this order: conversion of actions to the environment's own, camera images, normalisation of
-    observations and denormalisation of actions, a stack of the last ``To`` observations (the first one
-    repeated at the start), :class:`ChunkStep`, :class:`ActionHistory`, and on request
+    In this order: conversion of actions to the environment's own, camera images, (de)normalisation, a stack
+    of the last ``To`` observations, :class:`ChunkStep`, :class:`ActionHistory`, and on request
     :class:`HistoryObservation` and :class:`InferenceDelay`. It works around a single environment, and inside
     or outside of batched ones (with images, inside).
 
     Args:
-        policy: the policy; or its prior, of which only the lengths matter: the environment serves every
-            policy with a prior of these lengths.
-
-    Keyword Args:
+        policy: the policy; or its prior, of which only the lengths matter.
         normalizer: the normaliser of the training data; the policy's by default. Give the policy's prior in
             place of the policy if the environment is normalised already.
         actions: converts the policy's actions, in raw units, to the environment's, such as
-            :class:`AbsoluteActions`; a copy of it is used. None by default.
+            :class:`AbsoluteActions`; a copy of it is used.
         images: adds images to observations, such as :class:`CameraImages`; a copy of it is used.
         observation_steps: ``To``; those of the policy's network by default, or 2.
-        execute: actions executed per decision; by default all ``H``, or with a ``delay`` as many as
-            predictions allow.
+        execute: actions executed per decision; by default ``H``, or with a ``delay`` as many as predictions
+            allow.
         delay: control steps until a chunk takes effect, see :class:`InferenceDelay`. By default 0 for a
             policy with :class:`~warmprior.RealTimeChunking`, and otherwise none is written.
         gamma: discount per control step inside a chunk.
         see_history: whether the network sees the last actions; as in the policy by default.
         observation_key: the policy's by default.
-        success: the environment's key for whether the task is solved; it counts at any step of a chunk.
+        success: see :class:`ChunkStep`.
         measures: see :class:`ChunkStep`.
 
     Raises:
         TypeError: for anything else than a policy or a prior.
-        ValueError: if the normaliser lacks the action, or numbers do not fit each other, see
-            :class:`ChunkStep` and :class:`InferenceDelay`.
-
-    See Also:
-        - :func:`~warmprior.window_transforms`: the same for batches of demonstrations.
-        - :func:`~warmprior.training.evaluate`: plays episodes in the environment that has them.
+        ValueError: if the normaliser lacks the action, or numbers do not fit each other.
 
     Examples:
         >>> from torchrl.envs import GymEnv, TransformedEnv

@@ -19,28 +19,23 @@ __all__ = ["ObservationStack"]
 class ObservationStack(EnvTransform):
     """Replaces the observation ``[*B, d_o]`` by the last ``To`` of them, ``[*B, To, d_o]``.
 
-    Images ``[*B, C, H, W]`` become ``[*B, To, C, H, W]``, and so does every entry of a nested observation, as
-    in the windows of :class:`ActionWindow`. After a reset the first observation is repeated. Unlike
-    :class:`~torchrl.envs.transforms.CatFrames` it keeps no buffer: older observations come from the step's
-    own tensordict. So it is right inside and outside batched environments, and when only some
-    sub-environments reset or step.
+    Images ``[*B, C, H, W]`` become ``[*B, To, C, H, W]``, and so does every entry of a nested observation.
+    After a reset the first observation is repeated. Unlike :class:`~torchrl.envs.transforms.CatFrames` it
+    keeps no buffer: older observations come from the step's own tensordict. So it is right inside and outside
+    batched environments, and when only some sub-environments reset or step.
 
     Args:
         steps: ``To``.
-
-    Keyword Args:
         observation_key: key of the observation, in and out; or of several, nested under it.
 
     Raises:
         ValueError: if ``steps < 1``.
-        KeyError: if the environment has no such observation, or (on a step) the tensordict does not hold
-            the current stack.
+        KeyError: if the environment has no such observation, or (on a step) the tensordict no current stack.
 
     Examples:
-        >>> from warmprior import ObservationStack
         >>> from torchrl.envs import GymEnv, TransformedEnv
-        >>> env = TransformedEnv(GymEnv("Pendulum-v1"), ObservationStack(2))
-        >>> rollout = env.rollout(3)
+        >>> from warmprior import ObservationStack
+        >>> rollout = TransformedEnv(GymEnv("Pendulum-v1"), ObservationStack(2)).rollout(3)
         >>> rollout["observation"].shape
         torch.Size([3, 2, 3])
         >>> bool((rollout["observation"][1:, 0] == rollout["observation"][:-1, 1]).all())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
@@ -14,8 +16,7 @@ from warmprior import keys
 from warmprior.history import window_history
 from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.prior import Prior
-from warmprior.transforms.history import WithheldHistory
-from warmprior.transforms.history_observation import HistoryObservation
+from warmprior.transforms.history import HistoryObservation, WithheldHistory
 
 __all__ = ["ActionWindow", "window_replay_buffer", "window_transforms", "without_images"]
 
@@ -26,16 +27,14 @@ class ActionWindow(Transform):
     For the step ``i``, int64 ``[*B]`` under ``"frame"``, it gathers the last ``To`` observations (the
     episode's first one repeated at the start), the target chunk ``[i, i+P)`` (the episode's last action
     repeated past its end, and marked in ``"action_is_pad"``) and the history (:mod:`warmprior.history`): the
-    actions before, and the target's first ``P - H`` as a forecast. Windows never cross episode borders, and
-    border windows are sampled like all others. One buffer serves all priors of its lengths.
+    actions before, and the target's first ``P - H`` as a forecast. Windows never cross episode borders. One
+    buffer serves all priors of its lengths.
 
     Args:
         data: contiguous steps ``[N]`` in normalised units, with ``"observation"`` ``[N, d_o]``,
             ``"action"`` ``[N, d_a]`` and ``"episode"`` ``[N]``; in memory, memory-mapped or on a GPU.
             An observation may be an image ``[N, C, H, W]``, or several entries nested under its key.
         chunk_length: ``H``.
-
-    Keyword Args:
         prediction_length: ``P``; ``H`` by default.
         history_length: how many executed actions are remembered; ``H`` by default, and at least.
         observation_steps: ``To``.
@@ -47,19 +46,13 @@ class ActionWindow(Transform):
             not flat, an action is not one vector, an entry holds NaN or Inf, or an episode is not contiguous.
         IndexError: (on a call) for a step that the data do not hold.
 
-    See Also:
-        - :class:`~warmprior.ActionHistory`: writes the same history in an environment.
-        - :func:`~warmprior.window_replay_buffer`: a buffer of such windows.
-
     Examples:
-        >>> from warmprior import ActionWindow
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> data = TensorDict({"observation": torch.zeros(5, 3),
-        ...                    "action": torch.arange(5.0)[:, None],
+        >>> from warmprior import ActionWindow
+        >>> data = TensorDict({"observation": torch.zeros(5, 3), "action": torch.arange(5.0)[:, None],
         ...                    "episode": torch.zeros(5, dtype=torch.int64)}, [5])
-        >>> window = ActionWindow(data, 2)
-        >>> batch = window(TensorDict({"frame": torch.tensor([0, 2, 4])}, [3]))
+        >>> batch = ActionWindow(data, 2)(TensorDict({"frame": torch.tensor([0, 2, 4])}, [3]))
         >>> batch["vla_action", "chunk"].squeeze(-1).tolist()
         [[0.0, 1.0], [2.0, 3.0], [4.0, 4.0]]
         >>> batch["action_is_pad"].tolist()
@@ -215,10 +208,7 @@ def window_transforms(
 
     Args:
         data: contiguous normalised steps, see :class:`ActionWindow`.
-        prior: the policy's prior, of which only the lengths matter: the windows serve every prior of these
-            lengths.
-
-    Keyword Args:
+        prior: the policy's prior, of which only the lengths matter.
         observation_steps: ``To``.
         see_history: whether the network sees the last actions.
         withhold: share of the windows whose history is withheld.
@@ -235,8 +225,6 @@ def window_transforms(
         >>> batch = windows(TensorDict({"frame": torch.tensor([10, 25])}, [2]))
         >>> batch["vla_action", "chunk"].squeeze(-1).tolist()
         [[10.0, 11.0], [25.0, 26.0]]
-        >>> batch["history", "actions"].squeeze(-1).tolist()
-        [[8.0, 9.0], [0.0, 0.0]]
     """
     transforms: list[Transform] = [
         ActionWindow(
@@ -260,56 +248,33 @@ def window_replay_buffer(
     prior: Prior,
     *,
     batch_size: int,
-    observation_steps: int = 2,
-    see_history: bool = False,
-    withhold: float = 0.0,
     generator: torch.Generator | None = None,
-    observation_key: NestedKey = keys.OBSERVATION,
+    **options: Any,
 ) -> TensorDictReplayBuffer:
     """A replay buffer that samples training windows from demonstrations.
 
-    It stores only the step numbers; :class:`ActionWindow` gathers everything else from ``data``, which
-    is faster than letting the storage read whole steps first.
+    It stores only the step numbers; :class:`ActionWindow` gathers the rest, which is faster than reading
+    whole steps.
 
     Args:
-        data: contiguous normalised steps, see :class:`ActionWindow`.
-        prior: the policy's prior, of which only the lengths matter: the windows serve every prior of these
-            lengths.
-
-    Keyword Args:
+        data: see :func:`window_transforms`.
+        prior: likewise.
         batch_size: windows per sample.
-        observation_steps: ``To``.
-        see_history: see :func:`window_transforms`.
-        withhold: see :func:`window_transforms`.
         generator: source of randomness of sampler and what is withheld; PyTorch's global one by default.
-        observation_key: see :class:`ActionWindow`.
+        options: further ones of :func:`window_transforms`.
 
     Raises:
         ValueError: if ``batch_size < 1``, or see :class:`ActionWindow`.
 
-    See Also:
-        :class:`~warmprior.FlowMatchingLoss`: takes its batches.
-
     Examples:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from warmprior import PreviewPrior, window_replay_buffer
-        >>> data = TensorDict({"observation": torch.zeros(50, 3), "action": torch.zeros(50, 2),
-        ...                    "episode": torch.arange(50) // 25}, [50])
-        >>> batch = window_replay_buffer(data, PreviewPrior(8), batch_size=32).sample()
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> batch = window_replay_buffer(navigation_demonstrations(), PreviewPrior(8), batch_size=32).sample()
         >>> batch["vla_action", "chunk"].shape, batch["observation"].shape
-        (torch.Size([32, 16, 2]), torch.Size([32, 2, 3]))
+        (torch.Size([32, 16, 1]), torch.Size([32, 2, 9]))
     """
     check_whole_numbers(batch_size=batch_size)
-    windows = window_transforms(
-        data,
-        prior,
-        observation_steps=observation_steps,
-        see_history=see_history,
-        withhold=withhold,
-        generator=generator,
-        observation_key=observation_key,
-    )
+    windows = window_transforms(data, prior, generator=generator, **options)
     window = windows[0]
     frames = torch.arange(len(data), device=window.start.device)
     return TensorDictReplayBuffer(

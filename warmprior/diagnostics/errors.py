@@ -1,0 +1,201 @@
+"""Distance of actions and of the source's mean from the demonstrations, without a simulator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from warmprior import keys
+from warmprior.diagnostics.flow import allowed_nfes, drawn, evaluation_mode, flat_windows, judged, predict
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_keys
+from warmprior.modules.prior import Source
+
+__all__ = ["MeanError", "action_error", "mean_error", "mean_revision", "source_coverage"]
+
+
+def action_error(
+    policy: WarmPriorActor,
+    windows: TensorDictBase,
+    *,
+    nfes: Sequence[int] = (1, 9),
+) -> dict[int, float]:
+    r"""Mean squared error of the executed actions on windows of demonstrations.
+
+    The conditional mean :math:`E[a_1 \mid a_0, o]`, which one step of an exact field returns, has the
+    smallest error; samples from the data's own distribution have up to twice that. So compare policies at one
+    NFE, not one policy at several.
+
+    Args:
+        policy: the policy; its state stays as it is.
+        windows: ``[*B]`` of the policy's own prior, normalised, see :class:`~warmprior.ActionWindow`;
+            held-out ones for a fair error.
+        nfes: network evaluations per chunk to measure at; those beyond the policy's maximum are skipped.
+
+    Returns:
+        By NFE, ascending and from the same samples of the source, the mean over windows, the first ``H``
+        positions inside the episode and dimensions, in squared normalised action units.
+
+    Raises:
+        KeyError: if the windows lack a key.
+        ValueError: for bad windows, or if the policy allows none of the NFEs.
+        FloatingPointError: if a prediction is NaN or infinite.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import SharedObservations, action_error
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4))
+        >>> windows = SharedObservations(navigation_demonstrations(), 4).windows(untrained.prior)
+        >>> sorted(action_error(untrained, windows))
+        [1, 9]
+    """
+    prior, allowed = policy.prior, allowed_nfes(policy, nfes)
+    flat, target, rows, generator = judged(policy, windows)
+    counted = flat.counted[:, : prior.chunk_length, 0]
+    errors = {}
+    with evaluation_mode(policy):
+        a0 = drawn(policy, rows, generator)
+        for nfe in allowed:
+            chunk = predict(policy, rows, a0, nfe)
+            error = (chunk - target)[:, : prior.chunk_length].square()
+            errors[nfe] = float(error[counted].mean())
+    return errors
+
+
+@dataclass(frozen=True)
+class MeanError:
+    """Root mean squares over warm positions inside the episode and dimensions; NaN if the source has no mean.
+
+    Attributes:
+        target: distance of the mean from the demonstrated actions.
+        revision: distance of the mean from the policy's prediction.
+
+    Examples:
+        >>> from warmprior.diagnostics import MeanError
+        >>> MeanError(target=0.17, revision=0.2)  # see mean_error
+        MeanError(target=0.17, revision=0.2)
+    """
+
+    target: float
+    revision: float
+
+
+def mean_error(
+    policy: WarmPriorActor,
+    windows: TensorDictBase,
+    *,
+    nfe: int | None = None,
+) -> MeanError:
+    """Error of the mean at demonstrated states, in normalised action units.
+
+    Args:
+        policy: the policy; its state stays as it is.
+        windows: ``[*B]`` of the policy's own prior, with the mean at deployment
+            (:meth:`SharedObservations.deployed`); WP-Preview's training mean has no error.
+        nfe: network evaluations of the prediction; the policy's own by default.
+
+    Raises:
+        KeyError: if the windows lack a key.
+        ValueError: for bad windows.
+        FloatingPointError: if a prediction is NaN or infinite.
+
+    Examples:
+        >>> from warmprior import PreviewPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import SharedObservations, mean_error
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 8, observation_steps=1), PreviewPrior(4))
+        >>> shared = SharedObservations(navigation_demonstrations(), 4)
+        >>> mean_error(untrained, shared.windows(untrained.prior)).target  # the target itself
+        0.0
+    """
+    flat, target, rows, generator = judged(policy, windows)
+    with evaluation_mode(policy):
+        nfe = policy.ode.nfe if nfe is None else nfe
+        chunk = predict(policy, rows, drawn(policy, rows, generator), nfe)
+    mean, known = flat.loc, (flat.warm & flat.counted).expand_as(flat.loc)
+    return MeanError(_rms((mean - target)[known]), _rms((mean - chunk)[known]))
+
+
+def mean_revision(rollout: TensorDictBase) -> float:
+    """Distance of the mean from the policy's next prediction, along rollouts.
+
+    If it is larger than at demonstrated states (:attr:`MeanError.revision`), forecasts age worse in the
+    states that the policy reaches than in the demonstrations.
+
+    Args:
+        rollout: ``[D]`` decisions with what the policy wrote, see :class:`~warmprior.training.Episode`.
+
+    Returns:
+        Root mean square over warm positions and dimensions, in normalised action units; NaN if none is warm.
+
+    Raises:
+        KeyError: if a key is missing.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior.diagnostics import mean_revision
+        >>> rollout = TensorDict({  # forecasts 2, 3, then predicts 2, 5
+        ...     "vla_action": {"chunk": torch.tensor([[2.0, 5, 0, 0]])[..., None]},
+        ...     "prior": {"loc": torch.tensor([[2.0, 3, 0, 0]])[..., None],
+        ...               "warm": torch.tensor([[True, True, False, False]])[..., None]}}, [1])
+        >>> round(mean_revision(rollout), 3)
+        1.414
+    """
+    needed = (keys.CHUNK, keys.LOC, keys.WARM)
+    check_keys(rollout, needed, "mean_revision", ": let a policy write them")
+    chunk, loc, warm = (rollout.get(key) for key in needed)
+    return _rms((chunk - loc)[warm.expand_as(loc)])
+
+
+def _rms(values: Tensor) -> float:
+    return float(values.square().mean().sqrt()) if values.numel() else math.nan
+
+
+def source_coverage(policy: WarmPriorActor, windows: TensorDictBase, *, level: float = 0.9) -> float:
+    r"""Share of the target's coordinates inside the central interval of a Gaussian source.
+
+    A calibrated source covers ``level``. One that covers less trusts its mean too much; one that covers
+    everything is too wide, as N(0, I) is around normalised actions.
+
+    Args:
+        policy: the policy, whose prior gives the source (:meth:`Prior.distribution`).
+        windows: ``[*B]`` of its prior with targets, see :meth:`SharedObservations.met`; held-out ones for a
+            learned source.
+        level: of the interval :math:`\mu \pm z s`.
+
+    Returns:
+        Over the executed positions inside the episode; NaN for sources that are not Gaussian.
+
+    Raises:
+        KeyError: if the windows lack a key.
+        ValueError: for bad windows, or a ``level`` outside (0, 1).
+
+    Examples:
+        >>> from warmprior import GaussianPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import SharedObservations, source_coverage
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> actor = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), GaussianPrior(4))
+        >>> source_coverage(actor, SharedObservations(navigation_demonstrations(), 4).windows(actor.prior))
+        1.0
+    """
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"level must be in (0, 1), got {level}")
+    flat, prior = flat_windows(policy, windows, target_needed=True), policy.prior
+    assert flat.target is not None
+    with evaluation_mode(policy):
+        source = prior.distribution(flat.history, flat.observation)
+    if type(source) is not Source:
+        return math.nan
+    z = math.sqrt(2.0) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
+    inside = (flat.target - source.loc).abs() <= z * source.scale
+    executed = slice(prior.chunk_length)
+    return float(
+        inside[:, executed][flat.counted[:, executed].expand_as(inside[:, executed])].double().mean()
+    )

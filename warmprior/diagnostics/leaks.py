@@ -1,0 +1,360 @@
+"""How much of the source's noise, and of an error of the past, reaches the actions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from warmprior import keys
+from warmprior.diagnostics.flow import (
+    RunningVariance,
+    allowed_nfes,
+    drawn,
+    encoded_windows,
+    evaluation_mode,
+    flat_windows,
+    judged,
+    observed,
+    predict,
+    seen_anew,
+    sees_history,
+)
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_positive
+
+__all__ = ["INNER_STEP_BOUND", "LEAK_BOUND", "HistoryShift", "SourceLeak", "memory_gain", "source_leak"]
+
+
+LEAK_BOUND = 1.0
+"""Largest leak of a sampler that spreads like the data; a larger one adds noise."""
+
+INNER_STEP_BOUND = 1.3
+"""Largest inner step ratio of a sound policy, which is near 1 or, at few steps, below."""
+
+DISTANCES = 2**22
+"""Distances between observations held at a time: 16 MiB in single precision."""
+
+
+@dataclass(frozen=True)
+class SourceLeak:
+    """How the source's noise shows in the executed actions, in normalised action units.
+
+    Attributes:
+        nfe: network evaluations per chunk.
+        spread: standard deviation of predictions over draws of the source at fixed observation and mean, root
+            mean square over windows, positions and dimensions.
+        data_spread: the same for the targets at similar observations.
+        ratio_to_last: ``spread`` over that at the largest ``nfe`` measured.
+        inner_step: mean distance between consecutive actions inside predicted chunks; NaN at ``H = 1``.
+        data_inner_step: the same of the targets.
+
+    Examples:
+        >>> from warmprior.diagnostics import SourceLeak
+        >>> found = SourceLeak(nfe=1, spread=0.3, data_spread=0.2, ratio_to_last=1.5,
+        ...                    inner_step=0.11, data_inner_step=0.1)
+        >>> round(found.leak, 2), round(found.inner_step_ratio, 2)
+        (1.5, 1.1)
+        >>> found.warning
+        "at NFE 1 the actions carry noise of the source: their spread is 1.50 times the data's (bound 1)"
+    """
+
+    nfe: int
+    spread: float
+    data_spread: float
+    ratio_to_last: float
+    inner_step: float
+    data_inner_step: float
+
+    @property
+    def leak(self) -> float:
+        """Spread over the data's; NaN where the data do not spread."""
+        return _ratio(self.spread, self.data_spread)
+
+    @property
+    def inner_step_ratio(self) -> float:
+        """Inner step over the data's; NaN where the data do not move."""
+        return _ratio(self.inner_step, self.data_inner_step)
+
+    @property
+    def warning(self) -> str | None:
+        """A sentence that names the exceeded bounds, or ``None``."""
+        signs = (
+            ("spread is", self.leak, LEAK_BOUND),
+            ("steps inside chunks are", self.inner_step_ratio, INNER_STEP_BOUND),
+        )
+        exceeded = [
+            f"their {what} {ratio:.2f} times the data's (bound {bound:g})"
+            for what, ratio, bound in signs
+            if ratio > bound
+        ]
+        if not exceeded:
+            return None
+        return f"at NFE {self.nfe} the actions carry noise of the source: {', '.join(exceeded)}"
+
+
+def source_leak(
+    policy: WarmPriorActor,
+    windows: TensorDictBase,
+    *,
+    nfes: Sequence[int] = (1, 9),
+    draws: int = 8,
+    episodes: Tensor | None = None,
+) -> dict[int, SourceLeak]:
+    r"""How far predictions spread over draws of the source, relative to the data.
+
+    An exact sampler spreads at most like the targets at the same observation, so the leak is at most 1. A
+    velocity network that has not learnt to ignore the noise at ``t = 0`` passes it on to the actions, most of
+    all at few steps. With one step an exact field returns :math:`E[a_1 \mid a_0, o]`, whose spread is 0 for a
+    standard normal source, and at most the data's for a warm one, by the law of total variance.
+
+    The data's variance is half the mean squared difference between a window's target and that at the nearest
+    observation (Euclidean, all ``To`` steps) of another episode. It is conditioned on the observation alone
+    for every prior, because WP-Preview's training mean is cut from the target, and therefore errs upwards.
+    Several modes at one observation spread far enough to hide a leak, but noise between the actions of one
+    chunk still shows, as steps inside chunks that are longer than the data's. Positions past the first ``H``
+    or past an episode's end do not count.
+
+    Args:
+        policy: the policy; its state stays as it is.
+        windows: ``[*B]`` of the policy's own prior with observations ``[*B, To, d_o]`` and targets ``[*B, P,
+            d_a]``, normalised, see :meth:`SharedObservations.windows`.
+        nfes: network evaluations per chunk to measure at; those beyond the policy's maximum are skipped.
+        draws: samples of the source per window, at least 2, the same ones for every NFE.
+        episodes: each window's episode, ``[*B]``, such as :attr:`SharedObservations.episodes`; by default
+            ``"episode"`` in the windows; without it every window counts as an episode.
+
+    Returns:
+        The measures by NFE, in ascending order.
+
+    Raises:
+        KeyError: if the windows lack a key.
+        ValueError: for bad windows or options, or a single episode.
+        FloatingPointError: if a prediction is NaN or infinite.
+
+    Examples:
+        >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import SharedObservations, source_leak
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> shared = SharedObservations(navigation_demonstrations(), 4)
+        >>> untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), PastPrior(4))
+        >>> leak = source_leak(untrained, shared.windows(untrained.prior), episodes=shared.episodes)[1]
+        >>> leak.inner_step_ratio > 2, leak.warning is None  # noise, to smooth demonstrations
+        (True, False)
+    """
+    if draws < 2:
+        raise ValueError(f"need draws >= 2, got {draws}")
+    prior, allowed = policy.prior, allowed_nfes(policy, nfes)
+    flat, target, rows, generator = judged(policy, windows)
+    n, device, chunk_length = len(flat), flat.loc.device, prior.chunk_length
+    if episodes is None:
+        episodes = windows.get(keys.EPISODE, None)
+    episodes = torch.arange(n) if episodes is None else episodes.flatten()
+    if len(episodes) != n:
+        raise ValueError(f"each of the {n} windows needs its episode, got {len(episodes)}")
+    if len(episodes.unique()) < 2:
+        raise ValueError("each window is compared with one of another episode, and all are of one")
+    target, counted = target[:, :chunk_length], flat.counted[:, :chunk_length, 0]
+    moments = {nfe: RunningVariance() for nfe in allowed}
+    steps = {nfe: 0.0 for nfe in allowed}
+    with evaluation_mode(policy):
+        observation = observed(policy, windows).reshape(n, -1).to(device)
+        data_spread = _data_spread(observation, target, counted, episodes.to(device))
+        for _ in range(draws):
+            a0 = drawn(policy, rows, generator)
+            for nfe in allowed:
+                chunk = predict(policy, rows, a0, nfe)
+                chunk = moments[nfe].add(chunk[:, :chunk_length])
+                steps[nfe] += _inner_step(chunk, counted) / draws
+    spread = {
+        nfe: math.sqrt(float(moment.variance(unbiased=True)[counted].mean()))
+        for nfe, moment in moments.items()
+    }
+    return {
+        nfe: SourceLeak(
+            nfe=nfe,
+            spread=spread[nfe],
+            data_spread=data_spread,
+            ratio_to_last=_ratio(spread[nfe], spread[allowed[-1]]),
+            inner_step=steps[nfe],
+            data_inner_step=_inner_step(target, counted),
+        )
+        for nfe in allowed
+    }
+
+
+def _data_spread(observation: Tensor, target: Tensor, counted: Tensor, episodes: Tensor) -> float:
+    size = max(DISTANCES // len(observation), 1)
+    squares = []
+    for i in range(0, len(observation), size):
+        s = slice(i, i + size)
+        # The faster form by matrix products loses small distances, which matter here.
+        distance = torch.cdist(observation[s], observation, compute_mode="donot_use_mm_for_euclid_dist")
+        nearest = distance.masked_fill_(episodes[s, None] == episodes, math.inf).argmin(1)
+        difference = (target[s] - target[nearest]).square()
+        squares.append(difference[counted[s] & counted[nearest]])
+    return math.sqrt(float(torch.cat(squares).mean()) / 2)
+
+
+def _inner_step(chunk: Tensor, counted: Tensor) -> float:
+    step = torch.linalg.vector_norm(chunk.diff(dim=1), dim=-1)
+    return float(step[counted[:, 1:] & counted[:, :-1]].mean())
+
+
+def _ratio(value: float, reference: float) -> float:
+    return value / reference if reference else math.nan
+
+
+def memory_gain(
+    policy: WarmPriorActor,
+    windows: TensorDictBase,
+    *,
+    nfes: Sequence[int] = (1, 9),
+    shift: float = 0.05,
+) -> dict[int, float]:
+    r"""How much of a shift of the history reappears in the executed actions.
+
+    At the same observation and source noise, all actions of the history and its forecast are moved by
+    :math:`\pm\delta e`, with a random unit direction :math:`e` per window. The gain is
+
+    .. math::
+        E\,\Big[e \cdot \frac{a_\tau(\mu + \delta e) - a_\tau(\mu - \delta e)}{2\delta}\Big]
+
+    over windows, directions and the executed positions :math:`\tau` inside the episode: the slope of actions
+    by the mean, averaged over the dimensions. It is 0 for a policy that ignores its past, 1 for one that
+    repeats it, and negative for one that undoes it. A gain is not a fault, since the mean may know what the
+    observation does not show. But a wrong action of the policy's own, which demonstrations never contain, is
+    carried on as well.
+
+    The source's noise lowers the gain. If past and next actions are one height, which varies by :math:`s` at
+    an observation, and the noise's average over the chunk has the variance :math:`V = \sigma^2 (\rho + (1 -
+    \rho)/H)`, with a ``correlation`` of :math:`\rho`, the gain of an exact flow is :math:`s^2 / (s^2 + V)` at
+    one Euler step, and :math:`s / \sqrt{s^2 + V}` at infinitely many.
+
+    Windows without a history do not count. Actions beyond the policy's ``clip`` count as 0. The leftover that
+    guides a policy stays as it is.
+
+    Args:
+        policy: the policy; its state stays as it is.
+        windows: ``[*B]`` of the policy's own prior, normalised, see :meth:`SharedObservations.windows`.
+            Images may be encoded, unless the network sees the history.
+        nfes: network evaluations per chunk to measure at; those beyond the policy's maximum are skipped.
+        shift: :math:`\delta`, in normalised action units.
+
+    Returns:
+        By NFE, ascending; 0 if no window has a history, NaN if no position is inside an episode.
+
+    Raises:
+        KeyError: if the windows lack a key.
+        ValueError: for bad windows or options, or if the observation's last actions differ from the
+            history's.
+        FloatingPointError: if a prediction is NaN or infinite.
+
+    Examples:
+        >>> from warmprior import GaussianPrior, PastPrior, VelocityMLP, WarmPriorActor
+        >>> from warmprior.diagnostics import SharedObservations, memory_gain
+        >>> from warmprior.envs import navigation_demonstrations
+        >>> shared = SharedObservations(navigation_demonstrations(), 4)
+        >>> def measured(prior):
+        ...     untrained = WarmPriorActor(VelocityMLP(1, 9, 4, observation_steps=1), prior)
+        ...     return memory_gain(untrained, shared.windows(prior))[1]
+        >>> measured(PastPrior(4)) > 0.5, measured(GaussianPrior(4))
+        (True, 0.0)
+    """
+    check_positive(shift=shift)
+    prior, allowed = policy.prior, allowed_nfes(policy, nfes)
+    windows = windows.reshape(windows.batch_size.numel())
+    encoded = encoded_windows(policy, windows)
+    flat = flat_windows(policy, encoded)
+    device, n = flat.loc.device, len(flat)
+    # A network that sees the last actions encodes them together with the images.
+    plain = (windows if sees_history(policy) else encoded).to(device)
+    _check_seen(policy, plain)
+    generator = torch.Generator(device).manual_seed(0)
+    normal = torch.randn(n, 1, flat.loc.shape[-1], generator=generator, dtype=flat.loc.dtype, device=device)
+    direction = torch.nn.functional.normalize(normal, dim=-1)
+    state = generator.get_state()
+    history = flat.history
+
+    def predicted(shift: float) -> dict[int, Tensor]:
+        generator.set_state(state)  # the same noise on both sides
+        rows = seen_anew(
+            policy, plain.clone(recurse=False).set(keys.HISTORY, shifted(history, shift * direction))
+        )
+        rows = encoded_windows(policy, rows).select(*policy.in_keys)
+        a0 = drawn(policy, rows, generator)
+        return {nfe: predict(policy, rows, a0, nfe) for nfe in allowed}
+
+    with evaluation_mode(policy):
+        up, down = predicted(shift), predicted(-shift)
+    executed = slice(prior.chunk_length)
+    counted = flat.counted[:, executed, 0]
+    followed = counted & ((history["steps"] > 0) | (history["forecast_steps"] > 0))
+    cold = 0.0 if counted.any() else math.nan
+    gains = {}
+    for nfe in allowed:
+        along = ((up[nfe] - down[nfe])[:, executed] * direction).sum(-1) / (2 * shift)
+        gains[nfe] = float(along[followed].mean()) if followed.any() else cold
+    return gains
+
+
+def shifted(history: TensorDictBase, by: Tensor) -> TensorDictBase:
+    """A history with its real actions and forecast moved by ``[*B, n, d_a]``; empty entries stay zero."""
+    moved = history.copy()
+    for name, from_end in (("actions", True), ("forecast", False)):
+        entry, steps = history[name], history["steps" if from_end else "forecast_steps"]
+        position = torch.arange(entry.shape[-2], device=entry.device)
+        real = position >= len(position) - steps if from_end else position < steps
+        moved[name] = entry + real.unsqueeze(-1) * by[..., : len(position), :]
+    return moved
+
+
+def _check_seen(policy: WarmPriorActor, windows: TensorDictBase) -> None:
+    if not sees_history(policy):
+        return
+    key = policy.in_keys[0]
+    given, made = windows.get(key), seen_anew(policy, windows.copy()).get(key)
+    if isinstance(given, TensorDictBase):
+        given, made = given.get(keys.STATE), made.get(keys.STATE)
+    if given.shape != made.shape or not torch.allclose(given.to(made.dtype), made):
+        raise ValueError(
+            f"{key!r} does not end in the windows' last actions, as HistoryObservation writes them: pass "
+            "windows with images as they are, not encoded"
+        )
+
+
+class HistoryShift(TensorDictModuleBase):
+    """Adds normal noise of deviation ``std`` to a policy's history, actions and forecast, at every decision.
+
+    The environment's own history stays as it is. A ``ValueError`` if ``std < 0``.
+    """
+
+    def __init__(
+        self, policy: WarmPriorActor, std: float, *, generator: torch.Generator | None = None
+    ) -> None:
+        super().__init__()
+        if not std >= 0:
+            raise ValueError(f"std must be >= 0, got {std}")
+        self.policy, self.std, self.generator = policy, std, generator
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Disturb the history and act."""
+        history = tensordict[keys.HISTORY]
+        longest = max(history[name].shape[-2] for name in ("actions", "forecast"))
+        actions = history["actions"]
+        noise = torch.randn(
+            (*actions.shape[:-2], longest, actions.shape[-1]),
+            generator=self.generator,
+            dtype=actions.dtype,
+            device=actions.device,
+        )
+        seen = tensordict.clone(recurse=False)
+        seen.set(keys.HISTORY, shifted(history, self.std * noise))
+        out = self.policy(seen_anew(self.policy, seen))
+        return tensordict.update(out.select(*self.out_keys))

@@ -1,0 +1,163 @@
+"""Images of a simulator's cameras, and features of a frozen encoder in their place."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.utils import unravel_key
+from torchrl.data import Bounded, Composite, Unbounded
+
+from warmprior import keys
+from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.network import encoded, network_observation
+from warmprior.transforms.inner_step import EnvTransform
+
+__all__ = ["CameraImages", "EncodeObservation"]
+
+
+class CameraImages(EnvTransform):
+    """Adds an image per camera to an observation vector.
+
+    The images are rendered from the environment's state (``RobosuiteEnv(..., sim_state=True)``), which takes
+    several times as long as a control step, so only the observations that the next decision reads are
+    rendered. Place it first, next to the simulator, and inside the workers of batched environments
+    (:func:`policy_transforms` does so).
+
+    Args:
+        cameras: names of the simulator's cameras; the image of ``"agentview"`` becomes
+            ``("observation", "agentview_image")``, uint8 ``[3, size, size]``.
+        size: side of the images in pixels.
+
+    Raises:
+        ValueError: if there are no cameras, one is named twice or (in an environment) does not exist.
+        KeyError: if the environment does not write its state.
+        RuntimeError: if it is no simulator, or nothing here can render.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from warmprior import CameraImages
+        >>> from warmprior.envs import RobosuiteEnv
+        >>> env = TransformedEnv(  # doctest: +SKIP
+        ...     RobosuiteEnv("lift", sim_state=True), CameraImages(["agentview"], 84))
+        >>> CameraImages(["agentview", "agentview"])
+        Traceback (most recent call last):
+            ...
+        ValueError: CameraImages needs different cameras, got ['agentview', 'agentview']
+    """
+
+    def __init__(self, cameras: Sequence[str], size: int = 84) -> None:
+        super().__init__(in_keys=[keys.OBSERVATION, keys.SIM_STATE], out_keys=[keys.OBSERVATION])
+        self.cameras = tuple(cameras)
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras):
+            raise ValueError(f"CameraImages needs different cameras, got {list(self.cameras)}")
+        if size < 1:
+            raise ValueError(f"the size of images must be at least 1 pixel, got {size}")
+        self.size = size
+
+    @property
+    def _simulator(self) -> Any:
+        base: Any = None if self.container is None else self.container.base_env
+        if not hasattr(base, "render_frame"):
+            raise RuntimeError(
+                "CameraImages renders a simulator: append it to TransformedEnv(RobosuiteEnv(...)), inside of "
+                f"batched environments, not to {type(base).__name__}"
+            )
+        return base
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        state = next_tensordict.get(keys.SIM_STATE, None)
+        if state is None:
+            raise KeyError(
+                f"CameraImages needs the simulator's state at {keys.SIM_STATE!r}: build the environment with "
+                "sim_state=True"
+            )
+        simulator, numbers = self._simulator, state.cpu().numpy()
+        vector = next_tensordict.get(keys.OBSERVATION)
+        entries = {keys.STATE: vector}
+        for camera in self.cameras:
+            image = simulator.render_frame(camera, self.size, numbers).transpose(2, 0, 1)
+            entries[f"{camera}_image"] = torch.from_numpy(np.ascontiguousarray(image)).to(vector.device)
+        return next_tensordict.set(keys.OBSERVATION, TensorDict(entries))
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Replace the vector by the vector and images."""
+        if keys.SIM_STATE not in observation_spec:
+            raise KeyError(
+                f"CameraImages found no {keys.SIM_STATE!r}: build the environment with sim_state=True"
+            )
+        vector, shape = observation_spec[keys.OBSERVATION], (3, self.size, self.size)
+        image = Bounded(0, 255, shape=shape, dtype=torch.uint8, device=vector.device)
+        images = {f"{camera}_image": image.clone() for camera in self.cameras}
+        observation_spec[keys.OBSERVATION] = Composite({keys.STATE: vector, **images})
+        return observation_spec
+
+
+class EncodeObservation(EnvTransform):
+    """Writes the features ``[*B, To, d_o]`` that a frozen policy's encoder extracts from images.
+
+    Agents in the policy's source space and their critics read the features, so the encoder runs once per
+    decision and replay buffers hold vectors. The policy behind the agent reads them too:
+    ``actor.replace(observation_key=keys.FEATURES)``. Append it after :func:`policy_transforms`, and outside
+    batched environments: inside, every worker would hold a copy of the encoder.
+
+    Args:
+        actor: the policy; its network is copied and stays as it is.
+
+    Raises:
+        ValueError: if the network has no encoder (:attr:`VelocityNetwork.encodes`).
+        KeyError: if the environment lacks the policy's observation.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from warmprior import EncodeObservation, ImageEncoder, PastPrior, VelocityMLP, VisionNetwork
+        >>> from warmprior import WarmPriorActor
+        >>> encoder = ImageEncoder(["cam"], 3, image_size=32, crop_size=28, backbone="small")
+        >>> network = VisionNetwork(encoder, VelocityMLP(2, encoder.observation_dim, 4))
+        >>> images = torch.zeros(5, 2, 3, 32, 32, dtype=torch.uint8)
+        >>> data = TensorDict({"observation": {"state": torch.zeros(5, 2, 3), "cam": images}}, [5])
+        >>> EncodeObservation(WarmPriorActor(network, PastPrior(4)))(data)["features"].shape
+        torch.Size([5, 2, 67])
+    """
+
+    def __init__(self, actor: WarmPriorActor) -> None:
+        observation_key = unravel_key(actor.in_keys[0])
+        super().__init__(in_keys=[observation_key], out_keys=[keys.FEATURES])
+        if not getattr(actor.network, "encodes", False):
+            raise ValueError(
+                f"{type(actor.network).__name__} takes observations as they are: there is nothing to encode"
+            )
+        self.network = copy.deepcopy(actor.network).eval().requires_grad_(False)
+
+    def train(self, mode: bool = True) -> EncodeObservation:
+        """Stays in evaluation mode."""
+        return super().train(False)
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the features."""
+        observation = tensordict.get(self.in_keys[0], None)
+        if observation is None:
+            raise KeyError(f"EncodeObservation found no {self.in_keys[0]!r}")
+        batch, device = tensordict.batch_size, next(self.network.parameters()).device
+        seen = network_observation(observation, batch)
+        features = encoded(self.network, seen.to(device))
+        assert isinstance(features, torch.Tensor)
+        features = features.reshape(*batch, *features.shape[1:])
+        return tensordict.set(self.out_keys[0], features.to(tensordict.device or device))
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self.forward(next_tensordict)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the features."""
+        network = self.network
+        shape = (*observation_spec.shape, network.observation_steps, network.observation_dim)
+        device = observation_spec.device
+        observation_spec[self.out_keys[0]] = Unbounded(shape, device=device)
+        return observation_spec
