@@ -14,15 +14,6 @@ from torch.nn.functional import normalize
 
 from warmprior.io.extras import require
 
-__all__ = [
-    "HAND_TO_SITE",
-    "matrix_to_rotation_6d",
-    "matrix_to_rotvec",
-    "quaternion_to_matrix",
-    "rotation_6d_to_matrix",
-    "rotvec_to_matrix",
-]
-
 HAND_TO_SITE = (0.0, 0.0, -math.sqrt(0.5), math.sqrt(0.5))
 """From the hand's body, whose quaternion robomimic's observations have, to the gripper's site, which
 robosuite's controllers move: -90 degrees about the z axis that both share."""

@@ -26,8 +26,6 @@ from warmprior.modules.real_time_chunking import with_leftover
 from warmprior.transforms.delay import check_delay
 from warmprior.transforms.history import HistoryObservation
 
-__all__ = ["AsyncExecutor"]
-
 
 class AsyncExecutor:
     """Runs a policy beside a control loop: computes the next chunk while this one is executed.

@@ -23,8 +23,6 @@ from warmprior.modules.network import velocity_field
 from warmprior.modules.ode import LinearInterpolant, integrate
 from warmprior.modules.prior import Prior, Source
 
-__all__ = ["branching_bound", "branching_cost", "curvature", "flow_paths"]
-
 
 def branching_cost(
     policy: WarmPriorActor,

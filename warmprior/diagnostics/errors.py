@@ -16,8 +16,6 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_keys
 from warmprior.modules.prior import Source
 
-__all__ = ["MeanError", "action_error", "mean_error", "mean_revision", "source_coverage"]
-
 
 def action_error(
     policy: WarmPriorActor,

@@ -19,9 +19,6 @@ from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation
 from warmprior.transforms.window import window_transforms
 
-__all__ = ["SharedObservations", "deployed_history"]
-
-
 SPLIT = 4096
 """Largest batch of the network, for bounded memory; it changes nothing else."""
 

@@ -28,9 +28,6 @@ from warmprior.diagnostics.flow import (
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_positive
 
-__all__ = ["INNER_STEP_BOUND", "LEAK_BOUND", "HistoryShift", "SourceLeak", "memory_gain", "source_leak"]
-
-
 LEAK_BOUND = 1.0
 """Largest leak of a sampler that spreads like the data; a larger one adds noise."""
 

@@ -12,8 +12,6 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.transforms.delay import executed_chunk
 
-__all__ = ["Smoothness", "executed_actions", "smoothness"]
-
 
 @dataclass(frozen=True)
 class Smoothness:

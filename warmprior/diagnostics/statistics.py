@@ -13,14 +13,6 @@ from torch import Tensor
 
 from warmprior.io.extras import require
 
-__all__ = [
-    "bootstrap_ratio",
-    "paired_probability_better",
-    "probability_better",
-    "success_posterior",
-    "top_k_mean",
-]
-
 RESAMPLES = 2_000
 """Of a bootstrap."""
 

@@ -17,8 +17,6 @@ from warmprior.envs.simulator import isolated_numpy_seed
 from warmprior.envs.tasks import low_dim_keys
 from warmprior.io.extras import require
 
-__all__ = ["Arm", "ControlLoop", "StepLoop", "check_supported", "compiled_torques"]
-
 
 class Arm:
     """One robot's indices, controller and current goal in the world, ``goal_pos`` and ``goal_mat``."""

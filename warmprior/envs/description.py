@@ -18,14 +18,6 @@ from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.policy import policy_transforms
 
-__all__ = [
-    "environment_description",
-    "environment_name",
-    "environment_of",
-    "environment_parts",
-    "robosuite_parts",
-]
-
 _IMAGES = ("cameras", "size", "fast_rendering", "low_dim_keys")
 
 

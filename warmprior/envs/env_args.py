@@ -20,8 +20,6 @@ from warmprior.rotation import (
     rotvec_to_matrix,
 )
 
-__all__ = ["absolute_actions", "absolute_to_env_action", "delta_conventions", "modernize_env_args"]
-
 _ARMS = ("right", "left")
 _RENAMED = {"damping": "damping_ratio", "damping_limits": "damping_ratio_limits"}
 _OUTPUT_MAX = (0.05, 0.05, 0.05, 0.5, 0.5, 0.5)

@@ -13,8 +13,6 @@ from torchrl.envs.gym_like import BaseInfoDictReader
 
 from warmprior.keys import OBSERVATION
 
-__all__ = ["gym_env"]
-
 
 class _Infos(BaseInfoDictReader):
     """Reads numbers and flags of ``info`` as ``[1]``; what a step, or a reset, leaves out is 0."""

@@ -12,8 +12,6 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-__all__ = ["find_mimicgen", "is_mimicgen", "register_mimicgen"]
-
 _TASKS = ("stack", "coffee", "threading")
 _INSTALL = "git clone https://github.com/NVlabs/mimicgen ~/mimicgen && pip install --no-deps -e ~/mimicgen"
 _SINGLE_ARM = "robosuite.environments.manipulation.single_arm_env"

@@ -14,16 +14,6 @@ from torchrl.envs import EnvBase
 
 from warmprior import keys
 
-__all__ = [
-    "NavigationEnv",
-    "NavigationMetrics",
-    "navigation_collides",
-    "navigation_demonstrations",
-    "navigation_heights",
-    "navigation_metrics",
-    "navigation_positions",
-]
-
 STEPS = 64
 OBSTACLES = (-0.45, 0.45)
 HALF_WIDTH, HALF_HEIGHT = 0.12, 0.45

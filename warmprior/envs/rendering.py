@@ -20,8 +20,6 @@ import numpy as np
 from warmprior.io.extras import require
 from warmprior.io.workers import stop_forking
 
-__all__ = ["CameraRenderer", "EnvRenderers", "rendering_backend", "require_rendering"]
-
 # EGL first: it uses a GPU where there is one. Both render the same pixels in software.
 _BACKENDS = ("egl", "osmesa")
 _BUFFER = (640, 480)  # robosuite's; an image is a corner of it, and its edges look accordingly

@@ -20,8 +20,6 @@ from warmprior.envs.simulator import action_limits, make_simulator, task_env_arg
 from warmprior.envs.tasks import STYLES, task_of_env
 from warmprior.envs.tasks import low_dim_keys as default_keys
 
-__all__ = ["RobosuiteEnv"]
-
 _LOOPS = {"lean": ControlLoop, "robosuite": StepLoop}
 
 _FLAGS = keys.SUCCESS, "terminated", "truncated", "done"

@@ -17,8 +17,6 @@ from warmprior.envs.mimicgen import is_mimicgen, register_mimicgen
 from warmprior.envs.tasks import get_task
 from warmprior.io.extras import require
 
-__all__ = ["action_limits", "import_robosuite", "isolated_numpy_seed", "make_simulator", "task_env_args"]
-
 # Sizes drawn when a model is loaded (Lift's cube, Transport's hammer) must be the same in every
 # process, or the same seed would mean different episodes.
 _MODEL_SEED = 0

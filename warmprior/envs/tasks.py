@@ -6,8 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-__all__ = ["EVALUATION_SEED", "STYLES", "TASKS", "TaskSpec", "get_task", "low_dim_keys", "task_of_env"]
-
 #: Simulator seed of the first evaluation episode. Demonstrations are generated from smaller ones,
 #: so a policy is never evaluated on an initial state it was trained on.
 EVALUATION_SEED = 10_000_000

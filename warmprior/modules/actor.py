@@ -20,8 +20,6 @@ from warmprior.modules.prior import Prior, Source
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import Registered
 
-__all__ = ["PriorSampler", "StartPoint", "WarmPriorActor"]
-
 
 class StartPoint(Registered, nn.Module):
     """Base class of points :math:`a_s` at a time :math:`s` in (0, 1), from which a policy integrates.

@@ -12,8 +12,6 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-__all__ = ["check_finite", "check_finite_numbers", "check_keys", "check_positive", "check_whole_numbers"]
-
 
 def check_finite_numbers(**values: Any) -> None:
     """Raise ValueError for the first of them that is no finite number."""

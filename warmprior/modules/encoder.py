@@ -17,9 +17,6 @@ from warmprior.io.extras import require
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.registry import from_config
 
-__all__ = ["ImageEncoder", "VisionNetwork", "imagenet_weights", "load_imagenet"]
-
-
 Backbone = Literal["resnet18", "small"]
 
 _CHANNEL_MEAN = (0.485, 0.456, 0.406)

@@ -13,17 +13,6 @@ from torch import Tensor, nn
 from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.registry import Registered
 
-__all__ = [
-    "ChiTransformer",
-    "TimestepEmbedding",
-    "VelocityMLP",
-    "VelocityNetwork",
-    "network_observation",
-    "uncompiled",
-    "velocity_field",
-    "without_compilation",
-]
-
 
 class VelocityNetwork(nn.Module, Registered):
     """Base class of velocity networks ``v(t, a_t, o)`` that can be saved by name and configuration.

@@ -13,8 +13,6 @@ from torchrl.envs.transforms import ActionScaling, ObservationNorm, Transform
 
 from warmprior import keys
 
-__all__ = ["Normalizer"]
-
 
 class Normalizer(nn.Module):
     """Maps every dimension of every key to ``[-1, 1]`` by the data's minimum and maximum (Table 3).

@@ -19,18 +19,6 @@ from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.real_time_chunking import RealTimeChunking
 from warmprior.modules.registry import Registered
 
-__all__ = [
-    "DEFAULT_NFE",
-    "SOLVERS",
-    "BridgeInterpolant",
-    "Interpolant",
-    "LinearInterpolant",
-    "ODEActor",
-    "check_grid",
-    "grid_parts",
-    "integrate",
-]
-
 
 class Interpolant(Registered):
     r"""The path :math:`a_t = \alpha(t) a_0 + \beta(t) a_1` and its velocity.

@@ -19,9 +19,6 @@ from warmprior.modules.prior import Prior
 from warmprior.modules.registry import from_config
 from warmprior.rotation import HAND_TO_SITE, matrix_to_rotation_6d, quaternion_to_matrix
 
-__all__ = ["PoseTrend", "PreconditionedNetwork", "RestingAction", "SourceMoments"]
-
-
 DRAWS = 16
 """Of the source, per window: their mean has little noise, which belongs to no observation."""
 

@@ -15,8 +15,6 @@ from warmprior.history import check_history
 from warmprior.modules.checks import check_finite_numbers
 from warmprior.modules.registry import Registered
 
-__all__ = ["GaussianPrior", "PastPrior", "PreviewPrior", "Prior", "Source", "checked_mean"]
-
 
 @dataclass(frozen=True)
 class Source:

@@ -12,8 +12,6 @@ from torch import Tensor
 
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 
-__all__ = ["SCHEDULES", "RealTimeChunking", "with_leftover"]
-
 Velocity = Callable[[Tensor, Tensor], Tensor]
 
 SCHEDULES: dict[str, Callable[[Tensor], Tensor]] = {

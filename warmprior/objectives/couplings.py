@@ -18,8 +18,6 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.modules.ode import BridgeInterpolant
 
-__all__ = ["BridgeCoupling", "Coupling", "OTCoupling", "ReflowCoupling"]
-
 Coupling = Callable[[Tensor, Tensor, Tensor | TensorDictBase | None], tuple[Tensor, Tensor]]
 """Pairs sources and targets: ``(a0, a1, observation) -> (a0, a1)``, each chunk ``[*B, P, d_a]``.
 

@@ -20,21 +20,6 @@ from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.ode import Interpolant, LinearInterpolant, integrate
 from warmprior.objectives.couplings import Coupling
 
-__all__ = [
-    "TIMES",
-    "FlowMatchingLoss",
-    "Objective",
-    "Times",
-    "TimesName",
-    "Weighting",
-    "check_objective",
-    "logit_normal_times",
-    "start_times",
-    "u_shaped_times",
-    "uniform_times",
-]
-
-
 Times = Callable[[torch.Size, torch.Generator | None, torch.dtype, torch.device], Tensor]
 """Draws times in [0, 1]: ``(shape, generator, dtype, device) -> [*shape]``."""
 

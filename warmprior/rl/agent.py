@@ -23,8 +23,6 @@ from warmprior.rl.dsrl import DSRLNALoss
 from warmprior.rl.networks import BoxTanhNormal, make_prior_space_actor, make_prior_space_critic
 from warmprior.training.checkpoint import named, restore_optimizer, select, snapshot_optimizer
 
-__all__ = ["PriorSpaceAgent", "PriorSpaceConfig"]
-
 
 @dataclass(frozen=True)
 class PriorSpaceConfig:

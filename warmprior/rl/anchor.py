@@ -15,8 +15,6 @@ from warmprior.history import check_history, window_history
 from warmprior.modules.prior import Prior, checked_mean
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
-__all__ = ["PriorAnchor", "has_anchor", "residual_sigma", "source_anchor"]
-
 
 def has_anchor(actor: Any) -> bool:
     """Whether a policy's source has a moving centre, around which an agent can search.

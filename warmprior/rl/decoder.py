@@ -20,8 +20,6 @@ from warmprior.modules.checks import check_keys, check_positive
 from warmprior.rl.anchor import has_anchor, residual_sigma
 from warmprior.transforms.inner_step import EnvTransform
 
-__all__ = ["PriorDecoder", "PriorSpace", "ResidualSampler"]
-
 
 class PriorDecoder(TensorDictModuleBase):
     r"""The frozen policy as a decoder: ``(observation, anchor, delta) -> (noise, chunk)``.

@@ -23,8 +23,6 @@ from warmprior.modules.checks import check_finite, check_keys, check_positive, c
 from warmprior.rl.decoder import PriorDecoder, ResidualDistribution, ResidualSampler
 from warmprior.rl.networks import BoxTanhNormal
 
-__all__ = ["DSRLNALoss"]
-
 type Critics = TensorDictModule | list[TensorDictModule]
 
 CRITICS = 2

@@ -15,8 +15,6 @@ from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from warmprior import keys
 from warmprior.modules.checks import check_positive, check_whole_numbers
 
-__all__ = ["BoxTanhNormal", "make_prior_space_actor", "make_prior_space_critic"]
-
 
 class BoxTanhNormal(TanhNormal):
     r""":class:`~torchrl.modules.TanhNormal` with log-probabilities in units of its box.

@@ -19,8 +19,6 @@ from warmprior import keys
 from warmprior.io.ray_cluster import ray_cluster
 from warmprior.io.workers import WorkerError, stop_forking
 
-__all__ = ["WarmUpSwitch", "ray_rounds"]
-
 EPISODES_APART = 10_000
 """Between the seeds of two collectors."""
 

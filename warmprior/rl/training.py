@@ -28,8 +28,6 @@ from warmprior.rl.ray_collection import WarmUpSwitch, ray_rounds
 from warmprior.training.checkpoint import check_identity, digest_of_state, load_state, save_state
 from warmprior.training.evaluation import evaluate, watched
 
-__all__ = ["PriorSpaceTraining", "ReplaySegments"]
-
 
 class ReplaySegments:
     """A folder of safetensors files, one per save, with the transitions since the one before.

@@ -13,8 +13,6 @@ from warmprior import keys
 from warmprior.rotation import matrix_to_rotvec, rotation_6d_to_matrix
 from warmprior.transforms.inner_step import KEPT, EnvTransform
 
-__all__ = ["AbsoluteActions"]
-
 _DELTA, _ABSOLUTE = 7, 10  # numbers per arm
 _REACH = 2.0  # metres, in the specification of actions: it only says what is worth sampling
 

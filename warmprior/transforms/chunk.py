@@ -25,9 +25,6 @@ from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside
 from warmprior.transforms.stack import ObservationStack
 
-__all__ = ["ChunkStep", "LateTransforms", "advance"]
-
-
 _REACH: dict[type[Transform], Callable[[Any], int]] = {
     AbsoluteActions: lambda transform: 1,
     ActionScaling: lambda transform: 1,

@@ -13,8 +13,6 @@ from warmprior import keys
 from warmprior.modules.real_time_chunking import with_leftover
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
-__all__ = ["InferenceDelay", "check_delay", "executed_chunk"]
-
 
 def check_delay(delay: int, execute: int, length: int | None = None) -> None:
     """A ``ValueError`` if chunks of ``length`` cannot take effect ``delay`` control steps late."""

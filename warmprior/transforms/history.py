@@ -17,9 +17,6 @@ from warmprior.history import ENTRIES, advance, cold_history, without
 from warmprior.modules.checks import check_finite_numbers, check_whole_numbers
 from warmprior.transforms.inner_step import EnvTransform, keep_resting
 
-__all__ = ["ActionHistory", "HistoryObservation", "WithheldHistory"]
-
-
 HISTORY_KEYS: list[NestedKey] = [(keys.HISTORY, name) for name in ENTRIES]
 
 

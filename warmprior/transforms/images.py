@@ -17,8 +17,6 @@ from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.network import encoded, network_observation
 from warmprior.transforms.inner_step import EnvTransform
 
-__all__ = ["CameraImages", "EncodeObservation"]
-
 
 class CameraImages(EnvTransform):
     """Adds an image per camera to an observation vector.

@@ -11,8 +11,6 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.transforms import Compose, Transform, TransformedEnv
 
-__all__ = ["EnvTransform", "InnerStep", "keep_resting", "rows_where", "set_aside"]
-
 KEPT = "_kept"
 """Where :func:`set_aside` puts observations, at the root of a step's input."""
 

@@ -18,8 +18,6 @@ from warmprior.transforms.delay import InferenceDelay, check_delay
 from warmprior.transforms.history import ActionHistory, HistoryObservation
 from warmprior.transforms.stack import ObservationStack
 
-__all__ = ["policy_transforms"]
-
 
 def policy_transforms(
     policy: WarmPriorActor | Prior,

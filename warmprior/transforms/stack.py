@@ -13,8 +13,6 @@ from torchrl.data import Composite
 from warmprior import keys
 from warmprior.transforms.inner_step import KEPT, EnvTransform, set_aside
 
-__all__ = ["ObservationStack"]
-
 
 class ObservationStack(EnvTransform):
     """Replaces the observation ``[*B, d_o]`` by the last ``To`` of them, ``[*B, To, d_o]``.

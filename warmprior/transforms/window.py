@@ -18,8 +18,6 @@ from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation, WithheldHistory
 
-__all__ = ["ActionWindow", "window_replay_buffer", "window_transforms", "without_images"]
-
 
 class ActionWindow(Transform):
     """Replaces sampled steps by training windows with the history before them.

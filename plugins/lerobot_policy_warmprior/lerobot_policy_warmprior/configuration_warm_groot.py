@@ -9,8 +9,6 @@ from lerobot.policies.groot.configuration_groot import GrootConfig
 
 from lerobot_policy_warmprior.configuration_warm_vla import WarmConfigMixin
 
-__all__ = ["WarmGrootConfig"]
-
 
 @PreTrainedConfig.register_subclass("warm_groot")
 @dataclass

@@ -7,8 +7,6 @@ from lerobot.policies.groot.modeling_groot import GrootPolicy
 from lerobot_policy_warmprior.configuration_warm_groot import WarmGrootConfig
 from lerobot_policy_warmprior.modeling_warm_vla import WarmPolicyMixin
 
-__all__ = ["WarmGrootPolicy"]
-
 
 class WarmGrootPolicy(WarmPolicyMixin, GrootPolicy):
     """GR00T N1.7 whose chunks start from a prior; its checkpoints load unchanged."""

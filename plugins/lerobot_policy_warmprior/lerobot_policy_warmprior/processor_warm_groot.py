@@ -14,8 +14,6 @@ from torch.nn.functional import pad
 from lerobot_policy_warmprior.configuration_warm_groot import WarmGrootConfig
 from warmprior.lerobot.adapter import HISTORY, HISTORY_IS_PAD
 
-__all__ = ["WarmGrootPackInputsStep", "make_warm_groot_pre_post_processors"]
-
 DATA, PAD = TransitionKey.COMPLEMENTARY_DATA, "action_is_pad"
 
 
