@@ -29,6 +29,8 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
 
+__all__ = ["ENTRIES", "advance", "check_history", "cold_history", "window_history", "without"]
+
 ENTRIES = ("actions", "steps", "forecast", "forecast_steps")
 
 

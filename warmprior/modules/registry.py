@@ -9,6 +9,8 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
+__all__ = ["Registered", "find", "from_config", "make", "options_of"]
+
 
 class Registered:
     """Subclasses are known by name, and objects remember their constructor's arguments.
