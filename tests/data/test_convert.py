@@ -75,7 +75,6 @@ def test_both_buffers_hold_the_same(converted, options):
     )
     assert not equal(mine.data, theirs.data)
     assert mine.env_args == theirs.env_args and mine.task is theirs.task
-    assert mine.recorded_env_args == theirs.recorded_env_args
     assert mine.observation_keys == theirs.observation_keys
     assert mine.image_size == theirs.image_size
 

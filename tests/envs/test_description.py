@@ -69,7 +69,7 @@ def solved(path, actions):
     import h5py
 
     data = RobomimicExperienceReplay(path, absolute_actions=actions == "absolute")
-    make_env, adapters = robosuite_parts(environment_description(data.recorded_env_args, "ph", 2, actions))
+    make_env, adapters = robosuite_parts(environment_description(data.env_args, "ph", 2, actions))
     env = TransformedEnv(make_env(), Compose(*adapters.values()))
     outcomes = []
     with h5py.File(path) as file:

@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from tests.data.synthetic import env_args_14, env_args_15
 from warmprior.envs.env_args import (
     absolute_actions,
-    absolute_to_env_action,
     delta_conventions,
     modernize_env_args,
 )
@@ -76,8 +75,6 @@ def test_absolute_actions_against_scipy(arms):
     quaternion = np.concatenate([_quaternions(n, seed) for seed in range(arms)], -1)
     out = absolute_actions(*map(torch.from_numpy, (actions, position, quaternion)))
     assert out.shape == (n, 10 * arms)
-    env = absolute_to_env_action(out).numpy()
-    assert env.shape == (n, 7 * arms)
     for arm in range(arms):
         goal, rotation, gripper = _reference(
             actions[:, 7 * arm : 7 * arm + 7],
@@ -87,26 +84,17 @@ def test_absolute_actions_against_scipy(arms):
         rows = rotation.as_matrix()[:, :2].reshape(n, 6)
         expected = np.concatenate([goal, rows, gripper], -1)
         np.testing.assert_allclose(out[:, 10 * arm : 10 * arm + 10], expected, atol=1e-9)
-        np.testing.assert_allclose(env[:, 7 * arm : 7 * arm + 3], goal, atol=1e-9)
-        np.testing.assert_allclose(
-            Rotation.from_rotvec(env[:, 7 * arm + 3 : 7 * arm + 6]).as_matrix(),
-            rotation.as_matrix(),
-            atol=1e-9,
-        )
-        np.testing.assert_allclose(env[:, 7 * arm + 6 : 7 * arm + 7], gripper)
 
 
 # ---------------------------------------------------------------------------- env_args
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("make", [env_args_14, env_args_15])
-@pytest.mark.parametrize("absolute", [False, True])
-def test_modernize_is_pure_and_idempotent(task, make, absolute):
+def test_modernize_is_pure_and_idempotent(task, make):
     before = make(task)
     kept = copy.deepcopy(before)
-    once = modernize_env_args(before, absolute)
+    once = modernize_env_args(before)
     assert before == kept
     assert modernize_env_args(once) == once
-    assert modernize_env_args(once, absolute) == once
     once["env_kwargs"]["controller_configs"]["body_parts"]["right"]["kp"] = -1
     assert before == kept
 

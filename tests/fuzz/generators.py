@@ -268,7 +268,7 @@ def _says_so(path: Path, replay: RobomimicExperienceReplay, options: dict) -> bo
     if not options["absolute_actions"]:
         pairs.append((data["action"], actions))
     equal = all(torch.equal(mine, torch.from_numpy(theirs).float()) for mine, theirs in pairs)
-    return equal and replay.env_args == modernize_env_args(meta, options["absolute_actions"])
+    return equal and replay.env_args == modernize_env_args(meta)
 
 
 # --- saved policies and training states

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -264,10 +263,9 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         if storage == "memmap" and device.type != "cpu":
             raise ValueError(f"memory maps live on the CPU; use storage='memory' for {device}")
         action_dim = index.action_dim
-        self._env_args: dict[str, Any] = {}
         if index.env_args or absolute_actions:
             try:
-                self._env_args = modernize_env_args(index.env_args, absolute=absolute_actions)
+                modernize_env_args(index.env_args)
                 arms = len(delta_conventions(index.env_args)[1]) if absolute_actions else 0
             except Exception as error:  # whatever their unexpected structure leads to
                 reason = str(error) if isinstance(error, ValueError) else repr(error)
@@ -300,23 +298,16 @@ class DemonstrationReplay(TensorDictReplayBuffer):
         """The file or folder that was read."""
         return self._index.path
 
-    def _described(self, env_args: Mapping[str, Any]) -> dict[str, Any]:
-        if not env_args:
-            raise ValueError(f"{self.path} does not say which environment it was recorded in")
-        return modernize_env_args(env_args)
-
     @property
     def env_args(self) -> dict[str, Any]:
-        """The environment of the data, for robosuite 1.5, fit for the actions as they are stored; a copy.
+        """The environment in which the data were recorded, for robosuite 1.5; a copy.
 
-        A ``ValueError`` if it is unknown; see :func:`warmprior.envs.modernize_env_args`.
+        A ``ValueError`` if it is unknown; see :func:`warmprior.envs.modernize_env_args`. Where actions are
+        stored as absolute poses, :class:`~warmprior.AbsoluteActions` turns them into what it takes.
         """
-        return self._described(self._env_args)
-
-    @property
-    def recorded_env_args(self) -> dict[str, Any]:
-        """The same, fit for the actions as they were recorded, where those that are stored are absolute."""
-        return self._described(self._index.env_args)
+        if not self._index.env_args:
+            raise ValueError(f"{self.path} does not say which environment it was recorded in")
+        return modernize_env_args(self._index.env_args)
 
     @property
     def task(self) -> TaskSpec | None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from warmprior.envs.description import environment_description, environment_of
 from warmprior.envs.env_args import (
     absolute_actions,
-    absolute_to_env_action,
     delta_conventions,
     modernize_env_args,
 )
@@ -29,7 +28,6 @@ __all__ = [
     "RobosuiteEnv",
     "TaskSpec",
     "absolute_actions",
-    "absolute_to_env_action",
     "delta_conventions",
     "environment_description",
     "environment_of",

@@ -14,9 +14,7 @@ from warmprior.envs.mimicgen import is_mimicgen
 from warmprior.rotation import (
     HAND_TO_SITE,
     matrix_to_rotation_6d,
-    matrix_to_rotvec,
     quaternion_to_matrix,
-    rotation_6d_to_matrix,
     rotvec_to_matrix,
 )
 
@@ -25,7 +23,7 @@ _RENAMED = {"damping": "damping_ratio", "damping_limits": "damping_ratio_limits"
 _OUTPUT_MAX = (0.05, 0.05, 0.05, 0.5, 0.5, 0.5)
 
 
-def _modernize_part(part: dict[str, Any], *, old: bool, absolute: bool) -> None:
+def _modernize_part(part: dict[str, Any], old: bool) -> None:
     for before, after in _RENAMED.items():
         if before in part:
             part[after] = part.pop(before)
@@ -35,15 +33,9 @@ def _modernize_part(part: dict[str, Any], *, old: bool, absolute: bool) -> None:
     # frame unless the file says otherwise. Bases that face each other make the two differ.
     part.setdefault("input_ref_frame", "world" if old else "base")
     part.setdefault("gripper", {"type": "GRIP"})
-    if absolute:
-        if part.get("type") != "OSC_POSE":
-            raise ValueError(
-                f"absolute actions need an OSC_POSE controller, env_args has {part.get('type')!r}"
-            )
-        part["input_type"], part["input_ref_frame"] = "absolute", "world"
 
 
-def _modernize_controller(config: dict[str, Any], absolute: bool) -> dict[str, Any]:
+def _modernize_controller(config: dict[str, Any]) -> dict[str, Any]:
     old = "body_parts" not in config
     if old:
         config = {"type": "BASIC", "body_parts": {"right": config}}
@@ -51,11 +43,11 @@ def _modernize_controller(config: dict[str, Any], absolute: bool) -> dict[str, A
     parts.update(parts.pop("arms", {}))
     for name in _ARMS:
         if name in parts:
-            _modernize_part(parts[name], old=old, absolute=absolute)
+            _modernize_part(parts[name], old)
     return config
 
 
-def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> dict[str, Any]:
+def modernize_env_args(env_args: Mapping[str, Any]) -> dict[str, Any]:
     """Rewrite the ``env_args`` of any robomimic file for robosuite 1.5.
 
     :doc:`/data` has a table of what changes. Some files published for 1.5 still carry the old description, so
@@ -65,15 +57,12 @@ def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> d
     Args:
         env_args: the parsed JSON of the attribute ``data.attrs["env_args"]``, with ``env_name`` and
             ``env_kwargs``. Not modified.
-        absolute: make the environment take absolute poses in the world frame (see
-            :func:`absolute_to_env_action`) instead of what the file says.
 
     Returns:
         A deep copy, from which ``robosuite.make(new["env_name"], **new["env_kwargs"])`` works.
 
     Raises:
-        ValueError: if ``env_name`` or ``env_kwargs`` is missing, or ``absolute`` is asked of a controller
-            other than ``OSC_POSE``.
+        ValueError: if ``env_name`` or ``env_kwargs`` is missing.
 
     Examples:
         >>> from warmprior.envs import modernize_env_args
@@ -92,13 +81,11 @@ def modernize_env_args(env_args: Mapping[str, Any], absolute: bool = False) -> d
     if configs:
         listed = configs if isinstance(configs, list) else [configs]
         old = any("body_parts" not in config for config in listed)
-        listed = [_modernize_controller(config, absolute) for config in listed]
+        listed = [_modernize_controller(config) for config in listed]
         kwargs["controller_configs"] = listed if isinstance(configs, list) else listed[0]
         # MimicGen's tasks have the full step (see register_mimicgen), and some refuse the argument.
         if not is_mimicgen(new["env_name"]):
             kwargs.setdefault("lite_physics", not old)
-    elif absolute:
-        raise ValueError("absolute actions need the controller_configs of the file's env_kwargs")
     layout = kwargs.get("env_configuration")
     if isinstance(layout, str):
         kwargs["env_configuration"] = layout.removeprefix("single-arm-")
@@ -207,28 +194,3 @@ def absolute_actions(
     goal = position + step[..., 0, :]
     turned = matrix_to_rotation_6d(rotvec_to_matrix(step[..., 1, :]) @ rotation)
     return torch.cat((goal, turned, delta[..., 6:]), -1).flatten(-2).to(actions.dtype)
-
-
-def absolute_to_env_action(actions: Tensor) -> Tensor:
-    """Turn absolute actions into what an environment with absolute inputs takes.
-
-    Args:
-        actions: ``[..., 10]`` or ``[..., 20]``, as :func:`absolute_actions` returns them or as a policy
-            predicts them: the six rotation numbers are orthonormalised.
-
-    Returns:
-        ``[..., 7]`` or ``[..., 14]`` in the dtype of ``actions``: per arm the position in metres, the
-        rotation vector in radians and the gripper.
-
-    Raises:
-        ValueError: if the width is neither 10 nor 20.
-
-    Examples:
-        >>> import torch
-        >>> from warmprior.envs import absolute_to_env_action
-        >>> absolute_to_env_action(torch.tensor([0.1, 0, 1, 1, 0, 0, 0, 1, 0, -1]))
-        tensor([ 0.1000,  0.0000,  1.0000,  0.0000,  0.0000,  0.0000, -1.0000])
-    """
-    pose = _per_arm("actions", actions, 10)
-    rotvec = matrix_to_rotvec(rotation_6d_to_matrix(pose[..., 3:9]))
-    return torch.cat((pose[..., :3], rotvec, pose[..., 9:]), -1).flatten(-2).to(actions.dtype)

@@ -241,9 +241,7 @@ def robosuite_task(
     if is_mimicgen(index.env_args["env_name"]):
         find_mimicgen()
     dataset, images = _read(found, options, demos)
-    description = environment_description(
-        dataset.recorded_env_args, style, observation_steps, options.actions, images
-    )
+    description = environment_description(dataset.env_args, style, observation_steps, options.actions, images)
     make_env, adapters = robosuite_parts(description)
     # Poses in the units of deltas: an error, or a sigma, of the same size means the same in both spaces, and
     # positions, which range far, do not weigh little beside the gripper in the loss.
