@@ -21,7 +21,7 @@ import jobs
 from jobs import Jobs
 from options import Run
 
-from warmprior.io import workers
+from tests.processes import apart
 
 
 class AwkwardError(Exception):
@@ -49,10 +49,10 @@ def play(folder, number, episode):
 
 
 @pytest.mark.parametrize("engine", ["local", pytest.param("ray", marks=pytest.mark.slow)])
+@apart  # no fork survives a connection to Ray
 def test_failures_cost_themselves_alone(engine, tmp_path, monkeypatch, capsys):
     if engine == "ray":
         pytest.importorskip("ray")
-    monkeypatch.setattr(workers, "_forks", True)  # whatever Ray makes of it, it is as before afterwards
     monkeypatch.setattr(jobs, "DEATHS", 2)
     (tmp_path / "dies").touch()  # the first worker of job 4 is killed while it trains
     for name in ("out", "policies"):
