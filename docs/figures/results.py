@@ -270,7 +270,7 @@ def human() -> None:
     """Human demonstrations: score and success against the number of integration steps."""
     rows = read("pusht")
     counts = rows["demonstrations"].unique()
-    title = "Human demonstrations of Push-T: WP-Past leads with few; with all, the Gaussian source at nine steps"
+    title = "Human Push-T: with few demonstrations WP-Past leads, with all the Gaussian source at nine steps"
     made, axes = figure(11.6, 7.4, len(counts), title, rows=2)
     pairs = zip(axes[: len(counts)], axes[len(counts) :], strict=True)
     for (count, part), pair in zip(rows.groupby("demonstrations", sort=False), pairs, strict=True):
