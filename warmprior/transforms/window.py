@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.utils import NestedKey, unravel_key
@@ -246,8 +244,11 @@ def window_replay_buffer(
     prior: Prior,
     *,
     batch_size: int,
+    observation_steps: int = 2,
+    see_history: bool = False,
+    withhold: float = 0.0,
     generator: torch.Generator | None = None,
-    **options: Any,
+    observation_key: NestedKey = keys.OBSERVATION,
 ) -> TensorDictReplayBuffer:
     """A replay buffer that samples training windows from demonstrations.
 
@@ -255,11 +256,14 @@ def window_replay_buffer(
     whole steps.
 
     Args:
-        data: see :func:`window_transforms`.
-        prior: likewise.
+        data: contiguous normalised steps ``[N]``, see :class:`ActionWindow`.
+        prior: the policy's prior, of which only the lengths matter.
         batch_size: windows per sample.
+        observation_steps: ``To``.
+        see_history: whether the network sees the last actions.
+        withhold: share of the windows whose history is withheld.
         generator: source of randomness of sampler and what is withheld; PyTorch's global one by default.
-        options: further ones of :func:`window_transforms`.
+        observation_key: of the observation.
 
     Raises:
         ValueError: if ``batch_size < 1``, or see :class:`ActionWindow`.
@@ -272,7 +276,15 @@ def window_replay_buffer(
         (torch.Size([32, 16, 1]), torch.Size([32, 2, 9]))
     """
     check_whole_numbers(batch_size=batch_size)
-    windows = window_transforms(data, prior, generator=generator, **options)
+    windows = window_transforms(
+        data,
+        prior,
+        observation_steps=observation_steps,
+        see_history=see_history,
+        withhold=withhold,
+        generator=generator,
+        observation_key=observation_key,
+    )
     window = windows[0]
     frames = torch.arange(len(data), device=window.start.device)
     return TensorDictReplayBuffer(
