@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import os
 import subprocess
@@ -97,6 +98,9 @@ def test_a_base_checkpoint_becomes_a_warm_policy(found, name, built, tmp_path):
     with small(name):
         again = found[name].from_pretrained(tmp_path / "warm")
     assert again.config.prior == "past,sigma=0.0"
+    # LeRobot finds the processors by these names.
+    module = importlib.import_module(type(config).__module__.replace("configuration_", "processor_"))
+    assert callable(getattr(module, f"make_{name}_pre_post_processors"))
     assert all(map(torch.equal, again.state_dict().values(), policy.state_dict().values()))
 
 
