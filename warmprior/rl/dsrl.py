@@ -87,9 +87,8 @@ class DSRLNALoss(LossModule):
         target_entropy: :math:`\mathcal{H}`, of the residual in units of the box.
 
     .. note::
-        Keys (renameable by :meth:`set_keys`): ``chunk``, the decoded chunk of the transition (``("next",
-            "decoded",
-        "chunk")`` in data from :class:`~warmprior.PriorSpace`); under ``"next"`` ``reward``, ``done`` and
+        Keys (renameable by :meth:`set_keys`): ``chunk``, the decoded chunk of the transition (in data from
+        :class:`~warmprior.PriorSpace` ``("next", "decoded", "chunk")``); under ``"next"`` ``reward``, ``done`` and
         ``executed``; ``priority``, where the TD error of each row is written; ``priority_weight``;
         ``state_action_value``, the critics' output. ``loss.in_keys`` lists all that it reads:
         ``buffer.extend(data.reshape(-1).select(*loss.in_keys))``.
