@@ -88,10 +88,10 @@ class DSRLNALoss(LossModule):
 
     .. note::
         Keys (renameable by :meth:`set_keys`): ``chunk``, the decoded chunk of the transition (in data from
-        :class:`~warmprior.PriorSpace` ``("next", "decoded", "chunk")``); under ``"next"`` ``reward``, ``done`` and
-        ``executed``; ``priority``, where the TD error of each row is written; ``priority_weight``;
-        ``state_action_value``, the critics' output. ``loss.in_keys`` lists all that it reads:
-        ``buffer.extend(data.reshape(-1).select(*loss.in_keys))``.
+        :class:`~warmprior.PriorSpace` ``("next", "decoded", "chunk")``); under ``"next"`` ``reward``,
+        ``done`` and ``executed``; ``priority``, where the TD error of each row is written;
+        ``priority_weight``; ``state_action_value``, the critics' output. ``loss.in_keys`` lists all that it
+        reads: ``buffer.extend(data.reshape(-1).select(*loss.in_keys))``.
 
     Raises:
         TypeError: if the actor gives no distribution.
