@@ -174,14 +174,18 @@ class LeRobotActor(TensorDictModuleBase):
         *,
         std: Tensor | None = None,
         generator: torch.Generator | None = None,
-        **kwargs: Any,
+        names: Mapping[str, str] | None = None,
+        preprocess: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+        nfe: int | None = None,
+        seed: int = 0,
     ) -> None:
         super().__init__()
         if getattr(policy.config, "use_relative_actions", False):
             raise ValueError(
                 "ActionHistory cannot express relative actions at the next state: use WarmPriorAdapter"
             )
-        self.ode = LeRobotFlow(policy, ChunkSource(policy, prior, std), **kwargs)
+        source = ChunkSource(policy, prior, std)
+        self.ode = LeRobotFlow(policy, source, names=names, preprocess=preprocess, nfe=nfe, seed=seed)
         self.network = self.ode.network
         self.generator = generator
         self.in_keys = [keys.OBSERVATION, *((keys.HISTORY, name) for name in ENTRIES)]
