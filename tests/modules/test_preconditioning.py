@@ -279,7 +279,7 @@ def test_another_path_than_that_of_the_loss_is_refused():
 
 def test_windows_of_another_prior():
     windows = buffer_of(gaussian_steps(episodes=2), PastPrior(2), 8).sample()
-    with pytest.raises(ValueError, match=r"PreviewPrior.* needs 2 .* forecasts of 4, but .* has 2"):
+    with pytest.raises(ValueError, match=r"2 positions, but PreviewPrior.* predicts 4"):
         SourceMoments.fit(windows, PreviewPrior(2))
     flat = SourceMoments.fit(windows, PastPrior(2), generator=torch.Generator().manual_seed(0))
     folded = windows.reshape(2, 4)

@@ -199,8 +199,8 @@ def test_missing_key(missing):
 @pytest.mark.parametrize(
     ("made_for", "said"),
     [
-        (PreviewPrior(H), r"Past.* forecasts of 3, but .* has 6: make windows"),
-        (PastPrior(H - 1), r"Past.* forecasts of 3, but .* has 2: make windows"),
+        (PreviewPrior(H), r"\('vla_action', 'chunk'\) has 6 positions, but Past.* predicts 3: make"),
+        (PastPrior(H - 1), r"has 2 positions, but PastPrior.* predicts 3: make the windows"),
     ],
 )
 def test_windows_of_other_lengths(made_for, said):

@@ -14,6 +14,7 @@ from torch import Tensor
 from warmprior import keys
 from warmprior.history import advance
 from warmprior.modules.actor import WarmPriorActor
+from warmprior.modules.checks import check_positions
 from warmprior.modules.network import encoded
 from warmprior.modules.prior import Prior
 from warmprior.transforms.history import HistoryObservation
@@ -74,6 +75,8 @@ def flat_windows(policy: WarmPriorActor, batch: TensorDictBase, *, target_needed
 
     observation, target, pad = map(flat, (observation_key, keys.CHUNK, keys.IS_PAD))
     assert observation is not None
+    if target is not None:
+        check_positions(keys.CHUNK, target, prior)
     history = batch.get(keys.HISTORY).reshape(-1).to(device)
     entries = {
         observation_key: observation,

@@ -45,6 +45,15 @@ def check_keys(tensordict: TensorDictBase, needed: Iterable[NestedKey], whose: s
         raise KeyError(f"{whose} needs the keys {list(needed)}; missing: {missing}{hint}")
 
 
+def check_positions(key: NestedKey, chunk: Tensor, prior: Any) -> None:
+    """A ``ValueError`` if chunks ``[*B, P, d_a]`` have other positions than a prior predicts."""
+    if chunk.shape[-2] != prior.prediction_length:
+        raise ValueError(
+            f"{key} has {chunk.shape[-2]} positions, but {prior} predicts {prior.prediction_length}: make "
+            "the windows for this length"
+        )
+
+
 def check_finite(
     tensors: Mapping[Any, Tensor],
     cause: str = "the training has diverged; lower the learning rate or check the rewards",

@@ -382,7 +382,8 @@ class ODEActor(TensorDictModuleBase):
         """Write the chunk; ``sigma``, 1 by default, is the source's deviation for the guidance."""
         nfe = self.nfe if nfe is None else nfe
         self.check_nfe(nfe)
-        check_keys(tensordict, self.in_keys, "ODEActor", "" if self.guidance is None else GUIDED_BY_WHOM)
+        check_keys(tensordict, self.in_keys[:2], "ODEActor")
+        check_keys(tensordict, self.in_keys[2:], "ODEActor", GUIDED_BY_WHOM)
         a0, observation, *rest = (tensordict.get(key) for key in self.in_keys)
         velocity = velocity_field(self.network, network_observation(observation, a0.shape[:-2]))
         if self.guidance is not None:

@@ -12,6 +12,7 @@ from torch.nn.functional import pad
 from torchrl.data import ReplayBuffer
 
 from warmprior import keys
+from warmprior.modules.checks import check_positions
 from warmprior.modules.network import VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import Interpolant, LinearInterpolant
@@ -296,6 +297,7 @@ class SourceMoments(nn.Module):
         batch = TensorDict.cat([batch.reshape(-1) for batch in batches])
         if len(batch) < 2:
             raise ValueError(f"moments need at least 2 windows, got {len(batch)}")
+        check_positions(keys.CHUNK, batch[keys.CHUNK], prior)
         observation = batch.get(keys.OBSERVATION, None)
         a0, a1 = prior.sample(batch[keys.HISTORY], observation, generator), batch[keys.CHUNK]
         if coupling is not None:

@@ -15,7 +15,7 @@ from torchrl.objectives.common import LossModule
 
 from warmprior import keys
 from warmprior.modules.actor import WarmPriorActor
-from warmprior.modules.checks import check_keys
+from warmprior.modules.checks import check_keys, check_positions
 from warmprior.modules.network import network_observation, velocity_field
 from warmprior.modules.ode import Interpolant, LinearInterpolant, integrate
 from warmprior.objectives.couplings import Coupling
@@ -287,6 +287,7 @@ class FlowMatchingLoss(LossModule):
         check_keys(tensordict, needed, "FlowMatchingLoss", ". Take batches of window_replay_buffer")
         device = next(iter(self.velocity_network_params.values(True, True)), tensordict.get(k.chunk)).device
         a1, history, observation = (tensordict.get(key).to(device) for key in needed)
+        check_positions(k.chunk, a1, self.prior)
         batch = a1.shape[:-2]
         a0 = self.prior.sample(history, observation, self.generator)
         if self.coupling is not None:

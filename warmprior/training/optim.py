@@ -16,7 +16,10 @@ from warmprior.modules.network import VelocityNetwork, uncompiled
 
 
 def make_optimizer(network: nn.Module, *, learning_rate: float = 1e-4, weight_decay: float = 1e-5) -> AdamW:
-    """AdamW with the paper's values; no decay on biases, norms and position embeddings."""
+    """AdamW with the paper's values, for a :class:`~warmprior.VelocityNetwork`, compiled or not.
+
+    Biases, norms and position embeddings do not decay.
+    """
     groups = cast(VelocityNetwork, uncompiled(network)).parameter_groups(weight_decay)
     return AdamW(groups, lr=learning_rate, fused=True)
 
