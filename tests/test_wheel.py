@@ -14,6 +14,8 @@ from pathlib import Path
 
 import pytest
 
+from warmprior.training.saved import FORMAT
+
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 NAME = f"warmprior-{PROJECT['version']}"
@@ -98,7 +100,7 @@ def test_the_wheel_runs_in_an_empty_environment_and_the_quickstart_with_it(pytho
     assert [line.split(":")[0] for line in printed.splitlines()[:2]] == ["gaussian", "past"]
     printed = run(python, "-m", "warmprior", "info", "policy", cwd=tmp_path)
     assert "PastPrior(chunk_length=4" in printed
-    assert f"warmprior {PROJECT['version']}, format 5" in printed
+    assert f"warmprior {PROJECT['version']}, format {FORMAT}" in printed
 
 
 def test_the_plugin_and_the_citation_have_the_same_version():
