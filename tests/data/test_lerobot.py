@@ -14,7 +14,7 @@ from tests.data.lerobot_parts import WIDTHS, numbers, scene, write_lerobot
 from tests.data.synthetic import env_args_15
 from warmprior import PastPrior, window_replay_buffer
 from warmprior.data import LeRobotExperienceReplay
-from warmprior.data.lerobot import action_names, state_names
+from warmprior.data.lerobot_index import action_names, state_names
 from warmprior.envs.tasks import TASKS
 
 H, TO = 4, 3

@@ -12,7 +12,7 @@ pytest.importorskip("lerobot")
 from tests.data.lerobot_parts import edit_json, edit_table, write_lerobot
 from tests.data.synthetic import env_args_15
 from warmprior.data import DatasetError, LeRobotExperienceReplay
-from warmprior.data.lerobot import read_lerobot_index
+from warmprior.data.lerobot_index import read_lerobot_index
 
 LIFT = env_args_15("lift")
 DATA, EPISODES = "data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet"

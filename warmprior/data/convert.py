@@ -16,7 +16,7 @@ import torch
 from tqdm import tqdm
 
 from warmprior.data.hdf5 import read_index, read_masks, read_origin
-from warmprior.data.lerobot import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
+from warmprior.data.lerobot_index import DESCRIPTION, REWARD, SUCCESS, action_names, layout_of, state_names
 from warmprior.data.replay import DatasetError, DatasetIndex
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require

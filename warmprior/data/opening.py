@@ -9,12 +9,8 @@ from typing import Any
 import numpy as np
 
 from warmprior.data.hdf5 import read_index, read_origin
-from warmprior.data.lerobot import (
-    LeRobotExperienceReplay,
-    LeRobotIndex,
-    is_remote,
-    read_lerobot_index,
-)
+from warmprior.data.lerobot import LeRobotExperienceReplay
+from warmprior.data.lerobot_index import LeRobotIndex, is_remote, read_lerobot_index
 from warmprior.data.replay import DatasetError, DatasetIndex, DemonstrationReplay
 from warmprior.data.robomimic import RobomimicExperienceReplay
 from warmprior.io.extras import require

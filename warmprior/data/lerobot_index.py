@@ -1,0 +1,369 @@
+"""What a LeRobotDataset v3 holds, read from its ``meta/``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import Any
+
+from warmprior.data.replay import DatasetError, DatasetIndex, check_count, check_env_args
+from warmprior.envs.tasks import TaskSpec, task_of_env
+from warmprior.io.extras import require
+from warmprior.io.files import digest_of, file_digest, is_repository, read_json
+
+DESCRIPTION = "meta/warmprior.json"
+"""What :func:`warmprior.data.convert_robomimic` writes beside LeRobot's own files, which LeRobot ignores."""
+
+ENVIRONMENT_STATE, ROBOT_STATE = "observation.environment_state", "observation.state"
+REWARD, SUCCESS = "next.reward", "next.success"
+_ARM_ACTIONS = ("x", "y", "z", "rx", "ry", "rz", "gripper")
+
+LEROBOT_VERSION = "v3.0"
+"""The tag by which the hub's LeRobotDatasets name the version of their format."""
+
+
+def download_lerobot(
+    repository: str, files: Sequence[str] = ("meta/*",), *, revision: str | None = None
+) -> Path:
+    """Fetch files of a LeRobotDataset, by their patterns, unless they are here already; the dataset's folder.
+
+    ``$HF_LEROBOT_HOME/REPOSITORY`` comes first, as in LeRobot, then its cache, without a connection.
+    """
+    default = Path(require("huggingface_hub.constants", "lerobot").HF_HOME) / "lerobot"
+    home = Path(os.environ.get("HF_LEROBOT_HOME") or default).expanduser()
+    if revision is None and (home / repository / "meta" / "info.json").is_file():
+        return home / repository
+    revision = LEROBOT_VERSION if revision is None else revision
+    try:
+        found = require("huggingface_hub", "lerobot").snapshot_download(
+            repository,
+            repo_type="dataset",
+            revision=revision,
+            cache_dir=home / "hub",
+            allow_patterns=list(files),
+        )
+    except Exception as error:  # the client's errors share no base class
+        reason = str(error).strip() or "no message"
+        raise OSError(
+            f"could not download {repository} at {revision}: {type(error).__name__}: {reason}\n"
+            "Check the name and the connection. A dataset of an older version has no such revision: convert "
+            "it with python -m lerobot.scripts.convert_dataset_v21_to_v30. A folder fetched by other means "
+            "can be given by its path."
+        ) from error
+    return Path(found)
+
+
+@dataclass(frozen=True)
+class LeRobotIndex(DatasetIndex):
+    """What a LeRobotDataset holds, without its values.
+
+    Attributes:
+        metadata: LeRobot's own, a ``LeRobotDatasetMetadata``.
+        episodes: the rows of ``meta/episodes`` of the selected episodes.
+        columns: of each observation the feature that holds it, and where in it.
+        images: the feature of each of the images to read.
+        described: what ``meta/warmprior.json`` says; empty for datasets that were not converted.
+    """
+
+    metadata: Any
+    episodes: tuple[Mapping[str, Any], ...]
+    columns: Mapping[str, tuple[str, slice]]
+    images: Mapping[str, str]
+    described: Mapping[str, Any]
+
+    @property
+    def files(self) -> list[str]:
+        """The files outside ``meta/`` that hold what is selected, below the folder."""
+        videos = [name for name in self.images.values() if name in self.metadata.video_keys]
+        return sorted(
+            {episode_file(self.metadata, e, name) for e in self.episodes for name in [None, *videos]}
+        )
+
+    def digest(self) -> str:
+        """SHA-256 of what can be read: all files of numbers, and those of the images that are selected."""
+        meta = ("meta/info.json", DESCRIPTION, "meta/episodes/*/*.parquet")
+        files = {path for pattern in meta for path in self.path.glob(pattern)}
+        files |= {self.path / file for file in self.files}
+        return digest_of([[str(p.relative_to(self.path)), file_digest(p)] for p in sorted(files)])
+
+
+def episode_file(metadata: Any, episode: Mapping[str, Any], video: str | None = None) -> str:
+    """The file, below the dataset's folder, that holds an episode's numbers, or its video of a feature."""
+    part = "data" if video is None else f"videos/{video}"
+    numbers = {f"{n}_index": episode[f"{part}/{n}_index"] for n in ("chunk", "file")}
+    template = metadata.data_path if video is None else metadata.video_path
+    file = template.format(video_key=video, **numbers)
+    if file.startswith("/") or ".." in file.split("/"):
+        raise DatasetError(f"{metadata.root}: meta/info.json names {file!r}, which is not in the folder")
+    return file
+
+
+def is_remote(dataset: str | Path) -> bool:
+    """Whether a name is a repository of the hub, ``user/name``, and no folder here."""
+    return is_repository(str(dataset)) and not Path(dataset).exists()
+
+
+def _metadata(root: Path) -> Any:
+    """Let LeRobot read what describes a dataset in a folder, checked; the hub is never asked."""
+    if not (root / "meta" / "info.json").is_file():
+        raise FileNotFoundError(f"{root}: no meta/info.json there, so no LeRobotDataset; check the path")
+    datasets = require("lerobot.datasets", "lerobot")
+    again = "Copy or download it again, or record or convert it anew"
+    for pattern in ("meta/tasks.parquet", "meta/episodes/*/*.parquet"):
+        if not any(root.glob(pattern)):  # LeRobot would look for it at the hub
+            raise DatasetError(
+                f"{root} has no {pattern}: the dataset has no episodes, or its recording did not end with "
+                f"LeRobotDataset.finalize(). {again}."
+            )
+    try:
+        metadata = datasets.LeRobotDatasetMetadata(f"local/{root.name}", root=root)
+    except Exception as error:  # of json, pyarrow, datasets and LeRobot itself
+        raise DatasetError(
+            f"{root}: LeRobot cannot read the meta/ of this dataset ({error}). {again}."
+        ) from error
+    if not metadata.total_episodes:
+        raise DatasetError(f"{root}: the dataset has no episodes: record some")
+    numbers, steps = sorted(metadata.episodes["episode_index"]), sum(metadata.episodes["length"])
+    if numbers != list(range(metadata.total_episodes)) or steps != metadata.total_frames:
+        raise DatasetError(
+            f"{root}: meta/info.json counts {metadata.total_episodes} episodes of {metadata.total_frames} "
+            f"steps, and meta/episodes {len(numbers)} of {steps}. {again}."
+        )
+    return metadata
+
+
+def action_names(arms: int) -> list[str]:
+    """What the pose deltas of so many arms of robosuite are called in a dataset, such as ``robot0_rx``."""
+    return [f"robot{arm}_{name}" for arm in range(arms) for name in _ARM_ACTIONS]
+
+
+def state_names(widths: Mapping[str, int]) -> list[str]:
+    """What the numbers of observations of these widths are called in a dataset, in the same order."""
+    return [f"{key}_{i}" for key, width in widths.items() for i in range(width)]
+
+
+def layout_of(widths: Mapping[str, int]) -> dict[str, dict[str, int]]:
+    """Which feature of a converted dataset holds each observation of robomimic, and their widths."""
+    robots = {key: width for key, width in widths.items() if key.startswith("robot")}
+    others = {key: width for key, width in widths.items() if key not in robots}
+    layout = {ENVIRONMENT_STATE: others, ROBOT_STATE: robots}
+    return {feature: parts for feature, parts in layout.items() if parts}
+
+
+def read_lerobot_index(
+    dataset: str | Path,
+    *,
+    revision: str | None = None,
+    fetch: bool = False,
+    filter_key: str | None = None,
+    observation_keys: Sequence[str] | None = None,
+    image_keys: Sequence[str] = (),
+    poses: bool = False,
+    demos: int | None = None,
+    env_args: Mapping[str, Any] | None = None,
+) -> LeRobotIndex:
+    """Say what a LeRobotDataset v3 holds, by its ``meta/``. No values are read.
+
+    Of a dataset in the hub nothing else is fetched, unless ``fetch`` asks for what is to be read. Options and
+    errors are those of :class:`~warmprior.data.LeRobotExperienceReplay`; ``poses`` also requires the hand
+    pose of every arm, from which absolute actions are built.
+    """
+    remote = is_remote(dataset)
+    root = download_lerobot(str(dataset), revision=revision) if remote else Path(dataset).expanduser()
+    if demos is not None and demos < 1:
+        raise ValueError(f"demos must be at least 1, got {demos}")
+    metadata = _metadata(root)
+    described = _description(root)
+    recorded = described.get("env_args") or dict(env_args or {})
+    if env_args and recorded["env_name"] != env_args["env_name"]:
+        raise DatasetError(
+            f"{root}: the dataset was recorded in {recorded['env_name']}, not in {env_args['env_name']}: "
+            "leave the task (env_args) out or correct it"
+        )
+    task = task_of_env(recorded) if recorded else None
+    widths = {
+        name: feature["shape"][0]
+        for name, feature in metadata.features.items()
+        if len(feature["shape"]) == 1 and feature["dtype"].startswith(("float", "int", "uint"))
+    }
+    if "action" not in widths:
+        raise DatasetError(f"{root}: there is no feature 'action' that is a vector of numbers, but {widths}")
+    if recorded:
+        _check_actions(root, metadata, recorded, task)
+    named = _named_columns(root, metadata.features, widths, described, task)
+    whole = {name: (name, slice(0, width)) for name, width in widths.items() if name != "action"}
+    columns = named | whole
+    if observation_keys is None:
+        observation_keys = tuple(named)
+        if task is not None:
+            observation_keys = task.low_dim_keys
+        elif not described:
+            observation_keys = [key for key in (ENVIRONMENT_STATE, ROBOT_STATE) if key in columns]
+    arms = range(min(widths["action"] // 7, 2)) if poses else ()
+    for key in [*observation_keys, *(f"robot{a}_eef_{end}" for a in arms for end in ("pos", "quat"))]:
+        if key not in columns:
+            raise DatasetError(
+                f"{root}: there is no observation {key!r} among {', '.join(columns)}: choose others with "
+                "observation_keys, or convert or record the dataset with it"
+            )
+    if not observation_keys:
+        raise DatasetError(
+            f"{root}: no observations are chosen; name some with observation_keys: "
+            f"{', '.join(columns) or 'there are none'}"
+        )
+    cameras = {
+        f"{name.rpartition('.')[2]}_image": name
+        for name in metadata.camera_keys
+        if name not in metadata.depth_keys
+    }
+    episodes = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
+    if filter_key is not None:
+        masks = described.get("masks", {})
+        if filter_key not in masks:
+            known = f"choose one of {', '.join(masks)}" if masks else "this dataset has none"
+            raise DatasetError(f"{root}: unknown filter key {filter_key!r}; {known}")
+        episodes = [row for row in episodes if row["episode_index"] in masks[filter_key]]
+    check_count(root, demos, len(episodes))
+    episodes = episodes[:demos]
+    index = LeRobotIndex(
+        path=root,
+        demos=tuple(str(row["episode_index"]) for row in episodes),
+        lengths=tuple(row["length"] for row in episodes),
+        observation_keys=tuple(observation_keys),
+        observation_dims=tuple(columns[key][1].stop - columns[key][1].start for key in observation_keys),
+        image_keys=tuple(image_keys),
+        image_size=_image_size(root, metadata.features, cameras, image_keys),
+        available_keys=(*columns, *cameras),
+        action_dim=widths["action"],
+        env_args=recorded,
+        task=task,
+        metadata=metadata,
+        episodes=tuple(episodes),
+        columns=columns,
+        images={key: cameras[key] for key in image_keys},
+        described=described,
+    )
+    if fetch and remote and not all((root / file).is_file() for file in index.files):
+        index = replace(index, path=download_lerobot(str(dataset), index.files, revision=revision))
+    return index
+
+
+def _description(root: Path) -> dict[str, Any]:
+    path = root / DESCRIPTION
+    if not path.exists():
+        return {}
+    try:
+        found = read_json(path)
+    except ValueError as error:
+        raise DatasetError(f"{error}. Convert the file again.") from error
+    if not isinstance(found, dict) or found.get("format") != 1 or "observations" not in found:
+        raise DatasetError(f"{path} is not of this version: convert the file again, or remove it")
+    check_env_args(f"{path}: env_args", found.get("env_args"))
+    return found
+
+
+def _check_names(root: Path, feature: Mapping[str, Any], expected: list[str], what: str) -> None:
+    names = feature.get("names")
+    if isinstance(names, dict):  # {"motors": [...]} or {"x": 0, "y": 1, ...}
+        lists = [value for value in names.values() if isinstance(value, list)]
+        names = [name for value in lists for name in value] if lists else list(names)
+    # Seven numbers may be joints as well as a pose.
+    if names and names != expected:
+        raise DatasetError(
+            f"{root}: {what} {', '.join(expected)}, but here they are named {', '.join(map(str, names))}: "
+            "choose another task or dataset or, if these are only other names, set the feature's names in "
+            "meta/info.json to null"
+        )
+
+
+def _check_actions(root: Path, metadata: Any, env_args: Mapping[str, Any], task: TaskSpec | None) -> None:
+    """Whether the actions are those of an environment, one per control step."""
+    control = env_args["env_kwargs"].get("control_freq", 20)
+    if metadata.fps != control:
+        raise DatasetError(
+            f"{root}: fps is {metadata.fps}, but {env_args['env_name']} is controlled at {control} Hz, and "
+            "one action per control step is needed: resample the dataset, or name another task"
+        )
+    if task is None:
+        return
+    action = metadata.features["action"]
+    if tuple(action["shape"]) != (task.action_dim,):
+        raise DatasetError(
+            f"{root}: 'action' has {action['shape'][0]} columns, but {task.env_name} takes "
+            f"{task.action_dim}: choose another task or dataset"
+        )
+    _check_names(root, action, action_names(task.arms), f"the actions of {task.env_name} are")
+
+
+def _named_columns(
+    root: Path,
+    features: Mapping[str, Any],
+    widths: Mapping[str, int],
+    described: Mapping[str, Any],
+    task: TaskSpec | None,
+) -> dict[str, tuple[str, slice]]:
+    """Where robomimic's observations are."""
+    theirs = {name: width for name, width in widths.items() if name.startswith("observation.")}
+    if described:
+        found = {key: (name, slice(*ends)) for key, (name, *ends) in described["observations"].items()}
+        needed = {} if task is None else task.low_dim_widths
+        for key, (name, part) in found.items():
+            width = needed.get(key, part.stop - part.start)
+            if not 0 <= part.start < part.stop == part.start + width <= theirs.get(name, 0):
+                raise DatasetError(
+                    f"{root / DESCRIPTION}: observations[{key!r}] are columns {part.start} to {part.stop} of "
+                    f"{name}, which do not fit the dataset or its task: convert the file again"
+                )
+        return found
+    if task is None:
+        return {}
+    layouts: list[dict[str, dict[str, int]]] = [
+        {f"observation.{key}": {key: width} for key, width in task.low_dim_widths.items()},
+        layout_of(task.low_dim_widths),
+        {ROBOT_STATE: task.low_dim_widths},
+    ]
+    sums = [{name: sum(parts.values()) for name, parts in layout.items()} for layout in layouts]
+    fits = [total.items() <= theirs.items() for total in sums]
+    # Robots alone may be as wide as the whole state of another task.
+    fits[2] = fits[2] and ENVIRONMENT_STATE not in theirs
+    if not any(fits):
+        raise DatasetError(
+            f"{root}: the observations are {theirs}, but those of {task.env_name} are "
+            f"{' or '.join(map(str, reversed(sums)))}: choose another task or dataset"
+        )
+    layout = layouts[fits.index(True)]
+    found = {}
+    for name, parts in layout.items():
+        if name in (ENVIRONMENT_STATE, ROBOT_STATE):
+            what = f"the numbers of {name} in {task.env_name} are"
+            _check_names(root, features[name], state_names(parts), what)
+        ends = pairwise(accumulate(parts.values(), initial=0))
+        found |= {key: (name, slice(*end)) for key, end in zip(parts, ends, strict=True)}
+    return {key: found[key] for key in task.low_dim_widths}
+
+
+def _image_size(
+    root: Path, features: Mapping[str, Any], cameras: Mapping[str, str], keys: Sequence[str]
+) -> int:
+    """The side of the images to read, in pixels; 0 if there are none."""
+    sizes = set()
+    for key in keys:
+        if key not in cameras:
+            known = ", ".join(f"{k} ({name})" for k, name in cameras.items()) or "none"
+            raise DatasetError(
+                f"{root}: there are no images {key!r}; there are {known}. Choose other cameras, or render "
+                "them into a robomimic file (python -m warmprior render) and convert that with --images"
+            )
+        shape = tuple(features[cameras[key]]["shape"])
+        side = max(shape)
+        if shape not in ((side, side, 3), (3, side, side)):
+            raise DatasetError(
+                f"{root}: {cameras[key]!r} has shape {shape}; only square images of three colours can be used"
+            )
+        sizes.add(side)
+    if len(sizes) > 1:
+        raise DatasetError(f"{root}: the images have several sizes, {sizes}: choose those of one size")
+    return next(iter(sizes), 0)
