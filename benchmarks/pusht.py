@@ -46,9 +46,7 @@ def make_env(relative: bool = False) -> EnvBase:
 def task(options: DataOptions, relative: bool = False) -> Task:
     """The demonstrations, and where policies are played."""
     place = str(options.dataset or "lerobot/pusht_keypoints").removeprefix("lerobot:")
-    steps = lerobot_steps(place, OBSERVATION)
-    if options.demonstrations:
-        steps = steps[steps["episode"] < options.demonstrations[0]]
+    steps = lerobot_steps(place, OBSERVATION, demos=options.first("human"))
     if relative:
         steps["action"] = steps["action"] - steps["observation"][:, :2]
     ends: Any = {"success": "is_success", "measures": {"coverage": "max"}, "film_rate": 10}

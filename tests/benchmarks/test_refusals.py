@@ -35,6 +35,7 @@ def no_work(monkeypatch):
         ("robomimic", "--nfe 0", "--nfe must be a whole number of at least 1, got 0"),
         ("robomimic", "--device cuda:99", "--device cuda:99 does not work here"),
         ("robomimic", f"{FILE} --task can", "holds demonstrations of lift"),
+        ("robomimic", f"{FILE} --demonstrations 2 3", "--demonstrations takes one number with --dataset"),
         ("robomimic", "--prior regression --nfe 9", "regression is trained for --nfe 1 alone"),
         ("robomimic", "--prior ot --batch-size 1", "ot pairs within a batch"),
         ("robomimic", f"--task {DRIFT}:task {DRIFT}:other", "two tasks are called drift"),

@@ -15,7 +15,7 @@ from tests.data.synthetic import env_args_14, write_robomimic_file
 from tests.envs.mimicgen_stub import write_mimicgen
 from tests.processes import apart
 from warmprior import ImageEncoder
-from warmprior.data import RobomimicExperienceReplay, convert_robomimic
+from warmprior.data import DatasetError, RobomimicExperienceReplay, convert_robomimic
 from warmprior.diagnostics import encoded_windows
 from warmprior.training import DataOptions, load_policy
 
@@ -107,8 +107,11 @@ def test_push_t_takes_as_many_demonstrations_as_are_asked_for(tmp_path):
     widths = {"observation.state": 2, "observation.environment_state": 16, "action": 2}
     features = {name: {"dtype": "float32", "shape": (n,), "names": None} for name, n in widths.items()}
     write_lerobot(tmp_path / "pusht", lengths=(6, 4, 9), features=features)
-    given = [DataOptions(dataset=f"lerobot:{tmp_path}/pusht", demonstrations=n) for n in ((), (2,))]
-    every, two = map(pusht.task, given)
+    place = f"lerobot:{tmp_path}/pusht"
+    given = [DataOptions(dataset=place, demonstrations=n) for n in ((), (2,), (4,))]
+    every, two = map(pusht.task, given[:2])
+    with pytest.raises(DatasetError, match="there are 3 demonstrations, fewer than the 4"):
+        pusht.task(given[2])
     # The agent, then the block's corners; both within [-1, 1].
     assert (every.data["observation"].shape, two.data["observation"].shape) == ((19, 18), (10, 18))
     assert every.data["observation"].abs().max().item() == pytest.approx(1.0)

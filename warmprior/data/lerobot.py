@@ -209,13 +209,14 @@ class LeRobotExperienceReplay(DemonstrationReplay):
 
 
 def lerobot_steps(
-    dataset: str | Path, observation_keys: Sequence[str] = ("observation.state",)
+    dataset: str | Path, observation_keys: Sequence[str] = ("observation.state",), *, demos: int | None = None
 ) -> TensorDictBase:
     """Read the steps of a LeRobotDataset of any robot, in raw units.
 
     Args:
         dataset: its folder, or ``user/name`` of its repository at the hub.
         observation_keys: features that make the observation, concatenated in this order.
+        demos: how many demonstrations to read, from the first on; all of them by default.
 
     Returns:
         ``"observation"`` ``[N, d_o]``, ``"action"`` ``[N, d_a]``, float32, and ``"episode"`` ``[N]``, as
@@ -223,7 +224,8 @@ def lerobot_steps(
 
     Raises:
         FileNotFoundError: if there is no such dataset.
-        DatasetError: if there is no such feature, or it is no vector of numbers; if the dataset is damaged.
+        DatasetError: if there is no such feature, or it is no vector of numbers; if there are fewer
+            demonstrations; if the dataset is damaged.
         OSError: if a download fails.
 
     Examples:
@@ -232,5 +234,5 @@ def lerobot_steps(
         >>> steps["action"].shape  # doctest: +SKIP
         torch.Size([25650, 2])
     """
-    data = LeRobotExperienceReplay(dataset, observation_keys=observation_keys).data
+    data = LeRobotExperienceReplay(dataset, observation_keys=observation_keys, demos=demos).data
     return data.select(OBSERVATION, ACTION, EPISODE)

@@ -125,6 +125,10 @@ class DataOptions:
                 raise ValueError("--dataset reads a file: leave out --download")
             if len(self.task) > 1 or len(self.data) > 1:
                 raise ValueError("--dataset is of one task and style: name at most one --task and --data")
+            if len(self.demonstrations) > 1:
+                raise ValueError(
+                    f"--demonstrations takes one number with --dataset, got {self.demonstrations}"
+                )
             check_place(self.dataset, "--dataset")
         for task in filter(is_simulated, self.task):
             if self.generated and not get_task(task).scripted:
