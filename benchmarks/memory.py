@@ -26,7 +26,13 @@ def main(argv: list[str] | None) -> None:
     args = parser.parse_args(argv)
 
     # A record per task, method and NFE, with everything that is known of it as a column.
-    found = pd.concat([summary(read_rows(run / "results.jsonl"), top_k=1) for run in args.runs])
+    tables = [read_rows(run / "results.jsonl") for run in args.runs]
+    for run, rows in zip(args.runs, tables, strict=True):
+        if missing := {"task", "memory_gain", "outcomes"} - set(rows):
+            raise ValueError(
+                f"{run}: its rows have no {sorted(missing)}; name a run of robomimic.py or pusht.py"
+            )
+    found = pd.concat([summary(rows, top_k=1) for rows in tables])
     found = found[found.memory_gain.notna() & found.gain.notna()]
     if found.empty:
         raise ValueError("these runs have no method beside their first one that was measured")

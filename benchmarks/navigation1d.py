@@ -21,7 +21,7 @@ from report import labelled, table, unlike, write_report
 from robomimic import train_all
 
 from warmprior.diagnostics import SharedObservations, executed_actions, flow_paths
-from warmprior.training import NetworkOptions, TrainingConfig, judge_navigation, play_navigation
+from warmprior.training import DataOptions, NetworkOptions, TrainingConfig, judge_navigation, play_navigation
 from warmprior.training.options import PAPER
 
 JUDGED = [  # columns of the table
@@ -42,6 +42,8 @@ class NavigationOptions(Options):
     def check(self) -> None:
         super().check()
         check_single(self, "chunk")
+        if self.data != DataOptions():
+            raise ValueError("the toy has demonstrations of its own: leave out --task, --data and their like")
         if self.sources.chunk[0] > STEPS:
             raise ValueError(f"--chunk must be at most {STEPS}, got {self.sources.chunk[0]}")
 

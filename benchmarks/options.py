@@ -459,7 +459,8 @@ def check_typed(stored: Options, out: Path, known: Sequence[str]) -> None:
 
 def script(name: str, together: bool = False) -> Callable[[Callable[..., object]], Callable[..., int]]:
     """Make a function of a command line the `main` of a script, with errors as lines and an exit code."""
-    return lambda work: lambda argv=None: run_script(lambda: work(argv), name, together=together)
+    again = "--resume continues"
+    return lambda work: lambda argv=None: run_script(lambda: work(argv), name, together=together, hint=again)
 
 
 @contextmanager

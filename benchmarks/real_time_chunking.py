@@ -53,6 +53,8 @@ class DelayOptions(Options):
         check_counts(self, "execute")
         if self.toy != "no" and self.evaluation.play_on:
             raise ValueError("the toy has an end of its own: leave out --play-on, or add --toy no")
+        for delay in self.delay:
+            check_delay(delay, delay)
         for method in self.sources.methods():
             cells = self.conditions(method)
             if not cells:

@@ -26,7 +26,8 @@ torch.manual_seed(0)
 # --------------------
 # Every benchmark trains and plays in worker processes, as many as ``--envs`` says (one per core by
 # default). A worker takes one job after another and computes with one thread. Here are the toy's
-# policies from two sources, with a small network and two seeds.
+# policies from two sources, with a small network and two seeds. The script is found from the folder of this
+# tutorial, ``docs/tutorials`` of a checkout: start it there.
 
 folder = tempfile.TemporaryDirectory()
 script = Path("../../benchmarks/navigation1d.py")

@@ -149,4 +149,4 @@ def test_no_worker_outlives_the_driver(how, tmp_path):
     assert not psutil.wait_procs(children, timeout=15)[1]
     if how == signal.SIGINT:
         assert code == 130
-        assert process.stderr.read().decode().splitlines()[-1] == "sleep.py: interrupted; --resume continues"
+        assert process.stderr.read().decode().splitlines()[-1] == "sleep.py: interrupted"

@@ -218,3 +218,8 @@ def test_gains_of_all_runs_stand_beside_what_is_remembered(tmp_path, capsys):
     assert memory.main([*argv, "--out", str(tmp_path / "a.png")]) == 0
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("| ")]
     assert lines[2:] == ["| Square-PH | 1 | WP-Past | 0.250 | +30.0% |"] and is_png(tmp_path / "a.png")
+    assert memory.main([str(tmp_path / "none")]) == 2
+    assert capsys.readouterr().err.endswith("results.jsonl: no such file\n")
+    (tmp_path / "one" / "results.jsonl").write_text('{"task": "navigation"}\n')
+    assert memory.main(argv) == 2
+    assert "its rows have no ['memory_gain', 'outcomes']" in capsys.readouterr().err

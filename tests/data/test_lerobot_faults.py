@@ -158,6 +158,8 @@ def test_bad_options(root):
         LeRobotExperienceReplay(root, demos=0)
     with pytest.raises(DatasetError, match="there is no observation 'nothing' among"):
         LeRobotExperienceReplay(root, observation_keys=["nothing"])
+    with pytest.raises(DatasetError, match=r"'observation\.images\.side' is no vector but an image"):
+        LeRobotExperienceReplay(root, observation_keys=["observation.images.side"])
     with pytest.raises(DatasetError, match="no observations are chosen"):
         LeRobotExperienceReplay(root, observation_keys=[])
     with pytest.raises(DatasetError, match="unknown filter key 'train'; this dataset has none"):

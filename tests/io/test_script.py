@@ -20,7 +20,7 @@ def test_ctrl_c_is_one_line_whatever_becomes_of_it(capsys):
             raise RuntimeError("in the forward pass") from error
 
     before = signal.getsignal(signal.SIGINT)
-    assert run_script(script, "a.py") == 130
+    assert run_script(script, "a.py", hint="--resume continues") == 130
     assert capsys.readouterr().err == "\na.py: interrupted; --resume continues\n"
     assert signal.getsignal(signal.SIGINT) is before
 

@@ -138,6 +138,7 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
     """Minima and maxima by hand; the chunk is what GR00T's own processors make of it."""
     from lerobot.policies.factory import make_pre_post_processors
     from lerobot.policies.groot import processor_groot
+    from lerobot_policy_warmprior.processor_warm_groot import check_pretrained
 
     # What encodes images and language is on the hub.
     monkeypatch.setattr(processor_groot.GrootN17VLMEncodeStep, "__call__", lambda self, seen: seen)
@@ -168,6 +169,18 @@ def test_groots_processors_keep_the_history_apart(found, tmp_path, monkeypatch):
             assert torch.equal(batch[name], theirs[name]), name
         observation = {"observation.state": raw["observation.state"], "task": raw["task"]}
         assert "action_history" not in pipeline(observation)
+    # A training that continues takes the saved processors, which have to remember as many actions.
+    config.pretrained_path = tmp_path
+    check_pretrained(config)
+    config.prior_chunk = 4
+    with pytest.raises(ValueError, match=r"remembers 3 actions, and prior='past,sigma=0.0' 4: keep its"):
+        check_pretrained(config)
+    own.save_pretrained(tmp_path)
+    with (
+        small("warm_groot"),
+        pytest.raises(ValueError, match=r"give a checkpoint .* as --policy.base_model_path"),
+    ):
+        found["warm_groot"](config)
     before.steps[2].modality_config = {"action": {"action_configs": [{"rep": "relative"}]}}
     with pytest.raises(ValueError, match=r"has relative actions, .* choose an embodiment_tag"):
         before(dict(raw))
@@ -309,6 +322,10 @@ def test_the_flow_policy_remembers(found):
     chunks = [policy.predict_action_chunk(dict(batch)) for _ in range(2)]
     assert not torch.equal(sources[3], actions[:, 4:8])
     assert torch.equal(sources[4], chunks[0])
+    policy.predict_action_chunk(dict(batch), executed_steps=2)  # of four
+    assert torch.equal(sources[5][:, :2], chunks[0][:, 2:]) and torch.equal(
+        sources[5][:, 2:], chunks[1][:, :2]
+    )
 
 
 def test_the_flow_policy_sees_images(found, tmp_path):

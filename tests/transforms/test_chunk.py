@@ -112,11 +112,18 @@ def test_wrong_chunk_length(length):
 
 
 @pytest.mark.parametrize(
-    ("horizon", "options"),
-    [(3, {"execute": 4}), (3, {"execute": 0}), (3, {"prediction_length": 2}), (0, {}), (-1, {"execute": 1})],
+    ("horizon", "options", "said"),
+    [
+        (3, {"execute": 4}, "need 1 <= execute <= chunk_length <= prediction_length"),
+        (3, {"execute": 0}, "execute must be a whole number of at least 1, got 0"),
+        (3, {"execute": 2.5}, "execute must be a whole number of at least 1, got 2.5"),
+        (3, {"prediction_length": 2}, "need 1 <= execute <= chunk_length <= prediction_length"),
+        (0, {}, "chunk_length must be a whole number of at least 1, got 0"),
+        (-1, {"execute": 1}, "chunk_length must be a whole number of at least 1, got -1"),
+    ],
 )
-def test_bad_lengths(horizon, options):
-    with pytest.raises(ValueError, match="need 1 <= execute <= chunk_length <= prediction_length"):
+def test_bad_lengths(horizon, options, said):
+    with pytest.raises(ValueError, match=said):
         ChunkStep(horizon, **options)
 
 

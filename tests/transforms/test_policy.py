@@ -7,7 +7,7 @@ import torch
 from tensordict import TensorDict
 
 from tests.toy_env import ACTION_DIM, ChunkPolicy, placed
-from warmprior import Normalizer, PastPrior, policy_transforms
+from warmprior import Normalizer, PastPrior, VelocityMLP, WarmPriorActor, policy_transforms
 
 NORMALIZER = Normalizer.fit(
     TensorDict(
@@ -52,6 +52,13 @@ def test_policy_sees_the_last_normalised_observations(place, observation_steps):
             time = min(time + 3, length)
             assert after[-1, 0].round() == time
             time = 0 if time == length else time
+
+
+def test_a_compiled_policy_is_asked_as_it_is():
+    actor = WarmPriorActor(VelocityMLP(2, 4, 3, 1), PastPrior(3))
+    for policy in (actor, torch.compile(actor)):
+        stack, chunk, _ = policy_transforms(policy)
+        assert (stack.steps, chunk.chunk_length) == (1, 3)
 
 
 def test_the_normaliser_knows_the_action():

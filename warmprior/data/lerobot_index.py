@@ -204,6 +204,10 @@ def read_lerobot_index(
             observation_keys = [key for key in (ENVIRONMENT_STATE, ROBOT_STATE) if key in columns]
     arms = range(min(widths["action"] // 7, 2)) if poses else ()
     for key in [*observation_keys, *(f"robot{a}_eef_{end}" for a in arms for end in ("pos", "quat"))]:
+        if key in metadata.camera_keys:
+            raise DatasetError(
+                f"{root}: {key!r} is no vector but an image: name it with image_keys, or leave it out"
+            )
         if key not in columns:
             raise DatasetError(
                 f"{root}: there is no observation {key!r} among {', '.join(columns)}: choose others with "

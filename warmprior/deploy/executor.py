@@ -20,6 +20,7 @@ from warmprior import keys
 from warmprior.history import advance, cold_history
 from warmprior.modules.actor import WarmPriorActor
 from warmprior.modules.checks import check_whole_numbers
+from warmprior.modules.network import uncompiled
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.prior import Prior
 from warmprior.modules.real_time_chunking import with_leftover
@@ -49,7 +50,7 @@ class AsyncExecutor:
         execute: control steps between decisions; by default ``H``, or as many as ``delay`` allows.
         delay: expected delay in control steps until delays were measured.
         window: how many last decisions to take the largest delay of.
-        observation_steps: ``To``.
+        observation_steps: ``To``; that of the actor's network by default, or 2.
         normalizer: converts raw observations and actions, such as the actor's own; by default they are in the
             policy's units.
         timeout: seconds to wait for a late chunk once no action is left; ``None`` for as long as it takes.
@@ -80,17 +81,21 @@ class AsyncExecutor:
         execute: int | None = None,
         delay: int = 1,
         window: int = 10,
-        observation_steps: int = 2,
+        observation_steps: int | None = None,
         normalizer: Normalizer | None = None,
         timeout: float | None = 0.0,
         latency: int | None = None,
         pool: Executor | None = None,
         action_dim: int | None = None,
     ) -> None:
-        if isinstance(actor, WarmPriorActor):
-            prior = actor.prior if prior is None else prior
+        if isinstance(plain := uncompiled(actor), WarmPriorActor):
+            prior = plain.prior if prior is None else prior
+            network = uncompiled(plain.network)
             if action_dim is None:
-                action_dim = getattr(actor.network, "action_dim", None)
+                action_dim = getattr(network, "action_dim", None)
+            if observation_steps is None:
+                observation_steps = getattr(network, "observation_steps", None)
+        observation_steps = 2 if observation_steps is None else observation_steps
         if prior is None or action_dim is None:
             raise ValueError(
                 f"{type(actor).__name__} has no prior or action width: give prior and action_dim"
@@ -104,6 +109,7 @@ class AsyncExecutor:
         if execute is None:
             execute = min(prior.chunk_length, length - delay)
         check_delay(delay, execute, length)
+        check_whole_numbers(execute=execute)
         if not 1 <= execute <= prior.chunk_length:
             raise ValueError(
                 f"need 1 <= execute <= {prior.chunk_length}, the prior's chunk length, got {execute}"

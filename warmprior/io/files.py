@@ -64,7 +64,9 @@ def is_repository(name: str) -> bool:
 
 
 def check_regular(path: Path) -> None:
-    """Refuse a path that exists and is no file: a pipe or a device may never answer."""
+    """Refuse a path where there is no file, or another thing: a pipe or a device may never answer."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
     if not path.is_file():
         raise ValueError(f"{path} is not a regular file; remove it, or choose another folder")
 

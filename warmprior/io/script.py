@@ -29,10 +29,12 @@ def run_script(
     *,
     errors: tuple[type[BaseException], ...] = ERRORS,
     together: bool = False,
+    hint: str = "",
 ) -> int:
     """Run a script of this name; its exit code: 0, 2 after one of ``errors``, 130 after Ctrl-C.
 
-    ``together`` allows several processes that ``torchrun`` starts, of which the first prints.
+    ``together`` allows several processes that ``torchrun`` starts, of which the first prints. ``hint`` says
+    how to go on after Ctrl-C.
 
     Examples:
         >>> import sys
@@ -65,7 +67,7 @@ def run_script(
             script()
     except BaseException as error:
         if interrupted:  # whatever the libraries in between have made of it
-            print(f"\n{name}: interrupted; --resume continues", file=sys.stderr)
+            print(f"\n{name}: interrupted{hint and '; '}{hint}", file=sys.stderr)
             return 130
         if not isinstance(error, errors):
             raise

@@ -138,7 +138,7 @@ def action_std(policy: Any, stats: Mapping[str, Mapping[str, Any]] | None) -> Te
     if mode not in needs:
         raise ValueError(
             f"{type(policy).__name__} normalises actions by its own means ({mode}): give their standard "
-            "deviation in the model's units as std, or leave it out"
+            "deviation in the model's units as std (the plugin's --policy.action_std), or leave it out"
         )
     missing = [name for name in needs[mode] if name not in own]
     if missing:

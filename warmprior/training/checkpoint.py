@@ -71,7 +71,7 @@ def check_identity(path: Path, theirs: Any, mine: Mapping[str, Any]) -> None:
         if theirs.get(part) != value:
             raise ValueError(
                 f"{path} belongs to another {part}: it has {theirs.get(part)}, this run has {value}. Use "
-                "the same options, another output folder, or do not resume."
+                "the same options, or another output folder."
             )
 
 

@@ -20,6 +20,7 @@ from torchrl.envs.transforms import (
 )
 
 from warmprior import keys
+from warmprior.modules.checks import check_whole_numbers
 from warmprior.transforms.absolute_actions import AbsoluteActions
 from warmprior.transforms.images import CameraImages
 from warmprior.transforms.inner_step import EnvTransform, InnerStep, rows_where, set_aside
@@ -212,7 +213,8 @@ class ChunkStep(EnvTransform):
         super().__init__(in_keys_inv=[keys.ACTION], out_keys_inv=[keys.CHUNK])
         execute = chunk_length if execute is None else execute
         prediction_length = chunk_length if prediction_length is None else prediction_length
-        if not 1 <= execute <= chunk_length <= prediction_length:
+        check_whole_numbers(chunk_length=chunk_length, execute=execute)
+        if not execute <= chunk_length <= prediction_length:
             raise ValueError(
                 "need 1 <= execute <= chunk_length <= prediction_length, got "
                 f"execute={execute}, chunk_length={chunk_length}, "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal, cast
 
 from tensordict.utils import NestedKey
 from torchrl.envs.transforms import Compose, Transform
@@ -71,6 +71,7 @@ def policy_transforms(
         >>> env.reset()["observation"].shape
         torch.Size([2, 3])
     """
+    policy = cast(Any, uncompiled(cast(Any, policy)))
     prior = policy
     if isinstance(policy, WarmPriorActor):
         prior, observed = policy.prior, policy.in_keys[0]

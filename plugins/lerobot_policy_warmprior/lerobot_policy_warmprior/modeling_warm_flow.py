@@ -68,13 +68,12 @@ class WarmFlowPolicy(PreTrainedPolicy):
         sizes = (config.action_feature.shape[0], width, prior.prediction_length, config.n_obs_steps)
         if config.network:
             try:
-                described = json.loads(config.network)
-            except json.JSONDecodeError as error:
+                network = from_config(VelocityNetwork, json.loads(config.network))
+            except (json.JSONDecodeError, TypeError) as error:
                 raise ValueError(
                     "--policy.network is the JSON of VelocityNetwork.config(), got "
                     f"{config.network!r} ({error})"
                 ) from error
-            network = from_config(VelocityNetwork, described)
             names = ("action_dim", "observation_dim", "prediction_length", "observation_steps")
             built = tuple(getattr(network, name) for name in names)
             if built != sizes:
@@ -191,9 +190,13 @@ class WarmFlowPolicy(PreTrainedPolicy):
         """A new chunk, ``[B, P, d_a]``, normalised.
 
         From present observations ``[B, d]`` and images ``[B, 3, h, w]``, and those since :meth:`reset`.
+        ``executed_steps=`` tells how much of the last chunk was executed, all that is to be by default.
         """
         self._remember(batch)
-        if self._memory.waits:  # asked for chunks alone
+        executed = kwargs.pop("executed_steps", None)
+        if executed is not None:
+            self._memory.executed(executed)
+        elif self._memory.waits:  # asked for chunks alone
             self._memory.executed(self.config.n_action_steps)
         return self._chunk()
 

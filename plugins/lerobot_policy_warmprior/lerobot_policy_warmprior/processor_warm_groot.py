@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 import torch
+from huggingface_hub import hf_hub_download
+from huggingface_hub.errors import RemoteEntryNotFoundError
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.policies.groot.processor_groot import GrootN17PackInputsStep, make_groot_pre_post_processors
 from lerobot.processor import ProcessorStepRegistry
+from lerobot.utils.constants import POLICY_PREPROCESSOR_DEFAULT_NAME
 from torch.nn.functional import pad
 
 from lerobot_policy_warmprior.configuration_warm_groot import WarmGrootConfig
 from warmprior.lerobot.adapter import HISTORY, HISTORY_IS_PAD
 
 DATA, PAD = TransitionKey.COMPLEMENTARY_DATA, "action_is_pad"
+STEP = "warm_groot_pack_inputs"
 
 
 @dataclass
-@ProcessorStepRegistry.register("warm_groot_pack_inputs")
+@ProcessorStepRegistry.register(STEP)
 class WarmGrootPackInputsStep(GrootN17PackInputsStep):
     """Packs the chunk as GR00T does, which takes no longer one, and the actions before it beside it."""
 
@@ -69,3 +75,28 @@ def make_warm_groot_pre_post_processors(
         if hasattr(step, "pack_step"):
             step.pack_step = pack
     return before, after
+
+
+def check_pretrained(config: WarmGrootConfig) -> None:
+    """Refuse a ``pretrained_path``, whose processors LeRobot takes, if they remember other actions.
+
+    Raises:
+        ValueError: if they are GR00T's own, or remember another number of actions.
+    """
+    place, name = str(config.pretrained_path), f"{POLICY_PREPROCESSOR_DEFAULT_NAME}.json"
+    try:
+        file = Path(place) / name if Path(place).is_dir() else Path(hf_hub_download(place, name))
+        steps = json.loads(file.read_text())["steps"] if file.exists() else []
+    except RemoteEntryNotFoundError:
+        steps = []  # a checkpoint of GR00T itself
+    packs = [step["config"]["history_length"] for step in steps if step.get("registry_name") == STEP]
+    length = config.make_prior().history_length
+    if not packs:
+        raise ValueError(
+            f"{place} is no policy of warm_groot: give a checkpoint of GR00T as --policy.base_model_path"
+        )
+    if packs != [length]:
+        raise ValueError(
+            f"{place} remembers {packs[0]} actions, and prior={config.prior!r} {length}: keep its "
+            "--policy.prior and --policy.prior_chunk, or start from --policy.base_model_path"
+        )
