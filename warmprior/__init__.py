@@ -9,6 +9,7 @@ name; parts of them need the extra ``warmprior[sim]``.
 from importlib.metadata import version
 
 from warmprior.modules import (
+    AdaLNTransformer,
     BridgeInterpolant,
     ChiTransformer,
     GaussianPrior,
@@ -67,6 +68,7 @@ __all__ = [
     "AbsoluteActions",
     "ActionHistory",
     "ActionWindow",
+    "AdaLNTransformer",
     "BoxTanhNormal",
     "BridgeInterpolant",
     "CameraImages",

@@ -39,6 +39,7 @@ from tqdm import tqdm
 from training_figures import D_A, D_O, PRIOR, TO, H, steps
 
 from warmprior import (
+    AdaLNTransformer,
     ChiTransformer,
     FlowMatchingLoss,
     VelocityMLP,
@@ -86,13 +87,11 @@ def nearest(make: Callable[[int], nn.Module], widths: Sequence[int], parameters:
     return min(widths, key=excess)
 
 
-def ours(
-    kind: type[VelocityNetwork], width: str, widths: range, parameters: float, device: str, **options: float
-) -> Peer:
+def ours(kind: type[VelocityNetwork], width: str, widths: range, parameters: float, device: str) -> Peer:
     """FlowMatchingLoss on one of this library's networks, whose option for the width has a name."""
 
     def make(number: int) -> VelocityNetwork:
-        return kind(D_A, D_O, H, TO, **{width: number}, **options)
+        return kind(D_A, D_O, H, TO, **{width: number})
 
     network = make(nearest(make, widths, parameters)).to(device)
     actor = WarmPriorActor(network, PRIOR)
@@ -100,7 +99,7 @@ def ours(
     history = window_history(torch.zeros(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
     data = TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
     return Peer(
-        ", ".join(["warmprior: FlowMatchingLoss", kind.__name__, *(f"{k} {options[k]:g}" for k in options)]),
+        f"warmprior: FlowMatchingLoss, {kind.__name__}",
         network,
         lambda batch: loss(batch)["loss_flow_matching"],
         lambda nfe: actor(data, nfe=nfe),
@@ -239,11 +238,11 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
 
 
 # How to build each, and the packages that it needs.
-transformer = partial(ours, ChiTransformer, "embedding_dim", range(48, 1024, 24))  # the paper's network
+TOKENS = ("embedding_dim", range(48, 1024, 24))
 
 PEERS: dict[str, tuple[Callable[[float, str], Peer], tuple[str, ...]]] = {
-    "warmprior_transformer": (transformer, ()),
-    "warmprior_transformer_no_dropout": (partial(transformer, dropout=0.0), ()),
+    "warmprior_transformer": (partial(ours, ChiTransformer, *TOKENS), ()),  # the paper's network
+    "warmprior_adaln": (partial(ours, AdaLNTransformer, *TOKENS), ()),
     "warmprior_mlp": (partial(ours, VelocityMLP, "hidden_dim", range(64, 4096, 32)), ()),
     "torchrl": (torchrl, ()),
     "lerobot_diffusion": (lerobot_diffusion, ("lerobot", "diffusers")),

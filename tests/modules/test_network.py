@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from warmprior import ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior import AdaLNTransformer, ChiTransformer, VelocityMLP, VelocityNetwork
 from warmprior.modules.network import TimestepEmbedding
 from warmprior.modules.registry import from_config
 
@@ -32,6 +32,7 @@ class Linear(VelocityNetwork):
         Linear(2, 3, 4, k=5),
         VelocityMLP(2, 3, 4, 1, hidden_dim=16, num_blocks=2, timestep_embedding_dim=8),
         ChiTransformer(2, 3, 4, embedding_dim=12, num_layers=1, num_heads=3, dropout=0.0),
+        AdaLNTransformer(2, 3, 4, embedding_dim=12, num_layers=1, num_heads=3),
     ],
     ids=lambda network: type(network).__name__,
 )

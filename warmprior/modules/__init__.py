@@ -2,7 +2,7 @@
 
 from warmprior.modules.actor import PriorSampler, StartPoint, WarmPriorActor
 from warmprior.modules.encoder import ImageEncoder, VisionNetwork, imagenet_weights, load_imagenet
-from warmprior.modules.network import ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior.modules.network import AdaLNTransformer, ChiTransformer, VelocityMLP, VelocityNetwork
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import (
     BridgeInterpolant,
@@ -16,6 +16,7 @@ from warmprior.modules.prior import GaussianPrior, PastPrior, PreviewPrior, Prio
 from warmprior.modules.real_time_chunking import RealTimeChunking
 
 __all__ = [
+    "AdaLNTransformer",
     "BridgeInterpolant",
     "ChiTransformer",
     "GaussianPrior",

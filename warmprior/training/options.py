@@ -13,6 +13,7 @@ from warmprior.envs.rendering import require_rendering
 from warmprior.envs.tasks import get_task
 from warmprior.io.extras import require
 from warmprior.modules import (
+    AdaLNTransformer,
     ChiTransformer,
     ImageEncoder,
     VelocityMLP,
@@ -31,6 +32,7 @@ PRETRAINED = "resnet18-imagenet"
 _NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
     "mlp": (VelocityMLP, "hidden_dim"),
     "chi_transformer": (ChiTransformer, "embedding_dim"),
+    "adaln_transformer": (AdaLNTransformer, "embedding_dim"),
 }
 
 
@@ -163,7 +165,7 @@ class NetworkOptions:
     """The velocity network.
 
     Attributes:
-        network: its kind; chi_transformer is the paper's.
+        network: its kind; chi_transformer is the paper's, adaln_transformer a faster one.
         hidden_dim: its width; the class's own by default.
         precondition: by the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
@@ -181,7 +183,7 @@ class NetworkOptions:
         torch.Size([1, 8, 7])
     """
 
-    network: Literal["mlp", "chi_transformer"] = "mlp"
+    network: Literal["mlp", "chi_transformer", "adaln_transformer"] = "mlp"
     hidden_dim: int | None = None
     precondition: bool = True
     observation_steps: int = 2
