@@ -16,6 +16,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
+from torchrl._utils import _check_for_faulty_process
 from torchrl.data import Categorical
 from torchrl.envs import Compose, ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
@@ -33,7 +34,9 @@ from warmprior import (
     WarmPriorActor,
     policy_transforms,
 )
+from warmprior.io.workers import WorkerError
 from warmprior.training import Episode, evaluate, parallel_env, play_episode
+from warmprior.training.evaluation import watched
 
 H = 3
 
@@ -232,6 +235,17 @@ def test_a_killed_worker_is_an_error_and_not_a_hang(moment):
     assert "worker 1 of 2 (exit code -9)" in str(error) and "memory" in str(error)
     time.sleep(0.5)
     assert all(ended(pid) for pid in pids), "a worker still runs"
+
+
+def test_a_worker_that_torchrl_finds_dead_first_is_named():
+    """It then closes the other workers, of which nothing can be asked any more."""
+    env = environments(2, sleep=0.02)
+    env.reset()
+    workers = env._workers
+    with pytest.raises(WorkerError, match=r"worker 1 of 2 \(exit code -9\) died"), watched(env):
+        os.kill(workers[1].pid, signal.SIGKILL)
+        workers[1].join()
+        _check_for_faulty_process(workers)
 
 
 def hold_environments(pipe):

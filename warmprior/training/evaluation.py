@@ -152,18 +152,22 @@ def watched(env: EnvBase) -> Iterator[None]:
     workers = list(base._workers) if isinstance(base, ParallelEnv) else []
     finished = threading.Event()
     dead: list[str] = []
+    # When it finds a dead worker, TorchRL ends and closes the others, which then answer nothing.
+    closed_by_torchrl = suppress(ValueError)
 
     def look() -> None:
         for i, worker in enumerate(workers):
-            if not dead and not worker.is_alive():
-                dead.append(f"worker {i} of {len(workers)} (exit code {worker.exitcode})")
+            with closed_by_torchrl:
+                if not dead and not worker.is_alive():
+                    dead.append(f"worker {i} of {len(workers)} (exit code {worker.exitcode})")
 
     def watch() -> None:
         while not finished.wait(0.5):
             look()
             if dead:
                 for worker in workers:
-                    worker.terminate()  # closes the pipes that the parent waits on
+                    with closed_by_torchrl:
+                        worker.terminate()  # closes the pipes that the parent waits on
                 return
 
     watcher = threading.Thread(target=watch, daemon=True)
@@ -173,7 +177,8 @@ def watched(env: EnvBase) -> Iterator[None]:
     except BaseException as error:
         if isinstance(error, (ConnectionError, EOFError)):
             for worker in workers:  # TorchRL may notice before the process is reaped
-                worker.join(0.2)
+                with closed_by_torchrl:
+                    worker.join(0.2)
         look()
         finished.set()
         # Without this, idle workers would keep the interpreter from exiting.
@@ -181,7 +186,7 @@ def watched(env: EnvBase) -> Iterator[None]:
             env.close(raise_if_closed=False)
         except Exception:  # closing complains about dead workers itself
             for worker in workers:
-                with suppress(ValueError):  # already closed
+                with closed_by_torchrl:
                     worker.terminate()
         if dead:
             advice = "run one environment in this process to see its own error"
