@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from warmprior import AdaLNTransformer, ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior import AdaLNTransformer, ChiTransformer, PlainMLP, VelocityMLP, VelocityNetwork
 from warmprior.modules.network import TimestepEmbedding
 from warmprior.modules.registry import from_config
 
@@ -31,6 +31,7 @@ class Linear(VelocityNetwork):
     [
         Linear(2, 3, 4, k=5),
         VelocityMLP(2, 3, 4, 1, hidden_dim=16, num_blocks=2, timestep_embedding_dim=8),
+        PlainMLP(2, 3, 4, 1, hidden_dim=16),
         ChiTransformer(2, 3, 4, embedding_dim=12, num_layers=1, num_heads=3, dropout=0.0),
         AdaLNTransformer(2, 3, 4, embedding_dim=12, num_layers=1, num_heads=3),
     ],
@@ -52,6 +53,20 @@ def test_groups_of_a_user_s_network():
     assert [id(p) for p in decay["params"]] == [id(network.layer.weight)]
     expected = {network.position, network.layer.bias, network.norm.weight, network.norm.bias}
     assert set(rest["params"]) == expected
+
+
+def test_plain_mlp_is_four_layers_by_hand():
+    network = PlainMLP(2, 3, 4, 1, hidden_dim=16).double()
+    t, a, observation = (torch.randn(*shape).double() for shape in ((5,), (5, 4, 2), (5, 1, 3)))
+    x = torch.cat([t[:, None], a.reshape(5, 8), observation.reshape(5, 3)], 1)
+    weights = list(network.parameters())
+    assert len(weights) == 8  # four matrices and their biases
+    for weight, bias in zip(weights[:6:2], weights[1:6:2], strict=True):
+        x = x @ weight.T + bias
+        x = x * (1 + torch.erf(x / math.sqrt(2))) / 2
+    torch.testing.assert_close(
+        network(t, a, observation), (x @ weights[6].T + weights[7]).reshape(5, 4, 2)
+    )
 
 
 @pytest.mark.parametrize("dim", [4, 8, 128])

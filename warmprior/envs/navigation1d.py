@@ -19,7 +19,7 @@ OBSTACLES = (-0.45, 0.45)
 HALF_WIDTH, HALF_HEIGHT = 0.12, 0.45
 SCALES = (0.85, 1.0, 1.15)
 OCTAVES = 4
-FEATURES = 1 + 2 * OCTAVES
+"""Of sines and cosines beside the position: without them small networks underfit at small budgets."""
 UNDECIDED = 0.05
 """Heights nearer to the axis than this belong to neither side (no demonstration comes below 0.17)."""
 
@@ -58,17 +58,16 @@ def _middles() -> list[int]:
     return [int((navigation_positions() - c).abs().argmin()) for c in OBSTACLES]
 
 
-def _features(x: Tensor) -> Tensor:
-    # Raw positions underfit at small budgets: sines and cosines of four octaves stand beside them.
-    angle = x.unsqueeze(-1) * math.pi * 2.0 ** torch.arange(-1, OCTAVES - 1, device=x.device)
+def _features(x: Tensor, octaves: int) -> Tensor:
+    angle = x.unsqueeze(-1) * math.pi * 2.0 ** torch.arange(-1, octaves - 1, device=x.device)
     return torch.cat([x.unsqueeze(-1), angle.sin(), angle.cos()], dim=-1)
 
 
-def navigation_demonstrations() -> TensorDict:
+def navigation_demonstrations(octaves: int = OCTAVES) -> TensorDict:
     """The six demonstrations as contiguous steps ``[384]``, ready for :class:`~warmprior.ActionWindow`.
 
-    ``"observation"`` ``[384, 9]`` is the position, with its sines and cosines, ``"action"`` ``[384, 1]`` the
-    height, in [-1, 1] without normalisation, ``"episode"`` ``[384]``.
+    ``"observation"`` ``[384, 1 + 2 * octaves]`` is the position, with its sines and cosines, ``"action"``
+    ``[384, 1]`` the height, in [-1, 1] without normalisation, ``"episode"`` ``[384]``.
 
     Examples:
         >>> from warmprior.envs import navigation_demonstrations
@@ -79,7 +78,7 @@ def navigation_demonstrations() -> TensorDict:
     count = len(heights)
     return TensorDict(
         {
-            keys.OBSERVATION: _features(navigation_positions()).repeat(count, 1),
+            keys.OBSERVATION: _features(navigation_positions(), octaves).repeat(count, 1),
             keys.ACTION: heights.reshape(-1, 1),
             keys.EPISODE: torch.arange(count).repeat_interleave(STEPS),
         },
@@ -113,7 +112,7 @@ class NavigationEnv(EnvBase):
     =================  ==================  ===============================================
     key                shape               meaning
     =================  ==================  ===============================================
-    ``"observation"``  ``[*B, 9]`` float   position in [-1, 1], its sines and cosines
+    ``"observation"``  ``[*B, d_o]`` float position in [-1, 1], its sines and cosines
     ``"action"``       ``[*B, 1]`` float   height, in units of the normalised action space
     ``"reward"``       ``[*B, 1]`` float   1 at the end of an episode that succeeds
     ``"step_index"``   ``[*B, 1]`` int64   steps done, 0 to 64
@@ -129,6 +128,7 @@ class NavigationEnv(EnvBase):
 
     Args:
         route: for each of the two obstacles ``1`` (pass above) or ``-1`` (below); either by default.
+        octaves: of sines and cosines beside the position, ``d_o = 1 + 2 * octaves``; the paper has none.
         batch_size: ``*B``, independent agents.
         device: of all tensors.
 
@@ -152,10 +152,12 @@ class NavigationEnv(EnvBase):
         self,
         route: Sequence[int] | None = None,
         *,
+        octaves: int = OCTAVES,
         batch_size: tuple[int, ...] | list[int] | torch.Size = (),
         device: torch.device | str = "cpu",
     ) -> None:
         super().__init__(device=device, batch_size=torch.Size(batch_size))
+        self.octaves = octaves
         if route is not None and (len(route) != len(OBSTACLES) or any(side not in (1, -1) for side in route)):
             raise ValueError(f"a route is {len(OBSTACLES)} numbers 1 or -1, got {tuple(route)}")
         self.route = None if route is None else dict(zip(_middles(), route, strict=True))
@@ -173,7 +175,7 @@ class NavigationEnv(EnvBase):
 
         self.observation_spec = Composite(
             {
-                keys.OBSERVATION: Bounded(-1, 1, (*self.batch_size, FEATURES), device=device),
+                keys.OBSERVATION: Bounded(-1, 1, (*self.batch_size, 1 + 2 * octaves), device=device),
                 "success": flag(),
                 **carried(),
             },
@@ -213,7 +215,7 @@ class NavigationEnv(EnvBase):
     ) -> TensorDict:
         return TensorDict(
             {
-                keys.OBSERVATION: _features(self._at(step).squeeze(-1)),
+                keys.OBSERVATION: _features(self._at(step).squeeze(-1), self.octaves),
                 "success": success,
                 "step_index": step,
                 "height": height,

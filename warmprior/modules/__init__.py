@@ -2,7 +2,13 @@
 
 from warmprior.modules.actor import PriorSampler, StartPoint, WarmPriorActor
 from warmprior.modules.encoder import ImageEncoder, VisionNetwork, imagenet_weights, load_imagenet
-from warmprior.modules.network import AdaLNTransformer, ChiTransformer, VelocityMLP, VelocityNetwork
+from warmprior.modules.network import (
+    AdaLNTransformer,
+    ChiTransformer,
+    PlainMLP,
+    VelocityMLP,
+    VelocityNetwork,
+)
 from warmprior.modules.normalize import Normalizer
 from warmprior.modules.ode import (
     BridgeInterpolant,
@@ -26,6 +32,7 @@ __all__ = [
     "Normalizer",
     "ODEActor",
     "PastPrior",
+    "PlainMLP",
     "PoseTrend",
     "PreconditionedNetwork",
     "PreviewPrior",

@@ -1,4 +1,4 @@
-"""Velocity networks: the interface, a small one, the transformer of Diffusion Policy and a faster one."""
+"""Velocity networks: the interface, two MLPs, the transformer of Diffusion Policy and a faster one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from warmprior.modules.checks import check_whole_numbers
 from warmprior.modules.registry import Registered
@@ -259,6 +260,43 @@ class VelocityMLP(VelocityNetwork):
         for block in self.blocks:
             x = block(x, time)
         return self.head(x).view_as(a)
+
+
+class PlainMLP(VelocityNetwork):
+    """Four layers on time, chunk and observation side by side: the network of the paper's toy (Fig. 5).
+
+    Args:
+        action_dim: ``d_a``.
+        observation_dim: ``d_o``.
+        prediction_length: ``P``.
+        observation_steps: ``To``.
+        hidden_dim: width of the three hidden layers.
+
+    Examples:
+        >>> import torch
+        >>> from warmprior import PlainMLP
+        >>> PlainMLP(1, 1, 4, 1)(torch.rand(8), torch.randn(8, 4, 1), torch.randn(8, 1, 1)).shape
+        torch.Size([8, 4, 1])
+    """
+
+    def __init__(
+        self,
+        action_dim: int,
+        observation_dim: int,
+        prediction_length: int,
+        observation_steps: int = 2,
+        *,
+        hidden_dim: int = 1024,
+    ) -> None:
+        super().__init__(action_dim, observation_dim, prediction_length, observation_steps)
+        chunk = prediction_length * action_dim
+        inputs = 1 + chunk + observation_steps * observation_dim
+        self.layers = MLP(inputs, chunk, depth=3, num_cells=hidden_dim, activation_class=nn.GELU)
+
+    def forward(self, t: Tensor, a: Tensor, observation: Tensor) -> Tensor:
+        """Velocity ``[B, P, d_a]`` at times ``t`` ``[B]``, points ``a`` ``[B, P, d_a]``."""
+        self.check_shapes(a, observation)
+        return self.layers(t[:, None], a.flatten(1), observation.flatten(1)).view_as(a)
 
 
 def _check_heads(num_heads: int, embedding_dim: int) -> None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torchrl.envs import TransformedEnv
+from torchrl.envs import EnvBase, TransformedEnv
 
 from warmprior import keys
 from warmprior.diagnostics.flow import sees_history
@@ -23,7 +24,13 @@ SHIFT = 0.15
 
 
 def play_navigation(
-    actor: WarmPriorActor, seed: int, *, nfe: int, rollouts: int = 256, shift: float = 0.0
+    actor: WarmPriorActor,
+    seed: int,
+    *,
+    nfe: int,
+    rollouts: int = 256,
+    shift: float = 0.0,
+    make_env: Callable[..., EnvBase] = NavigationEnv,
 ) -> TensorDictBase:
     """Roll a policy out on the toy, :class:`~warmprior.envs.NavigationEnv`; ``[rollouts, decisions]``.
 
@@ -35,6 +42,7 @@ def play_navigation(
         nfe: network evaluations per chunk.
         rollouts: how many.
         shift: standard deviation of the noise on the remembered mean.
+        make_env: makes the toy as the policy sees it: that of its :class:`Task`.
 
     Examples:
         >>> from warmprior import PastPrior, VelocityMLP, WarmPriorActor
@@ -45,14 +53,21 @@ def play_navigation(
     """
     generator = torch.Generator().manual_seed(seed)
     transforms = policy_transforms(actor.prior, observation_steps=1, see_history=sees_history(actor))
-    env = TransformedEnv(NavigationEnv(batch_size=[rollouts]), transforms)
+    env = TransformedEnv(make_env(batch_size=[rollouts]), transforms)
     player = actor.replace(nfe=nfe, generator=generator)
     policy = HistoryShift(player, shift, generator=generator) if shift else player
     with torch.no_grad():
         return env.rollout(1_000, policy)
 
 
-def judge_navigation(actor: WarmPriorActor, seed: int, *, nfe: int, rollouts: int = 256) -> dict[str, Any]:
+def judge_navigation(
+    actor: WarmPriorActor,
+    seed: int,
+    *,
+    nfe: int,
+    rollouts: int = 256,
+    make_env: Callable[..., EnvBase] = NavigationEnv,
+) -> dict[str, Any]:
     """Play a policy on the toy (:func:`play_navigation`) and measure what it did.
 
     Metrics of the rollouts (:class:`~warmprior.envs.NavigationMetrics`), ``jump_ratio`` and ``jerk``
@@ -68,7 +83,7 @@ def judge_navigation(actor: WarmPriorActor, seed: int, *, nfe: int, rollouts: in
     """
     row: dict[str, Any] = {}
     for prefix, shift in (("", 0.0), ("shifted_", SHIFT)):
-        played = play_navigation(actor, seed, nfe=nfe, rollouts=rollouts, shift=shift)
+        played = play_navigation(actor, seed, nfe=nfe, rollouts=rollouts, shift=shift, make_env=make_env)
         if _diverged(played):
             row[f"{prefix}collision_rate"] = 1.0
             continue

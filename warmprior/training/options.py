@@ -16,6 +16,7 @@ from warmprior.modules import (
     AdaLNTransformer,
     ChiTransformer,
     ImageEncoder,
+    PlainMLP,
     VelocityMLP,
     VelocityNetwork,
     VisionNetwork,
@@ -31,6 +32,7 @@ PRETRAINED = "resnet18-imagenet"
 
 _NETWORKS: dict[str, tuple[type[VelocityNetwork], str]] = {
     "mlp": (VelocityMLP, "hidden_dim"),
+    "plain_mlp": (PlainMLP, "hidden_dim"),
     "chi_transformer": (ChiTransformer, "embedding_dim"),
     "adaln_transformer": (AdaLNTransformer, "embedding_dim"),
 }
@@ -165,7 +167,8 @@ class NetworkOptions:
     """The velocity network.
 
     Attributes:
-        network: its kind; chi_transformer is the paper's, adaln_transformer a faster one.
+        network: its kind; the paper's are chi_transformer and, for the toy, plain_mlp; adaln_transformer is
+            a faster transformer.
         hidden_dim: its width; the class's own by default.
         precondition: by the second moments of source and data, see PreconditionedNetwork.
         observation_steps: To, observations per decision.
@@ -183,7 +186,7 @@ class NetworkOptions:
         torch.Size([1, 8, 7])
     """
 
-    network: Literal["mlp", "chi_transformer", "adaln_transformer"] = "mlp"
+    network: Literal["mlp", "plain_mlp", "chi_transformer", "adaln_transformer"] = "mlp"
     hidden_dim: int | None = None
     precondition: bool = True
     observation_steps: int = 2

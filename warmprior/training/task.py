@@ -6,7 +6,7 @@ import importlib
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -22,7 +22,7 @@ from warmprior.data.render import renderer_versions
 from warmprior.data.replay import DatasetIndex, DemonstrationReplay
 from warmprior.envs.description import environment_description, robosuite_parts
 from warmprior.envs.mimicgen import find_mimicgen, is_mimicgen
-from warmprior.envs.navigation1d import NavigationEnv, navigation_demonstrations
+from warmprior.envs.navigation1d import OCTAVES, NavigationEnv, navigation_demonstrations
 from warmprior.envs.simulator import task_env_args
 from warmprior.envs.tasks import TASKS
 from warmprior.io.files import digest_of
@@ -352,8 +352,10 @@ def read_like(
     return dataset.data.exclude("next"), called
 
 
-def navigation_task() -> Task:
+def navigation_task(style: str = "toy") -> Task:
     """The one-dimensional navigation toy (Fig. 5): :class:`~warmprior.envs.NavigationEnv` and its data.
+
+    In the style ``"position"`` policies see the position alone, as in the paper.
 
     Examples:
         >>> from warmprior.training import navigation_task
@@ -361,7 +363,9 @@ def navigation_task() -> Task:
         >>> task.title, task.make_env(batch_size=[8]).batch_size
         ('navigation toy', torch.Size([8]))
     """
-    return Task("navigation", "toy", navigation_demonstrations(), NavigationEnv)
+    octaves = 0 if style == "position" else OCTAVES
+    make_env = partial(NavigationEnv, octaves=octaves)
+    return Task("navigation", style, navigation_demonstrations(octaves), make_env)
 
 
 def load_task(options: DataOptions, name: str | None, style: str = "ph", observation_steps: int = 2) -> Task:
@@ -383,7 +387,7 @@ def load_task(options: DataOptions, name: str | None, style: str = "ph", observa
         'navigation toy'
     """
     if name == "navigation":
-        return navigation_task()
+        return navigation_task(style)
     if name is not None and ":" in name:
         module, _, function = name.partition(":")
         try:
