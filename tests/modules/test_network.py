@@ -64,9 +64,7 @@ def test_plain_mlp_is_four_layers_by_hand():
     for weight, bias in zip(weights[:6:2], weights[1:6:2], strict=True):
         x = x @ weight.T + bias
         x = x * (1 + torch.erf(x / math.sqrt(2))) / 2
-    torch.testing.assert_close(
-        network(t, a, observation), (x @ weights[6].T + weights[7]).reshape(5, 4, 2)
-    )
+    torch.testing.assert_close(network(t, a, observation), (x @ weights[6].T + weights[7]).reshape(5, 4, 2))
 
 
 @pytest.mark.parametrize("dim", [4, 8, 128])
