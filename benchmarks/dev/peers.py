@@ -32,11 +32,10 @@ import pandas as pd
 import torch
 from matplotlib.figure import Figure
 from tensordict import TensorDict, TensorDictBase
-from throughput import Clock
+from throughput import D_A, D_O, NFES, PRIOR, TO, Clock, H, one_decision, steps
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 from tqdm import tqdm
-from training_figures import D_A, D_O, PRIOR, TO, H, steps
 
 from warmprior import (
     AdaLNTransformer,
@@ -47,16 +46,13 @@ from warmprior import (
     WarmPriorActor,
     window_replay_buffer,
 )
-from warmprior.history import window_history
 from warmprior.io.distributed import check_device
 from warmprior.io.machine import facts_of_machine
 from warmprior.io.script import run_script
 
-NFES = (1, 3, 9)
 VECTOR, OBJECTS = 9, D_O - 9  # widths of the robot's own state and of the objects'
 
 Batch = TensorDictBase
-Row = dict[str, Any]
 
 
 @dataclass
@@ -96,8 +92,7 @@ def ours(kind: type[VelocityNetwork], width: str, widths: range, parameters: flo
     network = make(nearest(make, widths, parameters)).to(device)
     actor = WarmPriorActor(network, PRIOR)
     loss = FlowMatchingLoss(actor)
-    history = window_history(torch.zeros(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
-    data = TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
+    data = one_decision(device)
     return Peer(
         f"warmprior: FlowMatchingLoss, {kind.__name__}",
         network,
@@ -273,20 +268,18 @@ def flop_of(peer: Peer, batch: Batch) -> int:
     return counter.get_total_flops()
 
 
-def measure(peers: Sequence[Peer], options: argparse.Namespace, clock: Clock) -> list[Row]:
+def measure(peers: Sequence[Peer], options: argparse.Namespace, clock: Clock) -> list[dict[str, Any]]:
     device, batch = options.device, options.batch_size
     data = steps(400, 200).to(device)
     sample = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO).sample
     training = clock.times(*(training_step(peer, sample) for peer in peers))
-    rows = [
-        {
-            "policy": peer.name,
-            "parameters": peer.parameters,
-            "samples_per_second": batch / statistics.median(seconds),
-            "gflop_per_sample": flop_of(peer, sample()) / batch / 1e9,
-        }
-        for peer, seconds in zip(peers, training, strict=True)
-    ]
+    rows: list[dict[str, Any]] = []
+    for peer, seconds in zip(peers, training, strict=True):
+        speed, work = batch / statistics.median(seconds), flop_of(peer, sample()) / batch / 1e9
+        row = {"policy": peer.name, "parameters": peer.parameters, "own_steps": peer.own_steps}
+        rows.append(
+            row | {"samples_per_second": speed, "gflop_per_sample": work, "gflop_per_second": speed * work}
+        )
     for peer in peers:
         peer.module.eval()
     with torch.no_grad():
@@ -295,38 +288,20 @@ def measure(peers: Sequence[Peer], options: argparse.Namespace, clock: Clock) ->
             for row, seconds in zip(rows, clock.times(*decisions, calls=5), strict=True):
                 row[f"latency_nfe_{nfe}"] = 1000 * statistics.median(seconds)
         for row, peer in zip(rows, peers, strict=True):
-            row["own_steps"] = peer.own_steps
             (seconds,) = clock.times(partial(peer.decide, peer.own_steps))
             row["latency_own"] = 1000 * statistics.median(seconds)
     return rows
 
 
-def report(rows: Sequence[Row]) -> str:
-    lines = {
-        row["policy"]: {
-            "parameters": f"{row['parameters'] / 1e6:.1f} M",
-            "training, samples/s": f"{row['samples_per_second']:.0f}",
-            "GFLOP/sample": f"{row['gflop_per_sample']:.2f}",
-            "GFLOP/s": f"{row['samples_per_second'] * row['gflop_per_sample']:.0f}",
-            **{f"NFE {nfe}, ms": f"{row[f'latency_nfe_{nfe}']:.1f}" for nfe in NFES},
-            "own steps, ms": f"{row['latency_own']:.0f} ({row['own_steps']})",
-        }
-        for row in rows
-    }
-    return pd.DataFrame(lines).T.to_string()
-
-
-def draw(path: Path, rows: Sequence[Row]) -> None:
+def draw(path: Path, found: pd.DataFrame) -> None:
     figure = Figure(figsize=(10, 3.6), layout="constrained")
     speed, latency = figure.subplots(1, 2)
-    names = [row["policy"].replace(": ", ":\n") for row in rows]
-    colors = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3", "#e7298a"][: len(rows)]
-    speed.barh(names, [row["samples_per_second"] for row in rows], color=colors)
+    colors = ["#1f77b4", "#6baed6", "#d95f02", "#2ca02c", "#7570b3", "#e7298a"][: len(found)]
+    speed.barh(found.index.str.replace(": ", ":\n"), found.samples_per_second, color=colors)
     speed.set(xlabel="training, samples/s")
     speed.invert_yaxis()
-    for row, color in zip(rows, colors, strict=True):  # of the bars, which name them
-        y = [row[f"latency_nfe_{nfe}"] for nfe in NFES]
-        latency.plot(NFES, y, "o-", color=color)
+    for (_, row), color in zip(found.iterrows(), colors, strict=True):  # of the bars, which name them
+        latency.plot(NFES, row[[f"latency_nfe_{nfe}" for nfe in NFES]], "o-", color=color)
     latency.set(xlabel="network evaluations per chunk", ylabel="latency of a chunk, ms")
     latency.set(yscale="log", xticks=NFES)
     figure.savefig(path, dpi=150)
@@ -365,9 +340,9 @@ def run(argv: Sequence[str] | None) -> None:
     )
     text = json.dumps({"meta": meta, "rows": rows}, indent=2)
     (options.out / "peers.json").write_text(text + "\n")
-    (options.out / "table.txt").write_text(report(rows) + "\n")
-    draw(options.out / "peers.png", rows)
-    print(report(rows))
+    found = pd.DataFrame(rows).set_index("policy")
+    draw(options.out / "peers.png", found)
+    print(found.T.to_string(float_format="{:,.4g}".format))
     print(f"written to {options.out}")
 
 

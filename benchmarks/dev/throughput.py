@@ -1,53 +1,54 @@
-"""Speed and memory of the library as ratios to what it is built on, each measured in one run.
+"""Speed of the library as ratios to what it is built on, each measured in one run.
 
 python benchmarks/dev/throughput.py                                  # everything, a few minutes
-python benchmarks/dev/throughput.py --only windows_per_second actor_over_network
+python benchmarks/dev/throughput.py --only windows_over_torch actor_over_network
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import importlib.util
 import json
 import logging
 import os
-import platform
+import socket
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import training_figures as training
+import torch.distributed
+import torch.multiprocessing
 from tensordict import TensorDict
+from torch import nn
 from torchrl.envs import TransformedEnv
 from tqdm import tqdm
-from training_figures import BATCH, D_A, D_O, PRIOR, TO, H, paper_network, small_network, step_of, steps
 
 from warmprior import (
+    ChiTransformer,
     Normalizer,
+    PastPrior,
+    VelocityMLP,
     WarmPriorActor,
     policy_transforms,
     window_replay_buffer,
 )
 from warmprior.data import LeRobotExperienceReplay
-from warmprior.data.scripted.episode import Episode, write_robomimic
 from warmprior.envs import RobosuiteEnv
-from warmprior.envs.simulator import task_env_args
 from warmprior.history import window_history
-from warmprior.io.files import read_json, write_atomic
+from warmprior.io.distributed import joined, rank
 from warmprior.io.machine import facts_of_machine
-from warmprior.io.ray_cluster import ray_cluster
-from warmprior.io.workers import fresh_processes
-from warmprior.training import precondition
+from warmprior.training import BehaviourCloning, TrainingConfig, precondition
+
+D_O, D_A, H, TO, BATCH = 23, 7, 8, 2, 256
+PRIOR = PastPrior(H)
+NFES = (1, 3, 9)
 
 
 class Clock:
@@ -81,31 +82,78 @@ class Clock:
         return statistics.median(a / b for a, b in zip(one, two, strict=True))
 
 
-def windows_per_second(clock: Clock) -> float:
-    buffer = window_replay_buffer(steps(400, 200), PRIOR, batch_size=BATCH, observation_steps=TO)
-    (seconds,) = clock.times(buffer.sample, calls=50)
-    return BATCH / statistics.median(seconds)
+# What is measured on
 
 
-def bare_windows(data: TensorDict, batch: int, select: bool) -> Callable[[], list[torch.Tensor]]:
-    """Windows as one would write them in bare torch: by indexing, or by the faster ``index_select``."""
+def steps(episodes: int, length: int) -> TensorDict:
+    """Demonstrations of random numbers."""
+    n = episodes * length
+    both = torch.rand(n, D_O + D_A, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    observation, action = both.split((D_O, D_A), dim=-1)
+    episode = torch.arange(n) // length
+    return TensorDict({"observation": observation, "action": action, "episode": episode}, [n]).contiguous()
+
+
+def one_decision(device: str = "cpu") -> TensorDict:
+    """What a policy is given for one decision."""
+    history = window_history(torch.randn(1, H, D_A), torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
+    return TensorDict({"observation": torch.randn(1, TO, D_O), "history": history}, [1]).to(device)
+
+
+def paper_network() -> ChiTransformer:
+    torch.manual_seed(0)
+    return ChiTransformer(D_A, D_O, PRIOR.prediction_length, TO)
+
+
+def small_network() -> VelocityMLP:
+    """That of the quick preset."""
+    torch.manual_seed(0)
+    return VelocityMLP(D_A, D_O, PRIOR.prediction_length, TO, hidden_dim=384)
+
+
+def cloning(
+    network: nn.Module, folder: str | Path, batch: int = BATCH, device: str = "cpu", **options: Any
+) -> BehaviourCloning:
+    """A training of the network, ready to step."""
+    actor, config = WarmPriorActor(network, PRIOR).to(device), TrainingConfig(batch_size=batch)
+    data = steps(400, 200).to(device)
+    training = BehaviourCloning(actor, data, config, folder, observation_steps=TO, **options)
+    actor.train()
+    return training
+
+
+def step_of(network: nn.Module, batch: int = BATCH, device: str = "cpu") -> Callable[[], None]:
+    """A training step of a network alone, on random numbers."""
+    optimizer = torch.optim.AdamW(network.parameters(), fused=True)
+    t, a = torch.rand(batch, device=device), torch.randn(batch, H, D_A, device=device)
+    o = torch.randn(batch, TO, D_O, device=device)
+
+    def step() -> None:
+        loss = network(t, a, o).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    return step
+
+
+# Windows
+
+
+def bare_windows(data: TensorDict, batch: int) -> Callable[[], list[torch.Tensor]]:
+    """Windows as one would write them in bare torch."""
     observation, action, episode = (data[key] for key in ("observation", "action", "episode"))
     length = int((episode == 0).sum())
     before, ahead = torch.arange(1 - TO, 1), torch.arange(-H, H)
-
-    def rows(values: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-        if not select:
-            return values[index]
-        return values.index_select(0, index.flatten()).view(*index.shape, *values.shape[1:])
 
     def sample() -> list[torch.Tensor]:
         frame = torch.randint(len(data), (batch, 1))
         start = frame - frame % length
         index = frame + ahead
         warm = index[:, :1] >= start
-        actions = rows(action, index.clamp(start, start + length - 1))
+        actions = action[index.clamp(start, start + length - 1)]
         history, target = actions[:, :H], actions[:, H:]
-        observations = rows(observation, (frame + before).clamp_min(start))
+        observations = observation[(frame + before).clamp_min(start)]
         is_pad = index[:, H:] >= start + length
         return [observations, target, is_pad, history * warm.unsqueeze(-1), warm]
 
@@ -113,27 +161,18 @@ def bare_windows(data: TensorDict, batch: int, select: bool) -> Callable[[], lis
 
 
 def windows_over_torch(clock: Clock) -> dict[str, float]:
-    """Windows per second of the replay buffer over those of bare torch, by batch and way of gathering."""
+    """Windows per second of the replay buffer over those of bare torch, by batch."""
     data, found = steps(400, 200), {}
     for batch in (BATCH, 1024):
         buffer = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO)
-        for name, select in (("index", False), ("index_select", True)):
-            bare = bare_windows(data, batch, select)
-            found[f"{batch}, {name}"] = clock.ratio(bare, buffer.sample, calls=100)
-    with tempfile.TemporaryDirectory() as folder:
-        mapped = data.memmap(folder, copy_existing=True)
-        buffers = [
-            window_replay_buffer(source, PRIOR, batch_size=BATCH, observation_steps=TO)
-            for source in (data, mapped)
-        ]
-        found["memory-mapped over memory"] = clock.ratio(*(b.sample for b in buffers), calls=100)
+        found[str(batch)] = clock.ratio(bare_windows(data, batch), buffer.sample, calls=100)
     return found
 
 
 def lerobot_windows_over_getitem(clock: Clock) -> float | None:
     """Windows of a LeRobotDataset, over those that its own ``__getitem__`` gives."""
     os.environ |= {"HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1"}
-    if not all(importlib.util.find_spec(name) for name in ("lerobot", "datasets", "pyarrow")):
+    if not all(find_spec(name) for name in ("lerobot", "datasets", "pyarrow")):
         tqdm.write("lerobot_windows_over_getitem: skipped, needs warmprior[lerobot]")
         return None
     logging.disable(logging.WARNING)  # about video decoders, which are not used here
@@ -159,14 +198,6 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
         theirs = LeRobotDataset(name, root=root, delta_timestamps=offsets)
         read = LeRobotExperienceReplay(root).data
         buffer = window_replay_buffer(read, PRIOR, batch_size=BATCH, observation_steps=TO)
-        for row in buffer.sample():
-            item = theirs[int(row["frame"])]
-            action, pad = item["action"], item["action_is_pad"]
-            assert torch.equal(action[H:], row["vla_action", "chunk"])
-            assert torch.equal(pad[H:], row["action_is_pad"])
-            assert torch.equal(item["observation.state"], row["observation"])
-            assert int(row["history", "steps"]) == int((~pad[:H]).sum())
-            assert pad[:H].any() or torch.equal(action[:H], row["history", "actions"])
         ratio = clock.ratio(
             lambda: [theirs[i] for i in torch.randint(len(data), (64,)).tolist()],
             lambda: [buffer.sample() for _ in range(20)],
@@ -174,26 +205,126 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
     return ratio * 20 * BATCH / 64
 
 
+# Training
+
+
+def train_step_over_network(clock: Clock) -> float:
+    with tempfile.TemporaryDirectory() as folder:
+        return clock.ratio(cloning(paper_network(), folder).step, step_of(paper_network()))
+
+
 def preconditioning_over_network(clock: Clock) -> float:
     network = precondition(small_network(), steps(400, 200), PRIOR, observation_steps=TO)
     return clock.ratio(step_of(network), step_of(small_network()), calls=20)
 
 
+SCALED = {"paper": (paper_network, 1), "small": (small_network, 10)}
+"""Networks, and training steps per round."""
+
+
+def _round(step: Callable[[], object], calls: int) -> torch.Tensor:
+    """Seconds, and seconds of processor time."""
+    start = time.perf_counter(), time.process_time()
+    for _ in range(calls):
+        step()
+    return torch.tensor([time.perf_counter() - start[0], time.process_time() - start[1]])
+
+
+def _scale(number: int, port: int, repeats: int, folder: str) -> None:
+    """In turn: the first process trains alone while the other waits, and both train together."""
+    torch.set_num_threads(1)
+    os.environ |= {"RANK": str(number), "LOCAL_RANK": str(number), "WORLD_SIZE": "2"}
+    os.environ |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    alone = {name: cloning(make(), Path(folder) / name) for name, (make, _) in SCALED.items()}
+    with joined():
+        for name, (make, calls) in SCALED.items():
+            both, found = cloning(make(), Path(folder) / f"{name} {number}"), []
+            for repeat in range(repeats + 1):
+                torch.distributed.barrier()
+                one = _round(alone[name].step, calls) if not rank() else torch.zeros(2)
+                torch.distributed.barrier()
+                two = _round(both.step, calls)
+                torch.distributed.all_reduce(two)
+                if repeat:  # the first round warms up
+                    found.append(one / two)
+            if not rank():
+                torch.save(torch.stack(found).median(0).values, Path(folder) / f"{name}.pt")
+
+
+def ddp_efficiency(clock: Clock) -> dict[str, dict[str, float]]:
+    """Windows per second of two processes of a thread, over twice those of one, at the same whole batch.
+
+    By time, and by processor time, which tells what sharing a batch costs where other work takes the cores.
+    """
+    with socket.socket() as free, tempfile.TemporaryDirectory() as folder:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+        free.close()
+        torch.multiprocessing.spawn(_scale, (port, clock.repeats, folder), nprocs=2)
+        found = {name: torch.load(Path(folder) / f"{name}.pt").tolist() for name in SCALED}
+    return {name: dict(zip(("time", "processor"), both, strict=True)) for name, both in found.items()}
+
+
+def _gpu(name: str) -> bool:
+    if not torch.cuda.is_available():
+        tqdm.write(f"{name}: skipped, needs a GPU")
+    return torch.cuda.is_available()
+
+
+def cuda_train_step_over_network(clock: Clock) -> float | None:
+    """Of the paper's preset, both as CUDA graphs."""
+    if not _gpu("cuda_train_step_over_network"):
+        return None
+    batch, bare = TrainingConfig().batch_size, paper_network().to("cuda")
+    bare.compile(mode="reduce-overhead")
+
+    def twenty(step: Callable[[], object]) -> Callable[[], None]:
+        def run() -> None:
+            for _ in range(20):
+                torch.compiler.cudagraph_mark_step_begin()
+                step()
+            torch.cuda.synchronize()
+
+        return run
+
+    with tempfile.TemporaryDirectory() as folder:
+        ours = cloning(paper_network(), folder, batch, "cuda", compile=True)
+        return clock.ratio(twenty(ours.step), twenty(step_of(bare, batch, "cuda")))
+
+
+# Decisions
+
+
+@torch.no_grad()
+def cuda_latency(clock: Clock) -> dict[str, float] | None:
+    """Milliseconds per chunk of a single decision, by number of network evaluations."""
+    if not _gpu("cuda_latency"):
+        return None
+    actor = WarmPriorActor(paper_network().eval(), PRIOR).eval().to("cuda")
+    actor.network.compile(mode="reduce-overhead")
+    found, data = {}, one_decision("cuda")
+    for nfe in NFES:
+        (seconds,) = clock.times(partial(actor, data, nfe=nfe), calls=50)  # it waits for the GPU
+        found[str(nfe)] = 1e3 * statistics.median(seconds)
+    return found
+
+
+@torch.no_grad()
 def actor_over_network(clock: Clock, compiled: bool = False) -> dict[str, float]:
     call = torch.compile(paper_network().eval()) if compiled else paper_network().eval()
     actor = WarmPriorActor(call, PRIOR).eval()
-    t, a, o = torch.rand(1), torch.randn(1, H, D_A), torch.randn(1, TO, D_O)
-    history = window_history(a, torch.full((1, 1), H), torch.zeros(1, H, D_A), H)
-    data = TensorDict({"observation": o, "history": history}, [1])
+    data, t, a = one_decision(), torch.rand(1), torch.randn(1, H, D_A)
     found = {}
-    with torch.no_grad():
-        for nfe in (1, 3, 9):
-            found[str(nfe)] = clock.ratio(
-                partial(actor, data, nfe=nfe),
-                lambda nfe=nfe: [call(t, a, o) for _ in range(nfe)],
-                calls=max(2, 18 // nfe),
-            )
+    for nfe in NFES:
+        found[str(nfe)] = clock.ratio(
+            partial(actor, data, nfe=nfe),
+            lambda nfe=nfe: [call(t, a, data["observation"]) for _ in range(nfe)],
+            calls=max(2, 18 // nfe),
+        )
     return found
+
+
+# Control steps
 
 
 def env_over_robosuite(clock: Clock) -> float:
@@ -236,115 +367,18 @@ def chunk_step_overhead(clock: Clock) -> float:
     return clock.ratio(decisions, lambda: [alone.loop.step(a) for a in actions], before=before) - 1
 
 
-def image_windows_over_h5py(clock: Clock) -> float:
-    """Batches of windows with images, over decoding their frames from a rendered file."""
-    import h5py
-
-    length, episodes, size, batch = 100, 10, 84, 64
-    camera, frames = "agentview_image", length * episodes
-    smooth = np.add.outer(np.arange(size), np.arange(size))[..., None] + np.arange(3)
-    noise = np.random.default_rng(0).integers(0, 8, (frames, size, size, 3))
-    images = (smooth + noise).astype(np.uint8)  # compresses about as much as a rendered image
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "images.hdf5"
-        with h5py.File(path, "w") as file:
-            chunk = (1, size, size, 3)
-            file.create_dataset(camera, data=images, chunks=chunk, compression="gzip")
-        data = steps(episodes, length)
-        vector = data["observation"]
-        channels_first = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
-        data["observation"] = TensorDict({"state": vector, camera: channels_first}, [frames])
-        data = data.memmap(Path(folder) / "memmap")
-        buffer = window_replay_buffer(data, PRIOR, batch_size=batch, observation_steps=TO)
-        with h5py.File(path) as file:
-            stored = file[camera]
-
-            def decode() -> None:
-                for i in torch.randint(frames, (batch,)).tolist():
-                    first = i - i % length
-                    for step in range(TO):
-                        stored[max(first, i - step)]
-
-            return clock.ratio(decode, buffer.sample)
-
-
-LOAD = """
-import sys
-from warmprior.data import RobomimicExperienceReplay
-def memory(name):
-    with open("/proc/self/status") as file:
-        return 1024 * int(next(line for line in file if line.startswith(name)).split()[1])
-RobomimicExperienceReplay(sys.argv[1])  # libraries and caches
-with open("/proc/self/clear_refs", "w") as file:
-    file.write("5")  # forget the peak so far
-before = memory("VmRSS")
-data = RobomimicExperienceReplay(sys.argv[2]).data
-print((memory("VmHWM") - before) / sum(v.numel() * v.element_size() for v in data.values(True, True)))
-"""
-
-
-def load_memory_over_data(clock: Clock) -> float:
-    widths = {"object": 14, "robot0_eef_pos": 3, "robot0_eef_quat": 4, "robot0_gripper_qpos": 2}
-    rng = np.random.default_rng(0)
-
-    def episode(seed: int, length: int) -> Episode:
-        observations = {k: rng.normal(size=(length + 1, w)) for k, w in widths.items()}
-        actions, rewards = rng.uniform(-1, 1, (length, D_A)), np.eye(length)[-1]
-        states = np.zeros((length, 1))
-        return Episode(seed, 0, "better", True, actions, states, rewards, observations)
-
-    with tempfile.TemporaryDirectory() as folder:
-        paths = [Path(folder) / f"{size}.hdf5" for size in ("small", "large")]
-        for path, count in zip(paths, (2, 2000), strict=True):
-            episodes = (episode(i, 500) for i in range(count))
-            write_robomimic(path, episodes, env_args=task_env_args("square"), model_file="")
-        command = [sys.executable, "-c", LOAD, *map(str, paths)]
-        done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return float(done.stdout)
-
-
-def empty_cell(number: int, folder: Path) -> int:
-    """What a cell costs beside its episodes: a job, and the file that tells its result."""
-    path = folder / f"{number}.json"
-    write_atomic(path, lambda temporary: temporary.write_text("{}"))
-    return len(read_json(path))
-
-
-def job_overhead(clock: Clock) -> dict[str, float]:
-    """Seconds per job that does nothing and writes its result, one after another, on each engine."""
-    with tempfile.TemporaryDirectory() as name, fresh_processes(1) as local:
-        folder = Path(name)
-
-        def locally() -> None:
-            for number in range(100):
-                local.submit(empty_cell, number, folder).result()
-
-        engines = {"local": locally}
-        with contextlib.ExitStack() as stack:
-            if importlib.util.find_spec("ray"):
-                ray = stack.enter_context(ray_cluster(num_cpus=1))
-                task = ray.remote(empty_cell)
-                engines["ray"] = lambda: [ray.get(task.remote(n, folder)) for n in range(100)]
-            rounds = clock.times(*engines.values())
-    return {name: statistics.median(r) / 100 for name, r in zip(engines, rounds, strict=True)}
-
-
 FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
-    "windows_per_second": (windows_per_second, ">= 150000"),
     "windows_over_torch": (windows_over_torch, ">= 0.6"),
     "lerobot_windows_over_getitem": (lerobot_windows_over_getitem, ">= 500"),
-    "train_step_over_network": (training.train_step_over_network, "<= 1.10"),
-    "ddp_efficiency": (training.ddp_efficiency, ""),
-    "cuda_train_step_over_network": (training.cuda_train_step_over_network, "<= 1.05"),
-    "cuda_latency": (training.cuda_latency, ""),
+    "train_step_over_network": (train_step_over_network, "<= 1.10"),
     "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
+    "ddp_efficiency": (ddp_efficiency, ""),
+    "cuda_train_step_over_network": (cuda_train_step_over_network, "<= 1.05"),
+    "cuda_latency": (cuda_latency, ""),
     "actor_over_network": (actor_over_network, "<= 1.10"),
     "actor_over_network_compiled": (partial(actor_over_network, compiled=True), ""),
     "env_over_robosuite": (env_over_robosuite, ">= 2"),
     "chunk_step_overhead": (chunk_step_overhead, "<= 0.10"),
-    "load_memory_over_data": (load_memory_over_data, "<= 1.3"),
-    "image_windows_over_h5py": (image_windows_over_h5py, ">= 5"),
-    "job_overhead": (job_overhead, ""),
 }
 
 
@@ -368,11 +402,8 @@ def main(argv: list[str] | None = None) -> None:
             results[name] = value = measure(Clock(options.repeats, bar))
             shown = f"{value:.4g}" if isinstance(value, float) else json.dumps(value)
             tqdm.write(f"{name:32} {shown} {f'(target {target})' if target else ''}")
-    results["meta"] = facts_of_machine(
-        cpu=platform.processor() or platform.machine(),
-        torch_threads=torch.get_num_threads(),
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
+    date = datetime.now(UTC).isoformat(timespec="seconds")
+    results["meta"] = facts_of_machine(torch_threads=torch.get_num_threads(), date=date)
     path.write_text(json.dumps(results, indent=2) + "\n")
     print(f"written to {path}")
 

@@ -101,8 +101,7 @@ folder.cleanup()
 # %%
 # How far that goes
 # -----------------
-# ``python benchmarks/dev/scaling.py POLICY`` plays a saved policy in one process and in one per core. With
-# two cores WP-Past on square played 1.87 times as many episodes per minute as with one, and trainings
+# With two cores WP-Past on square played 1.87 times as many episodes per minute as with one, and trainings
 # side by side took 1.96 times as many steps. A vectorised environment, in which all rows wait for the
 # slowest at every decision, was behind (:doc:`/scaling`).
 #
