@@ -18,8 +18,8 @@ pytest.importorskip("h5py")
 import h5py
 
 from warmprior.data.scripted import generate as generate_module
-from warmprior.data.scripted import generate_demonstrations
 from warmprior.data.scripted.episode import Episode, expert_loop, operator_of, run_episode, write_robomimic
+from warmprior.data.scripted.generate import generate_demonstrations
 from warmprior.data.scripted.motion import CLOSED, transfer
 from warmprior.envs.simulator import make_simulator
 from warmprior.envs.tasks import TASKS

@@ -15,9 +15,9 @@ from torchrl.envs.utils import check_env_specs
 
 from tests.data.synthetic import env_args_14
 from tests.processes import apart
-from warmprior.data.scripted.episode import PLANS
 from warmprior.data.scripted.motion import ArmRunner
 from warmprior.data.scripted.operators import SKILLED, Demonstrator
+from warmprior.data.scripted.tasks import EXPERTS
 from warmprior.envs import RobosuiteEnv, rendering_backend
 from warmprior.envs.tasks import TASKS
 
@@ -100,7 +100,7 @@ def test_workers_share_out_the_episodes(lift):
 def run_expert(env, steps, seed=0):
     td = env.reset()
     person = Demonstrator(SKILLED, np.random.default_rng(seed))
-    (plan,) = PLANS["lift"](env.loop, person)
+    (plan,) = EXPERTS["lift"](env.loop, person)
     runner = ArmRunner(env.loop, 0, plan, person)
     for _ in range(steps):
         td["action"] = torch.from_numpy(runner.act()).float()

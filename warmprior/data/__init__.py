@@ -7,7 +7,7 @@ from warmprior.data.lerobot import LeRobotExperienceReplay, lerobot_steps
 from warmprior.data.render import render_demonstrations
 from warmprior.data.replay import DatasetError
 from warmprior.data.robomimic import RobomimicExperienceReplay, download_robomimic
-from warmprior.data.scripted import generate_demonstrations
+from warmprior.data.scripted.generate import generate_demonstrations
 
 __all__ = [
     "DatasetError",

@@ -26,7 +26,7 @@ from warmprior.data.replay import (
     check_env_args,
     store_finite,
 )
-from warmprior.envs.tasks import task_of_env
+from warmprior.envs.tasks import low_dim_keys, task_of_env
 from warmprior.io.extras import require
 
 if TYPE_CHECKING:
@@ -154,7 +154,6 @@ def _check_stored(dataset: h5py.Dataset) -> None:
         )
 
 
-_ARM_SUFFIXES = ("eef_pos", "eef_quat", "gripper_qpos")
 _IMAGE_BYTES = 2**24  # of images read at once
 _LEAVE_OUT = "Rebuild or remove the demo, or leave it out with a mask."
 
@@ -271,9 +270,7 @@ def _demo(file: h5py.File, name: str) -> h5py.Group:
 
 
 def _default_keys(path: Path, available: Sequence[str]) -> tuple[str, ...]:
-    robots = sorted({key.split("_")[0] for key in available if key.startswith("robot")})
-    wanted = ["object", *(f"{robot}_{suffix}" for robot in robots for suffix in _ARM_SUFFIXES)]
-    keys = tuple(key for key in wanted if key in available)
+    keys = tuple(key for key in low_dim_keys(arms=2) if key in available)
     if available and not keys:
         raise DatasetError(
             f"{path}: no object or robot observations among {', '.join(available)}; "
@@ -372,8 +369,6 @@ def read_index(
     every arm.
     """
     path = Path(path)
-    if demos is not None and demos < 1:
-        raise ValueError(f"demos must be at least 1, got {demos}")
     with open_robomimic(path) as file:
         selected = _selected(file, path, filter_key)
         check_count(path, demos, len(selected))

@@ -173,8 +173,6 @@ def read_lerobot_index(
     """
     remote = is_remote(dataset)
     root = download_lerobot(str(dataset), revision=revision) if remote else Path(dataset).expanduser()
-    if demos is not None and demos < 1:
-        raise ValueError(f"demos must be at least 1, got {demos}")
     metadata = _metadata(root)
     described = _description(root)
     recorded = described.get("env_args") or dict(env_args or {})

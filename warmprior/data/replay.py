@@ -102,7 +102,9 @@ def check_env_args(what: str, env_args: Any) -> dict[str, Any]:
 
 
 def check_count(path: Path, demos: int | None, available: int) -> None:
-    """Refuse to take more demonstrations than there are."""
+    """Refuse to take no demonstrations, or more than there are."""
+    if demos is not None and demos < 1:
+        raise ValueError(f"demos must be at least 1, got {demos}")
     if demos is not None and demos > available:
         raise DatasetError(
             f"{path}: there are {available} demonstrations, fewer than the {demos} to be taken: ask "

@@ -3,29 +3,22 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from warmprior.data.scripted.motion import ArmRunner, Plan
+from warmprior.data.scripted.motion import ArmRunner
 from warmprior.data.scripted.operators import LEVELS, OPERATORS, SKILLED, Demonstrator
-from warmprior.data.scripted.tasks import can, lift, square, stack, transport
+from warmprior.data.scripted.tasks import EXPERTS
 from warmprior.envs.control_loop import ControlLoop, StepLoop
 from warmprior.envs.simulator import make_simulator, task_env_args
 from warmprior.envs.tasks import get_task
 from warmprior.io.extras import require
 from warmprior.io.files import write_atomic
 
-PLANS: dict[str, Callable[[StepLoop, Demonstrator], list[Plan]]] = {
-    "lift": lift,
-    "can": can,
-    "square": square,
-    "stack": stack,
-    "transport": transport,
-}
 _EXTRA_KEYS = ("eef_quat_site", "gripper_qvel", "joint_pos", "joint_vel")
 _HOLD = 6  # steps that the task must stay solved for before the episode ends
 
@@ -76,7 +69,7 @@ def run_episode(loop: StepLoop, task: str, style: str, seed: int) -> Episode:
     # The first number keeps this stream apart from others that are seeded with the same integer.
     person = Demonstrator(operator, np.random.default_rng([7919, seed]))
     observations = [observe(loop.reset(seed))]
-    runners = [ArmRunner(loop, arm, plan, person) for arm, plan in enumerate(PLANS[task](loop, person))]
+    runners = [ArmRunner(loop, arm, plan, person) for arm, plan in enumerate(EXPERTS[task](loop, person))]
     states, actions, rewards = [], [], []
     solved = 0
     for _ in range(spec.horizon(style)):

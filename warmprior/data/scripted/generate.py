@@ -12,15 +12,9 @@ from typing import Any
 from torchrl._utils import logger
 from tqdm import tqdm
 
-from warmprior.data.scripted.episode import (
-    PLANS,
-    Episode,
-    expert_loop,
-    operator_of,
-    run_episode,
-    write_robomimic,
-)
+from warmprior.data.scripted.episode import Episode, expert_loop, operator_of, run_episode, write_robomimic
 from warmprior.data.scripted.operators import OPERATORS
+from warmprior.data.scripted.tasks import EXPERTS
 from warmprior.envs.control_loop import ControlLoop
 from warmprior.envs.simulator import import_robosuite, task_env_args
 from warmprior.envs.tasks import EVALUATION_SEED, get_task
@@ -81,8 +75,8 @@ def generate_demonstrations(
             ...
         ValueError: there is no scripted expert for 'tool_hang'; only its official data exist: ...
     """
-    spec = get_task(task)
-    if not spec.scripted or task not in PLANS:
+    get_task(task)
+    if task not in EXPERTS:
         raise ValueError(
             f"there is no scripted expert for {task!r}; only its official data exist: pass "
             "download=True to the dataset"

@@ -67,7 +67,7 @@ def nearest_yaw(yaw: float, home: float, period: float = np.pi) -> float:
 
 
 OPEN, CLOSED = -1.0, 1.0
-_ANY = 9.0  # a tolerance that every pose meets
+ANY = 9.0  # a tolerance that every pose meets
 
 Live = Callable[[], np.ndarray]
 Plan = Iterator["Waypoint"]
@@ -213,7 +213,7 @@ def transfer(
     last = Waypoint(pos, mat, grip, **options)
     if np.linalg.norm(path) > 0.06 or turn:
         orientation = turn_z(turn / 2) @ start_mat if turn else mat
-        yield replace(last, pos=way, mat=orientation, tol=0.04, rtol=0.5 if turn else _ANY)
+        yield replace(last, pos=way, mat=orientation, tol=0.04, rtol=0.5 if turn else ANY)
     yield last
 
 
@@ -254,17 +254,15 @@ def grasp(
     yield Waypoint(pos, mat, OPEN, tol=0.008, rtol=0.06, speed=0.6, noise=0.5, limit=70)
     # The fingers need about ten steps to close; leaving earlier drops thin handles.
     stay = int(person.draw(9, 13))
-    yield Waypoint(pos(), mat, CLOSED, _ANY, _ANY, dwell=stay, speed=0.3, noise=0.3)
+    yield Waypoint(pos(), mat, CLOSED, ANY, ANY, dwell=stay, speed=0.3, noise=0.3)
 
 
 def release(loop: StepLoop, person: Demonstrator, arm: int, up: float = 0.1) -> Plan:
     """Open the fingers where the hand is, then move up by ``up`` metres."""
     stay = int(person.draw(5, 9))
-    yield Waypoint(
-        lambda: loop.eef(arm)[0], lambda: loop.eef(arm)[1], OPEN, _ANY, _ANY, dwell=stay, noise=0.3
-    )
+    yield Waypoint(lambda: loop.eef(arm)[0], lambda: loop.eef(arm)[1], OPEN, ANY, ANY, dwell=stay, noise=0.3)
     pos, mat = loop.eef(arm)
-    yield Waypoint(pos + np.array([0.0, 0.0, up]), mat, OPEN, tol=0.03, rtol=_ANY)
+    yield Waypoint(pos + np.array([0.0, 0.0, up]), mat, OPEN, tol=0.03, rtol=ANY)
 
 
 def lower(loop: StepLoop, arm: int, body: str, goal: np.ndarray, mat: np.ndarray, limit: int = 60) -> Plan:

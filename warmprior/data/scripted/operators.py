@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
-
-T = TypeVar("T")
 
 #: Skill levels of multi-human data, best first.
 LEVELS = ("better", "okay", "worse")
@@ -69,7 +66,7 @@ class Demonstrator:
         """Decide at random."""
         return bool(self.rng.random() < probability)
 
-    def pick(self, options: Sequence[T], cost: Callable[[T], float]) -> T:
+    def pick[T](self, options: Sequence[T], cost: Callable[[T], float]) -> T:
         """Choose by habit: the cheapest option, or the runner-up."""
         ranked = sorted(options, key=cost)
         return ranked[min(self.choice, len(ranked) - 1)]

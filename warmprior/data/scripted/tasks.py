@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from warmprior.data.scripted.motion import (
+    ANY,
     CLOSED,
     OPEN,
     Live,
@@ -35,6 +36,7 @@ from warmprior.data.scripted.operators import Demonstrator
 from warmprior.envs.control_loop import StepLoop
 
 _Attempt = Callable[[StepLoop, Demonstrator], Plan]
+_Expert = Callable[[StepLoop, Demonstrator], list[Plan]]  # a plan per arm, in a loop that was just reset
 _ATTEMPTS = 4
 _PEG = np.array([0.23, 0.1])
 _NUT = "SquareNut_main"
@@ -56,17 +58,13 @@ def _wrist_allows(yaw: float, pos: np.ndarray) -> bool:
     return bool(-1.9 < yaw - np.arctan2(pos[1], pos[0] - _BASE_X) < 3.4)
 
 
-def lift(loop: StepLoop, person: Demonstrator) -> list[Plan]:
-    """Lift the cube: a plan per arm, in a loop that was just reset."""
-    return [_repeat(_try_lift, loop, person)]
-
-
 def _repeat(attempt: _Attempt, loop: StepLoop, person: Demonstrator) -> Plan:
     for _ in range(_ATTEMPTS):
         yield from attempt(loop, person)
 
 
 def _try_lift(loop: StepLoop, person: Demonstrator) -> Plan:
+    """Lift the cube."""
     yaw = person.pick(_grasp_yaws(yaw_of(loop.body("cube_main")[1]), np.pi / 2), abs)
     hand = down(yaw, person.draw(-0.08, 0.08), person.draw(-0.08, 0.08))
     spot = above(loop, "cube_main", _up(person.draw(-0.004, 0.008)))
@@ -75,8 +73,8 @@ def _try_lift(loop: StepLoop, person: Demonstrator) -> Plan:
     yield Waypoint(loop.eef()[0] + np.array(aside), hand, CLOSED, tol=0.02)
 
 
-def can(loop: StepLoop, person: Demonstrator) -> list[Plan]:
-    """Put the can into its bin; see :func:`lift` for arguments."""
+def _can(loop: StepLoop, person: Demonstrator) -> list[Plan]:
+    """Put the can into its bin."""
     usual = person.choice == 0
     yaw = person.draw(-0.25, 0.25) if usual else person.side * person.draw(0.9, 1.4)
     return [_repeat(lambda loop, person: _try_can(loop, person, yaw), loop, person)]
@@ -109,12 +107,8 @@ def _try_can(loop: StepLoop, person: Demonstrator, yaw: float) -> Plan:
         yield from release(loop, person, 0)
 
 
-def square(loop: StepLoop, person: Demonstrator) -> list[Plan]:
-    """Put the square nut over the peg; see :func:`lift` for arguments."""
-    return [_repeat(_try_square, loop, person)]
-
-
 def _try_square(loop: StepLoop, person: Demonstrator) -> Plan:
+    """Put the square nut over the peg."""
     pos, mat = loop.body(_NUT)
     yaw = yaw_of(mat)
     # The peg is so far out that the nut's handle must point towards the robot; the hand may then
@@ -154,12 +148,8 @@ def _try_square(loop: StepLoop, person: Demonstrator) -> Plan:
     yield from release(loop, person, 0)
 
 
-def stack(loop: StepLoop, person: Demonstrator) -> list[Plan]:
-    """Stack the small cube on the large one; see :func:`lift` for arguments."""
-    return [_repeat(_try_stack, loop, person)]
-
-
 def _try_stack(loop: StepLoop, person: Demonstrator) -> Plan:
+    """Stack the small cube on the large one."""
     upper, lower_cube = "cubeA_main", "cubeB_main"
     yaw = person.pick(_grasp_yaws(yaw_of(loop.body(upper)[1]), np.pi / 2), abs)
     hand = down(yaw)
@@ -186,12 +176,11 @@ def _try_stack(loop: StepLoop, person: Demonstrator) -> Plan:
 
 
 _HAMMER, _LID, _TRASH = "payload_root", "transport_start_bin_lid_root", "trash_main"
-_ANY = 9.0
 _BALANCE = 0.017  # from the hammer's origin to the middle between head and handle end, in metres
 _GIVER_YAW, _TAKER_YAW = np.pi / 2, -np.pi / 2
 
 
-def transport(loop: StepLoop, person: Demonstrator) -> list[Plan]:
+def _transport(loop: StepLoop, person: Demonstrator) -> list[Plan]:
     """Move the hammer from one table to the other: the giver's and the taker's plan.
 
     The giver takes the lid off the start bin, takes the hammer out and offers it in the middle. The taker
@@ -226,10 +215,10 @@ def _giver(loop: StepLoop, person: Demonstrator, events: set[str]) -> Plan:
     here, mat = loop.eef(0)
     events.add("offered")
     yield Waypoint(here, mat, CLOSED, until=lambda: "taken" in events, limit=500, noise=0.3)
-    yield Waypoint(here, mat, OPEN, _ANY, _ANY, dwell=8, noise=0.3)
+    yield Waypoint(here, mat, OPEN, ANY, ANY, dwell=8, noise=0.3)
     events.add("let go")
-    yield Waypoint(here + np.array([0, -0.08, 0.1]), mat, OPEN, tol=0.04, rtol=_ANY)
-    yield Waypoint(here + np.array([0, -0.25, 0.1]), mat, OPEN, tol=0.04, rtol=_ANY)
+    yield Waypoint(here + np.array([0, -0.08, 0.1]), mat, OPEN, tol=0.04, rtol=ANY)
+    yield Waypoint(here + np.array([0, -0.25, 0.1]), mat, OPEN, tol=0.04, rtol=ANY)
 
 
 def _remove_lid(loop: StepLoop, person: Demonstrator) -> Plan:
@@ -291,7 +280,7 @@ def _taker(loop: StepLoop, person: Demonstrator, events: set[str]) -> Plan:
     hand = down(_yaw(_handle(loop), _TAKER_YAW))
     yield Waypoint(lambda: spot() + np.array([0, 0.02, 0.09]), hand, OPEN, tol=0.025)
     yield Waypoint(spot, hand, OPEN, tol=0.01, rtol=0.12, speed=0.6, noise=0.4, limit=70)
-    yield Waypoint(loop.eef(1)[0], hand, CLOSED, _ANY, _ANY, dwell=12, noise=0.3)
+    yield Waypoint(loop.eef(1)[0], hand, CLOSED, ANY, ANY, dwell=12, noise=0.3)
     here = loop.eef(1)[0]
     events.add("taken")
     yield Waypoint(here, hand, CLOSED, until=lambda: "let go" in events, limit=60, noise=0.3)
@@ -327,7 +316,7 @@ def _put_hammer_down(loop: StepLoop, person: Demonstrator, here: np.ndarray, han
         return np.append(centre(), max(0.875, loop.body(_HAMMER)[0][2] - 0.04))
 
     over = bring(loop, 1, _HAMMER, lambda: np.append(centre(), 1.08))
-    yield Waypoint(here + np.array([0, 0.1, 0.01]), hand, CLOSED, tol=0.04, rtol=_ANY)
+    yield Waypoint(here + np.array([0, 0.1, 0.01]), hand, CLOSED, tol=0.04, rtol=ANY)
     yield from transfer(loop, person, 1, over, home, CLOSED, tol=0.03, rtol=0.4)
     yield Waypoint(over, home, CLOSED, tol=0.015, rtol=0.12, limit=60)
     yield Waypoint(
@@ -339,3 +328,12 @@ def _put_hammer_down(loop: StepLoop, person: Demonstrator, here: np.ndarray, han
         until=lambda: loop.body(_HAMMER)[0][2] < 0.885,
     )
     yield from release(loop, person, 1)
+
+
+EXPERTS: dict[str, _Expert] = {
+    "lift": lambda loop, person: [_repeat(_try_lift, loop, person)],
+    "can": _can,
+    "square": lambda loop, person: [_repeat(_try_square, loop, person)],
+    "stack": lambda loop, person: [_repeat(_try_stack, loop, person)],
+    "transport": _transport,
+}
