@@ -32,10 +32,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "delta": ("g", "half the width of the agent's box"),
     "environment_steps": ("d", "control steps that the agent has learnt from"),
     "evaluation": ("", "base: the frozen policy, around zero from N(0, I); greedy, stochastic: the agent"),
-    "mean": (
-        "",
-        "history of the source: of the training, or deployed, after the policy's own last decision",
-    ),
+    "mean": ("", "history of the source: of training, or deployed, after the policy's own last decision"),
     "observations": ("d", "observations that the measure is the mean of"),
     # Success.
     "episodes": ("d", "evaluation episodes of the last checkpoint, of all seeds in a table"),
@@ -62,24 +59,14 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "inner_jump": (".3f", "mean distance between consecutive actions inside a chunk"),
     "jump_ratio": (".3f", "boundary_jump over inner_jump"),
     "mean_error": (".3f", "root mean square from the source's mean to the demonstrated actions"),
-    "mean_revision_data": (
-        ".3f",
-        "root mean square from the source's mean to the prediction, at demonstrated states",
-    ),
-    "mean_revision": (
-        ".3f",
-        "root mean square from the source's mean to the prediction, in evaluation episodes",
-    ),
+    "mean_revision_data": (".3f", "root mean square from the source's mean to the prediction, on data"),
+    "mean_revision": (".3f", "root mean square from the source's mean to the prediction, in episodes"),
     # What reaches the actions, on 512 observations of the training data.
-    "source_leak": (
-        ".2f",
-        "spread of actions over draws of the source / that of the data; (!): above 1, the network has not "
-        "learnt to ignore the source's noise",
-    ),
+    "source_leak": (".2f", "spread of actions over draws of the source / that of the data; (!): above 1"),
     "inner_step_ratio": (".2f", "step between actions of a chunk / that of the data; (!): above 1.3"),
     "memory_gain": (
         "z.3f",
-        "share of a shift of what was done or forecast that reappears in the actions (0: ignored)",
+        "share of a shift of the past or forecast that reappears in actions (0: ignored)",
     ),
     # The flow.
     "kappa": (".3f", "curvature of the flow (of results.jsonl: over the executed positions)"),
@@ -92,10 +79,7 @@ COLUMNS: dict[str, tuple[str, str]] = {
     "ratio": (".3f", "kappa over the first policy's, with a 95% bootstrap interval over episodes"),
     "ratio_executed": (".3f", "kappa_executed over the first policy's, with a 95% bootstrap interval"),
     "ratio_relative": (".3f", "relative_executed over the first policy's, with a 95% bootstrap interval"),
-    "ratio_one_step": (
-        ".3f",
-        "one_step_error_executed over the first policy's, with a 95% bootstrap interval",
-    ),
+    "ratio_one_step": (".3f", "one_step_error_executed over the first policy's, with its 95% interval"),
     "training_seconds": (".0f", "processor time of the training, with its teacher's"),
     # The toy.
     "switch_rate": (".3f", "share of chunk boundaries at which the side changes"),

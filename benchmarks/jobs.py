@@ -16,12 +16,10 @@ import os
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Self
 
@@ -170,6 +168,7 @@ class Jobs:
         self.engine: Local | Ray = Ray(run) if run.engine == "ray" else Local(run.envs, run.device)
         self._waiting: list[Job] = []
         self._failed: dict[str, str] = {}  # by group, why
+        self._spoke = time.monotonic()
 
     def __enter__(self) -> Self:
         return self
@@ -186,7 +185,7 @@ class Jobs:
         return job
 
     def say(self, line: str) -> None:
-        """Print a line that stays above the bars."""
+        """Print a line that stays above the bar."""
         tqdm.write(line)
         sys.stdout.flush()
 
@@ -194,7 +193,8 @@ class Jobs:
         """Compute all jobs; what failed, by group, and why."""
         running: dict[Future[Any], Job] = {}
         ended = 0
-        with progress(self.engine.workers) as show:
+        # disable=None: no bar without a terminal.
+        with tqdm(desc="jobs", leave=False, dynamic_ncols=True, disable=None) as bar:
             while self._waiting or running:
                 while (job := self._next()) is not None:
                     self._waiting.remove(job)
@@ -203,8 +203,18 @@ class Jobs:
                 for future in finished:
                     job = running.pop(future)
                     ended += self._ended(job, future)
-                show(list(running.values()), ended, ended + len(self._waiting) + len(running))
+                bar.n, bar.total = ended, ended + len(self._waiting) + len(running)
+                self._show(bar, running.values())
         return self._failed
+
+    def _show(self, bar: tqdm, running: Iterable[Job]) -> None:
+        """How far the trainings are: in the bar, or where there is none, in lines now and then."""
+        trainings = {job.name: done for job in running if (done := job.iterations())}
+        bar.set_postfix_str(", ".join(f"training {n / total:.0%}" for n, total in trainings.values()))
+        if bar.disable and time.monotonic() - self._spoke > LINES_EVERY:
+            self._spoke = time.monotonic()
+            for name, (n, total) in trainings.items():
+                print(f"{name}: {n:,} of {total:,} iterations", flush=True)
 
     def _next(self) -> Job | None:
         """The job that starts now, if one can."""
@@ -240,36 +250,3 @@ class Jobs:
         before = len(self._waiting)
         self._waiting = [other for other in self._waiting if other.group != job.group]
         return 1 + before - len(self._waiting)
-
-
-@contextmanager
-def progress(workers: int) -> Iterator[Callable[[list[Job], int, int], None]]:
-    """Show a bar of all jobs and one per worker on a terminal; elsewhere a line per training, now and then.
-
-    It gives a function of the running jobs, and of how many jobs are done, of how many.
-    """
-    spoke = time.monotonic()
-    # disable=None: no bars without a terminal.
-    options: dict[str, Any] = {"leave": False, "dynamic_ncols": True, "disable": None}
-
-    def show(running: list[Job], ended: int, total: int) -> None:
-        nonlocal spoke
-        whole.total, whole.n = total, ended
-        whole.refresh()
-        if not whole.disable:
-            for bar, job in zip_longest(bars, running[: len(bars)]):
-                done = job and job.iterations()
-                bar.n, bar.total = done or (0, 1)
-                bar.bar_format = "{desc}: {percentage:3.0f}%|{bar}| {n}/{total}" if done else "{desc}"
-                bar.set_description_str(job.name if job else "")
-        elif time.monotonic() - spoke > LINES_EVERY:
-            spoke = time.monotonic()
-            for job in running:
-                if done := job.iterations():
-                    print(f"{job.name}: {done[0]:,} of {done[1]:,} iterations", flush=True)
-
-    with ExitStack() as stack:
-        whole = stack.enter_context(tqdm(total=1, desc="jobs", **options))
-        worker = {"bar_format": "{desc}", **options}
-        bars = [stack.enter_context(tqdm(position=1 + i, **worker)) for i in range(min(workers, 8))]
-        yield show

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pandas as pd
 from options import script
-from plots import colors_of, legend_below, new_figure, save
+from plots import colors_of, new_figure, save
 from report import read_rows, summary, table
 
 
@@ -44,7 +44,6 @@ def main(argv: list[str] | None) -> None:
     axis.axhline(0, color="0.6", lw=0.8)
     axis.set_xlabel("memory gain (0: ignores what it did, 1: repeats it)")
     axis.set_ylabel("success over the first method (points)")
-    legend_below(figure)
     save(figure, args.out, f"{len(found)} cells of {len(args.runs)} runs")
 
     text = table(found, ["problem", "nfe", "method"], ["memory_gain", "gain"])

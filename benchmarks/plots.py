@@ -9,7 +9,6 @@ from string import ascii_lowercase
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from methods import color
@@ -38,14 +37,24 @@ def new_figure(
 ) -> tuple[Figure, list[Any]]:
     """A figure and its axes, row by row; it needs no display and leaves no pyplot state behind."""
     figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False, sharex=share, sharey=share)
     return figure, list(axes.flat)
 
 
 def save(figure: Figure, path: str | Path, title: str, size: int = 10) -> None:
+    """Write a figure with its title, and with one legend of all axes below, by which the picture grows."""
+    handles = {
+        label: handle
+        for axis in figure.axes
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
+    }
+    if handles:
+        entry = 0.6 + 0.07 * max(map(len, handles))  # inches
+        columns = max(1, int(figure.get_figwidth() / entry))
+        below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, 0), "frameon": False}
+        figure.legend(handles.values(), handles.keys(), ncols=columns, fontsize=9, **below)
     figure.suptitle(title, fontsize=size)
-    figure.savefig(path, dpi=150)
+    figure.savefig(path, dpi=150, bbox_inches="tight")
 
 
 def dress(axis: Any, title: str = "", x: str = "", y: str = "", rate: bool = False) -> None:
@@ -68,28 +77,6 @@ def colors_of(rows: DataFrame) -> dict[Hashable, Any]:
             share = PALEST * place / max(1, len(methods) - 1)
             colors[method] = tuple((1 - share) * part + share * end for part in own)
     return colors
-
-
-def legend_below(figure: Figure) -> None:
-    """One legend of all axes below them, in as many columns as the figure is wide.
-
-    The figure grows by its height, so that the axes keep theirs, and to its width if one column is wider.
-    """
-    handles = {
-        label: handle
-        for axis in figure.axes
-        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)
-    }
-    style: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "fontsize": 9}
-    for columns in range(max(1, len(handles)), 0, -1):
-        legend = figure.legend(handles.values(), handles.keys(), ncols=columns, **style)
-        needed = legend.get_window_extent()
-        if columns == 1 or needed.width <= figure.bbox.width:
-            break
-        legend.remove()
-    width, height = figure.get_size_inches()
-    grown = height + needed.height / figure.dpi
-    figure.set_size_inches(max(width, needed.width / figure.dpi), grown)
 
 
 def side_by_side(
@@ -130,10 +117,9 @@ def plot_success(rows: DataFrame, path: str | Path, title: str, group: str = "nf
         axis.fill_betweenx(grid, x - half, x + half, alpha=0.75, lw=0, **look)
         axis.plot([x - 0.3, x + 0.3], [posterior.mean()] * 2, color="black", lw=1.2)
         axis.text(x, -0.025, f"{k}/{n}", ha="center", va="top", fontsize=7, color="0.35")
-    dress(axis, title, y="success rate (posterior density)")
+    dress(axis, y="success rate (posterior density)")
     axis.set_ylim(-0.08, 1.0)
-    legend_below(figure)
-    figure.savefig(path, dpi=150)
+    save(figure, path, title)
 
 
 def plot_bars(
@@ -167,7 +153,6 @@ def plot_bars(
         if not rate:
             axis.margins(y=0.1)  # for the numbers above the bars
             axis.set_ylim(bottom=0)
-    legend_below(figure)
     save(figure, path, title)
 
 
@@ -209,7 +194,6 @@ def plot_lines(
         if scale != "linear":
             ticks = values if scale == "log" else range(len(values))
             axis.set_xticks(ticks, [f"{value:,g}" for value in values], fontsize=8)
-    legend_below(figure)
     save(figure, path, title)
 
 
@@ -231,7 +215,6 @@ def plot_learning_curves(
     dress(left, x="iteration", y="flow-matching loss (own source)")
     dress(right, x="iteration", y=f"success rate (NFE {rows['nfe'].iloc[0]})", rate=True)
     right.set_xlim(left.get_xlim())
-    legend_below(figure)
     save(figure, path, title)
 
 

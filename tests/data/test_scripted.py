@@ -130,7 +130,7 @@ def in_threads(count, state):
 @pytest.mark.parametrize(
     ("task", "options", "message"),
     [
-        ("tool_hang", {}, "no scripted expert for 'tool_hang'.*download=True"),
+        ("tool_hang", {}, "no scripted expert for 'tool_hang'.*download_robomimic"),
         ("lift", {"style": "mg"}, "style is 'ph' or 'mh', got 'mg'"),
         ("lift", {"seed": 100}, "seed must be between 0 and 99, got 100"),
     ],

@@ -65,7 +65,7 @@ def convert_robomimic(
         >>> convert_robomimic("nowhere.hdf5", "out")
         Traceback (most recent call last):
             ...
-        FileNotFoundError: nowhere.hdf5: no such file; check the path
+        FileNotFoundError: nowhere.hdf5: no such file; check the path, ...
     """
     path, folder = Path(path), Path(folder).expanduser()
     if images not in (None, *KINDS):

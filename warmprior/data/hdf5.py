@@ -164,7 +164,7 @@ def open_robomimic(path: str | Path) -> Iterator[h5py.File]:
     h5py = require("h5py", "sim")
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file; check the path")
+        raise FileNotFoundError(f"{path}: no such file; check the path, or fetch it (download_robomimic)")
     try:
         file = h5py.File(path, "r")
     except OSError as error:

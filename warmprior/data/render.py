@@ -78,7 +78,7 @@ def render_demonstrations(
         >>> render_demonstrations("nowhere.hdf5", ["agentview"])
         Traceback (most recent call last):
             ...
-        FileNotFoundError: nowhere.hdf5: no such file; check the path
+        FileNotFoundError: nowhere.hdf5: no such file; check the path, ...
     """
     path, index = Path(path), read_index(path, demos=demos)
     if cameras is None:

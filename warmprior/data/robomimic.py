@@ -112,17 +112,6 @@ def _published_digest(hub: Any, where: dict[str, Any]) -> str | None:
     return etag if etag is not None and len(etag) == 64 else None
 
 
-def _locate(dataset: str | Path, style: str | None, download: bool, root: str | Path | None) -> Path:
-    path = Path(dataset)
-    if path.is_file() or (str(dataset) not in TASKS and not download):
-        return path
-    if download:
-        return download_robomimic(str(dataset), style, root=root)
-    raise FileNotFoundError(
-        f"{dataset}: no such file. To fetch the official file of this task, pass download=True."
-    )
-
-
 class RobomimicExperienceReplay(DemonstrationReplay):
     """Demonstrations of an HDF5 file of robomimic or MimicGen, as one immutable TorchRL replay buffer.
 
@@ -140,10 +129,7 @@ class RobomimicExperienceReplay(DemonstrationReplay):
     Names, shapes and masks are checked before values are read.
 
     Args:
-        dataset: path of an HDF5 file, or with ``download=True`` the name of a task.
-        style: which official file, see :func:`warmprior.data.download_robomimic`. Ignored for a path.
-        download: fetch the official file if ``dataset`` is no file.
-        root: folder for downloads; by default the hub client's cache.
+        path: an HDF5 file, such as one of :func:`warmprior.data.download_robomimic`.
         filter_key: a mask of the file, such as ``"train"``; all demos if ``None``.
         demos: how many to take, the first ones by their numbers; all if ``None``.
         observation_keys: observations to concatenate; by default those of the task, or for an
@@ -161,26 +147,23 @@ class RobomimicExperienceReplay(DemonstrationReplay):
         DatasetError: if the file is not as it should be; says which demo and key.
         ValueError: if ``storage`` is unknown or does not fit ``device``, or absolute actions are asked
             of a controller without pose deltas.
-        OSError: if a download fails, or there is no space for memory maps.
+        OSError: if there is no space for memory maps.
 
     Examples:
         >>> from warmprior.data import RobomimicExperienceReplay
         >>> data = RobomimicExperienceReplay("square.hdf5", batch_size=256)  # doctest: +SKIP
         >>> data.sample()["observation"].shape  # doctest: +SKIP
         torch.Size([256, 23])
-        >>> RobomimicExperienceReplay("square")
+        >>> RobomimicExperienceReplay("nowhere.hdf5")
         Traceback (most recent call last):
             ...
-        FileNotFoundError: square: no such file. To fetch the official file of this task, ...
+        FileNotFoundError: nowhere.hdf5: no such file; check the path, or fetch it (download_robomimic)
     """
 
     def __init__(
         self,
-        dataset: str | Path,
+        path: str | Path,
         *,
-        style: str | None = None,
-        download: bool = False,
-        root: str | Path | None = None,
         filter_key: str | None = None,
         demos: int | None = None,
         observation_keys: Sequence[str] | None = None,
@@ -188,7 +171,6 @@ class RobomimicExperienceReplay(DemonstrationReplay):
         absolute_actions: bool = False,
         **kwargs: Any,
     ) -> None:
-        path = _locate(dataset, style, download, root)
         index = read_index(
             path,
             filter_key=filter_key,

@@ -78,8 +78,8 @@ def generate_demonstrations(
     get_task(task)
     if task not in EXPERTS:
         raise ValueError(
-            f"there is no scripted expert for {task!r}; only its official data exist: pass "
-            "download=True to the dataset"
+            f"there is no scripted expert for {task!r}; only its official data exist: fetch them "
+            "(download_robomimic, or --download)"
         )
     if style not in _STYLES:
         raise ValueError(f"style is {' or '.join(map(repr, _STYLES))}, got {style!r}")
