@@ -1,7 +1,6 @@
 """Training and inference beside LeRobot's and TorchRL's policies: the same windows, networks of equal size.
 
 python benchmarks/dev/peers.py                                   # minutes on two cores
-python benchmarks/dev/peers.py --parameters 2e6 --batch-size 64
 python benchmarks/dev/peers.py --device cuda --batch-size 1024
 
 Peers run as their packages ship them, in one process and on one thread (on a CPU), with the same
@@ -72,24 +71,9 @@ class Peer:
         return sum(p.numel() for p in self.module.parameters() if p.requires_grad)
 
 
-def nearest(make: Callable[[int], nn.Module], widths: Sequence[int], parameters: float) -> int:
-    """The width whose network has the number of parameters that is closest."""
-
-    def excess(width: int) -> float:
-        with torch.device("meta"):
-            network = make(width)
-        return abs(sum(p.numel() for p in network.parameters()) - parameters)
-
-    return min(widths, key=excess)
-
-
-def ours(kind: type[VelocityNetwork], width: str, widths: range, parameters: float, device: str) -> Peer:
+def ours(kind: type[VelocityNetwork], option: str, width: int, device: str) -> Peer:
     """FlowMatchingLoss on one of this library's networks, whose option for the width has a name."""
-
-    def make(number: int) -> VelocityNetwork:
-        return kind(D_A, D_O, H, TO, **{width: number})
-
-    network = make(nearest(make, widths, parameters)).to(device)
+    network = kind(D_A, D_O, H, TO, **{option: width}).to(device)
     actor = WarmPriorActor(network, PRIOR)
     loss = FlowMatchingLoss(actor)
     data = one_decision(device)
@@ -105,20 +89,14 @@ def ours(kind: type[VelocityNetwork], width: str, widths: range, parameters: flo
     )
 
 
-def torchrl(parameters: float, device: str) -> Peer:
+def torchrl(width: int, device: str) -> Peer:
     """DiffusionBCLoss and DiffusionActor on a chunk in one vector, with an MLP."""
-    from torchrl.modules import DiffusionActor
+    from torchrl.modules import MLP, DiffusionActor
     from torchrl.objectives import DiffusionBCLoss
 
     chunk, observed = H * D_A, TO * D_O
-
-    def make(width: int) -> nn.Module:
-        layers: list[nn.Module] = [nn.Linear(chunk + observed + 1, width), nn.SiLU()]
-        for _ in range(4):
-            layers += [nn.Linear(width, width), nn.SiLU()]
-        return nn.Sequential(*layers, nn.Linear(width, chunk))
-
-    network = make(nearest(make, range(64, 4096, 32), parameters)).to(device)
+    inputs = chunk + observed + 1
+    network = MLP(inputs, chunk, num_cells=[width] * 5, activation_class=nn.SiLU, device=device)
 
     def actor(num_steps: int) -> nn.Module:
         return DiffusionActor(chunk, score_network=network, num_steps=num_steps).to(device)
@@ -132,14 +110,13 @@ def torchrl(parameters: float, device: str) -> Peer:
         flat = {"observation": batch["observation"].flatten(1), "action": action}
         return loss(TensorDict(flat, batch.batch_size))["loss_diffusion_bc"]
 
-    width = chunk + observed + 1
     return Peer(
         "torchrl: DiffusionBCLoss, MLP",
         network,
         of,
         lambda nfe: actors[nfe](data.copy()),
         100,
-        lambda batch: network(torch.zeros(len(batch), width, device=device)),
+        lambda batch: network(torch.zeros(len(batch), inputs, device=device)),
     )
 
 
@@ -179,16 +156,13 @@ def lerobot(
     return Peer(name, policy, loss, decide, 100)
 
 
-def lerobot_diffusion(parameters: float, device: str) -> Peer:
+def lerobot_diffusion(width: int, device: str) -> Peer:
     """LeRobot's Diffusion Policy: a U-Net over the chunk, conditioned on state vectors."""
     from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
     from lerobot.policies.diffusion.modeling_diffusion import DiffusionPolicy
 
-    def make(width: int) -> nn.Module:
-        dims = (width, 2 * width, 4 * width)
-        return DiffusionPolicy(DiffusionConfig(**features(True, device), down_dims=dims))
-
-    policy = make(nearest(make, range(16, 513, 16), parameters)).to(device)
+    dims = (width, 2 * width, 4 * width)
+    policy = DiffusionPolicy(DiffusionConfig(**features(True, device), down_dims=dims)).to(device)
 
     def seen(observation: torch.Tensor) -> dict[str, torch.Tensor]:
         parts = observation.split((VECTOR, OBJECTS), dim=-1)
@@ -198,7 +172,7 @@ def lerobot_diffusion(parameters: float, device: str) -> Peer:
     return lerobot("lerobot: diffusion (U-Net)", policy, seen, set_steps, device)
 
 
-def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
+def lerobot_multi_task_dit(width: int, device: str) -> Peer:
     """LeRobot's multi_task_dit with flow matching, behind a language encoder that costs next to nothing."""
     from lerobot.policies.multi_task_dit import modeling_multi_task_dit as modeling
     from lerobot.policies.multi_task_dit.configuration_multi_task_dit import MultiTaskDiTConfig
@@ -213,14 +187,11 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
         num_attention_heads=2,
         eos_token_id=2,
     )
-
-    def make(width: int) -> nn.Module:
-        flow = {"objective": "flow_matching", "hidden_dim": width}
-        return modeling.MultiTaskDiTPolicy(MultiTaskDiTConfig(**features(False, device), **flow))
-
     encoder = classmethod(lambda kind, *args, **kwargs: kind(small))
+    flow = {"objective": "flow_matching", "hidden_dim": width}
     with mock.patch.object(modeling.CLIPTextModel, "from_pretrained", encoder):
-        policy = make(nearest(make, range(64, 769, 64), parameters)).to(device)
+        config = MultiTaskDiTConfig(**features(False, device), **flow)
+        policy = modeling.MultiTaskDiTPolicy(config).to(device)
 
     def seen(observation: torch.Tensor) -> dict[str, torch.Tensor]:
         token = torch.ones(len(observation), 1, dtype=torch.bool, device=device)
@@ -232,16 +203,14 @@ def lerobot_multi_task_dit(parameters: float, device: str) -> Peer:
     return lerobot("lerobot: multi_task_dit", policy, seen, set_steps, device)
 
 
-# How to build each, and the packages that it needs.
-TOKENS = ("embedding_dim", range(48, 1024, 24))
-
-PEERS: dict[str, tuple[Callable[[float, str], Peer], tuple[str, ...]]] = {
-    "warmprior_transformer": (partial(ours, ChiTransformer, *TOKENS), ()),  # the paper's network
-    "warmprior_adaln": (partial(ours, AdaLNTransformer, *TOKENS), ()),
-    "warmprior_mlp": (partial(ours, VelocityMLP, "hidden_dim", range(64, 4096, 32)), ()),
-    "torchrl": (torchrl, ()),
-    "lerobot_diffusion": (lerobot_diffusion, ("lerobot", "diffusers")),
-    "lerobot_multi_task_dit": (lerobot_multi_task_dit, ("lerobot", "diffusers", "transformers")),
+# How to build each, its width for 20M parameters, and the packages that it needs.
+PEERS: dict[str, tuple[Callable[[int, str], Peer], int, tuple[str, ...]]] = {
+    "warmprior_transformer": (partial(ours, ChiTransformer, "embedding_dim"), 384, ()),  # the paper's network
+    "warmprior_adaln": (partial(ours, AdaLNTransformer, "embedding_dim"), 360, ()),
+    "warmprior_mlp": (partial(ours, VelocityMLP, "hidden_dim"), 1984, ()),
+    "torchrl": (torchrl, 2208, ()),
+    "lerobot_diffusion": (lerobot_diffusion, 144, ("lerobot", "diffusers")),
+    "lerobot_multi_task_dit": (lerobot_multi_task_dit, 320, ("lerobot", "diffusers", "transformers")),
 }
 
 
@@ -313,23 +282,22 @@ def run(argv: Sequence[str] | None) -> None:
     )
     add = parser.add_argument
     add("--peers", nargs="+", default=list(PEERS), choices=PEERS, help="default: all")
-    add("--parameters", type=float, default=2e7, help="of each network (%(default)s)")
     add("--batch-size", type=int, default=256, help="windows (%(default)s)")
     add("--repeats", type=int, default=5, help="rounds (%(default)s)")
     add("--device", default="cpu", help="such as cuda (%(default)s)")
     add("--out", type=Path, default=Path("runs/peers"), help="output folder (%(default)s)")
     options = parser.parse_args(argv)
-    if options.repeats < 1 or options.batch_size < 1 or not 1e4 <= options.parameters <= 1e9:
-        parser.error("--repeats and --batch-size must be at least 1, --parameters 1e4 to 1e9")
+    if options.repeats < 1 or options.batch_size < 1:
+        parser.error("--repeats and --batch-size must be at least 1")
     check_device(options.device)
     torch.manual_seed(0)
     peers = []
     for name in options.peers:
-        make, packages = PEERS[name]
+        make, width, packages = PEERS[name]
         if missing := [package for package in packages if not find_spec(package)]:
             print(f"{name}: skipped, needs {' and '.join(missing)} (warmprior[vla])")
         else:
-            peers.append(make(options.parameters, options.device))
+            peers.append(make(width, options.device))
     if not peers:
         raise ValueError("none of these peers is installed: pip install 'warmprior[vla]'")
     options.out.mkdir(parents=True, exist_ok=True)
@@ -342,7 +310,7 @@ def run(argv: Sequence[str] | None) -> None:
     (options.out / "peers.json").write_text(text + "\n")
     found = pd.DataFrame(rows).set_index("policy")
     draw(options.out / "peers.png", found)
-    print(found.T.to_string(float_format="{:,.4g}".format))
+    print(found.T.to_string(float_format="{:,.2f}".format))
     print(f"written to {options.out}")
 
 
