@@ -7,7 +7,7 @@ as zeros. Everything here is opened by :func:`member`, which refuses both.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import product
 from math import ceil, prod
@@ -47,8 +47,7 @@ def reading(parent: h5py.Group, name: str) -> Iterator[None]:
         raise
     except Exception as error:  # HDF5's errors share no base class: OSError, RuntimeError, KeyError...
         raise DatasetError(
-            f"{parent.file.filename}: {_full(parent, name)} cannot be read ({error}); copy or "
-            "download the file again"
+            f"{parent.file.filename}: {_full(parent, name)} cannot be read ({error}). {_AGAIN}"
         ) from error
 
 
@@ -262,23 +261,6 @@ def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarra
     return None if rendering is None else _parsed(what, rendering), state
 
 
-def _demo(file: h5py.File, name: str) -> h5py.Group:
-    demo = member(file["data"], name, "group")
-    if demo is None:  # listed, but not to be found: its index is damaged
-        raise DatasetError(f"{file.filename}: data/{name} cannot be read; copy or download the file again")
-    return demo
-
-
-def _default_keys(path: Path, available: Sequence[str]) -> tuple[str, ...]:
-    keys = tuple(key for key in low_dim_keys(arms=2) if key in available)
-    if available and not keys:
-        raise DatasetError(
-            f"{path}: no object or robot observations among {', '.join(available)}; "
-            "name some with observation_keys"
-        )
-    return keys
-
-
 def _widths(path: Path, demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]:
     """Return the steps of a demo and the width of each key, after checking that they agree."""
     name = demo.name[1:]
@@ -312,18 +294,6 @@ def _widths(path: Path, demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dic
             )
         widths[key] = 1 if len(shape) == 1 else shape[1]
     return steps, widths
-
-
-def _check_widths(
-    path: Path, demo: h5py.Group, widths: Mapping[str, int], expected: Mapping[str, int], why: str
-) -> None:
-    for key, width in expected.items():
-        if widths[key] != width:
-            raise DatasetError(
-                f"{path}: {demo.name[1:]}/{key} has shape {demo[key].shape}; {why} has {width} "
-                "columns. Use data of one environment with pose-delta actions; if other "
-                "observations are meant, name them with observation_keys."
-            )
 
 
 def _image_sizes(path: Path, demo: h5py.Group, keys: Sequence[str], steps: int) -> dict[int, str]:
@@ -375,35 +345,43 @@ def read_index(
         selected = selected[:demos]
         env_args = _env_args(file, path)
         task = task_of_env(env_args)
-        first = _demo(file, selected[0])
-        observations = member(first, "obs", "group")
+        observations = member(file, f"data/{selected[0]}/obs", "group")
         available = () if observations is None else tuple(names(observations))
         if observation_keys is not None:
             keys = tuple(observation_keys)
-            if not keys:
-                raise DatasetError(f"{path}: observation_keys is empty; name at least one")
+        elif task is not None:
+            keys = task.low_dim_keys
         else:
-            keys = task.low_dim_keys if task else _default_keys(path, available)
+            keys = tuple(key for key in low_dim_keys(arms=2) if key in available)
+        if available and not keys:
+            raise DatasetError(
+                f"{path}: no observations are chosen; name some with observation_keys: {', '.join(available)}"
+            )
         wanted = [f"obs/{key}" for key in keys]
         if poses:
-            actions = member(first, "actions", "dataset")
+            actions = member(file, f"data/{selected[0]}/actions", "dataset")
             width = actions.shape[-1] if actions is not None and actions.shape else 0
             for arm in range(min(width // 7, 2)):
                 wanted += [f"obs/robot{arm}_eef_pos", f"obs/robot{arm}_eef_quat"]
-        required: dict[str, int] = {}
+        expected, whose = {}, env_args["env_name"]
         if task is not None:
-            required["actions"] = task.action_dim
+            expected["actions"] = task.action_dim
             if observation_keys is None:
-                required["obs/object"] = task.object_dim
+                expected["obs/object"] = task.object_dim
         lengths: list[int] = []
         sides: dict[int, str] = {}
-        reference: dict[str, int] = {}
         for name in selected:
-            demo = _demo(file, name)
+            demo = member(file["data"], name, "group")
+            if demo is None:  # listed, but not to be found: its index is damaged
+                raise DatasetError(f"{path}: data/{name} cannot be read. {_AGAIN}")
             steps, widths = _widths(path, demo, wanted)
-            _check_widths(path, demo, widths, required, env_args["env_name"])
-            reference = reference or widths
-            _check_widths(path, demo, widths, reference, f"data/{selected[0]}")
+            if other := [key for key, width in expected.items() if widths[key] != width]:
+                raise DatasetError(
+                    f"{path}: data/{name}/{other[0]} has shape {demo[other[0]].shape}; {whose} has "
+                    f"{expected[other[0]]} columns. Use data of one environment with pose-delta actions; if "
+                    "other observations are meant, name them with observation_keys."
+                )
+            expected, whose = widths, f"data/{selected[0]} of {env_args['env_name']}"
             lengths.append(steps)
             sides = _image_sizes(path, demo, image_keys, steps) | sides
     if len(sides) > 1:
@@ -414,11 +392,11 @@ def read_index(
         demos=selected,
         lengths=tuple(lengths),
         observation_keys=keys,
-        observation_dims=tuple(reference[f"obs/{key}"] for key in keys),
+        observation_dims=tuple(widths[f"obs/{key}"] for key in keys),
         image_keys=tuple(image_keys),
         image_size=next(iter(sides), 0),
         available_keys=available,
-        action_dim=reference["actions"],
+        action_dim=widths["actions"],
         env_args=env_args,
         task=task,
     )
