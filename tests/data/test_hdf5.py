@@ -76,7 +76,7 @@ def test_filter_keys(square_file, tmp_path):
         read_index(path, filter_key="train")
     bare = tmp_path / "bare.hdf5"
     write_robomimic_file(bare)
-    with pytest.raises(DatasetError, match="'train'; this file has none"):
+    with pytest.raises(DatasetError, match="'train'; this dataset has none"):
         read_index(bare, filter_key="train")
 
 

@@ -24,6 +24,7 @@ from warmprior.data.replay import (
     DemonstrationReader,
     check_count,
     check_env_args,
+    check_filter_key,
     store_finite,
 )
 from warmprior.envs.tasks import low_dim_keys, task_of_env
@@ -190,23 +191,22 @@ def _number(path: Path, name: str) -> int:
 def read_masks(path: str | Path) -> dict[str, set[str]]:
     """The names of the demos in each mask of a robomimic file."""
     with open_robomimic(path) as file:
-        group, demos = member(file, "mask", "group"), len(names(file["data"]))
-        known = [] if group is None else names(group)
-        return {name: _mask(file, Path(path), name, demos) for name in known}
+        return {name: _mask(file, Path(path), name) for name in _mask_names(file)}
 
 
-def _mask(file: h5py.File, path: Path, filter_key: str, demos: int) -> set[str]:
+def _mask_names(file: h5py.File) -> list[str]:
     group = member(file, "mask", "group")
-    known = [] if group is None else names(group)
-    entries = None if group is None else member(group, filter_key, "dataset")
-    if entries is None:
-        known_keys = f"choose one of {', '.join(known)}" if known else "this file has none"
-        raise DatasetError(f"{path}: unknown filter key {filter_key!r}; {known_keys}")
+    return [] if group is None else names(group)
+
+
+def _mask(file: h5py.File, path: Path, filter_key: str) -> set[str]:
+    check_filter_key(path, filter_key, _mask_names(file))
+    entries, demos = member(file["mask"], filter_key, "dataset"), len(names(file["data"]))
     what = f"{path}: mask/{filter_key}"
-    if entries.shape is None or len(entries.shape) != 1 or entries.dtype.kind not in "SO":
+    if entries is None or entries.shape is None or entries.ndim != 1 or entries.dtype.kind not in "SO":
         raise DatasetError(
-            f"{what} has shape {entries.shape} and type {entries.dtype}; a mask is a list of the names "
-            "of demos. Choose another filter key or rebuild the mask."
+            f"{what} is no list of the names of demos, but {entries}. Choose another filter key or rebuild "
+            "the mask."
         )
     if len(entries) > demos:
         raise DatasetError(f"{what} has {len(entries)} names, but data holds {demos} demos; rebuild the mask")
@@ -218,7 +218,7 @@ def _selected(file: h5py.File, path: Path, filter_key: str | None) -> tuple[str,
     present = set(names(file["data"]))
     selected = present
     if filter_key is not None:
-        selected = _mask(file, path, filter_key, len(present))
+        selected = _mask(file, path, filter_key)
         absent = sorted(selected - present)
         if absent or not selected:
             what = f"demos that data does not hold: {', '.join(absent)}" if absent else "no demos"
@@ -229,21 +229,14 @@ def _selected(file: h5py.File, path: Path, filter_key: str | None) -> tuple[str,
     return tuple(sorted(selected, key=lambda name: _number(path, name)))
 
 
-def _env_args(file: h5py.File, path: Path) -> dict[str, Any]:
-    what = f"{path}: data.attrs['env_args']"
-    with reading(file, "data.attrs['env_args']"):
-        text = file["data"].attrs.get("env_args")
-    if text is None:
-        raise DatasetError(
-            f"{path}: the group 'data' has no attribute env_args, which names the environment; "
-            "copy it from the file this one was made from"
-        )
-    return check_env_args(what, _parsed(what, text))
-
-
-def _parsed(what: str, text: Any) -> Any:
+def _described(file: h5py.File, name: str, default: str | None = None) -> Any:
+    """What an attribute of the demos says in JSON."""
+    attribute = f"data.attrs[{name!r}]"
+    with reading(file, attribute):
+        text = file["data"].attrs.get(name, default)
+    what = f"{file.filename}: {attribute}"
     if not isinstance(text, str | bytes):
-        raise DatasetError(f"{what} is not text; copy it from the file this one was made from")
+        raise DatasetError(f"{what} is missing, or no text: copy it from the file this one was made from")
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:  # not UTF-8 included
@@ -253,12 +246,11 @@ def _parsed(what: str, text: Any) -> Any:
 def read_origin(path: Path, demo: str) -> tuple[dict[str, Any] | None, np.ndarray | None]:
     """How the images of a file were rendered, and the first simulator state of a demo, if it says so."""
     with open_robomimic(path) as file:
-        rendering = file["data"].attrs.get("rendering")
+        rendering = _described(file, "rendering", "null")
         states = member(file, f"data/{demo}/states", "dataset")
         with reading(file, f"data/{demo}/states"):
             state = np.asarray(states[0], np.float64) if states is not None and states.size else None
-    what = f"{path}: data.attrs['rendering']"
-    return None if rendering is None else _parsed(what, rendering), state
+    return rendering, state
 
 
 def _widths(path: Path, demo: h5py.Group, keys: Sequence[str]) -> tuple[int, dict[str, int]]:
@@ -343,7 +335,7 @@ def read_index(
         selected = _selected(file, path, filter_key)
         check_count(path, demos, len(selected))
         selected = selected[:demos]
-        env_args = _env_args(file, path)
+        env_args = check_env_args(f"{path}: data.attrs['env_args']", _described(file, "env_args"))
         task = task_of_env(env_args)
         observations = member(file, f"data/{selected[0]}/obs", "group")
         available = () if observations is None else tuple(names(observations))

@@ -9,7 +9,13 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
-from warmprior.data.replay import DatasetError, DatasetIndex, check_count, check_env_args
+from warmprior.data.replay import (
+    DatasetError,
+    DatasetIndex,
+    check_count,
+    check_env_args,
+    check_filter_key,
+)
 from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
@@ -224,9 +230,7 @@ def read_lerobot_index(
     episodes = sorted(metadata.episodes.to_list(), key=lambda row: row["episode_index"])
     if filter_key is not None:
         masks = described.get("masks", {})
-        if filter_key not in masks:
-            known = f"choose one of {', '.join(masks)}" if masks else "this dataset has none"
-            raise DatasetError(f"{root}: unknown filter key {filter_key!r}; {known}")
+        check_filter_key(root, filter_key, masks)
         episodes = [row for row in episodes if row["episode_index"] in masks[filter_key]]
     check_count(root, demos, len(episodes))
     episodes = episodes[:demos]

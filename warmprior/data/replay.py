@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -110,6 +111,13 @@ def check_count(path: Path, demos: int | None, available: int) -> None:
             f"{path}: there are {available} demonstrations, fewer than the {demos} to be taken: ask "
             "for no more"
         )
+
+
+def check_filter_key(path: Path, filter_key: str, known: Collection[str]) -> None:
+    """Refuse the name of a mask that there is not."""
+    if filter_key not in known:
+        names = f"choose one of {', '.join(known)}" if known else "this dataset has none"
+        raise DatasetError(f"{path}: unknown filter key {filter_key!r}; {names}")
 
 
 def store_finite(block: np.ndarray, out: np.ndarray, what: str, first: int, advice: str) -> None:
