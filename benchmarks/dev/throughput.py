@@ -111,22 +111,18 @@ def small_network() -> VelocityMLP:
     return VelocityMLP(D_A, D_O, PRIOR.prediction_length, TO, hidden_dim=384)
 
 
-def cloning(
-    network: nn.Module, folder: str | Path, batch: int = BATCH, device: str = "cpu", **options: Any
-) -> BehaviourCloning:
+def cloning(network: nn.Module, folder: str | Path) -> BehaviourCloning:
     """A training of the network, ready to step."""
-    actor, config = WarmPriorActor(network, PRIOR).to(device), TrainingConfig(batch_size=batch)
-    data = steps(400, 200).to(device)
-    training = BehaviourCloning(actor, data, config, folder, observation_steps=TO, **options)
+    actor, config = WarmPriorActor(network, PRIOR), TrainingConfig(batch_size=BATCH)
+    training = BehaviourCloning(actor, steps(400, 200), config, folder, observation_steps=TO)
     actor.train()
     return training
 
 
-def step_of(network: nn.Module, batch: int = BATCH, device: str = "cpu") -> Callable[[], None]:
+def step_of(network: nn.Module) -> Callable[[], None]:
     """A training step of a network alone, on random numbers."""
     optimizer = torch.optim.AdamW(network.parameters(), fused=True)
-    t, a = torch.rand(batch, device=device), torch.randn(batch, H, D_A, device=device)
-    o = torch.randn(batch, TO, D_O, device=device)
+    t, a, o = torch.rand(BATCH), torch.randn(BATCH, H, D_A), torch.randn(BATCH, TO, D_O)
 
     def step() -> None:
         loss = network(t, a, o).square().mean()
@@ -185,11 +181,11 @@ def lerobot_windows_over_getitem(clock: Clock) -> float | None:
         root, name = Path(folder) / "data", "local/windows"
         options = {"fps": fps, "features": features, "root": root}
         written = LeRobotDataset.create(name, use_videos=False, **options)
-        for i, row in enumerate(data):
-            state, action = row["observation"].numpy(), row["action"].numpy()
-            written.add_frame({"observation.state": state, "action": action, "task": "none"})
-            if i == len(data) - 1 or data["episode"][i + 1] != data["episode"][i]:
-                written.save_episode()
+        for episode in data.view(25, 200):
+            for row in episode:
+                state, action = row["observation"].numpy(), row["action"].numpy()
+                written.add_frame({"observation.state": state, "action": action, "task": "none"})
+            written.save_episode()
         written.finalize()
         offsets = {
             "action": [i / fps for i in range(-H, H)],
@@ -265,48 +261,7 @@ def ddp_efficiency(clock: Clock) -> dict[str, dict[str, float]]:
     return {name: dict(zip(("time", "processor"), both, strict=True)) for name, both in found.items()}
 
 
-def _gpu(name: str) -> bool:
-    if not torch.cuda.is_available():
-        tqdm.write(f"{name}: skipped, needs a GPU")
-    return torch.cuda.is_available()
-
-
-def cuda_train_step_over_network(clock: Clock) -> float | None:
-    """Of the paper's preset, both as CUDA graphs."""
-    if not _gpu("cuda_train_step_over_network"):
-        return None
-    batch, bare = TrainingConfig().batch_size, paper_network().to("cuda")
-    bare.compile(mode="reduce-overhead")
-
-    def twenty(step: Callable[[], object]) -> Callable[[], None]:
-        def run() -> None:
-            for _ in range(20):
-                torch.compiler.cudagraph_mark_step_begin()
-                step()
-            torch.cuda.synchronize()
-
-        return run
-
-    with tempfile.TemporaryDirectory() as folder:
-        ours = cloning(paper_network(), folder, batch, "cuda", compile=True)
-        return clock.ratio(twenty(ours.step), twenty(step_of(bare, batch, "cuda")))
-
-
 # Decisions
-
-
-@torch.no_grad()
-def cuda_latency(clock: Clock) -> dict[str, float] | None:
-    """Milliseconds per chunk of a single decision, by number of network evaluations."""
-    if not _gpu("cuda_latency"):
-        return None
-    actor = WarmPriorActor(paper_network().eval(), PRIOR).eval().to("cuda")
-    actor.network.compile(mode="reduce-overhead")
-    found, data = {}, one_decision("cuda")
-    for nfe in NFES:
-        (seconds,) = clock.times(partial(actor, data, nfe=nfe), calls=50)  # it waits for the GPU
-        found[str(nfe)] = 1e3 * statistics.median(seconds)
-    return found
 
 
 @torch.no_grad()
@@ -373,8 +328,6 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "train_step_over_network": (train_step_over_network, "<= 1.10"),
     "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
     "ddp_efficiency": (ddp_efficiency, ""),
-    "cuda_train_step_over_network": (cuda_train_step_over_network, "<= 1.05"),
-    "cuda_latency": (cuda_latency, ""),
     "actor_over_network": (actor_over_network, "<= 1.10"),
     "actor_over_network_compiled": (partial(actor_over_network, compiled=True), ""),
     "env_over_robosuite": (env_over_robosuite, ">= 2"),

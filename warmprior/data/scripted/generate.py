@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from functools import cached_property, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -101,10 +101,10 @@ def generate_demonstrations(
     import_robosuite()
     workers = min(n, workers or available_cores())
     with (
-        working(workers, _Player(task, style)) as call,
+        working(workers, task) as call,
         tqdm(total=n, desc=f"{task}/{style}", unit="demo", disable=not progress) as bar,
     ):
-        model_file = call(_Player.model).result()
+        model_file = call(_model).result()
         write_robomimic(
             path,
             _successes(call, 2 * workers, style, n, seed * SEEDS_PER_FILE, bar.update),
@@ -117,7 +117,7 @@ def generate_demonstrations(
 
 
 def _successes(
-    call: Callable[[Callable[[_Player], Episode]], Future[Episode]],
+    call: Callable[[Callable[[str], Episode]], Future[Episode]],
     ahead: int,
     style: str,
     n: int,
@@ -137,7 +137,7 @@ def _successes(
             following = next((s for s in upcoming if wanted[operator_of(style, s)]), None)
             if following is None:
                 break
-            running.append(call(partial(_Player.play, seed=following)))
+            running.append(call(partial(_play, style=style, seed=following)))
         if not running:
             raise RuntimeError(f"only {n - sum(wanted)} of {n} demonstrations succeeded in {played} episodes")
         episode = running.popleft().result()
@@ -149,20 +149,16 @@ def _successes(
     logger.info(f"{n} demonstrations from {played} scripted episodes")
 
 
-class _Player:
-    """One simulation and the episodes played in it; it is made in the worker that plays."""
+@cache
+def _loop(task: str) -> ControlLoop:
+    """The simulation of a task, one per worker."""
+    return expert_loop(task)
 
-    def __init__(self, task: str, style: str) -> None:
-        self.task, self.style = task, style
 
-    @cached_property
-    def loop(self) -> ControlLoop:
-        return expert_loop(self.task)
+def _model(task: str) -> str:
+    """The simulator's model as XML."""
+    return str(_loop(task).env.sim.model.get_xml())
 
-    def model(self) -> str:
-        """The simulator's model as XML."""
-        return str(self.loop.env.sim.model.get_xml())
 
-    def play(self, seed: int) -> Episode:
-        """The episode of a seed."""
-        return run_episode(self.loop, self.task, self.style, seed)
+def _play(task: str, style: str, seed: int) -> Episode:
+    return run_episode(_loop(task), task, style, seed)
