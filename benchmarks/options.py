@@ -168,10 +168,10 @@ class Options:
             method.nfes(self.evaluation.nfe)
             if method.is_flow and self.training.times == "start":
                 raise ValueError(f"--times start trains no flow: leave out {method.name}, or take regression")
-            options = {"objective l1": self.training.objective == "l1"}
-            options |= {"self-distillation": self.training.self_distillation > 0}
-            for name in (name for name, asked in options.items() if asked and not method.is_straight):
-                raise ValueError(f"--{name} needs a straight path: leave out {method.name}")
+            l1, distilled = self.training.objective == "l1", self.training.self_distillation > 0
+            if (l1 or distilled) and not method.is_straight:
+                asked = "--objective l1" if l1 else "--self-distillation"
+                raise ValueError(f"{asked} needs a straight path: leave out {method.name}")
             if self.data.obs == "image" and method.needs_vector:
                 raise ValueError(
                     f"{method.name} reads observations that are one vector: leave it out with --obs image"

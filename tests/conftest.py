@@ -54,7 +54,7 @@ def lift_demonstrations(tmp_path_factory):
     generate = "warmprior.data.scripted.generate"
     cache = patch.dict(os.environ, WARMPRIOR_CACHE=str(folder / "demonstrations"))
     with FileLock(folder / "demonstrations.lock"), patch(f"{generate}.working", here), cache:
-        return generate_demonstrations("lift", n=3, workers=1, progress=False)
+        return generate_demonstrations("lift", n=3, workers=1)
 
 
 CLUSTER = """

@@ -84,7 +84,7 @@ def test_images_are_seen_through_the_encoder(lift_demonstrations, tmp_path, monk
 def test_results_of_a_lerobot_dataset_are_those_of_the_file(dataset, tmp_path, monkeypatch):
     pytest.importorskip("lerobot")
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    place = f"lerobot:{convert_robomimic(dataset, tmp_path / 'lift', progress=False)}"
+    place = f"lerobot:{convert_robomimic(dataset, tmp_path / 'lift')}"
     for name, data in (("file", dataset), ("lerobot", place)):
         few = {"prior": "past", "iterations": 10, "task": None}
         assert robomimic.main(options(data, tmp_path / name, **few)) == 0

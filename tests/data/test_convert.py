@@ -45,10 +45,7 @@ def converted(tmp_path_factory):
         env_args=env_args_14("transport"),
     )
     with_images(path)
-    return path, {
-        kind: convert_robomimic(path, folder / kind, images=kind, progress=False)
-        for kind in ("image", "video")
-    }
+    return path, {kind: convert_robomimic(path, folder / kind, images=kind) for kind in ("image", "video")}
 
 
 def equal(mine, theirs):
@@ -121,13 +118,13 @@ def test_an_interrupted_conversion_leaves_nothing(converted, tmp_path, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr(LeRobotDataset, "save_episode", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            convert_robomimic(path, folder, progress=False)
+            convert_robomimic(path, folder)
     assert saved and not list(folder.parent.iterdir())
     # A killed process cannot tidy up: what it left is not continued, and not in the way.
     left = folder.parent / ".data.converting" / "data" / "meta"
     left.mkdir(parents=True)
     (left / "info.json").write_text("{")
-    assert convert_robomimic(path, folder, progress=False) == folder
+    assert convert_robomimic(path, folder) == folder
     assert len(LeRobotExperienceReplay(folder)) == 16
     assert [p.name for p in folder.parent.iterdir()] == ["data"]
 
@@ -147,7 +144,7 @@ def test_what_cannot_be_converted(tmp_path):
     with pytest.raises(DatasetError, match="no images: render them first"):
         convert_robomimic(path, folder, images="image")
     with pytest.raises(DatasetError, match=r"demo_0/obs/robot0_eef_pos .* row 1\."):
-        convert_robomimic(path, folder, progress=False)
+        convert_robomimic(path, folder)
     env_args = env_args_15("lift")
     env_args["env_kwargs"]["control_freq"] = 12.5
     write_robomimic_file(path, task="lift", lengths=(3,), env_args=env_args)

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(rendering_backend() is None, reason="nothing ren
 CAMERAS = ("agentview", "robot0_eye_in_hand")
 IMAGES = [f"{camera}_image" for camera in CAMERAS]
 STEPS = 4
-OPTIONS = {"size": 16, "fast": True, "progress": False}
+OPTIONS = {"size": 16, "fast": True}
 
 
 @apart

@@ -41,9 +41,7 @@ def contents(path):
 
 @pytest.mark.slow
 def test_the_number_of_workers_does_not_matter(lift_demonstrations, tmp_path):
-    other = generate_demonstrations(
-        "lift", n=3, path=tmp_path / "deep" / "two.hdf5", workers=2, progress=False
-    )
+    other = generate_demonstrations("lift", n=3, path=tmp_path / "deep" / "two.hdf5", workers=2)
     first, second = contents(lift_demonstrations), contents(other)
     assert first.keys() == second.keys()
     for name, value in first.items():
@@ -160,7 +158,7 @@ def generated(monkeypatch, path, run_episode, **options):
     monkeypatch.setattr(generate_module, "expert_loop", MagicMock())
     monkeypatch.setattr(generate_module, "run_episode", run_episode)
     monkeypatch.setattr(generate_module, "write_robomimic", write)
-    generate_demonstrations("lift", path=path, progress=False, **options)
+    generate_demonstrations("lift", path=path, **options)
     return kept
 
 

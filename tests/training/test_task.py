@@ -152,7 +152,7 @@ def test_a_lerobot_dataset_is_the_task_of_its_file(path, tmp_path):
     pytest.importorskip("lerobot")
     from warmprior.data import convert_robomimic
 
-    folder = convert_robomimic(path, tmp_path / "lift", progress=False)
+    folder = convert_robomimic(path, tmp_path / "lift")
     file, theirs = (robosuite_task(p, options=DataOptions(("lift",))) for p in (path, f"lerobot:{folder}"))
     assert (file.data == theirs.data).all() and file.name == theirs.name == "lift"
     assert file.environment == theirs.environment and file.identity != theirs.identity

@@ -33,7 +33,6 @@ def convert_robomimic(
     *,
     images: Literal["image", "video"] | None = None,
     demos: int | None = None,
-    progress: bool = True,
 ) -> Path:
     """Write the demonstrations of a robomimic HDF5 file as a LeRobotDataset v3, which LeRobot reads.
 
@@ -49,7 +48,6 @@ def convert_robomimic(
         images: write those of the file as well, as pictures (``"image"``, lossless PNG) or as videos
             (``"video"``, lossy, smaller).
         demos: how many to convert, the first ones by their numbers; all if ``None``.
-        progress: show a bar with the remaining time.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -98,7 +96,7 @@ def convert_robomimic(
         try:
             # What a killed process left is of no use: its files have no ends.
             shutil.rmtree(whole, ignore_errors=True)
-            _write(datasets, index, whole, int(fps), images, progress)
+            _write(datasets, index, whole, int(fps), images)
             os.rename(whole, folder)
         finally:
             shutil.rmtree(parts, ignore_errors=True)
@@ -137,7 +135,6 @@ def _write(
     root: Path,
     fps: int,
     images: Literal["image", "video"] | None,
-    progress: bool,
 ) -> None:
     layout = layout_of(dict(zip(index.observation_keys, index.observation_dims, strict=True)))
     task = index.env_args["env_name"].lower() if index.task is None else index.task.name
@@ -161,9 +158,7 @@ def _write(
     for feature, widths in layout.items():
         numbers[feature] = torch.cat([parts[key] for key in widths], -1)
     rows = np.cumsum([0, *index.lengths])
-    bar = tqdm(
-        pairwise(rows), f"convert {index.path.stem}", len(index.lengths), unit="demo", disable=not progress
-    )
+    bar = tqdm(pairwise(rows), f"convert {index.path.stem}", len(index.lengths), unit="demo")
     with quietly():
         try:
             for start, stop in bar:

@@ -39,7 +39,6 @@ def render_demonstrations(
     fast: bool = False,
     out: str | Path | None = None,
     workers: int | None = None,
-    progress: bool = True,
 ) -> Path:
     """Add images to a robomimic file, rendered from the states that it holds.
 
@@ -60,7 +59,6 @@ def render_demonstrations(
             (``$WARMPRIOR_CACHE``, or ``~/.cache/warmprior`` if that is not set), from which a file rendered
             earlier from the same file is returned at once.
         workers: number of processes; ``None`` for one per available core.
-        progress: show a bar with the remaining time.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -108,16 +106,9 @@ def render_demonstrations(
     with exclusive(parts):
         missing = [demo for demo in index.demos if not illustrator.part(demo).exists()]
         workers = max(1, min(len(missing), workers or available_cores()))
-        with (
-            working(workers, illustrator) as call,
-            tqdm(
-                total=len(index.demos),
-                initial=len(index.demos) - len(missing),
-                desc=f"render {path.stem}",
-                unit="demo",
-                disable=not progress,
-            ) as bar,
-        ):
+        count = {"initial": len(index.demos) - len(missing), "total": len(index.demos)}
+        bar = tqdm(desc=f"render {path.stem}", unit="demo", **count)
+        with working(workers, illustrator) as call, bar:
             call(_Illustrator.check).result()  # before hours are spent
             for future in as_completed([call(partial(_Illustrator.render, demo=demo)) for demo in missing]):
                 future.result()

@@ -146,9 +146,7 @@ def _allocate(
         **{(OBSERVATION, key): image for key in index.image_keys},
         ACTION: (torch.float32, (action_dim,)),
         ("next", "reward"): (torch.float32, (1,)),
-        ("next", "done"): (torch.bool, (1,)),
-        ("next", "terminated"): (torch.bool, (1,)),
-        ("next", "truncated"): (torch.bool, (1,)),
+        **{("next", flag): (torch.bool, (1,)) for flag in ("done", "terminated", "truncated")},
         EPISODE: (torch.int64, ()),
         FRAME: (torch.int64, ()),
     }

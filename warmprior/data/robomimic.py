@@ -76,8 +76,14 @@ def _download(name: str, repositories: Sequence[str], root: str | Path | None, f
         for anew in dict.fromkeys((force, True)):  # a damaged copy is fetched once more
             try:
                 path = Path(hub.hf_hub_download(**where, local_dir=root, force_download=anew))
-                _check(path, _published_digest(hub, where))
-                return path
+                published = _published_digest(hub, where)
+                if published is not None and file_digest(path) != published:
+                    raise DatasetError(
+                        f"{path}: its sha256 is not the {published} that the hub publishes: it was damaged "
+                        "on the way or on this disk"
+                    )
+                with open_robomimic(path):
+                    return path
             # The client's failures share no base class: its own errors, those of the HTTP library
             # underneath, and OSError for a broken connection, a full disk or a short file.
             except Exception as error:
@@ -91,16 +97,6 @@ def _download(name: str, repositories: Sequence[str], root: str | Path | None, f
         + "\nCheck the connection; force=True replaces a broken local copy, and a file fetched by "
         "other means can be given by its path."
     ) from cause
-
-
-def _check(path: Path, digest: str | None) -> None:
-    if digest is not None and file_digest(path) != digest:
-        raise DatasetError(
-            f"{path}: its sha256 is not the {digest} that the hub publishes: it was damaged on the way "
-            "or on this disk"
-        )
-    with open_robomimic(path):
-        pass
 
 
 def _published_digest(hub: Any, where: dict[str, Any]) -> str | None:

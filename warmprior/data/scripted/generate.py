@@ -38,7 +38,6 @@ def generate_demonstrations(
     path: str | Path | None = None,
     overwrite: bool = False,
     workers: int | None = None,
-    progress: bool = True,
 ) -> Path:
     """Generate successful scripted demonstrations in robomimic's HDF5 layout; the path of the complete file.
 
@@ -58,7 +57,6 @@ def generate_demonstrations(
             that is not set), from which a file generated earlier with the same arguments is returned at once.
         overwrite: replace what is at ``path``.
         workers: number of processes; ``None`` for one per available core.
-        progress: show a bar with the remaining time.
 
     Raises:
         FileExistsError: if there is something at ``path``.
@@ -100,10 +98,7 @@ def generate_demonstrations(
     require("h5py", "sim")
     import_robosuite()
     workers = min(n, workers or available_cores())
-    with (
-        working(workers, task) as call,
-        tqdm(total=n, desc=f"{task}/{style}", unit="demo", disable=not progress) as bar,
-    ):
+    with working(workers, task) as call, tqdm(total=n, desc=f"{task}/{style}", unit="demo") as bar:
         model_file = call(_model).result()
         write_robomimic(
             path,
