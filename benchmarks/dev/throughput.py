@@ -265,15 +265,15 @@ def ddp_efficiency(clock: Clock) -> dict[str, dict[str, float]]:
 
 
 @torch.no_grad()
-def actor_over_network(clock: Clock, compiled: bool = False) -> dict[str, float]:
-    call = torch.compile(paper_network().eval()) if compiled else paper_network().eval()
-    actor = WarmPriorActor(call, PRIOR).eval()
+def actor_over_network(clock: Clock) -> dict[str, float]:
+    network = paper_network().eval()
+    actor = WarmPriorActor(network, PRIOR).eval()
     data, t, a = one_decision(), torch.rand(1), torch.randn(1, H, D_A)
     found = {}
     for nfe in NFES:
         found[str(nfe)] = clock.ratio(
             partial(actor, data, nfe=nfe),
-            lambda nfe=nfe: [call(t, a, data["observation"]) for _ in range(nfe)],
+            lambda nfe=nfe: [network(t, a, data["observation"]) for _ in range(nfe)],
             calls=max(2, 18 // nfe),
         )
     return found
@@ -329,7 +329,6 @@ FIGURES: dict[str, tuple[Callable[[Clock], Any], str]] = {
     "preconditioning_over_network": (preconditioning_over_network, "<= 1.02"),
     "ddp_efficiency": (ddp_efficiency, ""),
     "actor_over_network": (actor_over_network, "<= 1.10"),
-    "actor_over_network_compiled": (partial(actor_over_network, compiled=True), ""),
     "env_over_robosuite": (env_over_robosuite, ">= 2"),
     "chunk_step_overhead": (chunk_step_overhead, "<= 0.10"),
 }

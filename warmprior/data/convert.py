@@ -130,11 +130,7 @@ def _camera(key: str) -> str:
 
 
 def _write(
-    datasets: Any,
-    index: DatasetIndex,
-    root: Path,
-    fps: int,
-    images: Literal["image", "video"] | None,
+    datasets: Any, index: DatasetIndex, root: Path, fps: int, images: Literal["image", "video"] | None
 ) -> None:
     layout = layout_of(dict(zip(index.observation_keys, index.observation_dims, strict=True)))
     task = index.env_args["env_name"].lower() if index.task is None else index.task.name

@@ -9,13 +9,7 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any
 
-from warmprior.data.replay import (
-    DatasetError,
-    DatasetIndex,
-    check_count,
-    check_env_args,
-    check_filter_key,
-)
+from warmprior.data.replay import DatasetError, DatasetIndex, check_count, check_env_args, check_filter_key
 from warmprior.envs.tasks import TaskSpec, task_of_env
 from warmprior.io.extras import require
 from warmprior.io.files import digest_of, file_digest, is_repository, read_json
