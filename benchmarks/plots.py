@@ -242,7 +242,6 @@ def plot_navigation(
     path: str | Path,
     chunk_length: int,
     title: str,
-    shown: int = 24,
 ) -> None:
     """Executed paths between the obstacles, a panel per policy after one of the data (Fig. 5).
 
@@ -264,7 +263,7 @@ def plot_navigation(
         else:
             axis.plot(x, demonstrations.T, color="0.6", lw=0.6, ls=":")
             heights, lines = panels[name]
-            drawn = heights[:shown].numpy()
+            drawn = heights[:24].numpy()
             sides(axis, x, drawn, 0, lw=0.8, alpha=0.45)
             axis.plot(x, drawn[0], color=INK, lw=1.3)
             axis.plot(x[::chunk_length], drawn[0, ::chunk_length], "o", color=INK, ms=2.8)

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from warmprior.data.hdf5 import read_index, read_origin
 from warmprior.data.lerobot import LeRobotExperienceReplay
 from warmprior.data.lerobot_index import LeRobotIndex, is_remote, read_lerobot_index
@@ -136,12 +134,6 @@ class Demonstrations:
         else:
             rendering, state = read_origin(index.path, index.demos[0])
         first = self.replay(image_keys=keys, demos=1).data[OBSERVATION][0]
-        compare_first_images(
-            index,
-            {key: first[key].permute(1, 2, 0).numpy() for key in keys},
-            state=None if state is None else np.asarray(state, np.float64),
-            rendering=rendering,
-            fast=fast,
-            advice=advice,
-        )
+        images = {camera: first[f"{camera}_image"].permute(1, 2, 0).numpy() for camera in cameras}
+        compare_first_images(index, images, state, rendering, fast, advice)
         return self

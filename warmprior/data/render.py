@@ -201,9 +201,10 @@ class _Illustrator:
 
         write_atomic(self.part(demo), write)
 
-    def compare(self, state: np.ndarray, images: Mapping[str, np.ndarray], name: str, advice: str) -> None:
+    def compare(self, state: Sequence[float], images: Mapping[str, np.ndarray], advice: str) -> None:
         """Compare images of a state, by camera, with the simulator's."""
-        (joints,) = self._joints(state[None], 1, f"{name}: the first state")
+        name = self.index.path
+        (joints,) = self._joints(np.array([state], np.float64), 1, f"{name}: the first state")
         for camera, image in images.items():
             shown = self.renderer.render(camera, joints).astype(np.float32)
             stored = image.astype(np.float32)
@@ -270,13 +271,12 @@ def _write(path: Path, illustrator: _Illustrator, kept: Sequence[str]) -> None:
 def compare_first_images(
     index: DatasetIndex,
     images: Mapping[str, np.ndarray],
-    *,
-    state: np.ndarray | None,
+    state: Sequence[float] | None,
     rendering: Mapping[str, Any] | None,
     fast: bool,
     advice: str,
 ) -> None:
-    """Compare images of one state, uint8 ``[size, size, 3]`` by name, with what the simulator shows there.
+    """Compare images of one state, uint8 ``[size, size, 3]`` by camera, with what the simulator shows there.
 
     A ``DatasetError`` if they differ, or are of the other quality; a warning where there is no state.
     """
@@ -291,9 +291,7 @@ def compare_first_images(
             f"{path} holds no states: its images could not be compared with the simulator's", stacklevel=2
         )
         return
-    by_camera = {key.removesuffix("_image"): image for key, image in images.items()}
-    illustrator = _Illustrator(index, tuple(by_camera), index.image_size, fast, path)
+    illustrator = _Illustrator(index, tuple(images), index.image_size, fast, path)
     # In a process of its own: one that has rendered cannot fork others that do.
     with working(1, illustrator) as call:
-        compare = partial(_Illustrator.compare, state=state, images=by_camera, name=str(path), advice=advice)
-        call(compare).result()
+        call(partial(_Illustrator.compare, state=state, images=images, advice=advice)).result()
